@@ -1,0 +1,57 @@
+"""The filter-consistency test bench: does an estimator tell the truth about its own uncertainty?"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from consistency.diagnostics import analyse_estimates as analyse_estimates
+    from consistency.diagnostics import anees, anees_interval, nees
+    from consistency.errors import InputError
+    from consistency.filters import filter_names, get_filter
+    from consistency.findings import Finding, Study
+    from consistency.judge import analyse
+    from consistency.montecarlo import run_trials
+    from consistency.results import Results, read_results
+    from consistency.scenario import Scenario, load_scenario, scenario_names
+    from consistency.simulation import simulate
+    from consistency.types import Control, Gaussian, Info, Observation, Trial, Verdict
+
+_HOME = {
+    "InputError": "errors",
+    "Scenario": "scenario",
+    "load_scenario": "scenario",
+    "scenario_names": "scenario",
+    "simulate": "simulation",
+    "filter_names": "filters",
+    "get_filter": "filters",
+    "run_trials": "montecarlo",
+    "Results": "results",
+    "read_results": "results",
+    "nees": "diagnostics",
+    "anees": "diagnostics",
+    "anees_interval": "diagnostics",
+    "analyse": "judge",
+    "Finding": "findings",
+    "Study": "findings",
+    "Control": "types",
+    "Gaussian": "types",
+    "Info": "types",
+    "Observation": "types",
+    "Trial": "types",
+    "Verdict": "types",
+}
+
+__all__ = [
+    "Control", "Finding", "Gaussian", "Info", "InputError", "Observation", "Results", "Scenario", "Study", "Trial",
+    "Verdict", "analyse", "anees", "anees_interval", "filter_names", "get_filter", "load_scenario", "nees",
+    "read_results", "run_trials", "scenario_names", "simulate",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    # imported on first use, so that `import consistency` and `--help` stay fast
+    if name not in _HOME:
+        raise AttributeError(f"module 'consistency' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"consistency.{_HOME[name]}"), name)

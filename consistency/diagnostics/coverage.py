@@ -1,0 +1,30 @@
+"""How often the truth lies within the stated bounds, and how large the error is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consistency.types import Array
+
+TWO_SIGMA = 0.9544997361036416  # P(|N(0, 1)| <= 2)
+
+
+def coverage(error: Array, covariance: Array, bound: float = 2.0) -> Array:
+    """Share of errors within ``bound`` standard deviations, for each axis.
+
+    Shapes (..., n) and (..., n, n) -> (n,); rows with NaN do not count.
+    """
+    error = np.asarray(error, float)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    valid = np.isfinite(error) & np.isfinite(sigma)
+    inside = valid & (np.abs(np.where(valid, error, 0.0)) <= bound * np.where(valid, sigma, 0.0))
+    axes = tuple(range(error.ndim - 1))
+    count = valid.sum(axis=axes)
+    return np.where(count > 0, inside.sum(axis=axes) / np.maximum(count, 1), np.nan)
+
+
+def rmse(error: Array) -> float:
+    """Root of the mean squared length of errors (..., n) over all runs and steps; NaN rows do not count."""
+    squared = np.sum(np.square(np.asarray(error, float)), axis=-1)
+    squared = squared[np.isfinite(squared)]
+    return float(np.sqrt(squared.mean())) if squared.size else float("nan")

@@ -1,0 +1,63 @@
+"""Normalized estimation error squared, Bar-Shalom, Li & Kirubarajan (2001) sec. 5.4."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consistency.types import Array
+
+
+def nees(error: Array, covariance: Array) -> Array:
+    """error' covariance^-1 error, Herath et al. (2007) eq. 14.
+
+    Parameters
+    ----------
+    error : (..., n), truth minus estimate; wrap angles first
+    covariance : (..., n, n)
+
+    Returns
+    -------
+    (...), chi-square distributed with n degrees of freedom if the covariance is the error's
+
+    Raises
+    ------
+    ValueError
+        Shapes do not fit, a value is not finite, or a covariance is not symmetric or not positive
+        definite; the message names the first index.
+    """
+    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    if e.ndim < 1 or P.shape[-2:] != (e.shape[-1], e.shape[-1]):
+        raise ValueError(f"error {e.shape} and covariance {P.shape} must be (..., n) and (..., n, n)")
+    e, P = np.broadcast_arrays(e[..., None], P)[0][..., :1], np.broadcast_to(P, (*e.shape[:-1], *P.shape[-2:]))
+    _require(np.isfinite(e).all(axis=(-2, -1)), "the error is not finite")
+    _require(np.isfinite(P).all(axis=(-2, -1)), "the covariance is not finite")
+    scale = np.abs(P).max(axis=(-2, -1))
+    _require(
+        np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1)) <= 1e-8 * scale, "the covariance is not symmetric"
+    )
+    try:
+        root = np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        smallest = np.linalg.eigvalsh(P)[..., 0]
+        _require(smallest > 0, "the covariance is not positive definite")
+        raise ValueError("a covariance is not positive definite") from None
+    whitened = np.linalg.solve(root, e)[..., 0]
+    return np.einsum("...i,...i->...", whitened, whitened)
+
+
+def anees(values: Array) -> Array:
+    """Average over runs, Herath et al. (2007) eq. 16: (runs, steps) -> (steps,).
+
+    A NaN is a run that has no value in that step (rank-deficient covariance, or failed earlier); where
+    no run has one the average is NaN.
+    """
+    values = np.asarray(values, float)
+    count = np.isfinite(values).sum(axis=0)
+    total = np.where(np.isfinite(values), values, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _require(good: Array, what: str) -> None:
+    if not np.all(good):
+        index = tuple(int(i) for i in np.argwhere(~np.atleast_1d(good))[0])
+        raise ValueError(f"{what} at index {index if np.ndim(good) else ()}")

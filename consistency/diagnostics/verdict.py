@@ -1,0 +1,136 @@
+"""The verdict on one filter, from its errors over independent runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from consistency.diagnostics.coverage import TWO_SIGMA, coverage, rmse
+from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.diagnostics.nees import anees
+from consistency.types import Array, Failure, Verdict
+
+
+def judge(
+    filter_name: str,
+    error: Array | None,
+    covariance: Array,
+    nees: Array | None,
+    nis: Array,
+    nis_dof: Array,
+    failures: tuple[Failure, ...] = (),
+    confidence: float = 0.95,
+) -> Verdict:
+    """Consistent, overconfident, conservative or failed, with reasons and statistics.
+
+    The verdict compares the ANEES curve with a band that holds in all judged steps at once
+    (Bonferroni): N ANEES(k) is chi-square with N n degrees of freedom in every step, so a consistent
+    linear-Gaussian filter leaves that band anywhere with probability at most 1 - confidence, however
+    its steps depend on each other. The pointwise interval (eq. 17) is reported beside it. A filter
+    with failed runs is never consistent. Without truth the NIS is judged instead.
+
+    Parameters
+    ----------
+    error, covariance : (runs, steps, n), (runs, steps, n, n), NaN where a run has no estimate
+    nees : (runs, steps), NaN where the covariance is rank-deficient or the run has failed
+    nis, nis_dof : (runs, steps)
+    """
+    runs, steps = nis.shape
+    statistics: dict[str, Any] = {"runs": runs, "steps": steps, "confidence": confidence}
+    statistics |= _nis(nis, nis_dof, confidence)
+    statistics["failures"] = [[f.run, f.step, f.reason] for f in failures]
+    if error is None or nees is None:
+        status, reasons = _judge_nis(statistics)
+    else:
+        statistics |= _nees(error, covariance, nees, confidence)
+        status, reasons = _judge_nees(statistics)
+    if failures:
+        first = failures[0]
+        reasons.append(
+            f"{len(failures)} of {runs} runs failed, first run {first.run} in step {first.step}: {first.reason}"
+        )
+        status = "failed" if status == "consistent" or statistics.get("judged_steps") == 0 else status
+    return Verdict(filter_name, status, tuple(reasons), statistics)
+
+
+def _nees(error: Array, covariance: Array, nees: Array, confidence: float) -> dict[str, Any]:
+    n = error.shape[-1]
+    curve, alive = anees(nees), np.isfinite(nees).sum(axis=0)
+    judged = alive > 0
+    # steps that a failure emptied are not left out: only those in which no covariance has full rank
+    tail = 1.0 - (1.0 - confidence) / max(int(judged.sum()), 1)
+    bands = {int(m): (anees_interval(n, int(m), confidence), anees_interval(n, int(m), tail)) for m in set(alive[judged])}
+    band = np.full((len(curve), 2), np.nan)
+    simultaneous = np.full((len(curve), 2), np.nan)
+    for k in np.flatnonzero(judged):
+        band[k], simultaneous[k] = bands[int(alive[k])]
+    inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
+    above, below = curve > simultaneous[:, 1], curve < simultaneous[:, 0]
+    outside = np.flatnonzero(above | below)
+    covered = coverage(error, covariance)
+    return {
+        "dof": n,
+        "anees": curve,
+        "alive": alive,
+        "band": band,
+        "simultaneous": simultaneous,
+        "judged_steps": int(judged.sum()),
+        "left_out_steps": [int(k) + 1 for k in np.flatnonzero(~judged)],
+        "mean_anees": float(np.nanmean(curve)) if judged.any() else float("nan"),
+        "share_inside": float(inside[judged].mean()) if judged.any() else float("nan"),
+        "steps_above": int(above.sum()),
+        "steps_below": int(below.sum()),
+        "first_outside": int(outside[0]) + 1 if len(outside) else None,
+        "coverage": [float(c) for c in covered],
+        "rmse_position": rmse(error[..., :2]),
+        "rmse_heading": rmse(error[..., 2:]),
+    }
+
+
+def _nis(nis: Array, dof: Array, confidence: float) -> dict[str, Any]:
+    total = int(np.where(np.isfinite(nis), dof, 0).sum())
+    if total == 0:
+        return {"nis_ratio": float("nan"), "nis_interval": [float("nan")] * 2, "nis_dof": 0}
+    low, high = chi2_mean_interval(total, confidence)
+    return {"nis_ratio": float(np.nansum(nis) / total), "nis_interval": [low, high], "nis_dof": total}
+
+
+def _judge_nees(s: dict[str, Any]) -> tuple[str, list[str]]:
+    if s["judged_steps"] == 0:
+        return "failed", ["no step has a pose covariance of full rank to judge"]
+    percent = f"{100 * s['confidence']:g} %"
+    text = f"ANEES {s['mean_anees']:.3g} on average ({s['dof']} expected)"
+    low, high = s["simultaneous"][s["alive"] > 0][0]
+    band = f"the band [{low:.2f}, {high:.2f}] that holds in all steps at once with {percent}"
+    if s["first_outside"] is None:
+        status, text = "consistent", f"{text}; never outside {band}"
+    else:
+        status = "overconfident" if s["steps_above"] else "conservative"
+        where = []
+        if s["steps_above"]:
+            where.append(f"above it in {s['steps_above']}")
+        if s["steps_below"]:
+            where.append(f"below it in {s['steps_below']}")
+        count = f"{' and '.join(where)} of {s['judged_steps']} steps, first in step {s['first_outside']}"
+        text = f"{text}; {band}: {count}"
+    axes = ("x", "y", "heading")
+    covered = ", ".join(f"{axis} {100 * c:.1f} %" for axis, c in zip(axes, s["coverage"], strict=False))
+    return status, [text, f"2-sigma coverage {covered} ({100 * TWO_SIGMA:.1f} % expected)", _nis_sentence(s)]
+
+
+def _judge_nis(s: dict[str, Any]) -> tuple[str, list[str]]:
+    low, high = s["nis_interval"]
+    status = "consistent"
+    if not np.isfinite(s["nis_ratio"]):
+        return "failed", ["neither truth nor innovations to judge"]
+    if s["nis_ratio"] > high:
+        status = "overconfident"
+    elif s["nis_ratio"] < low:
+        status = "conservative"
+    return status, ["no truth: judged by the NIS alone, which cannot see most pose errors", _nis_sentence(s)]
+
+
+def _nis_sentence(s: dict[str, Any]) -> str:
+    low, high = s["nis_interval"]
+    return f"NIS per degree of freedom {s['nis_ratio']:.3f} ({low:.3f} to {high:.3f} expected)"

@@ -1,0 +1,76 @@
+"""Small linear algebra of the kernels, callable from Python too."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba.extending import register_jitable
+
+DEFICIENT = 1e-12  # pivot of a correlation matrix below which a direction carries no uncertainty
+
+
+@register_jitable
+def semidefinite_cholesky(A: Any, C: Any) -> bool:
+    """Lower C with C C' = A for a positive semidefinite A; the column of a zero pivot is zero.
+
+    The start of a trial is known exactly, so the first covariances are singular. Returns False for
+    an indefinite or not finite A.
+    """
+    n = A.shape[0]
+    for j in range(n):
+        pivot = A[j, j]
+        for k in range(j):
+            pivot -= C[j, k] * C[j, k]
+        if not pivot >= -DEFICIENT * abs(A[j, j]):
+            return False
+        C[j, j] = np.sqrt(pivot) if pivot > DEFICIENT * A[j, j] else 0.0
+        for i in range(j + 1, n):
+            C[j, i] = 0.0
+            if C[j, j] == 0.0:
+                C[i, j] = 0.0
+            else:
+                rest = A[i, j]
+                for k in range(j):
+                    rest -= C[i, k] * C[j, k]
+                C[i, j] = rest / C[j, j]
+    return True
+
+
+@register_jitable
+def forward_substitute(C: Any, B: Any) -> None:
+    """B <- C^-1 B by rows, for lower C; the rows of zero pivots become zero."""
+    for i in range(C.shape[0]):
+        if C[i, i] == 0.0:
+            B[i] = 0.0
+            continue
+        for k in range(i):
+            if C[i, k] != 0.0:
+                B[i] -= C[i, k] * B[k]
+        B[i] /= C[i, i]
+
+
+@register_jitable
+def definiteness(P: Any) -> int:
+    """1 positive definite, 0 rank-deficient, -1 indefinite or not finite, judged on correlations."""
+    n = P.shape[0]
+    deficient = False
+    C = np.zeros((n, n))
+    for j in range(n):
+        if not (P[j, j] >= 0.0 and P[j, j] < np.inf):
+            return -1
+        pivot = P[j, j]
+        for k in range(j):
+            pivot -= C[j, k] * C[j, k]
+        if not pivot >= -DEFICIENT * P[j, j]:
+            return -1
+        if pivot <= DEFICIENT * P[j, j]:
+            deficient = True
+            continue
+        C[j, j] = np.sqrt(pivot)
+        for i in range(j + 1, n):
+            rest = P[i, j]
+            for k in range(j):
+                rest -= C[i, k] * C[j, k]
+            C[i, j] = rest / C[j, j]
+    return 0 if deficient else 1

@@ -1,0 +1,190 @@
+"""How many times: trials through filters, in parallel, with the same bits whatever the number of workers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import joblib
+import pandas as pd
+from threadpoolctl import threadpool_limits
+
+from consistency.errors import InputError
+from consistency.filters import filter_names, get_filter
+from consistency.filters.stepping import name_of, run_filter
+from consistency.log import Log
+from consistency.progress import progress
+from consistency.protocols import CompiledFilter, Filter
+from consistency.results import Results, estimates_table, failures_table, manifest_of, truth_table
+from consistency.scenario import Belief, Scenario
+from consistency.simulation import draw_landmarks, require_landmarks_in_view, simulate
+from consistency.types import Estimates, Trial
+
+Outcome = tuple[Trial, list[Estimates]]
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C in :func:`run_trials`; ``results`` holds the runs that were finished."""
+
+    def __init__(self, results: Results) -> None:
+        super().__init__("interrupted")
+        self.results = results
+
+
+def run_trials(
+    scenario: Scenario,
+    filters: Sequence[str | Filter],
+    runs: int = 50,
+    seed: int = 0,
+    jobs: int = -1,
+    timeout: float | None = None,
+    previous: Results | None = None,
+) -> Results:
+    """Simulate ``runs`` trials of ``scenario`` and put each through every filter.
+
+    Parameters
+    ----------
+    filters : names of built-in filters, or objects with ``init``, ``predict``, ``update`` and ``pose``
+    seed : the results are a function of (scenario, filter, seed, run) alone
+    jobs : workers; -1 for one a core. Compiled filters share threads, others get processes.
+    timeout : seconds a trial, for filters that are not compiled
+    previous : results to go on from; its runs are not done again
+
+    Raises
+    ------
+    InputError
+        An unknown filter, one that does not fit the sensor, a number out of range, or nothing in view.
+    Interrupted
+        Ctrl-C; carries what is finished.
+    """
+    chosen = resolve_filters(filters, scenario.belief)
+    if runs < 1:
+        raise InputError(f"runs must be at least 1, got {runs}")
+    if seed < 0:
+        raise InputError(f"seed must not be negative, got {seed}")
+    require_landmarks_in_view(scenario)
+    done = set() if previous is None else previous.finished_runs([name_of(f) for f in chosen])
+    todo = [run for run in range(runs) if run not in done]
+    outcomes, wall, complete = _map(lambda run: simulate(scenario, run, seed), todo, chosen, scenario.belief, jobs, timeout)
+    results = _gather(outcomes, chosen, previous)
+    manifest = manifest_of(seed=seed, runs=runs, filters=[name_of(f) for f in chosen], wall=wall, complete=complete)
+    manifest |= {"scenario": scenario.model_dump(mode="json"), "scenario_hash": scenario.hash}
+    landmarks = pd.DataFrame(draw_landmarks(scenario.truth), columns=["x", "y", "z"])
+    landmarks.insert(0, "landmark", range(len(landmarks)))
+    return _finish(results, manifest, landmarks)
+
+
+def run_log(
+    log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None
+) -> Results:
+    """Put every run of a recorded log through every filter; raises as :func:`run_trials`."""
+    chosen = resolve_filters(filters, log.belief)
+    trials = {trial.run: trial for trial in log.trials}
+    outcomes, wall, complete = _map(trials.__getitem__, list(trials), chosen, log.belief, jobs, timeout)
+    results = _gather(outcomes, chosen, None)
+    manifest = manifest_of(seed=None, runs=len(trials), filters=[name_of(f) for f in chosen], wall=wall, complete=complete)
+    manifest |= {"log": log.name, "belief": log.belief.model_dump(mode="json")}
+    return _finish(results, manifest, log.landmarks)
+
+
+def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Filter]:
+    """Filters by name or as they are, checked against the sensor."""
+    chosen = [get_filter(f) if isinstance(f, str) else f for f in filters]
+    if not chosen:
+        raise InputError(f"no filter given; known: {', '.join(filter_names())}")
+    names = [name_of(f) for f in chosen]
+    if len(set(names)) < len(names):
+        raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+    model = belief.sensor.model
+    for filter_ in chosen:
+        sensors = getattr(filter_, "sensors", None)
+        if sensors is not None and model not in sensors:
+            fitting = [name for name in filter_names() if model in get_filter(name).sensors]
+            raise InputError(
+                f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
+                f"filters that fit: {', '.join(fitting)}"
+            )
+    return chosen
+
+
+def _one(trial: Trial, filters: list[Filter], belief: Belief, timeout: float | None) -> Outcome:
+    with threadpool_limits(1):
+        return trial, [run_filter(f, trial, belief, timeout) for f in filters]
+
+
+def _map(
+    make_trial: Callable[[int], Trial],
+    runs: list[int],
+    filters: list[Filter],
+    belief: Belief,
+    jobs: int,
+    timeout: float | None,
+) -> tuple[list[Outcome], float, bool]:
+    """Outcomes in order of the runs, wall time in s, and whether all were finished."""
+    if jobs == 0 or jobs < -1:
+        raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
+    for filter_ in filters:
+        if isinstance(filter_, CompiledFilter) and not getattr(filter_, "is_compiled", True):
+            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
+                filter_.run(_head(make_trial(runs[0])), belief)
+                advance(1)
+    threads = all(isinstance(f, CompiledFilter) for f in filters)
+    parallel = joblib.Parallel(
+        n_jobs=min(jobs, len(runs)) if jobs > 0 else jobs,
+        backend="threading" if threads else "loky",
+        return_as="generator_unordered",
+    )
+    started = time.monotonic()
+    outcomes: list[Outcome] = []
+    complete = True
+    try:
+        with progress("runs", len(runs)) as advance:
+            tasks: Iterable[Any] = (joblib.delayed(_one)(make_trial(run), filters, belief, timeout) for run in runs)
+            for outcome in parallel(tasks):
+                outcomes.append(outcome)
+                advance(1)
+    except KeyboardInterrupt:
+        complete = False
+    return sorted(outcomes, key=lambda outcome: outcome[0].run), time.monotonic() - started, complete
+
+
+def _head(trial: Trial) -> Trial:
+    """The first two steps of a trial: enough to compile on."""
+    last = trial.first[min(2, trial.steps)]
+    return Trial(
+        trial.run, trial.start, trial.controls[:2], trial.first[:3], trial.landmark[:last], trial.z[:last],
+        trial.n_landmarks, None, trial.landmarks,
+    )  # fmt: skip
+
+
+def _gather(outcomes: list[Outcome], filters: list[Filter], previous: Results | None) -> dict[str, pd.DataFrame]:
+    order = [name_of(f) for f in filters]
+    tables = {
+        "estimates": estimates_table(outcomes),
+        "truth": truth_table([trial for trial, _ in outcomes]),
+        "failures": failures_table([e.failure for _, estimates in outcomes for e in estimates if e.failure]),
+    }
+    if previous is not None:
+        for name, before in (
+            ("estimates", previous.estimates),
+            ("truth", previous.truth),
+            ("failures", previous.failures),
+        ):
+            tables[name] = pd.concat([t for t in (before, tables[name]) if t is not None and len(t)] or [tables[name]])
+    for name in ("estimates", "failures"):
+        table = tables[name]
+        rank = table["filter"].map({n: i for i, n in enumerate(order)})
+        tables[name] = table.assign(_rank=rank).sort_values(["_rank", "run", "step"]).drop(columns="_rank")
+    tables["truth"] = tables["truth"].sort_values(["run", "step"])
+    return {name: table.reset_index(drop=True) for name, table in tables.items()}
+
+
+def _finish(tables: dict[str, pd.DataFrame], manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results:
+    manifest["failures"] = len(tables["failures"])
+    truth = tables["truth"] if len(tables["truth"]) else None
+    results = Results(tables["estimates"], tables["failures"], truth, landmarks, manifest)
+    if not manifest["complete"]:
+        manifest["finished_runs"] = len(results.finished_runs(manifest["filters"]))
+        raise Interrupted(results)
+    return results

@@ -1,0 +1,9 @@
+"""What the world does: truth, controls and observations from a scenario and random generators.
+
+Nothing here knows a filter.
+"""
+
+from consistency.simulation.path import planned_controls, planned_path
+from consistency.simulation.world import draw_landmarks, require_landmarks_in_view, simulate
+
+__all__ = ["draw_landmarks", "planned_controls", "planned_path", "require_landmarks_in_view", "simulate"]

@@ -1,0 +1,125 @@
+"""Frozen records that the rooms of the house hand to each other; shapes stand on each field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """A mean and its covariance, SI units and radians."""
+
+    mean: Array  # (n,)
+    covariance: Array  # (n, n)
+
+
+@dataclass(frozen=True)
+class Control:
+    """What the filter is told about one step of motion."""
+
+    dt: float  # s
+    v: float  # m/s, along the heading
+    omega: float  # rad/s, counter-clockwise
+
+
+@dataclass(frozen=True)
+class Observation:
+    """All landmarks seen in one step; association is known."""
+
+    landmarks: Indices  # (m,)
+    z: Array  # (m, 3): (x, y, z) in m or (u, v, d) in px
+
+
+@dataclass(frozen=True)
+class Info:
+    """What an update observed about itself; diagnostics read this and never the filter's inside."""
+
+    innovation: Array  # (k,), z minus predicted z of the landmarks already in the state
+    S: Array  # (k, k), innovation covariance
+    gain: Array  # (n, k)
+
+    @property
+    def nis(self) -> float:
+        """Normalized innovation squared, innovation' S^-1 innovation."""
+        return float(self.innovation @ np.linalg.solve(self.S, self.innovation))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One data set, simulated or recorded: what a filter is given, and the truth where known.
+
+    Step k = 1..T moves the robot from k-1 to k, then observes. The observations of step k are the
+    rows ``first[k-1]:first[k]``.
+    """
+
+    run: int
+    start: Array  # (3,), pose at step 0, known exactly
+    controls: Array  # (T, 3): dt, v, omega
+    first: Indices  # (T + 1,)
+    landmark: Indices  # (M,), index into 0..n_landmarks-1
+    z: Array  # (M, 3)
+    n_landmarks: int
+    truth: Array | None = None  # (T + 1, 3): x, y, heading (not wrapped)
+    landmarks: Array | None = None  # (N, 3), true positions in the world
+
+    @property
+    def steps(self) -> int:
+        return len(self.controls)
+
+    @property
+    def t(self) -> Array:
+        """Time of steps 0..T in seconds, shape (T + 1,)."""
+        return np.concatenate([[0.0], np.cumsum(self.controls[:, 0])])
+
+    def control(self, step: int) -> Control:
+        """Control of step 1..T."""
+        return Control(*(float(value) for value in self.controls[step - 1]))
+
+    def observation(self, step: int) -> Observation:
+        """Observation of step 1..T."""
+        rows = slice(self.first[step - 1], self.first[step])
+        return Observation(self.landmark[rows], self.z[rows])
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A run that did not end well, with the step in which it broke."""
+
+    filter: str
+    run: int
+    step: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What a filter said in one run; rows from the step of a failure on are NaN."""
+
+    filter: str
+    run: int
+    pose: Array  # (T, 3)
+    covariance: Array  # (T, 3, 3)
+    nis: Array  # (T,), NaN where no known landmark was seen
+    nis_dof: Indices  # (T,)
+    failure: Failure | None = None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The referee's answer for one filter."""
+
+    filter: str
+    status: str  # consistent | overconfident | conservative | failed
+    reasons: tuple[str, ...]
+    statistics: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def consistent(self) -> bool:
+        return self.status == "consistent"

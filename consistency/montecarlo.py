@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import joblib
@@ -13,10 +14,10 @@ from threadpoolctl import threadpool_limits
 from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter
 from consistency.filters.stepping import name_of, run_filter
-from consistency.log import Log
+from consistency.log import Log, write_log
 from consistency.progress import progress
 from consistency.protocols import CompiledFilter, Filter
-from consistency.results import Results, estimates_table, failures_table, manifest_of, truth_table
+from consistency.results import Results, estimates_table, failures_table, manifest_of, read_results, truth_table
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import draw_landmarks, require_landmarks_in_view, simulate
 from consistency.types import Estimates, Trial
@@ -59,20 +60,14 @@ def run_trials(
         Ctrl-C; carries what is finished.
     """
     chosen = resolve_filters(filters, scenario.belief)
-    if runs < 1:
-        raise InputError(f"runs must be at least 1, got {runs}")
-    if seed < 0:
-        raise InputError(f"seed must not be negative, got {seed}")
+    _require_counts(runs, seed)
     require_landmarks_in_view(scenario)
     done = set() if previous is None else previous.finished_runs([name_of(f) for f in chosen])
     todo = [run for run in range(runs) if run not in done]
     outcomes, wall, complete = _map(lambda run: simulate(scenario, run, seed), todo, chosen, scenario.belief, jobs, timeout)
     results = _gather(outcomes, chosen, previous)
     manifest = manifest_of(seed=seed, runs=runs, filters=[name_of(f) for f in chosen], wall=wall, complete=complete)
-    manifest |= {"scenario": scenario.model_dump(mode="json"), "scenario_hash": scenario.hash}
-    landmarks = pd.DataFrame(draw_landmarks(scenario.truth), columns=["x", "y", "z"])
-    landmarks.insert(0, "landmark", range(len(landmarks)))
-    return _finish(results, manifest, landmarks)
+    return _finish(results, manifest | _scenario_entry(scenario), _landmarks_table(scenario))
 
 
 def run_log(
@@ -188,3 +183,45 @@ def _finish(tables: dict[str, pd.DataFrame], manifest: dict[str, Any], landmarks
         manifest["finished_runs"] = len(results.finished_runs(manifest["filters"]))
         raise Interrupted(results)
     return results
+
+
+def previous_results(folder: Path, scenario: Scenario, filters: Sequence[str | Filter], seed: int) -> Results:
+    """Interrupted results to go on from, refused unless scenario, filters and seed are the same."""
+    previous = read_results(folder)
+    names = [f if isinstance(f, str) else name_of(f) for f in filters]
+    for key, now, before in (
+        ("scenario", scenario.hash, previous.manifest.get("scenario_hash")),
+        ("filter", names, previous.manifest.get("filters")),
+        ("seed", seed, previous.manifest.get("seed")),
+    ):
+        if now != before:
+            raise InputError(f"--resume {folder}: was written with another {key}; use the same command as before")
+    return previous
+
+
+def simulate_log(scenario: Scenario, runs: int, seed: int, out: Path, overwrite: bool = False) -> None:
+    """Write ``runs`` simulated trials as a log folder; raises as :func:`run_trials`."""
+    _require_counts(runs, seed)
+    require_landmarks_in_view(scenario)
+    started = time.monotonic()
+    trials = [simulate(scenario, run, seed) for run in range(runs)]
+    manifest = manifest_of(seed=seed, runs=runs, wall=time.monotonic() - started, complete=True)
+    manifest |= _scenario_entry(scenario) | {"failures": 0}
+    write_log(out, trials, scenario.belief, _landmarks_table(scenario), manifest, overwrite)
+
+
+def _require_counts(runs: int, seed: int) -> None:
+    if runs < 1:
+        raise InputError(f"runs must be at least 1, got {runs}")
+    if seed < 0:
+        raise InputError(f"seed must not be negative, got {seed}")
+
+
+def _scenario_entry(scenario: Scenario) -> dict[str, Any]:
+    return {"scenario": scenario.model_dump(mode="json"), "scenario_hash": scenario.hash}
+
+
+def _landmarks_table(scenario: Scenario) -> pd.DataFrame:
+    table = pd.DataFrame(draw_landmarks(scenario.truth), columns=["x", "y", "z"])
+    table.insert(0, "landmark", range(len(table)))
+    return table

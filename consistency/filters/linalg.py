@@ -8,6 +8,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 DEFICIENT = 1e-12  # pivot of a correlation matrix below which a direction carries no uncertainty
+ROUNDING = 1e-24  # variance (m^2, rad^2) that rounding alone leaves behind where none is
 
 
 @register_jitable
@@ -64,7 +65,7 @@ def definiteness(P: Any) -> int:
             pivot -= C[j, k] * C[j, k]
         if not pivot >= -DEFICIENT * P[j, j]:
             return -1
-        if pivot <= DEFICIENT * P[j, j]:
+        if pivot <= DEFICIENT * P[j, j] or P[j, j] <= ROUNDING:
             deficient = True
             continue
         C[j, j] = np.sqrt(pivot)

@@ -1,0 +1,197 @@
+"""The command line: parses, calls, prints."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from consistency.errors import InputError
+
+app = typer.Typer(
+    help="Does a stereo-SLAM filter tell the truth about its own uncertainty?",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+Out = Annotated[Path, typer.Option("--out", help="Folder to write; must not exist.")]
+Runs = Annotated[int, typer.Option("--runs", help="Number of Monte Carlo runs.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of the noise.")]
+Jobs = Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core. The result does not depend on it.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output folder of this bench.")]
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder written by 'run' or 'reproduce'.")]
+SCENARIO = "Built-in name (see 'list') or path of a .toml file."
+
+
+@app.command("list")
+def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
+    """Scenarios, filters and experiments."""
+    from consistency.filters import filter_names
+    from consistency.findings import experiment_summaries
+    from consistency.scenario import load_scenario, scenario_names
+
+    scenarios = {name: load_scenario(name).summary for name in scenario_names()}
+    experiments = experiment_summaries()
+    if as_json:
+        print(json.dumps({"scenarios": scenarios, "filters": filter_names(), "experiments": experiments}, indent=2))
+        return
+    for title, entries in (("Scenarios", scenarios), ("Experiments", experiments)):
+        print(title)
+        width = max((len(name) for name in entries), default=0)
+        for name, summary in entries.items():
+            print(f"  {name:<{width}}  {summary}")
+        print()
+    print("Filters\n  " + "\n  ".join(filter_names()))
+
+
+@app.command()
+def simulate(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help=SCENARIO)],
+    out: Out,
+    runs: Runs = 1,
+    seed: Seed = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write truth, controls and observations of a scenario: a log for any filter, ours or not."""
+    from consistency.montecarlo import simulate_log
+    from consistency.results import require_free
+    from consistency.scenario import load_scenario
+
+    require_free(out, overwrite)
+    simulate_log(load_scenario(scenario), runs, seed, out, overwrite)
+    print(f"{runs} run{'s' * (runs != 1)} of {scenario} in {out}; filter them with: consistency run --log {out} --filter F")
+
+
+@app.command()
+def run(
+    out: Out,
+    filters: Annotated[list[str], typer.Option("--filter", help="Filter name; give it again for more.")],
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
+    log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
+    runs: Annotated[int | None, typer.Option("--runs", help="Number of Monte Carlo runs [default: 50].")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the noise [default: 0].")] = None,
+    jobs: Jobs = -1,
+    timeout: Annotated[float | None, typer.Option("--timeout", help="Seconds a run, filters in Python only.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run in --out.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Put simulated trials, or a recorded log, through filters."""
+    from consistency.judge import analyse
+    from consistency.log import read_log
+    from consistency.montecarlo import Interrupted, previous_results, run_log, run_trials
+    from consistency.results import require_free
+    from consistency.scenario import load_scenario
+    from consistency.table import print_verdicts
+
+    if (scenario is None) == (log is None):
+        raise InputError("give either a SCENARIO or --log DIR")
+    try:
+        if log is not None:
+            if runs is not None or seed is not None or resume:
+                raise InputError("--runs, --seed and --resume do not go with --log: a log has the runs it has")
+            require_free(out, overwrite)
+            results = run_log(read_log(log), filters, jobs, timeout)
+        else:
+            world = load_scenario(str(scenario))
+            runs, seed = 50 if runs is None else runs, 0 if seed is None else seed
+            previous = previous_results(out, world, filters, seed) if resume else None
+            overwrite = overwrite or resume
+            require_free(out, overwrite)
+            results = run_trials(world, filters, runs, seed, jobs, timeout, previous)
+    except Interrupted as stop:
+        done = stop.results.manifest["finished_runs"]
+        if not done:
+            print("stopped before a run was finished; nothing written", file=sys.stderr)
+        else:
+            stop.results.write(out, overwrite)
+            how = "add --resume to the same command to go on" if log is None else "run it again for the rest"
+            print(f"stopped: {done} finished runs are in {out}; {how}", file=sys.stderr)
+        raise typer.Exit(130) from None
+    results.write(out, overwrite)
+    print_verdicts(analyse(results))
+    print(f"results in {out}; next: consistency report {out}")
+
+
+@app.command()
+def analyse(
+    folder: Folder,
+    filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
+    confidence: Annotated[float, typer.Option("--confidence", help="Of the verdict, over all steps at once.")] = 0.95,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
+) -> None:
+    """Judge results: consistent, overconfident, conservative or failed, and why."""
+    from consistency.judge import analyse as judge_results
+    from consistency.results import read_results
+    from consistency.table import print_verdicts, verdicts_json
+
+    if fail_on not in (None, "inconsistent"):
+        raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
+    verdicts = judge_results(read_results(folder), filters, confidence)
+    if as_json:
+        print(verdicts_json(verdicts))
+    else:
+        print_verdicts(verdicts, reasons=True)
+    if fail_on and not all(verdict.consistent for verdict in verdicts.values()):
+        raise typer.Exit(1)
+
+
+@app.command()
+def report(
+    folder: Folder,
+    html: Annotated[Path | None, typer.Option("--html", help="HTML file [default: DIR/report.html].")] = None,
+    pdf: Annotated[Path | None, typer.Option("--pdf", help="PDF file [default: DIR/report.pdf].")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+) -> None:
+    """Write a report of results as one offline HTML file and a PDF."""
+    from consistency.reporting import write_reports
+
+    # one of the two named: only that one is written
+    wanted = {"html": html, "pdf": pdf} if html or pdf else {"html": folder / "report.html", "pdf": folder / "report.pdf"}
+    for path in write_reports(folder, wanted["html"], wanted["pdf"], overwrite):
+        print(path)
+
+
+@app.command()
+def reproduce(
+    only: Annotated[list[str] | None, typer.Option("--only", help="Only this finding; may be repeated.")] = None,
+    runs: Runs = 50,
+    seed: Seed = 0,
+    jobs: Jobs = -1,
+    out: Out = Path("reports/reproduce"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Set each published finding beside what is measured here; exit 1 if an experiment breaks."""
+    from consistency.findings import reproduce as reproduce_findings
+    from consistency.reporting import write_reports
+    from consistency.table import print_findings
+
+    findings = reproduce_findings(only, runs, seed, jobs, out, overwrite)
+    print_findings(findings)
+    for path in (out / "findings.json", *write_reports(out, out / "report.html", out / "report.pdf", overwrite=True)):
+        print(path)
+    if any(finding.verdict == "error" for finding in findings):
+        raise typer.Exit(1)
+
+
+def main(arguments: list[str] | None = None) -> Any:
+    """Entry point: unusable input ends in one line and exit status 2."""
+    try:
+        app(arguments)
+    except InputError as error:
+        print(f"consistency: {error}", file=sys.stderr)
+        sys.exit(2)
+    except BrokenPipeError:
+        sys.exit(141)
+    except KeyboardInterrupt:
+        print("consistency: stopped", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""Published findings beside measured ones: what the scripts of ``experiments/`` hand back."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pandas as pd
+
+from consistency.errors import InputError
+from consistency.judge import Curves, analyse, curves
+from consistency.montecarlo import run_trials
+from consistency.results import Results, manifest_of, require_free
+from consistency.scenario import Scenario, data_folder, load_scenario
+from consistency.types import Verdict
+
+REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One published claim and what was measured; ``accept`` was written before the run."""
+
+    id: str
+    source: str  # paper and place
+    claim: str
+    statistic: str  # what is measured
+    published: str
+    measured: str
+    accept: str  # numeric rule and its reason
+    verdict: str  # reproduced | not reproduced | refuted
+    runs: int
+    seed: int
+    scenario: str
+
+
+class Study:
+    """Runs trials for experiments, each (scenario, filter) once, and keeps what a report shows.
+
+    Parameters
+    ----------
+    runs, seed, jobs : as in :func:`consistency.run_trials`
+    """
+
+    def __init__(self, runs: int = 50, seed: int = 0, jobs: int = -1) -> None:
+        self.runs, self.seed, self.jobs = runs, seed, jobs
+        self.kept: dict[str, Results] = {}
+        self.tables: dict[str, pd.DataFrame] = {}
+
+    def results(self, scenario: str | Scenario, filters: Sequence[str]) -> Results:
+        """Results of all ``filters`` so far on a scenario; only those not yet run are run."""
+        world = load_scenario(scenario) if isinstance(scenario, str) else scenario
+        have = self.kept.get(world.name)
+        missing = [name for name in filters if have is None or name not in have.filters]
+        if missing:
+            print(f"{world.name}: {', '.join(missing)}", file=sys.stderr, flush=True)
+            new = run_trials(world, missing, self.runs, self.seed, self.jobs)
+            self.kept[world.name] = new if have is None else _joined(have, new)
+        return self.kept[world.name]
+
+    def judged(self, scenario: str | Scenario, filter_name: str) -> tuple[Verdict, Curves]:
+        """Verdict and curves of one filter on a scenario."""
+        results = self.results(scenario, [filter_name])
+        return analyse(results, [filter_name])[filter_name], curves(results, filter_name)
+
+    def finding(self, holds: bool, scenario: str, verdict_if_not: str = NOT_REPRODUCED, **text: str) -> Finding:
+        """A finding with this study's runs and seed; ``holds`` says whether its rule was met."""
+        verdict = REPRODUCED if holds else verdict_if_not
+        return Finding(verdict=verdict, runs=self.runs, seed=self.seed, scenario=scenario, **text)
+
+    def write(self, out: Path, findings: Sequence[Finding], wall: float, overwrite: bool = False) -> None:
+        """findings.json, extra tables and a folder a scenario, moved into place as a whole."""
+        require_free(out, overwrite)
+        partial = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}."))
+        try:
+            for name, results in self.kept.items():
+                results.write(partial / name)
+            for name, table in self.tables.items():
+                table.to_parquet(partial / f"{name}.parquet", compression="zstd", index=False)
+            text = json.dumps([asdict(finding) for finding in findings], indent=2, ensure_ascii=False)
+            (partial / "findings.json").write_text(text + "\n", encoding="utf-8")
+            manifest = manifest_of(seed=self.seed, runs=self.runs, wall=wall, complete=True)
+            manifest["failures"] = sum(len(results.failures) for results in self.kept.values())
+            manifest["studies"] = list(self.kept)
+            (partial / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+            partial.chmod(0o755)
+            if out.exists():
+                shutil.rmtree(out)
+            os.replace(partial, out)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+
+
+def _joined(a: Results, b: Results) -> Results:
+    manifest = a.manifest | {
+        "filters": a.filters + b.filters,
+        "failures": a.manifest["failures"] + b.manifest["failures"],
+        "wall_time_s": round(a.manifest["wall_time_s"] + b.manifest["wall_time_s"], 3),
+    }
+    estimates = pd.concat([a.estimates, b.estimates], ignore_index=True)
+    failures = pd.concat([t for t in (a.failures, b.failures) if len(t)] or [a.failures], ignore_index=True)
+    return Results(estimates, failures, a.truth, a.landmarks, manifest)
+
+
+# --- the scripts -----------------------------------------------------------------------------
+
+
+def experiments() -> dict[str, ModuleType]:
+    """Scripts of ``experiments/`` by name; each has FINDINGS (ids) and ``main(study)``.
+
+    Raises
+    ------
+    InputError
+        A script cannot be imported, or the folder is not there.
+    """
+    folder = data_folder("experiments")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: the experiments are missing; install the package again")
+    return {path.stem: _load(path) for path in sorted(folder.glob("e[0-9][0-9]_*.py"))}
+
+
+def _load(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"consistency_experiment_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"{path}: cannot be imported ({type(error).__name__}: {error})") from error
+    return module
+
+
+def experiment_summaries() -> dict[str, str]:
+    """First line of every script's docstring."""
+    return {name: (module.__doc__ or "").strip().splitlines()[0] for name, module in experiments().items()}
+
+
+def reproduce(
+    only: Sequence[str] | None, runs: int, seed: int, jobs: int, out: Path, overwrite: bool = False
+) -> list[Finding]:
+    """Run the experiments, write ``out`` and return the findings.
+
+    An experiment that breaks becomes findings that are not reproduced, with the error as what was
+    measured.
+
+    Raises
+    ------
+    InputError
+        An unknown id, a number out of range, or an output folder that cannot be written.
+    """
+    scripts = experiments()
+    known = {finding: module for module in scripts.values() for finding in module.FINDINGS}
+    if unknown := [name for name in only or () if name not in known]:
+        raise InputError(f"--only {unknown[0]}: no such finding; known: {', '.join(known)}")
+    require_free(out, overwrite)
+    study, started = Study(runs, seed, jobs), time.monotonic()
+    findings: list[Finding] = []
+    for module in scripts.values():
+        wanted = [name for name in module.FINDINGS if not only or name in only]
+        if wanted:
+            findings += [f for f in _guarded(module.main, study, wanted) if f.id in wanted]
+    study.write(out, findings, time.monotonic() - started, overwrite)
+    return findings
+
+
+def _guarded(main: Callable[[Study], list[Finding]], study: Study, ids: Sequence[str]) -> list[Finding]:
+    try:
+        return main(study)
+    except InputError:
+        raise
+    except Exception as error:
+        text = {"source": "", "claim": "", "statistic": "", "published": "", "accept": ""}
+        measured = f"the experiment broke: {type(error).__name__}: {error}"
+        return [study.finding(False, "", id=name, measured=measured, **text) for name in ids]
+
+
+def script(main: Callable[[Study], list[Finding]], arguments: Sequence[str] | None = None) -> None:
+    """What an experiment does when it is run by itself: ``python experiments/eNN_….py [RUNS] [SEED]``."""
+    from consistency.table import print_findings
+
+    values = [int(value) for value in (sys.argv[1:] if arguments is None else arguments)]
+    print_findings(main(Study(*values)))
+
+
+def read_findings(folder: Path) -> list[dict[str, Any]]:
+    """``findings.json`` of a folder, or an empty list where there is none."""
+    path = folder / "findings.json"
+    if not path.exists():
+        return []
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return [asdict(Finding(**entry)) for entry in data]
+    except (json.JSONDecodeError, UnicodeDecodeError, TypeError) as error:
+        raise InputError(f"{path}: not a list of findings ({error})") from None

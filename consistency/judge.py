@@ -1,0 +1,100 @@
+"""From result tables to the arrays that the diagnostics take, and to verdicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from consistency.diagnostics import judge
+from consistency.errors import InputError
+from consistency.geometry import pose_error
+from consistency.results import POSE, Results, covariances
+from consistency.types import Array, Failure, Indices, Verdict
+
+
+@dataclass(frozen=True)
+class Curves:
+    """One filter's results as arrays over (runs, steps); NaN where a run has no value."""
+
+    filter: str
+    runs: Indices  # (R,), run numbers
+    t: Array  # (T,)
+    pose: Array  # (R, T, 3)
+    covariance: Array  # (R, T, 3, 3)
+    error: Array | None  # (R, T, 3), truth minus estimate, heading wrapped
+    nees: Array | None  # (R, T)
+    nis: Array  # (R, T)
+    nis_dof: Indices  # (R, T)
+    failures: tuple[Failure, ...]
+
+
+def curves(results: Results, filter_name: str) -> Curves:
+    """Arrays of one filter.
+
+    Raises
+    ------
+    InputError
+        The results hold no such filter.
+    """
+    if filter_name not in results.filters:
+        raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
+    table = results.estimates[results.estimates["filter"] == filter_name]
+    broken = results.failures[results.failures["filter"] == filter_name]
+    runs = np.unique(np.concatenate([table["run"], broken["run"]])).astype(np.int64)
+    steps = _steps(results)
+    row, column = np.searchsorted(runs, table["run"]), table["step"].to_numpy() - 1
+
+    def grid(values: Array) -> Array:
+        out = np.full((len(runs), steps, *values.shape[1:]), np.nan)
+        out[row, column] = values
+        return out
+
+    pose = grid(table[POSE].to_numpy())
+    t = np.full(steps, np.nan)
+    t[column] = table["t"]
+    dof = grid(table["nis_dof"].to_numpy(float))
+    error = nees = None
+    if results.truth is not None:
+        error = pose_error(_true_pose(results.truth, runs, steps), pose)
+        nees = grid(table["nees"].to_numpy())
+    failures = tuple(Failure(filter_name, int(r), int(s), str(why)) for _, r, s, why in broken.itertuples(index=False))
+    return Curves(
+        filter_name, runs, t, pose, grid(covariances(table)), error, nees,
+        grid(table["nis"].to_numpy()), np.nan_to_num(dof).astype(np.int64), failures,
+    )  # fmt: skip
+
+
+def analyse(
+    results: Results, filters: list[str] | None = None, confidence: float = 0.95
+) -> dict[str, Verdict]:
+    """A verdict for every filter of the results, or for those named.
+
+    Raises
+    ------
+    InputError
+        Unknown filter, or a confidence outside (0, 1).
+    """
+    if not 0.0 < confidence < 1.0:
+        raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
+    verdicts = {}
+    for name in filters or results.filters:
+        c = curves(results, name)
+        verdicts[name] = judge(name, c.error, c.covariance, c.nees, c.nis, c.nis_dof, c.failures, confidence)
+    return verdicts
+
+
+def _steps(results: Results) -> int:
+    """Steps of the longest run, failed steps counted."""
+    tables = [results.estimates["step"], results.failures["step"]]
+    if results.truth is not None:
+        tables.append(results.truth["step"])
+    return int(max((column.max() for column in tables if len(column)), default=0))
+
+
+def _true_pose(truth: pd.DataFrame, runs: Indices, steps: int) -> Array:
+    out = np.full((len(runs), steps, 3), np.nan)
+    table = truth[(truth["step"] > 0) & truth["run"].isin(runs)]
+    out[np.searchsorted(runs, table["run"]), table["step"].to_numpy() - 1] = table[POSE].to_numpy()
+    return out

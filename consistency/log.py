@@ -1,0 +1,210 @@
+"""Recorded logs: a folder of controls, observations, what the filter believes, and the truth where known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import tomli_w
+
+from consistency.errors import InputError
+from consistency.results import POSE, controls_table, observations_table, read_parquet, truth_table, write_folder
+from consistency.scenario import (
+    Belief,
+    BelievedMotion,
+    BelievedSensor,
+    Finite,
+    Mount,
+    Positive,
+    Sigmas,
+    SigmaPoints,
+    Table,
+    read_table,
+)
+from consistency.types import Array, Trial
+
+
+class Start(Table):
+    """Pose at step 0, known exactly."""
+
+    x: Finite
+    y: Finite
+    heading: Finite
+
+
+class SensorFile(Table):
+    """``sensor.toml``: the sensor, its mount and noise, and the noise of the odometry, as believed."""
+
+    model: str
+    sigma: Sigmas
+    f: Positive | None = None
+    B: Positive | None = None
+    image: tuple[int, int] | None = None
+    principal_point: tuple[Finite, Finite] | None = None
+    mount: Mount = Mount()
+    motion: BelievedMotion
+    start: Start | None = None
+    sigma_points: SigmaPoints = SigmaPoints()
+
+    def belief(self) -> Belief:
+        sensor = BelievedSensor.model_validate(
+            {"model": self.model, "sigma": self.sigma, "f": self.f, "B": self.B, "mount": self.mount.model_dump()}
+        )
+        return Belief(motion=self.motion, sensor=sensor, sigma_points=self.sigma_points)
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log folder in memory."""
+
+    name: str
+    trials: list[Trial]
+    belief: Belief
+    landmarks: pd.DataFrame | None
+
+
+def read_log(folder: str | Path) -> Log:
+    """Read a log folder.
+
+    ``controls.parquet``, ``observations.parquet`` and ``sensor.toml`` are needed, ``truth.parquet`` and
+    ``landmarks.parquet`` are optional. A folder of ``consistency simulate`` is a log.
+
+    Raises
+    ------
+    InputError
+        A file is missing, damaged, or holds what a filter cannot use; names file, column and row.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"--log {folder}: no such folder")
+    path = folder / "sensor.toml"
+    sensor = read_table(path, SensorFile)
+    try:
+        belief = sensor.belief()
+    except ValueError as error:
+        raise InputError(f"{path}: {str(error).splitlines()[-2].strip().removeprefix('Value error, ')}") from None
+    controls, observations = read_parquet(folder, "controls"), read_parquet(folder, "observations")
+    tables = {
+        name: read_parquet(folder, name) if (folder / f"{name}.parquet").exists() else None
+        for name in ("truth", "landmarks")
+    }
+    _check(folder, controls, observations, belief)
+    start = np.array([sensor.start.x, sensor.start.y, sensor.start.heading]) if sensor.start else None
+    labels = np.unique(observations["landmark"])
+    positions = _positions(folder, tables["landmarks"], labels, belief)
+    trials = [
+        _trial(folder, int(run), part, observations, labels, tables["truth"], start, positions)
+        for run, part in controls.groupby("run", sort=True)
+    ]
+    return Log(str(folder), trials, belief, tables["landmarks"])
+
+
+def write_log(
+    folder: Path,
+    trials: list[Trial],
+    belief: Belief,
+    landmarks: pd.DataFrame | None,
+    manifest: dict[str, object],
+    overwrite: bool = False,
+) -> None:
+    """Write trials as a log folder, whole or not at all."""
+    tables = {"controls": controls_table(trials), "observations": observations_table(trials)}
+    if trials[0].truth is not None:
+        tables["truth"] = truth_table(trials)
+    if landmarks is not None:
+        tables["landmarks"] = landmarks
+    text = tomli_w.dumps(_sensor_file(belief, trials[0].start))
+    write_folder(folder, tables, manifest, lambda at: _write_text(at / "sensor.toml", text), overwrite)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def _sensor_file(belief: Belief, start: Array) -> dict[str, object]:
+    sensor = belief.sensor.model_dump(exclude_none=True)
+    unit = "sigma_px" if belief.sensor.model == "uvd" else "sigma_m"
+    return {
+        "model": sensor["model"],
+        unit: list(sensor["sigma"]),
+        **{key: sensor[key] for key in ("f", "B") if key in sensor},
+        "mount": {key: list(value) for key, value in sensor["mount"].items()},
+        "motion": belief.motion.model_dump(),
+        "start": dict(zip(POSE, map(float, start), strict=True)),
+        "sigma_points": belief.sigma_points.model_dump(),
+    }
+
+
+def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, belief: Belief) -> None:
+    path = folder / "controls.parquet"
+    if controls.empty:
+        raise InputError(f"{path}: holds no control; at least one step is needed")
+    for run, part in controls.groupby("run"):
+        if not np.array_equal(np.sort(part["step"]), np.arange(1, len(part) + 1)):
+            raise InputError(f"{path}: column 'step' of run {run} must count 1, 2, … without gap or repetition")
+    if (controls["dt"] <= 0).any():
+        row = int(np.flatnonzero(controls["dt"] <= 0)[0])
+        raise InputError(f"{path}: column 'dt', row {row}: must be positive")
+    path = folder / "observations.parquet"
+    if observations.empty:
+        raise InputError(f"{path}: holds no observation; no landmark was ever in view")
+    twice = observations.duplicated(["run", "step", "landmark"])
+    if twice.any():
+        raise InputError(f"{path}: row {int(np.flatnonzero(twice)[0])}: this landmark is there twice in one step")
+    known = pd.MultiIndex.from_frame(controls[["run", "step"]])
+    stray = ~pd.MultiIndex.from_frame(observations[["run", "step"]]).isin(known)
+    if stray.any():
+        raise InputError(f"{path}: row {int(np.flatnonzero(stray)[0])}: controls.parquet has no such run and step")
+    if belief.sensor.model == "uvd" and (observations["z2"] <= 0).any():
+        row = int(np.flatnonzero(observations["z2"] <= 0)[0])
+        raise InputError(f"{path}: column 'z2', row {row}: a disparity must be positive")
+
+
+def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, belief: Belief) -> Array | None:
+    path = folder / "landmarks.parquet"
+    if landmarks is None:
+        if belief.sensor.model == "linear":
+            raise InputError(f"{path}: missing; a linear world needs the landmarks it is linearised about")
+        return None
+    table = landmarks.set_index("landmark")[["x", "y", "z"]]
+    if table.index.has_duplicates:
+        raise InputError(f"{path}: column 'landmark': every landmark may stand there once")
+    if missing := sorted(set(labels) - set(table.index)):
+        raise InputError(f"{path}: landmark {missing[0]} of observations.parquet is not there")
+    return table.loc[labels].to_numpy(float)
+
+
+def _trial(
+    folder: Path,
+    run: int,
+    controls: pd.DataFrame,
+    observations: pd.DataFrame,
+    labels: Array,
+    truth: pd.DataFrame | None,
+    start: Array | None,
+    positions: Array | None,
+) -> Trial:
+    controls = controls.sort_values("step")
+    steps = len(controls)
+    seen = observations[observations["run"] == run].sort_values("step", kind="stable")
+    path = None
+    if truth is not None:
+        own = truth[truth["run"] == run].sort_values("step")
+        if not np.array_equal(own["step"], np.arange(steps + 1)):
+            raise InputError(f"{folder / 'truth.parquet'}: run {run} must have the steps 0 to {steps}, each once")
+        path = own[POSE].to_numpy(float)
+    if start is None:
+        start = path[0] if path is not None else np.zeros(3)
+    return Trial(
+        run,
+        start,
+        controls[["dt", "v", "omega"]].to_numpy(float),
+        np.searchsorted(seen["step"], np.arange(1, steps + 2)),
+        np.searchsorted(labels, seen["landmark"]),
+        seen[["z0", "z1", "z2"]].to_numpy(float),
+        len(labels),
+        path,
+        positions,
+    )

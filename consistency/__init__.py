@@ -6,7 +6,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from consistency.diagnostics import analyse_estimates as analyse_estimates
     from consistency.diagnostics import anees, anees_interval, nees
     from consistency.errors import InputError
     from consistency.filters import filter_names, get_filter

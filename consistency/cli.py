@@ -64,7 +64,8 @@ def simulate(
 
     require_free(out, overwrite)
     simulate_log(load_scenario(scenario), runs, seed, out, overwrite)
-    print(f"{runs} run{'s' * (runs != 1)} of {scenario} in {out}; filter them with: consistency run --log {out} --filter F")
+    count = f"{runs} run{'s' * (runs != 1)}"
+    print(f"{count} of {scenario} in {out}; filter them with: consistency run --log {out} --filter F")
 
 
 @app.command()
@@ -152,7 +153,9 @@ def report(
     from consistency.reporting import write_reports
 
     # one of the two named: only that one is written
-    wanted = {"html": html, "pdf": pdf} if html or pdf else {"html": folder / "report.html", "pdf": folder / "report.pdf"}
+    wanted = (
+        {"html": html, "pdf": pdf} if html or pdf else {"html": folder / "report.html", "pdf": folder / "report.pdf"}
+    )
     for path in write_reports(folder, wanted["html"], wanted["pdf"], overwrite):
         print(path)
 

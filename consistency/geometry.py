@@ -9,7 +9,7 @@ from consistency.types import Array
 
 def wrap(angle: Array) -> Array:
     """Angle in radians brought to [-pi, pi), any shape."""
-    return (np.asarray(angle) + np.pi) % (2.0 * np.pi) - np.pi
+    return np.mod(np.asarray(angle) + np.pi, 2.0 * np.pi) - np.pi
 
 
 def pose_error(truth: Array, estimate: Array) -> Array:

@@ -66,9 +66,7 @@ def curves(results: Results, filter_name: str) -> Curves:
     )  # fmt: skip
 
 
-def analyse(
-    results: Results, filters: list[str] | None = None, confidence: float = 0.95
-) -> dict[str, Verdict]:
+def analyse(results: Results, filters: list[str] | None = None, confidence: float = 0.95) -> dict[str, Verdict]:
     """A verdict for every filter of the results, or for those named.
 
     Raises

@@ -18,8 +18,8 @@ from consistency.scenario import (
     Finite,
     Mount,
     Positive,
-    Sigmas,
     SigmaPoints,
+    Sigmas,
     Table,
     read_table,
 )
@@ -95,8 +95,8 @@ def read_log(folder: str | Path) -> Log:
     labels = np.unique(observations["landmark"])
     positions = _positions(folder, tables["landmarks"], labels, belief)
     trials = [
-        _trial(folder, int(run), part, observations, labels, tables["truth"], start, positions)
-        for run, part in controls.groupby("run", sort=True)
+        _trial(folder, run, controls[controls["run"] == run], observations, labels, tables["truth"], start, positions)
+        for run in sorted({int(run) for run in controls["run"]})
     ]
     return Log(str(folder), trials, belief, tables["landmarks"])
 
@@ -173,7 +173,7 @@ def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, beli
         raise InputError(f"{path}: column 'landmark': every landmark may stand there once")
     if missing := sorted(set(labels) - set(table.index)):
         raise InputError(f"{path}: landmark {missing[0]} of observations.parquet is not there")
-    return table.loc[labels].to_numpy(float)
+    return table.loc[list(labels)].to_numpy(float)
 
 
 def _trial(

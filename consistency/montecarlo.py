@@ -64,21 +64,23 @@ def run_trials(
     require_landmarks_in_view(scenario)
     done = set() if previous is None else previous.finished_runs([name_of(f) for f in chosen])
     todo = [run for run in range(runs) if run not in done]
-    outcomes, wall, complete = _map(lambda run: simulate(scenario, run, seed), todo, chosen, scenario.belief, jobs, timeout)
+    outcomes, wall, complete = _map(
+        lambda run: simulate(scenario, run, seed), todo, chosen, scenario.belief, jobs, timeout
+    )
     results = _gather(outcomes, chosen, previous)
     manifest = manifest_of(seed=seed, runs=runs, filters=[name_of(f) for f in chosen], wall=wall, complete=complete)
     return _finish(results, manifest | _scenario_entry(scenario), _landmarks_table(scenario))
 
 
-def run_log(
-    log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None
-) -> Results:
+def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None) -> Results:
     """Put every run of a recorded log through every filter; raises as :func:`run_trials`."""
     chosen = resolve_filters(filters, log.belief)
     trials = {trial.run: trial for trial in log.trials}
     outcomes, wall, complete = _map(trials.__getitem__, list(trials), chosen, log.belief, jobs, timeout)
     results = _gather(outcomes, chosen, None)
-    manifest = manifest_of(seed=None, runs=len(trials), filters=[name_of(f) for f in chosen], wall=wall, complete=complete)
+    manifest = manifest_of(
+        seed=None, runs=len(trials), filters=[name_of(f) for f in chosen], wall=wall, complete=complete
+    )
     manifest |= {"log": log.name, "belief": log.belief.model_dump(mode="json")}
     return _finish(results, manifest, log.landmarks)
 
@@ -104,8 +106,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
 
 
 def _one(trial: Trial, filters: list[Filter], belief: Belief, timeout: float | None) -> Outcome:
-    with threadpool_limits(1):
-        return trial, [run_filter(f, trial, belief, timeout) for f in filters]
+    return trial, [run_filter(f, trial, belief, timeout) for f in filters]
 
 
 def _map(
@@ -124,17 +125,20 @@ def _map(
             with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
                 filter_.run(_head(make_trial(runs[0])), belief)
                 advance(1)
+    # kernels release the GIL; filters in Python need processes. One BLAS thread each: bits depend on it
     threads = all(isinstance(f, CompiledFilter) for f in filters)
-    parallel = joblib.Parallel(
-        n_jobs=min(jobs, len(runs)) if jobs > 0 else jobs,
-        backend="threading" if threads else "loky",
-        return_as="generator_unordered",
-    )
+    workers = {"backend": "threading"} if threads else {"backend": "loky", "inner_max_num_threads": 1}
+    n_jobs = min(jobs, max(len(runs), 1)) if jobs > 0 else jobs
     started = time.monotonic()
     outcomes: list[Outcome] = []
     complete = True
     try:
-        with progress("runs", len(runs)) as advance:
+        with (
+            threadpool_limits(1),
+            joblib.parallel_config(**workers, n_jobs=n_jobs),
+            progress("runs", len(runs)) as advance,
+        ):
+            parallel = joblib.Parallel(return_as="generator_unordered")
             tasks: Iterable[Any] = (joblib.delayed(_one)(make_trial(run), filters, belief, timeout) for run in runs)
             for outcome in parallel(tasks):
                 outcomes.append(outcome)

@@ -231,7 +231,9 @@ def require_free(folder: Path, overwrite: bool) -> None:
         if not overwrite:
             raise InputError(f"--out {folder}: exists already; choose another folder or add --overwrite")
         if not (folder / "manifest.json").is_file():
-            raise InputError(f"--out {folder}: is not an output folder of this bench (no manifest.json); not overwritten")
+            raise InputError(
+                f"--out {folder}: is not an output folder of this bench (no manifest.json); not overwritten"
+            )
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}."):
@@ -330,7 +332,8 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(wanted)}")
     for column, kind in wanted.items():
         _check_column(path, table, column, kind)
-    return table[list(wanted)].astype(wanted)
+    checked: pd.DataFrame = table[list(wanted)].astype(wanted)
+    return checked
 
 
 def _check_column(path: Path, table: pd.DataFrame, column: str, kind: str) -> None:

@@ -66,7 +66,8 @@ def print_findings(findings: Sequence[Finding]) -> None:
 def verdicts_json(verdicts: dict[str, Verdict]) -> str:
     """Status, reasons and statistics by filter; NaN becomes null."""
     data = {
-        name: {"status": v.status, "reasons": v.reasons, "statistics": plain(v.statistics)} for name, v in verdicts.items()
+        name: {"status": v.status, "reasons": v.reasons, "statistics": plain(v.statistics)}
+        for name, v in verdicts.items()
     }
     return json.dumps(data, indent=2, allow_nan=False)
 

@@ -32,9 +32,7 @@ def nees(error: Array, covariance: Array) -> Array:
     _require(np.isfinite(e).all(axis=(-2, -1)), "the error is not finite")
     _require(np.isfinite(P).all(axis=(-2, -1)), "the covariance is not finite")
     scale = np.abs(P).max(axis=(-2, -1))
-    _require(
-        np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1)) <= 1e-8 * scale, "the covariance is not symmetric"
-    )
+    _require(np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1)) <= 1e-8 * scale, "the covariance is not symmetric")
     try:
         root = np.linalg.cholesky(P)
     except np.linalg.LinAlgError:
@@ -42,7 +40,7 @@ def nees(error: Array, covariance: Array) -> Array:
         _require(smallest > 0, "the covariance is not positive definite")
         raise ValueError("a covariance is not positive definite") from None
     whitened = np.linalg.solve(root, e)[..., 0]
-    return np.einsum("...i,...i->...", whitened, whitened)
+    return np.asarray(np.einsum("...i,...i->...", whitened, whitened))
 
 
 def anees(values: Array) -> Array:

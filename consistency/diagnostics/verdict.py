@@ -60,7 +60,9 @@ def _nees(error: Array, covariance: Array, nees: Array, confidence: float) -> di
     judged = alive > 0
     # steps that a failure emptied are not left out: only those in which no covariance has full rank
     tail = 1.0 - (1.0 - confidence) / max(int(judged.sum()), 1)
-    bands = {int(m): (anees_interval(n, int(m), confidence), anees_interval(n, int(m), tail)) for m in set(alive[judged])}
+    bands = {
+        int(m): (anees_interval(n, int(m), confidence), anees_interval(n, int(m), tail)) for m in set(alive[judged])
+    }
     band = np.full((len(curve), 2), np.nan)
     simultaneous = np.full((len(curve), 2), np.nan)
     for k in np.flatnonzero(judged):

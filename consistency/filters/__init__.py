@@ -12,16 +12,17 @@ from typing import Any
 
 from consistency.errors import InputError
 
+# name -> module of this folder and the attribute in it; imported when asked for
 MODULES = {
-    "kf": "kf",
-    "ekf-xyz": "ekf_xyz",
-    "ekf-uvd": "ekf_uvd",
-    "ukf-xyz": "ukf_xyz",
-    "ukf-uvd": "ukf_uvd",
-    "filterpy-ekf-xyz": "filterpy_ekf_xyz",
-    "filterpy-ekf-uvd": "filterpy_ekf_uvd",
-    "filterpy-ukf-xyz": "filterpy_ukf_xyz",
-    "filterpy-ukf-uvd": "filterpy_ukf_uvd",
+    "kf": ("kf", "FILTER"),
+    "ekf-xyz": ("ekf_xyz", "FILTER"),
+    "ekf-uvd": ("ekf_uvd", "FILTER"),
+    "ukf-xyz": ("ukf_xyz", "FILTER"),
+    "ukf-uvd": ("ukf_uvd", "FILTER"),
+    "filterpy-ekf-xyz": ("filterpy_adapters", "EKF_XYZ"),
+    "filterpy-ekf-uvd": ("filterpy_adapters", "EKF_UVD"),
+    "filterpy-ukf-xyz": ("filterpy_adapters", "UKF_XYZ"),
+    "filterpy-ukf-uvd": ("filterpy_adapters", "UKF_UVD"),
 }
 
 
@@ -42,4 +43,5 @@ def get_filter(name: str) -> Any:
         near = difflib.get_close_matches(name, MODULES, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else "."
         raise InputError(f"unknown filter '{name}'{hint} Known: {', '.join(MODULES)}")
-    return importlib.import_module(f"consistency.filters.{MODULES[name]}").FILTER
+    module, attribute = MODULES[name]
+    return getattr(importlib.import_module(f"consistency.filters.{module}"), attribute)

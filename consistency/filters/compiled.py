@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from consistency.filters.jit import is_compiled
 from consistency.filters.textbook import ExtendedKalman, sensor_noise
-from consistency.filters.trial import REASONS
+from consistency.filters.trial import REASONS, run_trial
 from consistency.models.motion import dead_reckoning
 from consistency.protocols import Problem
 from consistency.scenario import Belief
@@ -19,8 +18,8 @@ from consistency.types import Control, Estimates, Failure, Gaussian, Info, Obser
 class Compiled:
     """``init``, ``predict``, ``update``, ``pose`` of the twin, and ``run`` of the kernel."""
 
-    def __init__(self, twin: ExtendedKalman, entry: Callable[..., Any], sensors: tuple[str, ...]) -> None:
-        self.twin, self.entry, self.sensors = twin, entry, sensors
+    def __init__(self, twin: ExtendedKalman, rule: int, model: int, sensors: tuple[str, ...]) -> None:
+        self.twin, self.rule, self.model, self.sensors = twin, rule, model, sensors
         self.name = twin.name
 
     def init(self, problem: Problem) -> Any:
@@ -38,26 +37,22 @@ class Compiled:
     @property
     def is_compiled(self) -> bool:
         """Whether ``run`` starts at once, or spends seconds on compiling first."""
-        return is_compiled(self.entry)
+        return is_compiled(run_trial)
 
     def run(self, trial: Trial, belief: Belief) -> Estimates:
         """Estimates of all steps of ``trial``."""
         sensor, points = belief.sensor, belief.sigma_points
         z, R = sensor_noise(trial.z, sensor, converted=sensor.model == "uvd" and not self.twin.uvd)
         linear = sensor.model == "linear"
-        pose, covariance, nis, nis_dof, step, code = self.entry(
-            trial.controls,
-            trial.first,
-            trial.landmark,
-            np.ascontiguousarray(z),
-            R,
-            trial.n_landmarks,
-            trial.start,
-            dead_reckoning(trial.start, trial.controls),
-            trial.landmarks if linear and trial.landmarks is not None else np.zeros((trial.n_landmarks, 3)),
-            np.array([belief.motion.sigma_v, belief.motion.sigma_omega]),
-            sensor.packed(),
-            np.array([points.alpha, points.beta, points.kappa]),
-        )
+        landmarks0 = trial.landmarks if linear and trial.landmarks is not None else np.zeros((trial.n_landmarks, 3))
+        arrays = (
+            (trial.controls, float), (trial.first, np.int64), (trial.landmark, np.int64), (z, float), (R, float),
+            (trial.start, float), (dead_reckoning(trial.start, trial.controls), float), (landmarks0, float),
+            ([belief.motion.sigma_v, belief.motion.sigma_omega], float), (sensor.packed(), float),
+            ([points.alpha, points.beta, points.kappa], float),
+        )  # fmt: skip
+        # copies: writable and C-contiguous, so that one compiled signature serves every caller
+        out = run_trial(self.rule, self.model, trial.n_landmarks, *(np.array(a, dtype=kind) for a, kind in arrays))
+        pose, covariance, nis, nis_dof, step, code = out
         failure = Failure(self.name, trial.run, step, REASONS[code]) if step else None
         return Estimates(self.name, trial.run, pose, covariance, nis, nis_dof, failure)

@@ -1,23 +1,8 @@
 """EKF-SLAM on (u, v, d), Herath et al. (2007) eq. 22."""
 
-from typing import Any
-
 from consistency.filters.compiled import Compiled
-from consistency.filters.jit import kernel
 from consistency.filters.observation import UVD
-from consistency.filters.rules import linearised
+from consistency.filters.rules import LINEARISED
 from consistency.filters.textbook import ExtendedKalman
-from consistency.filters.trial import compose_trial
 
-_run_trial = compose_trial(linearised(UVD), UVD)
-
-
-@kernel
-def run_ekf_uvd(
-    controls: Any, first: Any, landmark: Any, z: Any, R: Any, n: int, start: Any, path0: Any, landmarks0: Any,
-    q: Any, rig: Any, points: Any,
-) -> Any:  # fmt: skip
-    return _run_trial(controls, first, landmark, z, R, n, start, path0, landmarks0, q, rig, points)
-
-
-FILTER = Compiled(ExtendedKalman("ekf-uvd", uvd=True), run_ekf_uvd, sensors=("uvd",))
+FILTER = Compiled(ExtendedKalman("ekf-uvd", uvd=True), rule=LINEARISED, model=UVD, sensors=("uvd",))

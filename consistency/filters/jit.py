@@ -34,14 +34,14 @@ CACHE = _cache_folder()
 
 def kernel(function: Any) -> Any:
     """Decorator of a whole-trial entry: compiled on first use, kept on disk for later processes."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(CACHE)
+    config: Any = numba.config
+    before, config.CACHE_DIR = config.CACHE_DIR, str(CACHE)
     try:
         return numba.njit(nogil=True, error_model="numpy", cache=True)(function)
     except RuntimeError:  # no folder can be written: compile in every process
         return numba.njit(nogil=True, error_model="numpy")(function)
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before
 
 
 def is_compiled(entry: Any) -> bool:

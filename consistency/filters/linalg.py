@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba.extending import register_jitable
+
+from consistency.models.jitable import jitable
 
 DEFICIENT = 1e-12  # pivot of a correlation matrix below which a direction carries no uncertainty
 ROUNDING = 1e-24  # variance (m^2, rad^2) that rounding alone leaves behind where none is
 
 
-@register_jitable
+@jitable
 def semidefinite_cholesky(A: Any, C: Any) -> bool:
     """Lower C with C C' = A for a positive semidefinite A; the column of a zero pivot is zero.
 
@@ -38,7 +39,7 @@ def semidefinite_cholesky(A: Any, C: Any) -> bool:
     return True
 
 
-@register_jitable
+@jitable
 def forward_substitute(C: Any, B: Any) -> None:
     """B <- C^-1 B by rows, for lower C; the rows of zero pivots become zero."""
     for i in range(C.shape[0]):
@@ -51,7 +52,7 @@ def forward_substitute(C: Any, B: Any) -> None:
         B[i] /= C[i, i]
 
 
-@register_jitable
+@jitable
 def definiteness(P: Any) -> int:
     """1 positive definite, 0 rank-deficient, -1 indefinite or not finite, judged on correlations."""
     n = P.shape[0]

@@ -39,17 +39,17 @@ def sensor_noise(z: Array, sensor: BelievedSensor, converted: bool) -> tuple[Arr
     variance = np.diag(np.square(sensor.sigma))
     if not converted:
         return z, np.broadcast_to(variance, (len(z), 3, 3)).copy()
-    assert sensor.f is not None and sensor.B is not None
-    J = np.stack(np.broadcast_arrays(*stereo.triangulate_jacobian(*z.T, sensor.f, sensor.B)), axis=-1)
-    J = J.reshape(-1, 3, 3)
-    return np.column_stack(stereo.triangulate(*z.T, sensor.f, sensor.B)), J @ variance @ np.swapaxes(J, 1, 2)
+    f, B = sensor.f or 0.0, sensor.B or 0.0
+    u, v, d = z.T
+    J = np.stack(np.broadcast_arrays(*stereo.triangulate_jacobian(u, v, d, f, B)), axis=-1).reshape(-1, 3, 3)
+    return np.column_stack(stereo.triangulate(u, v, d, f, B)), J @ variance @ np.swapaxes(J, 1, 2)
 
 
 class Unicycle:
     """Eq. 18."""
 
     def move(self, pose: Array, control: Control) -> Array:
-        return np.array(motion.unicycle(*pose, control.dt, control.v, control.omega))
+        return np.array(motion.unicycle(pose[0], pose[1], pose[2], control.dt, control.v, control.omega))
 
     def jacobians(self, pose: Array, control: Control) -> tuple[Array, Array]:
         """F (3, 3) with respect to the pose and G (3, 2) with respect to (v, omega)."""
@@ -70,12 +70,12 @@ class PointSensor:
     def measure(self, pose: Array, landmark: Array) -> Array:
         """h: landmarks (..., 3) seen from poses (..., 3)."""
         body = point.to_robot(*np.moveaxis(pose, -1, 0), *np.moveaxis(landmark, -1, 0))
-        c = point.to_sensor(*body, self.mount)
-        return np.stack(stereo.project(*c, self.f, self.B) if self.uvd else c, axis=-1)
+        x, y, z = point.to_sensor(*body, self.mount)
+        return np.stack(stereo.project(x, y, z, self.f, self.B) if self.uvd else (x, y, z), axis=-1)
 
     def jacobians(self, pose: Array, landmark: Array) -> tuple[Array, Array]:
         """dh/d pose and dh/d landmark, each (3, 3)."""
-        body = np.array(point.to_robot(*pose, *landmark))
+        body = point.to_robot(*pose, *landmark)
         c = point.to_sensor(*body, self.mount)
         J = np.reshape(stereo.project_jacobian(*c, self.f, self.B), (3, 3)) if self.uvd else np.eye(3)
         world_to_robot = _heading_matrix(pose[2]).T
@@ -86,13 +86,14 @@ class PointSensor:
         """Landmark (3,) from one observation, with its Jacobians with respect to pose and z."""
         c, J = z, np.eye(3)
         if self.uvd:
-            c = np.array(stereo.triangulate(*z, self.f, self.B))
-            J = np.reshape(stereo.triangulate_jacobian(*z, self.f, self.B), (3, 3))
-        body = np.array(point.from_sensor(*c, self.mount))
+            u, v, d = z
+            c = np.array(stereo.triangulate(u, v, d, self.f, self.B))
+            J = np.reshape(stereo.triangulate_jacobian(u, v, d, self.f, self.B), (3, 3))
+        body = point.from_sensor(c[0], c[1], c[2], self.mount)
         robot_to_world = _heading_matrix(pose[2])
         d_heading = robot_to_world @ [-body[1], body[0], 0.0]
         d_pose = np.column_stack([[1.0, 0, 0], [0, 1.0, 0], d_heading])
-        return np.array(point.to_world(*pose, *body)), d_pose, robot_to_world @ self.turn @ J
+        return np.array(point.to_world(pose[0], pose[1], pose[2], *body)), d_pose, robot_to_world @ self.turn @ J
 
 
 def _heading_matrix(heading: float) -> Array:
@@ -100,8 +101,10 @@ def _heading_matrix(heading: float) -> Array:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
-def _process_noise(G: Array, belief: Belief) -> Array:
-    return G @ np.diag(np.square([belief.motion.sigma_v, belief.motion.sigma_omega])) @ G.T
+def process_noise(G: Array, belief: Belief) -> Array:
+    """G Q G' with Q = diag(sigma_v^2, sigma_omega^2), shape (3, 3)."""
+    Q = np.diag(np.square([belief.motion.sigma_v, belief.motion.sigma_omega]))
+    return np.asarray(G @ Q @ G.T)
 
 
 class ExtendedKalman:
@@ -123,7 +126,7 @@ class ExtendedKalman:
         F[:3, :3], G = self.motion.jacobians(x[:3], control)
         x[:3] = self.motion.move(x[:3], control)
         P = F @ state.P @ F.T
-        P[:3, :3] += _process_noise(G, state.problem.belief)
+        P[:3, :3] += process_noise(G, state.problem.belief)
         return replace(state, x=x, P=P, reference=self.motion.move(state.reference, control))
 
     def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
@@ -179,7 +182,7 @@ class LinearKalman(ExtendedKalman):
         x[:3] = reference + F @ (state.x[:3] - state.reference)
         P[:3] = F @ P[:3]
         P[:, :3] = P[:, :3] @ F.T
-        P[:3, :3] += _process_noise(G, state.problem.belief)
+        P[:3, :3] += process_noise(G, state.problem.belief)
         return replace(state, x=x, P=P, reference=reference)
 
     def _expected(self, state: SlamState, seen: list[int]) -> tuple[Array, Array]:
@@ -214,7 +217,7 @@ class Unscented(ExtendedKalman):
         x = wm @ moved
         P = (moved - x).T @ (wc[:, None] * (moved - x))
         _, G = self.motion.jacobians(state.x[:3], control)
-        P[:3, :3] += _process_noise(G, state.problem.belief)
+        P[:3, :3] += process_noise(G, state.problem.belief)
         return replace(state, x=x, P=P, reference=self.motion.move(state.reference, control))
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
@@ -240,16 +243,21 @@ def sigma_points(x: Array, P: Array, involved: Array, belief: Belief) -> tuple[A
     root. The centre weight is what makes the weights sum to one over all n.
     """
     n, L, set_ = len(x), len(involved), belief.sigma_points
-    order = np.concatenate([involved, np.setdiff1d(np.arange(n), involved)])
-    root = np.zeros((n, n))
-    root[np.ix_(order, np.arange(n))] = square_root(P[np.ix_(order, order)])
     spread2 = set_.alpha**2 * (L + set_.kappa)
-    steps = np.sqrt(spread2) * root.T
+    steps = np.sqrt(spread2) * ordered_root(P, involved).T
     wm = np.full(2 * n + 1, 0.5 / spread2)
     wm[0] = 1.0 - n / spread2
     wc = wm.copy()
     wc[0] += 1.0 - set_.alpha**2 + set_.beta
     return np.concatenate([[x], x + steps, x - steps]), wm, wc
+
+
+def ordered_root(P: Array, first: Array) -> Array:
+    """Root C with C C' = P, lower triangular once the variables ``first`` are put first."""
+    order = np.concatenate([first, np.setdiff1d(np.arange(len(P)), first)])
+    root = np.empty_like(P)
+    root[order] = square_root(P[np.ix_(order, order)])
+    return root
 
 
 def square_root(P: Array) -> Array:

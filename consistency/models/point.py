@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba.extending import register_jitable
+
+from consistency.models.jitable import jitable
 
 
-@register_jitable
+@jitable
 def to_robot(px: Any, py: Any, heading: Any, lx: Any, ly: Any, lz: Any) -> tuple[Any, Any, Any]:
     """Landmark in the robot frame (x forward, y left, z up), all in m."""
     c, s = np.cos(heading), np.sin(heading)
@@ -16,14 +17,14 @@ def to_robot(px: Any, py: Any, heading: Any, lx: Any, ly: Any, lz: Any) -> tuple
     return c * dx + s * dy, -s * dx + c * dy, lz
 
 
-@register_jitable
+@jitable
 def to_world(px: Any, py: Any, heading: Any, bx: Any, by: Any, bz: Any) -> tuple[Any, Any, Any]:
     """Inverse of :func:`to_robot`."""
     c, s = np.cos(heading), np.sin(heading)
     return px + c * bx - s * by, py + s * bx + c * by, bz
 
 
-@register_jitable
+@jitable
 def to_sensor(bx: Any, by: Any, bz: Any, mount: Any) -> tuple[Any, Any, Any]:
     """Robot frame to the frame of a sensor at ``mount``: 12 numbers, position and rotation by rows."""
     dx, dy, dz = bx - mount[0], by - mount[1], bz - mount[2]
@@ -34,7 +35,7 @@ def to_sensor(bx: Any, by: Any, bz: Any, mount: Any) -> tuple[Any, Any, Any]:
     )
 
 
-@register_jitable
+@jitable
 def from_sensor(cx: Any, cy: Any, cz: Any, mount: Any) -> tuple[Any, Any, Any]:
     """Inverse of :func:`to_sensor`."""
     return (

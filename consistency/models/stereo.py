@@ -7,31 +7,31 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba.extending import register_jitable
+from consistency.models.jitable import jitable
 
 Nine = tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any]
 
 
-@register_jitable
+@jitable
 def project(x: Any, y: Any, z: Any, f: Any, B: Any) -> tuple[Any, Any, Any]:
     """Eq. 22: point in the sensor frame (m) to (u, v, d) in px; f in px, baseline B in m."""
     return -f * y / x, -f * z / x, f * B / x
 
 
-@register_jitable
+@jitable
 def project_jacobian(x: Any, y: Any, z: Any, f: Any, B: Any) -> Nine:
     """d(u, v, d) / d(x, y, z) by rows."""
     g = f / x
     return g * y / x, -g, 0.0 * g, g * z / x, 0.0 * g, -g, -g * B / x, 0.0 * g, 0.0 * g
 
 
-@register_jitable
+@jitable
 def triangulate(u: Any, v: Any, d: Any, f: Any, B: Any) -> tuple[Any, Any, Any]:
     """Eq. 21: (u, v, d) in px to the point in the sensor frame (m)."""
     return B * f / d, -B * u / d, -B * v / d
 
 
-@register_jitable
+@jitable
 def triangulate_jacobian(u: Any, v: Any, d: Any, f: Any, B: Any) -> Nine:
     """d(x, y, z) / d(u, v, d) by rows."""
     g = B / d

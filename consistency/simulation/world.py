@@ -86,11 +86,8 @@ def _drive_linear(reference: Array, planned: Array, noise: Array) -> Array:
         heading = reference[k, 2]
         fx, fy = motion.unicycle_jacobian(heading, dt, v)
         along = dt * v_noise
-        error = error + [
-            fx * error[2] + along * np.cos(heading),
-            fy * error[2] + along * np.sin(heading),
-            dt * omega_noise,
-        ]
+        error += np.array([fx * error[2], fy * error[2], 0.0])
+        error += np.array([along * np.cos(heading), along * np.sin(heading), dt * omega_noise])
         path[k + 1] += error
     return path
 
@@ -106,20 +103,20 @@ def _visible(truth: Truth, path: Array, landmarks: Array) -> Array:
     sensor = truth.sensor
     p = _in_sensor(truth, path[1:, None, :], landmarks[None, :, :])
     distance = np.linalg.norm(p, axis=-1)
-    seen = (distance >= sensor.range[0]) & (distance <= sensor.range[1])
+    seen: Array = (distance >= sensor.range[0]) & (distance <= sensor.range[1])
     if sensor.image is None:
         return seen
     assert sensor.f is not None
     (width, height), (column, row) = sensor.image, sensor.centre
     with np.errstate(divide="ignore", invalid="ignore"):
-        u, v, _ = stereo.project(*np.moveaxis(p, -1, 0), sensor.f, 0.0)
+        u, v, _ = stereo.project(p[..., 0], p[..., 1], p[..., 2], sensor.f, 0.0)
     inside = (u >= -column) & (u < width - column) & (v >= -row) & (v < height - row)
-    return seen & (p[..., 0] > 0) & inside
+    return np.asarray(seen & (p[..., 0] > 0) & inside)
 
 
 def _measure(truth: Truth, p: Array) -> Array:
     if isinstance(truth.sensor, UvdSensor):
-        return np.stack(stereo.project(*p.T, truth.sensor.f, truth.sensor.B), axis=-1)
+        return np.stack(stereo.project(p[:, 0], p[:, 1], p[:, 2], truth.sensor.f, truth.sensor.B), axis=-1)
     return p
 
 

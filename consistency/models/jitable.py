@@ -1,0 +1,16 @@
+"""Marks a plain function as callable from compiled kernels, and leaves it what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from numba.extending import register_jitable
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def jitable(function: F) -> F:
+    """Decorator: the function stays plain Python, and Numba compiles it where a kernel calls it."""
+    register_jitable(function)
+    return function

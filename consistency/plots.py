@@ -1,0 +1,188 @@
+"""Figures of a filter's honesty: records and arrays onto Matplotlib Axes. Nothing is computed here.
+
+Every function draws on the Axes it is given and returns nothing; text is shown literally, so a name
+may hold any character. Colours are those of Okabe & Ito (2008); each style has its own dash pattern
+and marker as well, so that a grey print still reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from consistency.types import Array, Indices
+
+TRUTH, ODOMETRY, BAND = "#000000", "#7f7f7f", "#d9d9d9"
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# lengths in points, drawn and left out; 5 patterns and 6 colours repeat together only after 30
+DASHES: tuple[tuple[float, ...], ...] = (
+    (),
+    (5.0, 2.0),
+    (1.5, 1.5),
+    (7.0, 2.0, 1.5, 2.0),
+    (3.0, 1.5, 1.0, 1.5, 1.0, 1.5),
+)
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+AXES = (("x", "m"), ("y", "m"), ("heading", "deg"))
+
+
+@dataclass(frozen=True)
+class Style:
+    """How one filter looks everywhere."""
+
+    colour: str
+    dash: tuple[float, ...]  # empty: solid
+    marker: str
+
+    @property
+    def linestyle(self) -> str | tuple[float, tuple[float, ...]]:
+        """The dash pattern as Matplotlib takes it."""
+        return (0.0, self.dash) if self.dash else "-"
+
+
+def style(index: int) -> Style:
+    """Style of the filter with this number; the same number always looks the same."""
+    return Style(COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)], MARKERS[index % len(MARKERS)])
+
+
+def scenario(
+    axes: Axes,
+    true_path: Array | None,
+    odometry: Array | None,
+    landmarks: Array | None,
+    paths: Sequence[tuple[Style, Array]] = (),
+) -> None:
+    """World from above, as Herath et al. (2007) fig. 2a.
+
+    Parameters
+    ----------
+    true_path, odometry : (T + 1, 2) in m, or None where unknown
+    landmarks : (N, 2) in m, or None
+    paths : a style and an estimated path (T, 2) in m for each filter
+    """
+    if landmarks is not None:
+        axes.plot(*landmarks.T, "*", color="#8c8c8c", markersize=4, markeredgewidth=0, zorder=1)
+    if odometry is not None:
+        axes.plot(*odometry.T, color=ODOMETRY, linewidth=1.1, dashes=(6, 3), zorder=2)
+    if true_path is not None:
+        axes.plot(*true_path.T, color=TRUTH, linewidth=1.6, zorder=3)
+        axes.plot(*true_path[0], "o", color="white", markeredgecolor=TRUTH, markersize=7, zorder=6)
+    for look, path in paths:
+        axes.plot(*path.T, color=look.colour, linestyle=look.linestyle, linewidth=1.1, zorder=4)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+    _frame(axes)
+
+
+def pose_error(axes: Axes, steps: Indices, error: Array, sigma: Array, look: Style, component: int) -> None:
+    """One component of the pose error of one run with its 2-sigma bounds, as Herath et al. (2007) fig. 2b.
+
+    Parameters
+    ----------
+    steps, error, sigma : (T,), m, or degrees for the heading
+    component : 0 for x, 1 for y, 2 for the heading
+    """
+    name, unit = AXES[component]
+    axes.fill_between(steps, -2 * sigma, 2 * sigma, color=look.colour, alpha=0.15, linewidth=0)
+    for sign in (-2.0, 2.0):
+        axes.plot(steps, sign * sigma, color=look.colour, linewidth=0.9, linestyle="--")
+    axes.plot(steps, error, color=look.colour, linewidth=0.9)
+    axes.axhline(0.0, color="#555555", linewidth=0.5)
+    axes.set(ylabel=f"{name} error ({unit})")
+    axes.margins(x=0.01)
+    _frame(axes)
+
+
+def anees_band(
+    axes: Axes, steps: Indices, band: Array, simultaneous: Array, expected: float, look: Style | None = None
+) -> None:
+    """Where the average NEES of a consistent filter stays: in one step (shaded), in all at once (dashed).
+
+    ``band`` and ``simultaneous`` are (T, 2). With ``look`` both are thin lines in that style's colour.
+    """
+    if look is None:
+        axes.fill_between(steps, *band.T, color=BAND, linewidth=0, zorder=0)
+        axes.axhline(expected, color="#555555", linewidth=0.8, zorder=1)
+    colour = "#333333" if look is None else look.colour
+    for low_high in simultaneous.T:
+        axes.plot(steps, low_high, color=colour, linewidth=0.9, dashes=(4, 3), zorder=1)
+    if look is not None:
+        for low_high in band.T:
+            axes.plot(steps, low_high, color=colour, linewidth=0.7, dashes=(1, 2), zorder=1)
+
+
+def anees(axes: Axes, curves: Sequence[tuple[Style, Indices, Array]], log: bool, single: bool = False) -> None:
+    """Average NEES (or, with ``single``, the NEES of one run) over steps, as Herath et al. (2007) fig. 11.
+
+    ``curves`` holds a style, steps (T,) and values (T,) for each filter.
+    """
+    for look, steps, values in curves:
+        axes.plot(steps, values, color=look.colour, linestyle=look.linestyle, linewidth=1.2, zorder=3)
+    if log:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+    axes.set(xlabel="step", ylabel=f"{'NEES' if single else 'ANEES'} of the pose")
+    axes.margins(x=0.01)
+    _frame(axes)
+
+
+def nis(axes: Axes, steps: Indices, ratio: Array, look: Style, log: bool = False) -> None:
+    """Normalized innovation squared over its degrees of freedom, one point a step; 1 is expected."""
+    axes.plot(steps, ratio, look.marker, color=look.colour, markersize=2.0, markeredgewidth=0, alpha=0.7)
+    axes.axhline(1.0, color="#333333", linewidth=0.8)
+    if log:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+    axes.set(xlabel="step", ylabel="NIS / dof")
+    axes.margins(x=0.01)
+    _frame(axes)
+
+
+def samples(axes: Axes, points: Array, linear: Array, fitted: Array) -> None:
+    """Transformed points (n, 2) in m with two ellipses (m, 2), as Herath et al. (2007) fig. 12."""
+    axes.plot(*points.T, ".", color="#8c8c8c", markersize=1.6, markeredgewidth=0, alpha=0.6, rasterized=True)
+    axes.plot(*linear.T, color=COLOURS[0], linewidth=1.4)
+    axes.plot(*fitted.T, color=COLOURS[1], linewidth=1.4, dashes=DASHES[1])
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+    _frame(axes)
+
+
+def marginal(axes: Axes, edges: Array, density: Array, grid: Array, linear: Array, fitted: Array) -> None:
+    """Histogram of x (edges (n + 1,), density (n,)) and two densities on ``grid`` (g,), per m."""
+    axes.stairs(density, edges, fill=True, color="#c4c4c4")
+    axes.plot(grid, linear, color=COLOURS[0], linewidth=1.4)
+    axes.plot(grid, fitted, color=COLOURS[1], linewidth=1.4, dashes=DASHES[1])
+    axes.set(xlabel="x (m)", ylabel="density (1/m)", ylim=(0, None))
+    _frame(axes)
+
+
+def key(figure: Figure, entries: Sequence[tuple[str, Line2D]], columns: int = 4, top: float = 1.0) -> None:
+    """Legend above the axes of ``figure``; labels are shown literally."""
+    handles = [handle for _, handle in entries]
+    legend = figure.legend(
+        handles, [str(i) for i in range(len(handles))], loc="upper center", ncols=columns, frameon=False,
+        bbox_to_anchor=(0.5, top), handlelength=2.6, columnspacing=1.4, borderaxespad=0.1,
+    )  # fmt: skip
+    for text, (label, _) in zip(legend.get_texts(), entries, strict=True):
+        text.set_parse_math(False)
+        text.set_text(label)
+
+
+def line(look: Style) -> Line2D:
+    """Legend entry of a filter."""
+    return Line2D([], [], color=look.colour, linestyle=look.linestyle, linewidth=1.4)
+
+
+def title(axes: Axes, text: str) -> None:
+    """Title shown literally, dollar signs included."""
+    axes.set_title(text, loc="left", parse_math=False)
+
+
+def _frame(axes: Axes) -> None:
+    axes.grid(visible=True, color="#ececec", linewidth=0.6, zorder=0)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,163 @@
+"""From an output folder to the report model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from pydantic import ValidationError
+
+from consistency.errors import InputError
+from consistency.findings import read_findings
+from consistency.judge import Curves, analyse, curves
+from consistency.models.motion import dead_reckoning
+from consistency.reporting.distributions import distributions
+from consistency.reporting.model import Report, Study, Track
+from consistency.reporting.wording import answer, number
+from consistency.results import Results, read_manifest, read_results
+from consistency.scenario import Scenario
+from consistency.simulation import simulate
+from consistency.types import Array, Verdict
+
+DECADE = 10.0  # values that span more are drawn on a log axis
+DEGREES = np.array([1.0, 1.0, 180.0 / np.pi])
+
+
+def build_report(folder: Path) -> Report:
+    """Read a folder of ``consistency run`` or ``consistency reproduce`` and work out what a report says.
+
+    Raises
+    ------
+    InputError
+        The folder holds no results, or a file in it is damaged.
+    """
+    manifest = read_manifest(folder)
+    if "studies" in manifest:
+        parts = [folder / str(name) for name in manifest["studies"]]
+    elif "filters" in manifest:
+        parts = [folder]
+    else:
+        raise InputError(f"{folder}: holds no filter results; write some with 'consistency run', then report those")
+    styles: dict[str, int] = {}
+    studies = tuple(_study(part, styles) for part in parts)
+    findings = tuple(read_findings(folder))
+    name = "reproduction" if "studies" in manifest else studies[0].name
+    return Report(
+        f"Filter consistency: {name}", answer(studies, findings), studies, findings,
+        distributions(folder / "fig12.parquet"), _provenance(manifest),
+    )  # fmt: skip
+
+
+def _study(folder: Path, styles: dict[str, int]) -> Study:
+    results = read_results(folder)
+    scenario = _scenario(results, folder)
+    verdicts = analyse(results)
+    all_curves = {name: curves(results, name) for name in results.filters}
+    runs = np.unique(np.concatenate([c.runs for c in all_curves.values()]))
+    shown = int(runs[0]) if len(runs) else 0
+    steps = max((len(c.t) for c in all_curves.values()), default=0)
+    for name in results.filters:
+        styles.setdefault(name, len(styles))
+    common = _common_band(verdicts)
+    tracks = tuple(_track(all_curves[n], verdicts[n], shown, styles[n], common) for n in results.filters)
+    resolved = results.manifest.get("scenario") or results.manifest.get("belief") or {}
+    return Study(
+        name=scenario.name if scenario else Path(str(results.manifest.get("log", folder.name))).name,
+        summary=scenario.summary if scenario else "Recorded log",
+        runs=len(runs),
+        shown_run=shown,
+        steps=np.arange(1, steps + 1),
+        tracks=tracks,
+        true_path=_true_path(results.truth, shown),
+        odometry=_odometry(scenario, results.manifest, shown),
+        landmarks=None if results.landmarks is None else results.landmarks[["x", "y"]].to_numpy(float),
+        anees_log=_wide([v for t in tracks for v in (t.anees, t.simultaneous) if v is not None]),
+        nis_log=_wide([t.nis_ratio for t in tracks]),
+        is_log=scenario is None,
+        provenance=_provenance(results.manifest),
+        resolved=json.dumps(resolved, indent=2, ensure_ascii=False),
+    )
+
+
+def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | None) -> Track:
+    steps = len(c.t)
+    row = int(np.searchsorted(c.runs, shown))
+    has_run = row < len(c.runs) and c.runs[row] == shown
+    s = verdict.statistics
+    band = s.get("band")
+    variance = np.diagonal(c.covariance, axis1=-2, axis2=-1)
+    known = np.isfinite(c.nis) & (c.nis_dof > 0)
+    dof = np.where(known, c.nis_dof, 0).sum(axis=0)
+    total = np.where(known, c.nis, 0.0).sum(axis=0)
+    empty = np.full((steps, 3), np.nan)
+    return Track(
+        name=c.filter,
+        style=style,
+        verdict=verdict,
+        path=(c.pose[row] if has_run else empty)[:, :2],
+        error=None if c.error is None else DEGREES * (c.error[row] if has_run else empty),
+        sigma=DEGREES * np.sqrt(np.maximum(variance[row], 0.0)) if has_run else empty,
+        anees=s.get("anees"),
+        band=band,
+        simultaneous=s.get("simultaneous"),
+        own_band=band is not None and not np.array_equal(band, common, equal_nan=True),
+        nis_ratio=np.where(dof > 0, total / np.maximum(dof, 1), np.nan),
+    )
+
+
+def _common_band(verdicts: dict[str, Verdict]) -> Array | None:
+    """The band of the filter with the most estimates: failed runs widen the others'."""
+    judged = [v.statistics for v in verdicts.values() if v.statistics.get("judged_steps")]
+    best = max(judged, key=lambda s: int(s["alive"].sum()), default=None)
+    return None if best is None else best["band"]
+
+
+def _wide(values: list[Array]) -> bool:
+    flat = np.concatenate([v.ravel() for v in values]) if values else np.empty(0)
+    flat = flat[np.isfinite(flat) & (flat > 0)]
+    return bool(flat.size) and bool(flat.max() > DECADE * flat.min())
+
+
+def _true_path(truth: pd.DataFrame | None, run: int) -> Array | None:
+    if truth is None:
+        return None
+    path = truth.loc[truth["run"] == run].sort_values("step")[["x", "y"]].to_numpy(float)
+    return path if len(path) else None
+
+
+def _scenario(results: Results, folder: Path) -> Scenario | None:
+    try:
+        return results.scenario
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{folder / 'manifest.json'}: key 'scenario.{key}': {first['msg']}; run it again") from None
+
+
+def _odometry(scenario: Scenario | None, manifest: dict[str, Any], run: int) -> Array | None:
+    """The path by the controls alone; results keep no controls, but a simulated trial can be drawn again."""
+    seed = manifest.get("seed")
+    if scenario is None or seed is None:
+        return None
+    trial = simulate(scenario, run, int(seed))
+    return dead_reckoning(trial.start, trial.controls)[:, :2]
+
+
+def _provenance(manifest: dict[str, Any]) -> tuple[tuple[str, str], ...]:
+    versions = manifest.get("versions") or {}
+    wall = manifest.get("wall_time_s")
+    rows = {
+        "Seed": manifest.get("seed"),
+        "Runs": manifest.get("runs"),
+        "Scenario hash": manifest.get("scenario_hash"),
+        "Command": manifest.get("command"),
+        "Git commit": manifest.get("git_commit"),
+        "Wall time": None if wall is None else f"{number(float(wall), '.1f')} s",
+        "Versions": ", ".join(f"{name} {version}" for name, version in versions.items()) or None,
+    }
+    if manifest.get("complete") is False:
+        rows["Complete"] = "no: the run was interrupted; the numbers are of the finished runs"
+    return tuple((name, str(value)) for name, value in rows.items() if value is not None)

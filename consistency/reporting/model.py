@@ -1,0 +1,112 @@
+"""What a report says: every number in it, apart from how it is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from consistency.types import Array, Gaussian, Indices, Verdict
+
+STATUSES = ("consistent", "overconfident", "conservative", "failed")
+SINGLE_RUN = 1
+
+
+@dataclass(frozen=True)
+class Track:
+    """One filter in one study; T steps. Rows are NaN where the filter had no estimate."""
+
+    name: str
+    style: int  # the same number for the same filter in the whole report
+    verdict: Verdict
+    path: Array  # (T, 2), m, of the shown run
+    error: Array | None  # (T, 3), m, m, deg, truth minus estimate of the shown run
+    sigma: Array  # (T, 3), m, m, deg, stated standard deviation
+    anees: Array | None  # (T,)
+    band: Array | None  # (T, 2), where the ANEES of a consistent filter lies in one step
+    simultaneous: Array | None  # (T, 2), where it lies in all steps at once
+    own_band: bool  # failed runs have made the bands differ from those of the study
+    nis_ratio: Array  # (T,), NIS of all runs over their degrees of freedom
+
+
+@dataclass(frozen=True)
+class Study:
+    """Filters on one scenario or one log."""
+
+    name: str
+    summary: str
+    runs: int
+    shown_run: int
+    steps: Indices  # (T,), 1..T
+    tracks: tuple[Track, ...]
+    true_path: Array | None  # (T + 1, 2), m
+    odometry: Array | None  # (T + 1, 2), m
+    landmarks: Array | None  # (N, 2), m
+    anees_log: bool
+    nis_log: bool
+    is_log: bool
+    provenance: tuple[tuple[str, str], ...]
+    resolved: str  # the scenario, or the log's belief, as JSON
+
+    @property
+    def has_truth(self) -> bool:
+        return any(track.anees is not None for track in self.tracks)
+
+    @property
+    def single(self) -> bool:
+        """One run: the curve is a NEES, no average."""
+        return self.runs == SINGLE_RUN
+
+    @property
+    def statistic(self) -> str:
+        return "NEES" if self.single else "ANEES"
+
+    @property
+    def common_band(self) -> Track | None:
+        """The filter whose bands are those of the study."""
+        return next((t for t in self.tracks if t.band is not None and not t.own_band), None)
+
+    @property
+    def failures(self) -> list[tuple[str, int, int, str]]:
+        """Filter, run, step and reason of every failed run."""
+        return [
+            (track.name, int(run), int(step), str(reason))
+            for track in self.tracks
+            for run, step, reason in track.verdict.statistics["failures"]
+        ]
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Eq. 21 applied to Gaussian (u, d) for one baseline, as Herath et al. (2007) fig. 12."""
+
+    baseline: float  # m
+    samples: int
+    points: Array  # (n, 2), m, the samples drawn
+    window: tuple[tuple[float, float], tuple[float, float]]  # drawn range of x and y, m
+    outside: float  # share of samples beyond the drawn range
+    edges: Array  # (b + 1,), m
+    density: Array  # (b,), 1/m
+    grid: Array  # (g,), m
+    linear: Gaussian  # J diag(sigma^2) J' at the true point
+    fitted: Gaussian  # moments of the samples
+    linear_ellipse: Array  # (m, 2), 2 sigma
+    fitted_ellipse: Array
+    linear_density: Array  # (g,), 1/m
+    fitted_density: Array
+
+
+@dataclass(frozen=True)
+class Report:
+    """All of it."""
+
+    title: str
+    answer: str
+    studies: tuple[Study, ...]
+    findings: tuple[dict[str, Any], ...]
+    distributions: tuple[Distribution, ...]
+    provenance: tuple[tuple[str, str], ...]
+
+    @property
+    def filters(self) -> list[tuple[str, int]]:
+        """Names and style numbers, each filter once."""
+        return list(dict.fromkeys((track.name, track.style) for study in self.studies for track in study.tracks))

@@ -135,6 +135,7 @@ def _load(path: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses of the script look for their names
     try:
         spec.loader.exec_module(module)
     except Exception as error:

@@ -58,9 +58,10 @@ def main(study: cs.Study) -> list[cs.Finding]:
 def inside(curves: Curves) -> np.ndarray:
     """Share of steps within 2 sigma, for each run and axis, shape (runs, 3)."""
     assert curves.error is not None
+    assert curves.nees is not None
     sigma = np.sqrt(np.diagonal(curves.covariance, axis1=-2, axis2=-1))
     judged = np.isfinite(curves.nees)[..., None]  # where the covariance has full rank
-    return np.nanmean(np.where(judged, np.abs(curves.error) <= 2 * sigma, np.nan), axis=1)
+    return np.asarray(np.nanmean(np.where(judged, np.abs(curves.error) <= 2 * sigma, np.nan), axis=1))
 
 
 def too_few_inside(curves: Curves) -> np.ndarray:

@@ -42,7 +42,7 @@ def predict(rule: int, x: Any, P: Any, n: int, u: Any, pose0: Any, q: Any, point
 def innovate(
     rule: int, model: int, x: Any, P: Any, n: int, at: Any, pose0: Any, landmarks0: Any, rig: Any, points: Any,
     zhat: Any, S: Any, A: Any,
-) -> bool:  # fmt: skip
+) -> Any:  # fmt: skip
     """zhat, S (without R) and A = Cov(z, x) of the landmarks at state offsets ``at``; False if P is indefinite."""
     if rule == UNSCENTED:
         return _innovate_unscented(model, x, P, n, at, rig, points, zhat, S, A)

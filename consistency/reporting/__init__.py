@@ -1,0 +1,81 @@
+"""Results as one offline HTML file and as a PDF; both show the same model.
+
+``build`` reads a folder and works out every number, ``html`` and ``pdf`` only show them. No
+statistic is computed here that the diagnostics do not already have.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from consistency.errors import InputError
+
+__all__ = ["write_reports"]
+
+
+def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: bool) -> list[Path]:
+    """Report of a folder of ``consistency run`` or ``reproduce``, each file whole or not at all.
+
+    Parameters
+    ----------
+    folder : output folder
+    html, pdf : files to write; None leaves that one out
+    overwrite : replace files that exist
+
+    Returns
+    -------
+    The files written
+
+    Raises
+    ------
+    InputError
+        The folder cannot be read, or a file exists or cannot be written.
+    """
+    targets = [path for path in (html, pdf) if path is not None]
+    if html is not None and pdf is not None and html.absolute() == pdf.absolute():
+        raise InputError(f"{html}: is named for both HTML and PDF; name two files")
+    for path in targets:
+        _require_writable(path, overwrite)
+    from consistency.reporting.build import build_report
+    from consistency.reporting.html import render_html
+    from consistency.reporting.pdf import render_pdf
+
+    report = build_report(Path(folder))
+    contents: list[tuple[Path, bytes]] = []
+    if html is not None:
+        contents.append((html, render_html(report).encode("utf-8")))
+    if pdf is not None:
+        contents.append((pdf, render_pdf(report)))
+    for path, content in contents:
+        _write(path, content)
+    return targets
+
+
+def _require_writable(path: Path, overwrite: bool) -> None:
+    """Refuse, before any work, what cannot be written or must not be replaced."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file")
+    if (path.exists() or path.is_symlink()) and not overwrite:
+        raise InputError(f"{path}: exists already; name another file or add --overwrite")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _write(path: Path, content: bytes) -> None:
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException as error:
+        Path(name).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        raise

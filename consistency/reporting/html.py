@@ -1,0 +1,57 @@
+"""The report model as one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bokeh.embed import components
+from bokeh.resources import Resources
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from consistency.plots import style
+from consistency.reporting import wording
+from consistency.reporting.charts import MARKERS, distribution_charts, study_charts
+from consistency.reporting.model import Report
+from consistency.reporting.thin import LIMIT
+
+MAXIMUM = 6_000_000  # bytes of the whole file
+SCRIPT = 1_400_000  # bytes of Bokeh itself, style and words
+CHART = 16_000  # bytes of a chart before its data
+POINT = 5.4  # bytes of one number in base64
+LEAST = 120  # points a line below which a curve is no curve
+NUMBERS = 22  # columns of all charts of one filter
+
+
+def render_html(report: Report) -> str:
+    """The whole page: style, script, data and words in one string."""
+    limit = points_a_line(report)
+    charts: dict[str, Any] = {}
+    for index, study in enumerate(report.studies):
+        charts |= {f"s{index}-{name}": chart for name, chart in study_charts(study, index, limit).items()}
+    for index, distribution in enumerate(report.distributions):
+        charts[f"d{index}-cloud"], charts[f"d{index}-histogram"] = distribution_charts(distribution)
+    script, divs = components(charts) if charts else ("", {})
+    environment = Environment(
+        loader=PackageLoader("consistency.reporting"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["paragraph_id"] = lambda index: f"study-{index}"
+    return environment.get_template("report.html.j2").render(
+        report=report,
+        wording=wording,
+        style=style,
+        shapes=MARKERS,
+        thinned=limit if any(len(study.steps) > limit for study in report.studies) else None,
+        bokeh=Markup(Resources(mode="inline", components=["bokeh"]).render()) if charts else "",
+        chart_script=Markup(script),
+        chart={name: Markup(div) for name, div in divs.items()},
+    )
+
+
+def points_a_line(report: Report) -> int:
+    """Points that a line may have so that the file stays below its greatest size."""
+    tracks = sum(len(study.tracks) for study in report.studies)
+    charts = 6 * len(report.studies) + 2 * len(report.distributions)
+    room = MAXIMUM - SCRIPT - CHART * charts - 30_000 * len(report.distributions)
+    return int(min(LIMIT, max(LEAST, room / (POINT * NUMBERS * max(tracks, 1)))))

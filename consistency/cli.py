@@ -11,6 +11,8 @@ import typer
 
 from consistency.errors import InputError
 
+UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
+
 app = typer.Typer(
     help="Does a stereo-SLAM filter tell the truth about its own uncertainty?",
     no_args_is_help=True,
@@ -169,7 +171,7 @@ def reproduce(
     out: Out = Path("reports/reproduce"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Set each published finding beside what is measured here; exit 1 if an experiment breaks."""
+    """Set each published finding beside what is measured here; exit 1 if one is not reproduced."""
     from consistency.findings import reproduce as reproduce_findings
     from consistency.reporting import write_reports
     from consistency.table import print_findings
@@ -178,16 +180,21 @@ def reproduce(
     print_findings(findings)
     for path in (out / "findings.json", *write_reports(out, out / "report.html", out / "report.pdf", overwrite=True)):
         print(path)
-    if any(finding.verdict == "error" for finding in findings):
+    if missed := [finding.id for finding in findings if finding.verdict != "reproduced"]:
+        print(f"not reproduced: {', '.join(missed)}", file=sys.stderr)
         raise typer.Exit(1)
 
 
 def main(arguments: list[str] | None = None) -> Any:
     """Entry point: unusable input ends in one line and exit status 2."""
     try:
-        app(arguments)
+        sys.exit(app(arguments, standalone_mode=False))
     except InputError as error:
         print(f"consistency: {error}", file=sys.stderr)
+        sys.exit(2)
+    except UsageError as error:
+        command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
+        print(f"consistency: {error.format_message()} See: {command} --help", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:
         sys.exit(141)

@@ -73,7 +73,7 @@ def scenario(
         axes.plot(*true_path[0], "o", color="white", markeredgecolor=TRUTH, markersize=7, zorder=6)
     for look, path in paths:
         axes.plot(*path.T, color=look.colour, linestyle=look.linestyle, linewidth=1.1, zorder=4)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.set(xlabel="x (m)", ylabel="y (m)")
     _frame(axes)
 

@@ -342,7 +342,7 @@ def _check_column(path: Path, table: pd.DataFrame, column: str, kind: str) -> No
     values = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
     if not np.isfinite(values).all():
         row = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise InputError(f"{path}: column '{column}', row {row}: not a finite number ({table[column].iloc[row]!r})")
+        raise InputError(f"{path}: column '{column}', row {row}: not a finite number ({table[column].iloc[row]})")
     if kind == "int64" and (values != np.round(values)).any():
         row = int(np.flatnonzero(values != np.round(values))[0])
         raise InputError(f"{path}: column '{column}', row {row}: not a whole number ({values[row]})")

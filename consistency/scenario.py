@@ -345,9 +345,9 @@ def load_scenario(name: str | Path) -> Scenario:
         path = data_folder("scenarios") / f"{name}.toml"
     elif path.suffix != ".toml":
         near = difflib.get_close_matches(str(name), scenario_names(), n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
         known = ", ".join(scenario_names())
-        raise InputError(f"unknown scenario '{name}'{hint} Known: {known}; or give the path of a .toml file")
+        raise InputError(f"unknown scenario '{name}'{hint}; known: {known}; or give the path of a .toml file")
     return read_table(path, Scenario, name=path.stem)
 
 
@@ -368,8 +368,9 @@ def read_table(path: Path, model: type[T], **extra: Any) -> T:
 
 
 def explain(error: ValidationError, model: type[Table]) -> str:
-    """The first complaint of pydantic in one line: key, what is wrong, what is allowed."""
-    first, more = error.errors()[0], error.error_count() - 1
+    """One complaint of pydantic in one line: key, what is wrong, what is allowed; unknown keys first."""
+    complaints = sorted(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
+    first, more = complaints[0], len(complaints) - 1
     # pydantic inserts the tag of a tagged union into the location: it is no key of the file
     keys = [str(part) for part in first["loc"]]
     tags = {"circle", "rounded-rectangle", "figure-of-eight", "corridor", "waypoints", "uniform", "listed"}
@@ -381,6 +382,11 @@ def explain(error: ValidationError, model: type[Table]) -> str:
         text = f"unknown key; allowed here: {', '.join(allowed)}"
     elif first["type"] == "missing":
         text = "missing; it must be given"
+    elif first["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        tag = first["ctx"]["discriminator"].strip("'")
+        expected = first["ctx"].get("expected_tags") or "see scenarios/README.md"
+        where = f"key '{'.'.join([*keys, tag])}': "
+        text = f"'{first['ctx'].get('tag', '')}' is not one of {expected}"
     else:
         text = first["msg"].removeprefix("Value error, ")
         if first["type"] != "value_error":

@@ -16,7 +16,7 @@ from consistency.types import Verdict
 
 COLOURS = {
     "consistent": "green", "overconfident": "red", "conservative": "yellow", "failed": "red",
-    "reproduced": "green", "not reproduced": "yellow", "refuted": "red", "error": "red",
+    "reproduced": "green", "not reproduced": "yellow", "refuted": "red",
 }  # fmt: skip
 
 

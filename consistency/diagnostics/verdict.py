@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from consistency.diagnostics.coverage import TWO_SIGMA, coverage, rmse
-from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval, detectable_ratio
 from consistency.diagnostics.nees import anees
 from consistency.types import Array, Failure, Verdict
 
@@ -80,6 +80,7 @@ def _nees(error: Array, covariance: Array, nees: Array, confidence: float) -> di
         "judged_steps": int(judged.sum()),
         "left_out_steps": [int(k) + 1 for k in np.flatnonzero(~judged)],
         "mean_anees": float(np.nanmean(curve)) if judged.any() else float("nan"),
+        "detectable": detectable_ratio(n, int(alive.max()), tail) if judged.any() else float("nan"),
         "share_inside": float(inside[judged].mean()) if judged.any() else float("nan"),
         "steps_above": int(above.sum()),
         "steps_below": int(below.sum()),
@@ -107,6 +108,7 @@ def _judge_nees(s: dict[str, Any]) -> tuple[str, list[str]]:
     band = f"the band [{low:.2f}, {high:.2f}] that holds in all steps at once with {percent}"
     if s["first_outside"] is None:
         status, text = "consistent", f"{text}; never outside {band}"
+        text += f" ({s['alive'].max()} runs find a covariance too small by x{s['detectable']:.2g} with power 0.95)"
     else:
         status = "overconfident" if s["steps_above"] else "conservative"
         where = []

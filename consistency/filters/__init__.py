@@ -41,7 +41,7 @@ def get_filter(name: str) -> Any:
     """
     if name not in MODULES:
         near = difflib.get_close_matches(name, MODULES, n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else "."
-        raise InputError(f"unknown filter '{name}'{hint} Known: {', '.join(MODULES)}")
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise InputError(f"unknown filter '{name}'{hint}; known: {', '.join(MODULES)}")
     module, attribute = MODULES[name]
     return getattr(importlib.import_module(f"consistency.filters.{module}"), attribute)

@@ -103,15 +103,15 @@ def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | 
         anees=s.get("anees"),
         band=band,
         simultaneous=s.get("simultaneous"),
-        own_band=band is not None and not np.array_equal(band, common, equal_nan=True),
+        own_band=band is not None and bool(c.failures) and not np.array_equal(band, common, equal_nan=True),
         nis_ratio=np.where(dof > 0, total / np.maximum(dof, 1), np.nan),
     )
 
 
 def _common_band(verdicts: dict[str, Verdict]) -> Array | None:
-    """The band of the filter with the most estimates: failed runs widen the others'."""
+    """The band of the filter with the fewest failed runs: those of the others are wider."""
     judged = [v.statistics for v in verdicts.values() if v.statistics.get("judged_steps")]
-    best = max(judged, key=lambda s: int(s["alive"].sum()), default=None)
+    best = min(judged, key=lambda s: (len(s["failures"]), -int(s["alive"].sum())), default=None)
     return None if best is None else best["band"]
 
 

@@ -1,0 +1,101 @@
+"""The report model as a PDF: Matplotlib figures as SVG, set by Typst; no LaTeX and no system font."""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+from importlib import resources
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import typst
+
+from consistency.reporting import figures, wording
+from consistency.reporting.model import Report, Study
+
+TEMPLATE = "report.typ"
+LONG_WORD = re.compile(r"[^\s\u200b]{14}")
+
+
+def render_pdf(report: Report) -> bytes:
+    """The whole document; the same report gives the same bytes."""
+    with tempfile.TemporaryDirectory(prefix="consistency-report-") as name, mpl.rc_context(figures.RC):
+        folder = Path(name)
+        data = {
+            "title": report.title,
+            "answer": report.answer,
+            "columns": list(wording.VERDICT_COLUMNS),
+            "studies": [_study(study, f"s{i}", folder) for i, study in enumerate(report.studies)],
+            "findings": [_finding(finding) for finding in report.findings],
+            "distributions": [_distribution(d, f"d{i}", folder) for i, d in enumerate(report.distributions)],
+            "provenance": [list(row) for row in report.provenance],
+        }
+        (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
+        template = resources.files("consistency.reporting").joinpath("templates", TEMPLATE)
+        (folder / TEMPLATE).write_text(template.read_text(encoding="utf-8"), encoding="utf-8")
+        pdf: bytes = typst.compile(str(folder / TEMPLATE), root=str(folder), ignore_system_fonts=True)
+        return pdf
+
+
+def _study(study: Study, prefix: str, folder: Path) -> dict[str, Any]:
+    def save(name: str, figure: Any) -> str:
+        return _svg(figure, folder / f"{prefix}-{name}.svg")
+
+    entry: dict[str, Any] = {
+        "name": study.name,
+        "summary": study.summary,
+        "runs": study.runs,
+        "steps": len(study.steps),
+        "shown_run": study.shown_run,
+        "statistic": study.statistic,
+        "verdicts": [[_soft(cell) for cell in wording.verdict_row(track)] for track in study.tracks],
+        "reasons": [
+            {"filter": track.name, "status": track.verdict.status, "reasons": [_soft(r) for r in track.verdict.reasons]}
+            for track in study.tracks
+        ],
+        "failures": [[_soft(name), str(run), str(step), _soft(why)] for name, run, step, why in study.failures],
+        "map": {"image": save("map", figures.scenario(study)), "caption": wording.scenario_caption(study)},
+        "errors": [],
+        "anees": None,
+        "nis": {"image": save("nis", figures.nis(study)), "caption": wording.nis_caption(study)},
+        "no_truth": None if study.has_truth else wording.no_truth(study),
+        "error_caption": wording.error_caption(study),
+        "provenance": [list(row) for row in study.provenance],
+        "resolved": _rows(json.loads(study.resolved)),
+    }
+    if study.has_truth:
+        rows = figures.pose_errors(study)
+        entry["errors"] = [save(f"error-{i}", row) for i, row in enumerate(rows)]
+        entry["anees"] = {"image": save("anees", figures.anees(study)), "caption": wording.anees_caption(study)}
+    return entry
+
+
+def _finding(finding: dict[str, Any]) -> dict[str, str]:
+    return {key: _soft(str(value)) for key, value in finding.items()}
+
+
+def _distribution(distribution: Any, prefix: str, folder: Path) -> dict[str, str]:
+    image = _svg(figures.distribution(distribution), folder / f"{prefix}.svg")
+    return {"image": image, "caption": wording.distribution_caption(distribution)}
+
+
+def _svg(figure: Any, path: Path) -> str:
+    buffer = BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    path.write_bytes(buffer.getvalue())
+    return path.name
+
+
+def _soft(text: str) -> str:
+    """Text that may break inside long words, so that a table cell never overflows."""
+    return LONG_WORD.sub(lambda match: match.group() + "\u200b", text)
+
+
+def _rows(value: Any, path: str = "") -> list[list[str]]:
+    """Nested tables as rows of dotted key and value."""
+    if isinstance(value, dict):
+        return [row for key, item in value.items() for row in _rows(item, f"{path}.{key}" if path else str(key))]
+    return [[_soft(path), _soft(json.dumps(value, ensure_ascii=False))]]

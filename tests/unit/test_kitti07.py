@@ -1,0 +1,211 @@
+"""The conversion of recorded stereo tracks, on tracks small enough to check by hand, and on the recording."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import consistency as cs
+from consistency.log import read_log, write_log
+from consistency.models.stereo import project
+from consistency.types import Array, Trial
+
+ROOT = Path(__file__).parents[2]
+KITTI = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # right, down, forward <- forward, left, up
+CENTRE, F, B = np.array([600.0, 180.0]), 700.0, 0.5
+
+
+def load(name: str) -> ModuleType:
+    path = ROOT / "experiments" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"tested_{name}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+experiment = load("e09_kitti07")
+conversion = experiment.conversion
+
+
+def recording(pixels: dict[int, list[tuple[float, float, float] | None]], frames: int, poses: Array | None = None):
+    """Tracks given as (u, v, d) from frame 0 on, None where not seen; a robot that stands still."""
+    features = np.full((4, max(pixels, default=0) + 1, frames), -1.0)
+    for track, rows in pixels.items():
+        for step, row in enumerate(rows):
+            if row is not None:
+                u, v = np.array(row[:2]) + CENTRE
+                features[:, track, step] = u, v, u - row[2], v
+    still = np.tile(np.eye(3, 4), (frames, 1, 1)) if poses is None else poses
+    zero = np.zeros((3, frames))
+    return conversion.Recording(
+        features, 0.1 * np.arange(frames), zero, zero, F, CENTRE, B, KITTI, np.zeros(3), still
+    )  # fmt: skip
+
+
+def moving(steps: int, d: float = 20.0, u: float = 0.0) -> list[tuple[float, float, float] | None]:
+    """A track that is never an exact copy of itself."""
+    return [(u + 0.01 * step, 5.0, d) for step in range(steps)]
+
+
+def test_a_point_to_the_right_and_below_has_positive_u_v_and_disparity() -> None:
+    seen = project(10.0, -1.0, -0.5, F, B)  # forward, left, up
+    assert min(seen) > 0
+    rows = conversion.fresh_observations(recording({0: [seen]}, 1))
+    np.testing.assert_allclose(rows[["z0", "z1", "z2"]].to_numpy(), [seen])
+
+
+def test_mount_turns_the_sensor_frame_into_the_camera_frame() -> None:
+    roll_pitch_heading = conversion.roll_pitch_heading(KITTI.T @ conversion.KITTI_FROM_SENSOR)
+    np.testing.assert_allclose(roll_pitch_heading, 0.0, atol=1e-12)
+    angles = (0.1, -0.2, 0.3)
+    np.testing.assert_allclose(conversion.roll_pitch_heading(conversion.rotation(*angles)), angles)
+
+
+def test_track_ends_at_a_stale_copy_of_all_four_numbers() -> None:
+    slipped = [*moving(3), moving(3)[2], (9.0, 9.0, 30.0), (9.1, 9.0, 30.0)]
+    half = [(1.0, 5.0, 20.0), (1.0, 5.0, 21.0), (1.0, 5.0, 22.0)]  # u and v stay, the right camera's u does not
+    rows = conversion.fresh_observations(recording({0: slipped, 1: half}, 6))
+    assert rows[rows["track"] == 0]["step"].tolist() == [0, 1, 2]
+    assert rows[rows["track"] == 1]["step"].tolist() == [0, 1, 2]
+
+
+def test_a_gap_starts_a_new_piece_and_small_disparities_are_left_out() -> None:
+    gap = [*moving(2), None, *moving(5)[3:]]
+    far = moving(5, d=conversion.MIN_DISPARITY - 0.1)
+    rows = conversion.fresh_observations(recording({0: gap, 1: far}, 5))
+    assert rows["track"].unique().tolist() == [0]
+    assert rows.groupby("piece")["step"].apply(list).tolist() == [[0, 1], [3, 4]]
+
+
+def test_a_track_that_leaves_the_common_motion_is_cut_there_and_only_there() -> None:
+    still = {track: moving(4, u=40.0 * track) for track in range(8)}
+    still[8] = [(300.0 + 10.0 * (step >= 2), 5.0, 20.0) for step in range(4)]
+    for step in range(4):  # no exact copies
+        u, v, d = still[8][step] or (0.0, 0.0, 0.0)
+        still[8][step] = (u, v + 0.01 * step, d)
+    data = recording(still, 4)
+    pieces = conversion.consistent_pieces(conversion.fresh_observations(data), data)
+    steps = pieces.groupby(["track", "piece"])["step"].apply(list)
+    assert steps.loc[8].tolist() == [[0, 1], [2, 3]]
+    assert all(steps.loc[track].tolist() == [[0, 1, 2, 3]] for track in range(8))
+
+
+def table(lives: dict[int, tuple[int, int, float]]) -> pd.DataFrame:
+    """Pieces: number -> (first step, observations, u)."""
+    rows = [(p, a + i, u, 0.0, 20.0) for p, (a, n, u) in lives.items() for i in range(n)]
+    return pd.DataFrame(rows, columns=["piece", "step", "z0", "z1", "z2"])
+
+
+def test_no_landmark_is_older_than_the_age_cut_and_cuts_are_staggered() -> None:
+    seen = conversion.thinned(table({p: (1, 40, 0.0) for p in range(4)}))
+    ages = seen.groupby("landmark").size()
+    assert ages.loc[[0, 1, 2, 3]].tolist() == [6, 12, 6, 12]
+    assert ages.max() <= conversion.MAX_AGE
+    assert seen.groupby("landmark")["step"].apply(lambda s: (s.diff().dropna() == 1).all()).all()
+
+
+def test_slots_are_filled_from_all_columns_and_by_life_without_chance() -> None:
+    lives = {p: (1, 3 + p % 2, u) for p, u in enumerate([-500.0, -490, -480, -470, -460, -450, 0, 10, 500])}
+    rows = table(lives)
+    seen = conversion.thinned(rows)
+    assert seen.groupby("step").size().max() == conversion.SLOTS
+    first = seen[seen["step"] == 1]
+    assert sorted(first["z0"]) == [-490, -470, 10, 500]  # one a column, then the fullest; the longer lives
+    pd.testing.assert_frame_equal(
+        seen, conversion.thinned(rows.sample(frac=1, random_state=1).sort_values(["piece", "step"]))
+    )
+    assert (conversion.thinned(rows, slots=2).groupby("step").size() <= 2).all()
+
+
+def test_step_0_and_single_sights_are_not_used() -> None:
+    seen = conversion.thinned(table({0: (0, 3, 0.0), 1: (2, 1, 0.0)}))
+    assert seen["step"].tolist() == [1, 2]
+    with pytest.raises(cs.InputError, match="no track"):
+        conversion.thinned(table({0: (2, 1, 0.0)}))
+
+
+def test_planar_truth_of_a_left_turn_on_a_slope() -> None:
+    heading = np.linspace(0.3, 0.3 + 4.0, 30)  # beyond pi: not wrapped
+    flat = np.column_stack([np.cumsum(np.cos(heading)), np.cumsum(np.sin(heading)), np.zeros(30)])
+    slope = conversion.rotation(0.05, -0.1, 0.0)
+    lever = np.array([1.0, -0.3, 0.7])
+    turns = np.stack([slope @ conversion.rotation(0.0, 0.0, h) for h in heading])
+    camera = flat @ slope.T + turns @ lever
+    poses = np.concatenate([KITTI @ turns @ KITTI.T, (camera @ KITTI.T)[:, :, None]], axis=2)
+    # KITTI gives poses in the camera frame of frame 0
+    start, origin = poses[0, :, :3].copy(), poses[0, :, 3].copy()
+    poses = np.concatenate([start.T @ poses[:, :, :3], ((poses[:, :, 3] - origin) @ start)[:, :, None]], axis=2)
+    data = conversion.replace(recording({}, 30, poses), lever=lever) if hasattr(conversion, "replace") else None
+    data = data or conversion.Recording(**{**vars(recording({}, 30, poses)), "lever": lever})
+    truth = conversion.planar_truth(data)
+    moved = (flat - flat[0]) @ conversion.rotation(0.0, 0.0, 0.3)
+    np.testing.assert_allclose(truth, np.column_stack([moved[:, :2], heading - 0.3]), atol=1e-9)
+
+
+def test_unlinked_steps_and_the_floor_they_leave() -> None:
+    # landmark 0 in steps 1-2, 1 in 2-3, 2 in 4: nothing links 4 to 3, nor 1 to the start, nor 5 to 4
+    controls = np.tile([0.1, 1.0, 0.0], (5, 1))
+    trial = Trial(
+        0, np.zeros(3), controls, np.array([0, 1, 3, 4, 5, 5]), np.array([0, 0, 1, 1, 2]), np.ones((5, 3)), 3
+    )  # fmt: skip
+    assert experiment.unlinked_steps(trial).tolist() == [1, 4, 5]
+    assert experiment.heading_floor(trial, 0.05) == pytest.approx(0.05 * 0.1 * np.sqrt(3))
+
+
+def test_unusable_data_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = ["--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    with pytest.raises(cs.InputError, match=r"0027\.npz is missing"):
+        experiment.command(command)
+    np.savez(tmp_path / "0027.npz", features=np.zeros((4, 2, 3)))
+    np.savetxt(tmp_path / "kitti07_gt.txt", np.zeros((3, 13)))
+    with pytest.raises(cs.InputError, match="'time_stamps' is missing"):
+        experiment.command(command)
+    (tmp_path / "0027.npz").write_bytes(b"PK not an archive")
+    with pytest.raises(cs.InputError, match="--data") as told:
+        experiment.command(command)
+    assert "\n" not in str(told.value)
+    monkeypatch.delenv("CONSISTENCY_DATA", raising=False)
+    assert experiment.main(cs.Study(runs=1)) == []
+
+
+def recorded() -> Path:
+    folder = Path(os.environ.get("CONSISTENCY_DATA", ROOT.parent / "shared" / "data")) / "ece276a_stereo_tracks"
+    if not (folder / "0027.npz").is_file():
+        pytest.skip("the KITTI 07 tracks are not here (not shipped: CC BY-NC-SA); set CONSISTENCY_DATA to their folder")
+    return folder
+
+
+@pytest.mark.slow
+def test_the_recording_becomes_a_log_that_is_read_back(tmp_path: Path) -> None:
+    logs = experiment.logs_of(recorded(), seed=0)
+    trial, belief = logs["kitti07"].trials[0], logs["kitti07"].belief
+    assert (trial.steps, trial.n_landmarks) == (1100, 627)
+    assert len(experiment.unlinked_steps(trial)) == 92  # the 91 slips, and step 1: nothing is seen in step 0
+    assert trial.truth is not None
+    path = np.hypot(*np.diff(trial.truth[:, :2], axis=0).T).sum()
+    assert path == pytest.approx(692.0, abs=1.0)
+    write_log(tmp_path / "log", [trial], belief, None, {"schema_version": 1})
+    back = read_log(tmp_path / "log")
+    np.testing.assert_array_equal(back.trials[0].z, trial.z)
+    np.testing.assert_array_equal(back.trials[0].landmark, trial.landmark)
+    assert back.belief == belief
+
+
+@pytest.mark.slow
+def test_the_noise_of_the_twin_is_what_the_filter_believes() -> None:
+    # with truth given, whitened noise has variance 1; 5 standard errors, so a false alarm in 1e6 a number
+    data = conversion.read_recording(recorded())
+    trial, belief = conversion.log_of(data)
+    quiet, loud = (experiment.white_twin(trial, belief, np.random.default_rng(s)) for s in (None, 1))
+    whitened = (quiet.z - loud.z) / belief.sensor.sigma / np.sqrt(2)
+    assert np.abs(whitened.var(axis=0) - 1).max() < 5 * np.sqrt(2 / len(whitened))
+    assert np.hypot(*(loud.truth - trial.truth)[-1, :2]) < 1.0  # the unicycle model fits the drive

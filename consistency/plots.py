@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogFormatter
 
 from consistency.types import Array, Indices
 
@@ -123,8 +126,7 @@ def anees(axes: Axes, curves: Sequence[tuple[Style, Indices, Array]], log: bool,
     for look, steps, values in curves:
         axes.plot(steps, values, color=look.colour, linestyle=look.linestyle, linewidth=1.2, zorder=3)
     if log:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
+        _log_scale(axes)
     axes.set(xlabel="step", ylabel=f"{'NEES' if single else 'ANEES'} of the pose")
     axes.margins(x=0.01)
     _frame(axes)
@@ -135,8 +137,7 @@ def nis(axes: Axes, steps: Indices, ratio: Array, look: Style, log: bool = False
     axes.plot(steps, ratio, look.marker, color=look.colour, markersize=2.0, markeredgewidth=0, alpha=0.7)
     axes.axhline(1.0, color="#333333", linewidth=0.8)
     if log:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
+        _log_scale(axes)
     axes.set(xlabel="step", ylabel="NIS / dof")
     axes.margins(x=0.01)
     _frame(axes)
@@ -144,7 +145,7 @@ def nis(axes: Axes, steps: Indices, ratio: Array, look: Style, log: bool = False
 
 def samples(axes: Axes, points: Array, linear: Array, fitted: Array) -> None:
     """Transformed points (n, 2) in m with two ellipses (m, 2), as Herath et al. (2007) fig. 12."""
-    axes.plot(*points.T, ".", color="#8c8c8c", markersize=1.6, markeredgewidth=0, alpha=0.6, rasterized=True)
+    axes.plot(*points.T, ".", color="#555555", markersize=2.0, markeredgewidth=0, alpha=0.6)
     axes.plot(*linear.T, color=COLOURS[0], linewidth=1.4)
     axes.plot(*fitted.T, color=COLOURS[1], linewidth=1.4, dashes=DASHES[1])
     axes.set(xlabel="x (m)", ylabel="y (m)")
@@ -160,12 +161,14 @@ def marginal(axes: Axes, edges: Array, density: Array, grid: Array, linear: Arra
     _frame(axes)
 
 
-def key(figure: Figure, entries: Sequence[tuple[str, Line2D]], columns: int = 4, top: float = 1.0) -> None:
-    """Legend above the axes of ``figure``; labels are shown literally."""
-    handles = [handle for _, handle in entries]
+def key(figure: Figure, entries: Sequence[tuple[str, Artist]], columns: int, beside: bool = False) -> None:
+    """Legend above the axes of ``figure``, or to the right of them; labels are shown literally."""
+    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.0)}
+    if beside:
+        place = {"loc": "center right", "bbox_to_anchor": (1.0, 0.5)}
     legend = figure.legend(
-        handles, [str(i) for i in range(len(handles))], loc="upper center", ncols=columns, frameon=False,
-        bbox_to_anchor=(0.5, top), handlelength=2.6, columnspacing=1.4, borderaxespad=0.1,
+        [handle for _, handle in entries], [str(i) for i in range(len(entries))], ncols=columns, frameon=False,
+        handlelength=2.6, columnspacing=1.4, borderaxespad=0.1, **place,
     )  # fmt: skip
     for text, (label, _) in zip(legend.get_texts(), entries, strict=True):
         text.set_parse_math(False)
@@ -180,6 +183,12 @@ def line(look: Style) -> Line2D:
 def title(axes: Axes, text: str) -> None:
     """Title shown literally, dollar signs included."""
     axes.set_title(text, loc="left", parse_math=False)
+
+
+def _log_scale(axes: Axes) -> None:
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.4, 0.4)))
 
 
 def _frame(axes: Axes) -> None:

@@ -42,16 +42,18 @@ def build_report(folder: Path) -> Report:
     else:
         raise InputError(f"{folder}: holds no filter results; write some with 'consistency run', then report those")
     styles: dict[str, int] = {}
-    studies = tuple(_study(part, styles) for part in parts)
+    provenance = _provenance(manifest)
+    studies = tuple(_study(part, styles, () if part == folder else provenance) for part in parts)
     findings = tuple(read_findings(folder))
     name = "reproduction" if "studies" in manifest else studies[0].name
     return Report(
         f"Filter consistency: {name}", answer(studies, findings), studies, findings,
-        distributions(folder / "fig12.parquet"), _provenance(manifest),
+        distributions(folder / "fig12.parquet"), provenance,
     )  # fmt: skip
 
 
-def _study(folder: Path, styles: dict[str, int]) -> Study:
+def _study(folder: Path, styles: dict[str, int], said: tuple[tuple[str, str], ...]) -> Study:
+    """One folder of results; ``said`` are lines of provenance that the report gives already."""
     results = read_results(folder)
     scenario = _scenario(results, folder)
     verdicts = analyse(results)
@@ -77,7 +79,7 @@ def _study(folder: Path, styles: dict[str, int]) -> Study:
         anees_log=_wide([v for t in tracks for v in (t.anees, t.simultaneous) if v is not None]),
         nis_log=_wide([t.nis_ratio for t in tracks]),
         is_log=scenario is None,
-        provenance=_provenance(results.manifest),
+        provenance=tuple(row for row in _provenance(results.manifest) if row not in said),
         resolved=json.dumps(resolved, indent=2, ensure_ascii=False),
     )
 

@@ -186,7 +186,7 @@ def distribution_charts(d: Distribution) -> tuple[Any, Any]:
     """Samples with two ellipses, and the histogram of x with two densities."""
     (x_low, x_high), (y_low, y_high) = d.window
     cloud = _figure("x (m)", "y (m)", 320, x_range=Range1d(x_low, x_high), y_range=Range1d(y_low, y_high))
-    cloud.scatter("x", "y", source=_source(x=d.points[:, 0], y=d.points[:, 1]), size=2, color="#8c8c8c", alpha=0.6)
+    cloud.scatter("x", "y", source=_source(x=d.points[:, 0], y=d.points[:, 1]), size=3, color="#555555", alpha=0.6)
     histogram = _figure("x (m)", "density of x (1/m)", 320, x_range=cloud.x_range)
     source = _source(left=d.edges[:-1], right=d.edges[1:], density=d.density)
     bars = histogram.quad(

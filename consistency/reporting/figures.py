@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -25,15 +26,21 @@ def _figure(height: float, rows: int = 1, columns: int = 1, **options: Any) -> t
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def _key(figure: Figure, entries: list[tuple[str, Any]]) -> None:
-    """Legend in the room that the layout leaves above the axes."""
-    longest = max((len(label) for label, _ in entries), default=1)
-    columns = max(1, min(len(entries), 5, int(110 / (longest + 12))))
+def _key(figure: Figure, entries: list[tuple[str, Any]], beside: bool = False) -> None:
+    """Legend in room that the layout leaves above the axes, or to their right."""
+    entries = [(_wrapped(label), handle) for label, handle in entries]
+    longest = max((len(line) for label, _ in entries for line in label.split("\n")), default=1)
+    columns = 1 if beside else max(1, min(len(entries), 5, int(118 / (longest + 9))))
     rows = -(-len(entries) // columns)
-    share = (0.17 * rows + 0.06) / figure.get_figheight()
+    lines = rows * max((label.count("\n") + 1 for label, _ in entries), default=1)
+    share = (0.16 * lines + 0.06) / figure.get_figheight()
     engine: Any = figure.get_layout_engine()
-    engine.set(rect=(0, 0, 1, 1 - share))
-    plots.key(figure, entries, columns)
+    engine.set(rect=(0, 0, 0.68, 1) if beside else (0, 0, 1, 1 - share))
+    plots.key(figure, entries, columns, beside)
+
+
+def _wrapped(label: str, width: int = 26) -> str:
+    return "\n".join(textwrap.wrap(label, width)) or label
 
 
 def _filters(study: Study) -> list[tuple[str, Any]]:
@@ -42,7 +49,7 @@ def _filters(study: Study) -> list[tuple[str, Any]]:
 
 def scenario(study: Study) -> Figure:
     """Map of the study with the estimates of the shown run."""
-    figure, axes = _figure(4.1)
+    figure, axes = _figure(2.7)
     paths = [(plots.style(t.style), t.path[thin(*t.path.T)]) for t in study.tracks]
     true_path, odometry = (None if p is None else p[thin(*p.T)] for p in (study.true_path, study.odometry))
     plots.scenario(axes[0, 0], true_path, odometry, study.landmarks, paths)
@@ -58,7 +65,7 @@ def scenario(study: Study) -> Figure:
         entries.append(
             ("landmark", Line2D([], [], linestyle="", marker="*", color="#8c8c8c", markersize=5, markeredgewidth=0))
         )
-    _key(figure, entries + _filters(study))
+    _key(figure, entries + _filters(study), beside=True)
     return figure
 
 
@@ -67,7 +74,7 @@ def pose_errors(study: Study) -> list[Figure]:
     rows = []
     for track in study.tracks:
         assert track.error is not None
-        figure, axes = _figure(1.45, columns=3)
+        figure, axes = _figure(1.4, columns=3)
         for component, panel in enumerate(axes[0]):
             error, sigma = track.error[:, component], track.sigma[:, component]
             keep = thin(error, sigma)
@@ -75,7 +82,7 @@ def pose_errors(study: Study) -> list[Figure]:
             plots.pose_error(panel, study.steps[keep], error[keep], sigma[keep], look, component)
             panel.set_xlabel("step")
             panel.set_xlim(0, len(study.steps))
-        plots.title(axes[0, 0], track.name)
+        plots.title(axes[0, 0], _wrapped(track.name, 90))
         if not (error == error).any():
             panel.text(0.5, 0.5, "no estimate in this run", transform=panel.transAxes, ha="center", va="center")
         rows.append(figure)
@@ -84,7 +91,7 @@ def pose_errors(study: Study) -> list[Figure]:
 
 def anees(study: Study) -> Figure:
     """ANEES of every filter against the bands."""
-    figure, axes = _figure(2.9)
+    figure, axes = _figure(2.35)
     panel = axes[0, 0]
     common = study.common_band
     for track in [t for t in study.tracks if t is common or t.own_band]:
@@ -102,8 +109,8 @@ def anees(study: Study) -> Figure:
     entries: list[tuple[str, Any]] = []
     if common is not None:
         entries = [
-            ("95 % band of one step", Patch(color=plots.BAND)),
-            ("band of all steps", Line2D([], [], color="#333333", linewidth=0.9, dashes=(4, 3))),
+            ("95 % band, one step", Patch(color=plots.BAND)),
+            ("95 % band, all steps", Line2D([], [], color="#333333", linewidth=0.9, dashes=(4, 3))),
             ("expected", Line2D([], [], color="#555555", linewidth=0.8)),
         ]
     _key(figure, entries + _filters(study))
@@ -115,12 +122,12 @@ def nis(study: Study) -> Figure:
     count = len(study.tracks)
     columns = count if count < 4 else 2 if count == 4 else 3
     rows = -(-count // columns)
-    figure, axes = _figure(0.35 + 1.25 * rows, rows, columns, sharex=True, sharey=True)
+    figure, axes = _figure(0.35 + 1.05 * rows, rows, columns, sharex=True, sharey=True)
     for track, panel in zip(study.tracks, axes.flat, strict=False):
         keep = thin(track.nis_ratio)
         plots.nis(panel, study.steps[keep], track.nis_ratio[keep], plots.style(track.style), study.nis_log)
         panel.set_xlim(0, len(study.steps))
-        plots.title(panel, track.name)
+        plots.title(panel, _wrapped(track.name))
         panel.label_outer()
     for empty in range(count - rows * columns, 0):
         axes[-1, empty].set_axis_off()

@@ -26,26 +26,27 @@ NUMBERS = 22  # columns of all charts of one filter
 def render_html(report: Report) -> str:
     """The whole page: style, script, data and words in one string."""
     limit = points_a_line(report)
-    charts: dict[str, Any] = {}
+    groups: list[dict[str, Any]] = []
     for index, study in enumerate(report.studies):
-        charts |= {f"s{index}-{name}": chart for name, chart in study_charts(study, index, limit).items()}
+        groups.append({f"s{index}-{name}": chart for name, chart in study_charts(study, index, limit).items()})
     for index, distribution in enumerate(report.distributions):
-        charts[f"d{index}-cloud"], charts[f"d{index}-histogram"] = distribution_charts(distribution)
-    script, divs = components(charts) if charts else ("", {})
+        pair = distribution_charts(distribution)
+        groups.append({f"d{index}-cloud": pair[0], f"d{index}-histogram": pair[1]})
+    # one document a study: Bokeh walks through a whole document for every chart added to it
+    embedded = [components(group) for group in groups]
     environment = Environment(
         loader=PackageLoader("consistency.reporting"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters["paragraph_id"] = lambda index: f"study-{index}"
     return environment.get_template("report.html.j2").render(
         report=report,
         wording=wording,
         style=style,
         shapes=MARKERS,
         thinned=limit if any(len(study.steps) > limit for study in report.studies) else None,
-        bokeh=Markup(Resources(mode="inline", components=["bokeh"]).render()) if charts else "",
-        chart_script=Markup(script),
-        chart={name: Markup(div) for name, div in divs.items()},
+        bokeh=Markup(Resources(mode="inline", components=["bokeh"]).render()) if groups else "",
+        chart_scripts=[Markup(script) for script, _ in embedded],
+        chart={name: Markup(div) for _, divs in embedded for name, div in divs.items()},
     )
 
 

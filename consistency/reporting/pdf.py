@@ -7,6 +7,7 @@ import re
 import tempfile
 from importlib import resources
 from io import BytesIO
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from consistency.reporting import figures, wording
 from consistency.reporting.model import Report, Study
 
 TEMPLATE = "report.typ"
+SHORT = 4000  # characters of settings that surely fit on one page
 LONG_WORD = re.compile(r"[^\s\u200b]{14}")
 
 
@@ -64,7 +66,8 @@ def _study(study: Study, prefix: str, folder: Path) -> dict[str, Any]:
         "no_truth": None if study.has_truth else wording.no_truth(study),
         "error_caption": wording.error_caption(study),
         "provenance": [list(row) for row in study.provenance],
-        "resolved": _rows(json.loads(study.resolved)),
+        "resolved": _settings(json.loads(study.resolved)),
+        "short": len(study.resolved) < SHORT,
     }
     if study.has_truth:
         rows = figures.pose_errors(study)
@@ -94,8 +97,14 @@ def _soft(text: str) -> str:
     return LONG_WORD.sub(lambda match: match.group() + "\u200b", text)
 
 
-def _rows(value: Any, path: str = "") -> list[list[str]]:
-    """Nested tables as rows of dotted key and value."""
+def _settings(resolved: dict[str, Any]) -> list[list[str]]:
+    """Rows of key, value, key, value: two columns of settings, read downwards; what is not set is left out."""
+    pairs = [pair for key, value in resolved.items() if key not in ("name", "summary") for pair in _pairs(value, key)]
+    half = -(-len(pairs) // 2)
+    return [[*left, *right] for left, right in zip_longest(pairs[:half], pairs[half:], fillvalue=("", ""))]
+
+
+def _pairs(value: Any, path: str) -> list[tuple[str, str]]:
     if isinstance(value, dict):
-        return [row for key, item in value.items() for row in _rows(item, f"{path}.{key}" if path else str(key))]
-    return [[_soft(path), _soft(json.dumps(value, ensure_ascii=False))]]
+        return [pair for key, item in value.items() for pair in _pairs(item, f"{path}.{key}")]
+    return [] if value is None else [(_soft(path), _soft(json.dumps(value, ensure_ascii=False)))]

@@ -20,7 +20,7 @@ import pandas as pd
 from consistency.errors import InputError
 from consistency.judge import Curves, analyse, curves
 from consistency.montecarlo import run_trials
-from consistency.results import Results, manifest_of, require_free
+from consistency.results import Results, joined, manifest_of, require_free
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.types import Verdict
 
@@ -65,7 +65,7 @@ class Study:
         if missing:
             print(f"{world.name}: {', '.join(missing)}", file=sys.stderr, flush=True)
             new = run_trials(world, missing, self.runs, self.seed, self.jobs)
-            self.kept[world.name] = new if have is None else _joined(have, new)
+            self.kept[world.name] = new if have is None else joined([have, new])
         return self.kept[world.name]
 
     def judged(self, scenario: str | Scenario, filter_name: str) -> tuple[Verdict, Curves]:
@@ -100,17 +100,6 @@ class Study:
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
-
-
-def _joined(a: Results, b: Results) -> Results:
-    manifest = a.manifest | {
-        "filters": a.filters + b.filters,
-        "failures": a.manifest["failures"] + b.manifest["failures"],
-        "wall_time_s": round(a.manifest["wall_time_s"] + b.manifest["wall_time_s"], 3),
-    }
-    estimates = pd.concat([a.estimates, b.estimates], ignore_index=True)
-    failures = pd.concat([t for t in (a.failures, b.failures) if len(t)] or [a.failures], ignore_index=True)
-    return Results(estimates, failures, a.truth, a.landmarks, manifest)
 
 
 # --- the scripts -----------------------------------------------------------------------------

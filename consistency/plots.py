@@ -30,6 +30,7 @@ DASHES: tuple[tuple[float, ...], ...] = (
     (3.0, 1.5, 1.0, 1.5, 1.0, 1.5),
 )
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+BESIDE = 0.66  # of the figure's width is left of a legend that stands beside the axes
 AXES = (("x", "m"), ("y", "m"), ("heading", "deg"))
 
 
@@ -95,7 +96,7 @@ def pose_error(axes: Axes, steps: Indices, error: Array, sigma: Array, look: Sty
         axes.plot(steps, sign * sigma, color=look.colour, linewidth=0.9, linestyle="--")
     axes.plot(steps, error, color=look.colour, linewidth=0.9)
     axes.axhline(0.0, color="#555555", linewidth=0.5)
-    axes.set(ylabel=f"{name} error ({unit})")
+    axes.set(ylabel=f"{name} error\n({unit})")
     axes.margins(x=0.01)
     _frame(axes)
 
@@ -165,7 +166,7 @@ def key(figure: Figure, entries: Sequence[tuple[str, Artist]], columns: int, bes
     """Legend above the axes of ``figure``, or to the right of them; labels are shown literally."""
     place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.0)}
     if beside:
-        place = {"loc": "center right", "bbox_to_anchor": (1.0, 0.5)}
+        place = {"loc": "center left", "bbox_to_anchor": (BESIDE, 0.5)}
     legend = figure.legend(
         [handle for _, handle in entries], [str(i) for i in range(len(entries))], ncols=columns, frameon=False,
         handlelength=2.6, columnspacing=1.4, borderaxespad=0.1, **place,

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -81,6 +81,18 @@ class Results:
         tables = {"estimates": self.estimates, "failures": self.failures}
         tables |= {n: t for n, t in (("truth", self.truth), ("landmarks", self.landmarks)) if t is not None}
         write_folder(folder, tables, self.manifest, overwrite=overwrite)
+
+
+def joined(parts: Sequence[Results]) -> Results:
+    """Results of several filters on the same trials as one."""
+    manifest = parts[0].manifest | {
+        "filters": [name for part in parts for name in part.filters],
+        "failures": sum(len(part.failures) for part in parts),
+        "wall_time_s": round(sum(part.manifest["wall_time_s"] for part in parts), 3),
+    }
+    estimates = pd.concat([part.estimates for part in parts], ignore_index=True)
+    failures = pd.concat([p.failures for p in parts if len(p.failures)] or [parts[0].failures], ignore_index=True)
+    return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest)
 
 
 # --- tables from arrays ------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from consistency.log import Log, write_log
 from consistency.models import point, stereo
 from consistency.models.motion import dead_reckoning
 from consistency.montecarlo import run_log
-from consistency.results import Results, manifest_of, require_free
+from consistency.results import Results, joined, manifest_of, require_free
 from consistency.table import print_findings
 from consistency.types import Array, Trial
 
@@ -181,18 +181,6 @@ def run_all(logs: dict[str, Log], jobs: int) -> dict[str, Results]:
         futures = [pool.submit(run_log, logs[log], [name], 1) for log, name in tasks]
         done = [(log, future.result()) for (log, _), future in zip(tasks, futures, strict=True)]
     return {name: joined([part for log, part in reversed(done) if log == name]) for name in logs}
-
-
-def joined(parts: list[Results]) -> Results:
-    """Results of several filters on one log as one."""
-    manifest = parts[0].manifest | {
-        "filters": [name for part in parts for name in part.filters],
-        "failures": sum(len(part.failures) for part in parts),
-        "wall_time_s": round(sum(part.manifest["wall_time_s"] for part in parts), 3),
-    }
-    estimates = pd.concat([part.estimates for part in parts], ignore_index=True)
-    failures = pd.concat([p.failures for p in parts if len(p.failures)] or [parts[0].failures], ignore_index=True)
-    return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest)
 
 
 def measure(study: cs.Study, logs: dict[str, Log]) -> list[cs.Finding]:

@@ -14,6 +14,7 @@ from consistency.reporting.model import Distribution, Study
 from consistency.reporting.thin import thin
 
 WIDTH = 6.7  # inches, the text width of the page
+LINE = 0.16  # inches, a line of a legend
 RC: dict[str, Any] = {
     "font.family": "DejaVu Sans", "font.size": 7.5, "axes.titlesize": 8, "axes.labelsize": 7.5, "legend.fontsize": 7.5,
     "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6, "svg.hashsalt": "consistency",
@@ -31,11 +32,13 @@ def _key(figure: Figure, entries: list[tuple[str, Any]], beside: bool = False) -
     entries = [(_wrapped(label), handle) for label, handle in entries]
     longest = max((len(line) for label, _ in entries for line in label.split("\n")), default=1)
     columns = 1 if beside else max(1, min(len(entries), 5, int(118 / (longest + 9))))
-    rows = -(-len(entries) // columns)
-    lines = rows * max((label.count("\n") + 1 for label, _ in entries), default=1)
-    share = (0.16 * lines + 0.06) / figure.get_figheight()
+    lines = -(-len(entries) // columns) * max((label.count("\n") + 1 for label, _ in entries), default=1)
+    room, height = LINE * lines + 0.06, figure.get_figheight()
+    # the axes keep their size: a long legend makes the figure taller
+    height = max(height, room) if beside else height + room - LINE
+    figure.set_figheight(height)
     engine: Any = figure.get_layout_engine()
-    engine.set(rect=(0, 0, 0.68, 1) if beside else (0, 0, 1, 1 - share))
+    engine.set(rect=(0, 0, plots.BESIDE, 1) if beside else (0, 0, 1, 1 - room / height))
     plots.key(figure, entries, columns, beside)
 
 
@@ -49,7 +52,7 @@ def _filters(study: Study) -> list[tuple[str, Any]]:
 
 def scenario(study: Study) -> Figure:
     """Map of the study with the estimates of the shown run."""
-    figure, axes = _figure(2.7)
+    figure, axes = _figure(2.65)
     paths = [(plots.style(t.style), t.path[thin(*t.path.T)]) for t in study.tracks]
     true_path, odometry = (None if p is None else p[thin(*p.T)] for p in (study.true_path, study.odometry))
     plots.scenario(axes[0, 0], true_path, odometry, study.landmarks, paths)
@@ -57,7 +60,10 @@ def scenario(study: Study) -> Figure:
     if true_path is not None:
         entries.append(("true path", Line2D([], [], color=plots.TRUTH, linewidth=1.6)))
         entries.append(
-            ("start", Line2D([], [], linestyle="", marker="o", color="white", markeredgecolor=plots.TRUTH, markersize=6))
+            (
+                "start",
+                Line2D([], [], linestyle="", marker="o", color="white", markeredgecolor=plots.TRUTH, markersize=6),
+            )
         )
     if odometry is not None:
         entries.append(("odometry alone", Line2D([], [], color=plots.ODOMETRY, linewidth=1.1, dashes=(4, 2))))
@@ -122,7 +128,7 @@ def nis(study: Study) -> Figure:
     count = len(study.tracks)
     columns = count if count < 4 else 2 if count == 4 else 3
     rows = -(-count // columns)
-    figure, axes = _figure(0.35 + 1.05 * rows, rows, columns, sharex=True, sharey=True)
+    figure, axes = _figure(0.35 + 1.0 * rows, rows, columns, sharex=True, sharey=True)
     for track, panel in zip(study.tracks, axes.flat, strict=False):
         keep = thin(track.nis_ratio)
         plots.nis(panel, study.steps[keep], track.nis_ratio[keep], plots.style(track.style), study.nis_log)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tempfile
+import warnings
 from importlib import resources
 from io import BytesIO
 from itertools import zip_longest
@@ -87,7 +88,10 @@ def _distribution(distribution: Any, prefix: str, folder: Path) -> dict[str, str
 
 def _svg(figure: Any, path: Path) -> str:
     buffer = BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    with warnings.catch_warnings():
+        # a name in a script that the font lacks is drawn as boxes; the tables of the HTML show it
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
     path.write_bytes(buffer.getvalue())
     return path.name
 

@@ -38,7 +38,7 @@ def verdict_row(track: Track) -> tuple[str, ...]:
         number(s.get("mean_anees"), ".3g" if s.get("mean_anees", 0) >= 100 else ".2f"),
         number(s.get("share_inside"), ".2f"),
         str(first) if first is not None else ("never" if s.get("judged_steps") else "–"),
-        " / ".join(number(100 * c, ".1f") for c in covered) if covered else "–",
+        " / ".join(number(100 * c, ".1f") for c in covered) if covered and np.isfinite(covered).any() else "–",
         number(s.get("rmse_position"), ".3f"),
         number(None if heading is None else np.rad2deg(heading), ".2f"),
         number(s.get("nis_ratio"), ".3f"),

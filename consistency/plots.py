@@ -15,7 +15,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from consistency.types import Array, Indices
 
@@ -43,7 +43,7 @@ class Style:
     marker: str
 
     @property
-    def linestyle(self) -> str | tuple[float, tuple[float, ...]]:
+    def linestyle(self) -> Any:
         """The dash pattern as Matplotlib takes it."""
         return (0.0, self.dash) if self.dash else "-"
 
@@ -188,8 +188,10 @@ def title(axes: Axes, text: str) -> None:
 
 def _log_scale(axes: Axes) -> None:
     axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 200 * low else (1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.4, 0.4)))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _frame(axes: Axes) -> None:

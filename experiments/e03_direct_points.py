@@ -28,8 +28,8 @@ def main(study: cs.Study) -> list[cs.Finding]:
             claim="for a small loop the average NEES of a standard EKF is well bounded",
             statistic="ANEES over all steps against its band",
             published="inside [2.36, 3.72]",
-            measured=f"{verdict.status}: mean ANEES {s['mean_anees']:.2f}, {100 * s['share_inside']:.0f} % of steps inside "
-            f"(exact Kalman filter of linear-gaussian: {exact.statistics['mean_anees']:.2f}, "
+            measured=f"{verdict.status}: mean ANEES {s['mean_anees']:.2f}, {100 * s['share_inside']:.0f} % of steps "
+            f"inside (exact Kalman filter of linear-gaussian: {exact.statistics['mean_anees']:.2f}, "
             f"{100 * exact.statistics['share_inside']:.0f} %)",
             accept=ACCEPT,
         )

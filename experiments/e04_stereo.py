@@ -18,12 +18,12 @@ MINIMAL = 0.5  # share of the way to consistency below which an improvement is m
 
 ACCEPT_11B = f"mean ANEES above {UPPER} and the verdict overconfident: 'unacceptably large' is at least outside the published band"
 ACCEPT_13A = (
-    f"ekf-uvd has the lower mean NEES in significantly more runs than ekf-xyz (paired sign test over runs, {SIGN_TEST:g}; "
-    "runs, because one diverging run decides a mean) and is still overconfident"
+    "ekf-uvd has the lower mean NEES in significantly more runs than ekf-xyz (paired sign test over runs, "
+    f"{SIGN_TEST:g}; runs, because one diverging run decides a mean) and is still overconfident"
 )
 ACCEPT_13B = (
-    f"ukf-uvd is still overconfident, and in the median run it goes less than {MINIMAL:.0%} of the way from ekf-uvd's mean "
-    "NEES to 3: an improvement is minimal while most of the excess remains"
+    f"ukf-uvd is still overconfident, and in the median run it goes less than {MINIMAL:.0%} of the way from ekf-uvd's "
+    "mean NEES to 3: an improvement is minimal while most of the excess remains"
 )
 
 
@@ -42,7 +42,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
             scenario=SCENARIO,
             id="fig11b",
             source="Herath 2007, fig. 11b and sec. 4.5",
-            claim="a straightforward SLAM implementation on stereo points is inconsistent: unacceptably large average NEES",
+            claim="straightforward SLAM on stereo points is inconsistent: unacceptably large average NEES",
             statistic="mean ANEES of ekf-xyz and the verdict",
             published="unacceptably large",
             measured=said(xyz, xyz_curves),

@@ -10,7 +10,7 @@ FINDINGS = ("other-worlds",)
 CLAIMED = {"ekf-xyz": "overconfident", "ekf-uvd": "overconfident", "ukf-uvd": "overconfident"}
 
 ACCEPT = (
-    "in a second world (rounded rectangle) and a third (figure of eight), each with landmarks of its own, every verdict "
+    "in a second world (rounded rectangle) and a third (figure of eight), each with its own landmarks, every verdict "
     "on the stereo sensor is the one of the first world, and ekf-xyz on direct points is consistent in each"
 )
 

@@ -105,9 +105,13 @@ def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | 
         anees=s.get("anees"),
         band=band,
         simultaneous=s.get("simultaneous"),
-        own_band=band is not None and bool(c.failures) and not np.array_equal(band, common, equal_nan=True),
+        own_band=bool(c.failures) and not _same(band, common),
         nis_ratio=np.where(dof > 0, total / np.maximum(dof, 1), np.nan),
     )
+
+
+def _same(a: Array | None, b: Array | None) -> bool:
+    return a is None or b is None or np.array_equal(a, b, equal_nan=True)
 
 
 def _common_band(verdicts: dict[str, Verdict]) -> Array | None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, HoverTool, Range1d, Span
+from bokeh.models import ColumnDataSource, HoverTool, Range1d
+from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
 from consistency.plots import AXES, BAND, COLOURS, DASHES, ODOMETRY, TRUTH, style
@@ -54,7 +55,7 @@ def _figure(x: str, y: str, height: int = 280, **options: Any) -> Any:
 
 def _source(**columns: Any) -> ColumnDataSource:
     """Columns in single precision: seven digits are more than a screen shows."""
-    data = {
+    data: dict[str, Any] = {
         name: np.asarray(values, np.int32 if np.asarray(values).dtype.kind == "i" else np.float32)
         for name, values in columns.items()
     }
@@ -69,7 +70,9 @@ def _hover(chart: Any, renderers: list[Any], tooltips: list[tuple[str, str]], **
 def _line(chart: Any, source: ColumnDataSource, x: str, y: str, track: Track, label: str, **options: Any) -> Any:
     look = style(track.style)
     options = {"line_width": 1.6, "line_dash": _dash(look.dash)} | options
-    return chart.line(x, y, source=source, line_color=look.colour, name=track.name, tags=[label], **options)
+    line = chart.line(x, y, source=source, line_color=look.colour, name=track.name, **options)
+    line.tags = [label]
+    return line
 
 
 def _dash(pattern: tuple[float, ...]) -> Any:
@@ -114,8 +117,8 @@ def _error(study: Study, index: int, component: int, shared: Any, limit: int) ->
         source = _source(step=study.steps[keep], error=error[keep], high=bound[keep], low=-bound[keep])
         label = tag(index, track)
         for column in ("high", "low"):
-            _line(chart, source, "step", column, track, label, line_width=1.1, line_dash=[5, 4], line_alpha=0.8)
-        lines.append(_line(chart, source, "step", "error", track, label, line_dash="solid"))
+            _line(chart, source, "step", column, track, label, line_width=0.9, line_dash=[5, 4], line_alpha=0.7)
+        lines.append(_line(chart, source, "step", "error", track, label))
     chart.add_layout(Span(location=0.0, dimension="width", line_color="#777777", line_width=0.6))
     rows = [("step", "@step"), ("error", f"@error{{0.0000}} {unit}"), ("2 sigma", f"@high{{0.0000}} {unit}")]
     _hover(chart, lines, rows)
@@ -152,7 +155,8 @@ def _anees(study: Study, index: int, shared: Any, limit: int) -> Any:
 
 
 def _common_band(chart: Any, study: Study, common: Track, limit: int) -> None:
-    assert common.band is not None and common.simultaneous is not None
+    assert common.band is not None
+    assert common.simultaneous is not None
     keep = thin(common.band[:, 1], limit=limit)
     inner = _source(step=study.steps[keep], low=common.band[keep, 0], high=common.band[keep, 1])
     chart.varea("step", "low", "high", source=inner, fill_color=BAND, fill_alpha=0.8)
@@ -171,12 +175,12 @@ def _nis(study: Study, index: int, shared: Any, limit: int) -> Any:
         look = style(track.style)
         keep = thin(track.nis_ratio, limit=limit)
         source = _source(step=study.steps[keep], value=track.nis_ratio[keep])
-        points.append(
-            chart.scatter(
-                "step", "value", source=source, marker=MARKERS[look.marker], size=5, fill_color=look.colour,
-                line_color=look.colour, fill_alpha=0.6, line_alpha=0.6, name=track.name, tags=[tag(index, track)],
-            )
+        glyph = chart.scatter(
+            "step", "value", source=source, marker=MARKERS[look.marker], size=5, fill_color=look.colour,
+            line_color=look.colour, fill_alpha=0.6, line_alpha=0.6, name=track.name,
         )  # fmt: skip
+        glyph.tags = [tag(index, track)]
+        points.append(glyph)
     chart.add_layout(Span(location=1.0, dimension="width", line_color="#333333", line_width=1.0))
     _hover(chart, points, [("step", "@step"), ("NIS / dof", "@value{0.000}")])
     return chart
@@ -185,7 +189,8 @@ def _nis(study: Study, index: int, shared: Any, limit: int) -> Any:
 def distribution_charts(d: Distribution) -> tuple[Any, Any]:
     """Samples with two ellipses, and the histogram of x with two densities."""
     (x_low, x_high), (y_low, y_high) = d.window
-    cloud = _figure("x (m)", "y (m)", 320, x_range=Range1d(x_low, x_high), y_range=Range1d(y_low, y_high))
+    x_range, y_range = Range1d(start=x_low, end=x_high), Range1d(start=y_low, end=y_high)
+    cloud = _figure("x (m)", "y (m)", 320, x_range=x_range, y_range=y_range)
     cloud.scatter("x", "y", source=_source(x=d.points[:, 0], y=d.points[:, 1]), size=3, color="#555555", alpha=0.6)
     histogram = _figure("x (m)", "density of x (1/m)", 320, x_range=cloud.x_range)
     source = _source(left=d.edges[:-1], right=d.edges[1:], density=d.density)

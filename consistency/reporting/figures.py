@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -15,7 +16,7 @@ from consistency.reporting.thin import thin
 
 WIDTH = 6.7  # inches, the text width of the page
 LINE = 0.16  # inches, a line of a legend
-RC: dict[str, Any] = {
+RC: Any = {
     "font.family": "DejaVu Sans", "font.size": 7.5, "axes.titlesize": 8, "axes.labelsize": 7.5, "legend.fontsize": 7.5,
     "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6, "svg.hashsalt": "consistency",
     "path.simplify": True, "axes.formatter.useoffset": False,
@@ -32,7 +33,8 @@ def _key(figure: Figure, entries: list[tuple[str, Any]], beside: bool = False) -
     entries = [(_wrapped(label), handle) for label, handle in entries]
     longest = max((len(line) for label, _ in entries for line in label.split("\n")), default=1)
     columns = 1 if beside else max(1, min(len(entries), 5, int(118 / (longest + 9))))
-    lines = -(-len(entries) // columns) * max((label.count("\n") + 1 for label, _ in entries), default=1)
+    tall = [label.count("\n") + 1 for label, _ in entries]
+    lines = sum(tall) if beside else -(-len(entries) // columns) * max(tall, default=1)
     room, height = LINE * lines + 0.06, figure.get_figheight()
     # the axes keep their size: a long legend makes the figure taller
     height = max(height, room) if beside else height + room - LINE
@@ -52,7 +54,7 @@ def _filters(study: Study) -> list[tuple[str, Any]]:
 
 def scenario(study: Study) -> Figure:
     """Map of the study with the estimates of the shown run."""
-    figure, axes = _figure(2.65)
+    figure, axes = _figure(2.5)
     paths = [(plots.style(t.style), t.path[thin(*t.path.T)]) for t in study.tracks]
     true_path, odometry = (None if p is None else p[thin(*p.T)] for p in (study.true_path, study.odometry))
     plots.scenario(axes[0, 0], true_path, odometry, study.landmarks, paths)
@@ -89,19 +91,20 @@ def pose_errors(study: Study) -> list[Figure]:
             panel.set_xlabel("step")
             panel.set_xlim(0, len(study.steps))
         plots.title(axes[0, 0], _wrapped(track.name, 90))
-        if not (error == error).any():
-            panel.text(0.5, 0.5, "no estimate in this run", transform=panel.transAxes, ha="center", va="center")
+        if not np.isfinite(track.error).any():
+            axes[0, 1].text(0.5, 0.5, "no estimate in this run", transform=axes[0, 1].transAxes, ha="center")
         rows.append(figure)
     return rows
 
 
 def anees(study: Study) -> Figure:
     """ANEES of every filter against the bands."""
-    figure, axes = _figure(2.35)
+    figure, axes = _figure(2.2)
     panel = axes[0, 0]
     common = study.common_band
     for track in [t for t in study.tracks if t is common or t.own_band]:
-        assert track.band is not None and track.simultaneous is not None
+        assert track.band is not None
+        assert track.simultaneous is not None
         keep = thin(track.band[:, 1])
         look = plots.style(track.style) if track.own_band else None
         expected = float(track.verdict.statistics["dof"])

@@ -20,6 +20,7 @@ from consistency.reporting.model import Report, Study
 
 TEMPLATE = "report.typ"
 SHORT = 4000  # characters of settings that surely fit on one page
+FILES = ("image", "errors")  # keys of file names
 LONG_WORD = re.compile(r"[^\s\u200b]{14}")
 
 
@@ -32,11 +33,11 @@ def render_pdf(report: Report) -> bytes:
             "answer": report.answer,
             "columns": list(wording.VERDICT_COLUMNS),
             "studies": [_study(study, f"s{i}", folder) for i, study in enumerate(report.studies)],
-            "findings": [_finding(finding) for finding in report.findings],
+            "findings": [{key: str(value) for key, value in finding.items()} for finding in report.findings],
             "distributions": [_distribution(d, f"d{i}", folder) for i, d in enumerate(report.distributions)],
             "provenance": [list(row) for row in report.provenance],
         }
-        (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
+        (folder / "data.json").write_text(json.dumps(_soft(data), ensure_ascii=False), encoding="utf-8")
         template = resources.files("consistency.reporting").joinpath("templates", TEMPLATE)
         (folder / TEMPLATE).write_text(template.read_text(encoding="utf-8"), encoding="utf-8")
         pdf: bytes = typst.compile(str(folder / TEMPLATE), root=str(folder), ignore_system_fonts=True)
@@ -54,12 +55,12 @@ def _study(study: Study, prefix: str, folder: Path) -> dict[str, Any]:
         "steps": len(study.steps),
         "shown_run": study.shown_run,
         "statistic": study.statistic,
-        "verdicts": [[_soft(cell) for cell in wording.verdict_row(track)] for track in study.tracks],
+        "verdicts": [list(wording.verdict_row(track)) for track in study.tracks],
         "reasons": [
-            {"filter": track.name, "status": track.verdict.status, "reasons": [_soft(r) for r in track.verdict.reasons]}
+            {"filter": track.name, "status": track.verdict.status, "reasons": list(track.verdict.reasons)}
             for track in study.tracks
         ],
-        "failures": [[_soft(name), str(run), str(step), _soft(why)] for name, run, step, why in study.failures],
+        "failures": [[name, str(run), str(step), why] for name, run, step, why in study.failures],
         "map": {"image": save("map", figures.scenario(study)), "caption": wording.scenario_caption(study)},
         "errors": [],
         "anees": None,
@@ -77,10 +78,6 @@ def _study(study: Study, prefix: str, folder: Path) -> dict[str, Any]:
     return entry
 
 
-def _finding(finding: dict[str, Any]) -> dict[str, str]:
-    return {key: _soft(str(value)) for key, value in finding.items()}
-
-
 def _distribution(distribution: Any, prefix: str, folder: Path) -> dict[str, str]:
     image = _svg(figures.distribution(distribution), folder / f"{prefix}.svg")
     return {"image": image, "caption": wording.distribution_caption(distribution)}
@@ -96,9 +93,13 @@ def _svg(figure: Any, path: Path) -> str:
     return path.name
 
 
-def _soft(text: str) -> str:
-    """Text that may break inside long words, so that a table cell never overflows."""
-    return LONG_WORD.sub(lambda match: match.group() + "\u200b", text)
+def _soft(value: Any) -> Any:
+    """The same data with room to break inside long words, so that nothing runs over an edge."""
+    if isinstance(value, dict):
+        return {key: item if key in FILES else _soft(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_soft(item) for item in value]
+    return LONG_WORD.sub(lambda match: match.group() + "\u200b", value) if isinstance(value, str) else value
 
 
 def _settings(resolved: dict[str, Any]) -> list[list[str]]:
@@ -111,4 +112,4 @@ def _settings(resolved: dict[str, Any]) -> list[list[str]]:
 def _pairs(value: Any, path: str) -> list[tuple[str, str]]:
     if isinstance(value, dict):
         return [pair for key, item in value.items() for pair in _pairs(item, f"{path}.{key}")]
-    return [] if value is None else [(_soft(path), _soft(json.dumps(value, ensure_ascii=False)))]
+    return [] if value is None else [(path, json.dumps(value, ensure_ascii=False))]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from consistency.types import Array, Indices
@@ -21,7 +23,7 @@ def thin(*lines: Array, limit: int = LIMIT) -> Indices:
     pieces = max(1, (limit - 2) // (2 * len(lines)))
     edges = np.linspace(0, steps, pieces + 1).astype(np.int64)
     keep = {0, steps - 1}
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
+    for start, end in pairwise(edges):
         for line in lines:
             piece = line[start:end]
             if np.isfinite(piece).any():

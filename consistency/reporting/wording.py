@@ -16,9 +16,17 @@ MEANING = {
     "failed": "a run broke down, or there was nothing to judge",
 }
 VERDICT_COLUMNS = (
-    "Filter", "Verdict", "Mean ANEES", "Share of steps in the pointwise band", "First step outside the simultaneous band",
-    "2-sigma coverage x / y / heading (%)", "RMSE position (m)", "RMSE heading (deg)", "NIS / dof", "Failed runs",
-)  # fmt: skip
+    "Filter",
+    "Verdict",
+    "Mean ANEES",
+    "Share of steps in the pointwise band",
+    "First step outside the simultaneous band",
+    "2-sigma coverage x / y / heading (%)",
+    "RMSE position (m)",
+    "RMSE heading (deg)",
+    "NIS / dof",
+    "Failed runs",
+)
 
 
 def number(value: Any, form: str) -> str:
@@ -52,21 +60,20 @@ def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
     text = []
     if pairs:
         honest = sum(track.verdict.consistent for track, _ in pairs)
+        passed = ("is" if honest == 1 else "are") + " honest about the uncertainty of the pose"
+        if not any(study.has_truth for study in studies):
+            passed = ("passes" if honest == 1 else "pass") + " the test of the innovations, the only one without truth"
         if len(studies) == 1:
-            text.append(
-                f"In {studies[0].name} ({_count(studies[0].runs, 'run')} of {_count(len(studies[0].steps), 'step')}), "
-                f"{honest} of {_count(len(pairs), 'filter')} {'is' if honest == 1 else 'are'} honest about the "
-                "uncertainty of the pose."
-            )
+            size = f"{_count(studies[0].runs, 'run')} of {_count(len(studies[0].steps), 'step')}"
+            text.append(f"In {studies[0].name} ({size}), {honest} of {_count(len(pairs), 'filter')} {passed}.")
         else:
             text.append(
-                f"{len(studies)} studies put {len(pairs)} pairs of filter and scenario to the test; {honest} "
-                f"{'is' if honest == 1 else 'are'} honest about the uncertainty of the pose."
+                f"{len(studies)} studies put {len(pairs)} pairs of filter and scenario to the test; {honest} {passed}."
             )
         text += [sentence for status in STATUSES if (sentence := _status_sentence(status, pairs, len(studies)))]
         text.append(_failure_sentence(studies))
     if any(not study.has_truth for study in studies):
-        text.append("Where the truth is not known the verdict rests on the innovations alone.")
+        text.append("Where the truth is not known the innovations alone decide, and they cannot see most pose errors.")
     if findings:
         text.append(_finding_sentence(findings))
     return " ".join(text) or "This folder holds neither results nor findings."
@@ -87,7 +94,7 @@ def _failure_sentence(studies: Sequence[Study]) -> str:
     failed = sum(len(study.failures) for study in studies)
     total = sum(study.runs * len(study.tracks) for study in studies)
     if not failed:
-        return f"None of the {total} runs through a filter broke down."
+        return "No run broke down."
     return f"{failed} of {total} runs through a filter broke down; they are listed below and counted in the verdicts."
 
 
@@ -146,9 +153,9 @@ def anees_caption(study: Study) -> str:
         f" Fewer runs carry the curve of {listed(own)}; its wider bands are thin lines in its colour." if own else ""
     )
     return (
-        f"{what}; {n} is expected (line). Shaded: the 95 % band of a single step (eq. 17). Dashed: the band that a "
-        f"consistent filter leaves in any step with probability at most 5 %. Above is overconfident, below conservative."
-        f"{extra}"
+        f"{what}; {n} is expected (line). Shaded: the 95 % band of a single step (eq. 17). Dashed: the band that "
+        f"a consistent filter leaves in any step with probability at most 5 %. Above is overconfident, below "
+        f"conservative.{extra}"
     )
 
 
@@ -167,6 +174,6 @@ def distribution_caption(d: Distribution) -> str:
     beyond = f" {100 * d.outside:.1f} % of the samples lie beyond the axes." if d.outside >= 0.0005 else ""
     return (
         f"Baseline {d.baseline:g} m: {d.samples} samples of eq. 21 for a point at x = 10 m, y = 1 m "
-        f"({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the samples' "
-        f"moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
+        f"({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
+        f"samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
     )

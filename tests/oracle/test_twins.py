@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import consistency as cs
 from consistency.filters.stepping import step_through
+from consistency.filters.trial import run_trial
 from consistency.scenario import Belief
 from consistency.simulation import planned_path
 from consistency.types import Array, Estimates, Trial
@@ -93,6 +95,18 @@ def test_the_four_steps_of_a_compiled_filter_are_its_twin(uvd: cs.Scenario) -> N
     trial, filter_ = cs.simulate(uvd), cs.get_filter("ekf-uvd")
     stepped = step_through(filter_, trial, uvd.belief)
     assert np.array_equal(stepped.pose, step_through(filter_.twin, trial, uvd.belief).pose)
+
+
+def test_one_compiled_signature_serves_every_caller(uvd: cs.Scenario) -> None:
+    """Arrays from a table are often column-major; a second signature would cost half a minute to compile."""
+    trial = cs.simulate(uvd)
+    ours = compiled("ekf-uvd", trial, uvd.belief)
+    signatures = len(run_trial.signatures)
+    turned = replace(trial, controls=np.asfortranarray(trial.controls), z=np.asfortranarray(trial.z))
+    turned.controls.flags.writeable = False
+    again = compiled("ekf-uvd", turned, uvd.belief)
+    assert np.array_equal(again.pose, ours.pose)
+    assert len(run_trial.signatures) == signatures
 
 
 def test_sigma_points_matter(small: Small) -> None:

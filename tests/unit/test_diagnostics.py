@@ -11,6 +11,7 @@ from scipy.spatial.distance import mahalanobis
 
 import consistency as cs
 from consistency.diagnostics import chi2_mean_interval, coverage, normality, rmse
+from consistency.diagnostics.intervals import detectable_ratio
 from consistency.types import Array
 
 # exact 95 % intervals of chi-square(3 N) / N, computed outside this project
@@ -173,6 +174,15 @@ def test_anees_interval_refuses_counts_below_one(dof: int, runs: int) -> None:
 def test_interval_refuses_a_confidence_outside_zero_to_one(confidence: float) -> None:
     with pytest.raises(ValueError, match="between 0 and 1"):
         cs.anees_interval(3, 50, confidence)
+
+
+def test_detectable_ratio_is_detected_with_its_power() -> None:
+    """The NEES of a covariance that is too small by the ratio is the ratio times chi-square."""
+    for runs, power in ((50, 0.95), (400, 0.9)):
+        ratio = detectable_ratio(3, runs, 0.99, power)
+        _, high = cs.anees_interval(3, runs, 0.99)
+        assert stats.chi2.sf(high * runs / ratio, 3 * runs) == pytest.approx(power)
+        assert ratio > 1
 
 
 # --- coverage and error ----------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import consistency as cs
 from consistency import montecarlo
 from consistency.filters.stepping import run_filter
 from consistency.montecarlo import Interrupted, previous_results
+from consistency.results import joined
 from consistency.types import Control, Gaussian, Observation, Trial
 
 Small = Callable[..., cs.Scenario]
@@ -106,6 +108,13 @@ def test_other_filters_do_not_matter(uvd: cs.Scenario, ten: cs.Results) -> None:
     pd.testing.assert_frame_equal(alone.estimates, among, check_exact=True)
 
 
+def test_filters_that_ran_apart_are_joined(uvd: cs.Scenario, ten: cs.Results) -> None:
+    parts = [cs.run_trials(uvd, [name], runs=10, seed=3, jobs=1) for name in ("ekf-uvd", "ekf-xyz")]
+    whole = joined(parts)
+    assert equal(whole, ten)
+    assert whole.filters == ten.filters
+
+
 def test_seed_matters(uvd: cs.Scenario, ten: cs.Results) -> None:
     """Negative control of the three tests above."""
     other = cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=4, jobs=1)
@@ -191,7 +200,10 @@ def test_a_filter_that_breaks_at_once(xyz: cs.Scenario) -> None:
     assert len(results.estimates) == 0
     assert list(results.failures["step"]) == [1, 1, 1]
     assert set(results.failures["reason"]) == {"KeyError: 'no such map'"}
-    assert cs.analyse(results)["stillborn"].status == "failed"
+    verdict = cs.analyse(results)["stillborn"]
+    assert verdict.status == "failed"
+    assert verdict.statistics["runs"] == 3
+    assert any("3 of 3 runs failed" in reason for reason in verdict.reasons)
 
 
 def test_a_compiled_filter_that_breaks(small: Small) -> None:
@@ -247,7 +259,7 @@ def test_a_filter_that_does_not_fit_the_sensor(xyz: cs.Scenario) -> None:
 
 
 def test_an_unknown_filter(xyz: cs.Scenario) -> None:
-    with pytest.raises(cs.InputError, match="unknown filter 'ekf-xzy'; did you mean 'ekf-xyz'"):
+    with pytest.raises(cs.InputError, match=r"unknown filter 'ekf-xzy' \(did you mean 'ekf-xyz'\?\); known: kf, "):
         cs.run_trials(xyz, ["ekf-xzy"], runs=1)
 
 
@@ -342,6 +354,34 @@ def test_resuming_keeps_failed_runs(
 def test_resuming_what_is_complete_changes_nothing(uvd: cs.Scenario, ten: cs.Results) -> None:
     again = cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1, previous=ten)
     assert equal(again, ten)
+
+
+def test_resuming_fills_gaps(uvd: cs.Scenario, ten: cs.Results) -> None:
+    """Workers do not finish in order: run 4 may be missing where run 7 is there."""
+    kept = {
+        name: table[~table["run"].isin([4, 8, 9])].reset_index(drop=True)
+        for name, table in (("estimates", ten.estimates), ("truth", ten.truth))
+    }
+    previous = replace(ten, **kept)
+    assert equal(cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=2, previous=previous), ten)
+
+
+def test_resuming_what_is_complete_needs_no_compiler(
+    uvd: cs.Scenario, ten: cs.Results, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("consistency.filters.compiled.is_compiled", lambda entry: False)
+    assert equal(cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1, previous=ten), ten)
+
+
+def test_resuming_with_fewer_runs_than_there_are_is_refused(uvd: cs.Scenario, ten: cs.Results) -> None:
+    """A folder must not hold more runs than its manifest says."""
+    with pytest.raises(cs.InputError, match="runs"):
+        cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=5, seed=3, jobs=1, previous=ten)
+
+
+def test_resuming_with_more_runs_adds_them(uvd: cs.Scenario, ten: cs.Results) -> None:
+    four = cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=4, seed=3, jobs=1)
+    assert equal(cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=2, previous=four), ten)
 
 
 def test_stopped_before_the_first_run(uvd: cs.Scenario, stop_after: Callable[[int], None]) -> None:

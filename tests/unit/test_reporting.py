@@ -1,0 +1,355 @@
+"""Reports say what the diagnostics say, show every name literally, and appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import asdict, replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import consistency as cs
+from consistency.findings import Finding
+from consistency.montecarlo import run_log, simulate_log
+from consistency.reporting import build, html, pdf, wording, write_reports
+from consistency.reporting.build import build_report
+from consistency.reporting.thin import thin
+from consistency.results import read_results
+
+ODD = {
+    "ekf-xyz": "<script>alert(1)</script><img src=x onerror=alert(2)>",
+    "ekf-uvd": "#set *b* $x^2$ $$y$$ \\frac `c` @ref {{ 7*7 }} </script>",
+}
+FILTERS = list(ODD)
+FINDING = Finding(
+    "fig11b", "Herath 2007, fig. 11b", "unacceptably large <ANEES>", "mean ANEES", "large", "58", "above 3.72",
+    "reproduced", 4, 0, "small",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def results(uvd):
+    return cs.run_trials(uvd, FILTERS, runs=4, seed=1, jobs=1)
+
+
+@pytest.fixture
+def folder(results, tmp_path) -> Path:
+    results.write(tmp_path / "run")
+    return tmp_path / "run"
+
+
+def odd_results(results):
+    """The same under odd names; one filter fails in two runs, the other in all of them at once."""
+    estimates = results.estimates.assign(filter=results.estimates["filter"].map(ODD))
+    first, second = ODD.values()
+    late = (estimates["filter"] == first) & (estimates["run"] < 2) & (estimates["step"] >= 30)
+    estimates = estimates[~late & (estimates["filter"] != second)]
+    rows = [(first, run, 30, "not positive definite") for run in (0, 1)]
+    rows += [(second, run, 1, "<b>broken</b> $ # " + 150 * "x") for run in range(4)]
+    failures = pd.DataFrame(rows, columns=["filter", "run", "step", "reason"])
+    return replace(
+        results, estimates=estimates, failures=failures, manifest=results.manifest | {"filters": list(ODD.values())}
+    )
+
+
+def reproduction(results, folder: Path) -> Path:
+    """A folder as ``consistency reproduce`` writes it."""
+    folder.mkdir()
+    results.write(folder / "small")
+    rng = np.random.default_rng(3)
+    rows = []
+    for baseline in (0.09, 0.5):
+        d = 150 * baseline / 10 + 0.65 * rng.standard_normal(3000)
+        u = -15 + 1.34 * rng.standard_normal(3000)
+        u, d = u[d > 1], d[d > 1]
+        rows.append(
+            pd.DataFrame({"baseline": baseline, "x": baseline * 150 / d, "y": -baseline * u / d, "u": u, "d": d})
+        )
+    pd.concat(rows).to_parquet(folder / "fig12.parquet")
+    (folder / "findings.json").write_text(json.dumps([asdict(FINDING)]))
+    manifest = results.manifest | {"studies": ["small"]}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return folder
+
+
+class Page(HTMLParser):
+    """Text, tags and whatever a browser would load."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.tags: list[str] = []
+        self.loads: list[str] = []
+        self.style = ""
+        self.feed(source)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        given = dict(attrs)
+        self.loads += [str(given[key]) for key in ("src", "srcset", "poster", "data") if key in given]
+        if tag == "link":
+            self.loads.append(str(given.get("href")))
+
+    def handle_data(self, data):
+        if self.tags and self.tags[-1] == "style":
+            self.style += data
+        self.text.append(data)
+
+
+def test_the_model_is_what_analyse_says(folder):
+    results = read_results(folder)
+    verdicts, (study,) = cs.analyse(results), build_report(folder).studies
+    for track in study.tracks:
+        verdict = verdicts[track.name]
+        assert track.verdict.status == verdict.status
+        assert track.verdict.reasons == verdict.reasons
+        np.testing.assert_array_equal(track.anees, verdict.statistics["anees"])
+        np.testing.assert_array_equal(track.simultaneous, verdict.statistics["simultaneous"])
+        table = results.estimates[results.estimates["filter"] == track.name]
+        by_step = table.groupby("step")
+        np.testing.assert_allclose(track.nis_ratio, by_step["nis"].sum() / by_step["nis_dof"].sum().replace(0, np.nan))
+        first = table[table["run"] == 0]
+        np.testing.assert_allclose(track.sigma[:, 2], np.rad2deg(np.sqrt(first["P_hh"])))
+        np.testing.assert_allclose(track.path, first[["x", "y"]])
+
+
+def test_the_odometry_is_that_of_the_trial(folder, uvd):
+    (study,) = build_report(folder).studies
+    trial = cs.simulate(uvd, run=0, seed=1)
+    np.testing.assert_array_equal(study.true_path, trial.truth[:, :2])
+    step = trial.controls[0, 0] * trial.controls[0, 1]
+    np.testing.assert_allclose(np.linalg.norm(study.odometry[1] - study.odometry[0]), abs(step))
+
+
+def test_verdict_cells_are_the_statistics(folder):
+    (study,) = build_report(folder).studies
+    cells, s = wording.verdict_row(study.tracks[0]), study.tracks[0].verdict.statistics
+    assert cells[2] == f"{s['mean_anees']:.2f}"
+    assert cells[7] == f"{np.rad2deg(s['rmse_heading']):.2f}"
+    assert cells[9] == "0 of 4"
+    assert len(cells) == len(wording.VERDICT_COLUMNS)
+
+
+def test_the_answer_names_every_filter(folder):
+    report = build_report(folder)
+    assert all(name in report.answer for name in FILTERS)
+    assert report.studies[0].tracks[0].verdict.status in report.answer.lower()
+
+
+def test_both_files_are_written_and_refused_a_second_time(folder):
+    targets = [folder / "report.html", folder / "report.pdf"]
+    assert write_reports(folder, *targets, overwrite=False) == targets
+    assert targets[1].read_bytes().startswith(b"%PDF")
+    before = sorted(os.listdir(folder))
+    with pytest.raises(cs.InputError, match=r"report\.html: exists already; .*--overwrite"):
+        write_reports(folder, *targets, overwrite=False)
+    contents = [path.read_bytes() for path in targets]
+    assert write_reports(folder, *targets, overwrite=True) == targets
+    assert contents[1] == targets[1].read_bytes()
+    assert sorted(os.listdir(folder)) == before
+
+
+def test_one_of_the_two_alone(folder, tmp_path):
+    assert write_reports(folder, None, tmp_path / "new" / "r.pdf", overwrite=False) == [tmp_path / "new" / "r.pdf"]
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["r.pdf"]
+
+
+def test_targets_that_cannot_be_written(folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(cs.InputError, match="cannot be written"):
+        write_reports(folder, tmp_path / "file" / "r.html", None, overwrite=True)
+    with pytest.raises(cs.InputError, match="is a folder"):
+        write_reports(folder, folder, None, overwrite=True)
+    with pytest.raises(cs.InputError, match="both"):
+        write_reports(folder, tmp_path / "r", tmp_path / "r", overwrite=True)
+
+
+def test_nothing_is_left_of_a_report_that_breaks(folder, monkeypatch):
+    monkeypatch.setattr(pdf, "render_pdf", lambda report: 1 / 0)
+    before = sorted(os.listdir(folder))
+    with pytest.raises(ZeroDivisionError):
+        write_reports(folder, folder / "report.html", folder / "report.pdf", overwrite=False)
+    assert sorted(os.listdir(folder)) == before
+
+
+def test_a_file_that_exists_survives_a_write_that_breaks(folder, monkeypatch):
+    target = folder / "report.html"
+    target.write_text("before")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(cs.InputError, match=r"cannot be written \(No space left on device\)"):
+        write_reports(folder, target, None, overwrite=True)
+    assert target.read_text() == "before"
+    assert not list(folder.glob(".report*"))
+
+
+def test_folders_without_results(tmp_path, uvd):
+    with pytest.raises(cs.InputError, match="no such folder"):
+        write_reports(tmp_path / "none", tmp_path / "none" / "report.html", None, overwrite=False)
+    assert not (tmp_path / "none").exists()
+    simulate_log(uvd, 1, 0, tmp_path / "log")
+    with pytest.raises(cs.InputError, match="holds no filter results"):
+        write_reports(tmp_path / "log", tmp_path / "r.html", None, overwrite=False)
+
+
+def test_odd_names_are_shown_literally(results, tmp_path):
+    odd_results(results).write(tmp_path / "odd")
+    report = build_report(tmp_path / "odd")
+    source = html.render_html(report)
+    page = Page(source)
+    text = "".join(page.text)
+    for name in ODD.values():
+        assert name in text
+    assert "img" not in page.tags
+    assert "49" not in report.answer
+    assert "<script>alert" not in source
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def test_failed_runs_are_listed(results, tmp_path):
+    odd_results(results).write(tmp_path / "odd")
+    (study,) = build_report(tmp_path / "odd").studies
+    assert len(study.failures) == 6
+    assert study.tracks[1].verdict.status == "failed"
+    assert not np.isfinite(study.tracks[1].path).any()
+    assert "6 of 8 runs" in build_report(tmp_path / "odd").answer
+
+
+def test_only_failed_runs_give_a_filter_bands_of_its_own(results, tmp_path):
+    late = (
+        (results.estimates["filter"] == "ekf-xyz") & (results.estimates["run"] == 0) & (results.estimates["step"] > 29)
+    )
+    rows = [("ekf-xyz", 0, 30, "not positive definite")]
+    failures = pd.DataFrame(rows, columns=["filter", "run", "step", "reason"])
+    replace(results, estimates=results.estimates[~late], failures=failures).write(tmp_path / "run")
+    report = build_report(tmp_path / "run")
+    assert [track.own_band for track in report.studies[0].tracks] == [True, False]
+    assert report.studies[0].common_band.name == "ekf-uvd"
+    assert "Fewer runs carry the curve of ekf-xyz" in html.render_html(report)
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def test_html_loads_nothing_and_is_small(results, tmp_path):
+    report = build_report(reproduction(results, tmp_path / "all"))
+    source = html.render_html(report)
+    page = Page(source)
+    assert len(source.encode()) <= 6_000_000
+    assert page.loads == ["data:,"]
+    assert not re.search(r"@import|url\((?!['\"]?data:)", page.style)
+    assert "default-src 'none'" in source
+    assert page.tags.count("h1") == 1
+
+
+def test_many_long_studies_stay_below_six_megabytes(results, tmp_path):
+    results.write(tmp_path / "run")
+    report = build_report(tmp_path / "run")
+    steps = 20_000
+    rng = np.random.default_rng(0)
+
+    def long(track):
+        anees = rng.random(steps)
+        anees[7_777] = 99.0
+        return replace(
+            track, path=rng.random((steps, 2)), error=rng.random((steps, 3)), sigma=rng.random((steps, 3)), anees=anees,
+            band=np.tile([2.0, 4.0], (steps, 1)), simultaneous=np.tile([1.0, 5.0], (steps, 1)), nis_ratio=anees,
+        )  # fmt: skip
+
+    study = replace(
+        report.studies[0], steps=np.arange(1, steps + 1), tracks=tuple(long(t) for t in report.studies[0].tracks * 4)
+    )
+    limit = html.points_a_line(replace(report, studies=(study,) * 6))
+    assert 120 <= limit < 2000
+    source = html.render_html(replace(report, studies=(study,) * 6))
+    assert len(source.encode()) <= 6_000_000
+    assert "peaks and troughs are kept" in source
+
+
+def test_thin_keeps_extremes_ends_and_short_lines():
+    line = np.sin(np.linspace(0, 60, 30_000))
+    line[12_345], line[23_456] = 7.0, -7.0
+    line[5_000:6_000] = np.nan
+    keep = thin(line, limit=500)
+    assert len(keep) <= 500
+    assert {0, 12_345, 23_456, 29_999} <= set(keep.tolist())
+    assert (np.diff(keep) > 0).all()
+    np.testing.assert_array_equal(thin(line[:400], limit=500), np.arange(400))
+
+
+def test_findings_and_distributions(results, tmp_path):
+    report = build_report(reproduction(results, tmp_path / "all"))
+    assert "1 reproduced" in report.answer
+    narrow, wide = report.distributions
+    # first order: sigma_x = x^2 sigma_d / (f B)
+    np.testing.assert_allclose(np.sqrt(narrow.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.09))
+    np.testing.assert_allclose(np.sqrt(wide.linear.covariance[0, 0]), 100 * 0.65 / (150 * 0.5))
+    np.testing.assert_allclose(np.sum(wide.density * np.diff(wide.edges)), 1.0, atol=0.02)
+    source = html.render_html(report)
+    assert "unacceptably large &lt;ANEES&gt;" in source
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def test_findings_alone(tmp_path, results):
+    folder = reproduction(results, tmp_path / "all")
+    manifest = json.loads((folder / "manifest.json").read_text()) | {"studies": []}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    report = build_report(folder)
+    assert report.studies == ()
+    assert "No study was run" in html.render_html(report)
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def test_damaged_distributions_are_named(results, tmp_path):
+    folder = reproduction(results, tmp_path / "all")
+    (folder / "fig12.parquet").write_bytes(b"PAR1")
+    with pytest.raises(cs.InputError, match=r"fig12\.parquet: cannot be read"):
+        build_report(folder)
+
+
+def test_a_log_without_truth_says_so(uvd, tmp_path):
+    simulate_log(uvd, 1, 0, tmp_path / "log")
+    for name in ("truth", "landmarks"):
+        (tmp_path / "log" / f"{name}.parquet").unlink()
+    from consistency.log import read_log
+
+    run_log(read_log(tmp_path / "log"), ["ekf-uvd"], jobs=1).write(tmp_path / "run")
+    report = build_report(tmp_path / "run")
+    (study,) = report.studies
+    assert not study.has_truth
+    assert study.odometry is None
+    assert str(tmp_path) not in study.name
+    source = html.render_html(report)
+    assert "The truth of log is not known" in source
+    assert "Pose errors" not in source
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def test_one_run_is_a_nees(uvd, tmp_path):
+    cs.run_trials(uvd, ["ekf-uvd"], runs=1, seed=0, jobs=1).write(tmp_path / "run")
+    report = build_report(tmp_path / "run")
+    assert report.studies[0].statistic == "NEES"
+    assert "NEES of the single run 0" in html.render_html(report)
+
+
+def test_a_filter_looks_the_same_in_every_study(results, tmp_path):
+    folder = reproduction(results, tmp_path / "all")
+    swapped = results.manifest | {"filters": FILTERS[::-1]}
+    replace(results, manifest=swapped).write(folder / "other")
+    manifest = json.loads((folder / "manifest.json").read_text()) | {"studies": ["small", "other"]}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    looks = [{t.name: t.style for t in study.tracks} for study in build_report(folder).studies]
+    assert looks[0] == looks[1]
+
+
+def test_reports_are_deterministic(folder):
+    assert pdf.render_pdf(build_report(folder)) == pdf.render_pdf(build_report(folder))
+    ids = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f-]{22}|p\d{4,}")
+    first, second = (ids.sub("", html.render_html(build.build_report(folder))) for _ in range(2))
+    assert len(first) == len(second)

@@ -19,12 +19,13 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import ValidationError
 
 from consistency.diagnostics import nees
 from consistency.errors import InputError
 from consistency.filters.linalg import definiteness
 from consistency.geometry import pose_error
-from consistency.scenario import Scenario
+from consistency.scenario import Scenario, explain
 from consistency.types import Array, Estimates, Failure, Trial
 
 SCHEMA_VERSION = 1
@@ -65,7 +66,10 @@ class Results:
     def scenario(self) -> Scenario | None:
         """The scenario, or None for a recorded log."""
         data = self.manifest.get("scenario")
-        return Scenario.model_validate(data) if data else None
+        try:
+            return Scenario.model_validate(data) if data else None
+        except ValidationError as error:
+            raise InputError(f"manifest.json: key 'scenario': {explain(error, Scenario)}") from None
 
     def finished_runs(self, filters: Sequence[str]) -> set[int]:
         """Runs that every one of ``filters`` has finished, well or not."""
@@ -201,7 +205,19 @@ def covariances(table: pd.DataFrame) -> Array:
 
 def manifest_of(**fields: Any) -> dict[str, Any]:
     """Provenance that every output folder carries."""
-    packages = ("filter-consistency", "numpy", "scipy", "numba", "filterpy", "pandas", "pyarrow", "joblib")
+    packages = (
+        "filter-consistency",
+        "numpy",
+        "scipy",
+        "numba",
+        "filterpy",
+        "pandas",
+        "pyarrow",
+        "joblib",
+        "bokeh",
+        "matplotlib",
+        "typst",
+    )
     versions = {"python": platform.python_version()}
     for package in packages:
         try:

@@ -302,10 +302,13 @@ class Scenario(Table):
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def variant(self, name: str, **changes: Any) -> Scenario:
-        """A copy under a new name with some values changed, keyed by dotted path with ``__`` for the dot.
+        """A copy under a new name with values changed, keyed by dotted path with ``__`` for the dot.
+
+        Without a ``summary`` the copy's says what it is a variant of.
 
         >>> load_scenario("herath2007-stereo").variant("far", truth__sensor__range=(0.5, 8.0))  # doctest: +SKIP
         """
+        changes.setdefault("summary", f"{self.name} with other {', '.join(changes) or 'name'}".replace("__", "."))
         data = self.model_dump()
         data["name"] = name
         for path, value in changes.items():

@@ -97,8 +97,8 @@ def described(test: Normality, linear: float, shared: float, found: float) -> st
     """One line of numbers."""
     return (
         f"mean {test.mean:.2f} m (true 10), std {test.std:.2f} m (linearised {linear:.2f}), "
-        f"skewness {test.skewness:.2f}, excess kurtosis {test.excess_kurtosis:.2f}, p = {test.p_value:.1g}; Gaussians share {100 * shared:.0f} % of "
-        f"their area; {100 * found:.0f} % of disparities found"
+        f"skewness {test.skewness:.2f}, excess kurtosis {test.excess_kurtosis:.2f}, p = {test.p_value:.1g}; "
+        f"Gaussians share {100 * shared:.0f} % of their area; {100 * found:.0f} % of disparities found"
     )
 
 

@@ -20,6 +20,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     narrow = cs.load_scenario("herath2007-stereo")
     between = narrow.variant(
         "herath2007-baseline-20cm",
+        summary="The world of herath2007-stereo with a baseline of 20 cm",
         truth__sensor__B=BASELINES[1],
         belief__sensor__B=BASELINES[1],
         truth__sensor__disparity=(1.0, 32.0 * BASELINES[1] / BASELINES[0]),

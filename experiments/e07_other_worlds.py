@@ -57,7 +57,10 @@ def worlds() -> dict[str, tuple[cs.Scenario, cs.Scenario]]:
         landmarks = {"layout": "uniform", "count": count, "seed": seed, "x": x, "y": y, "z": (-1.25, 1.25)}
         stereo, points = (
             cs.load_scenario(f"herath2007-{kind}").variant(
-                f"herath2007-{kind}-{name}", truth__path=path, truth__landmarks=landmarks
+                f"herath2007-{kind}-{name}",
+                summary=f"Noise and sensor of herath2007-{kind}; another path ({path['shape']}), other landmarks",
+                truth__path=path,
+                truth__landmarks=landmarks,
             )
             for kind in ("stereo", "xyz")
         )

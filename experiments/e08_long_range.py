@@ -18,7 +18,11 @@ ACCEPT = (
 
 def main(study: cs.Study) -> list[cs.Finding]:
     """herath2007-stereo with landmarks used up to 8 m instead of 4 m."""
-    far = cs.load_scenario("herath2007-stereo").variant("herath2007-stereo-8m", truth__sensor__range=(0.5, RANGE))
+    far = cs.load_scenario("herath2007-stereo").variant(
+        "herath2007-stereo-8m",
+        summary="The world of herath2007-stereo with landmarks used up to 8 m",
+        truth__sensor__range=(0.5, RANGE),
+    )
     uvd, uvd_curves = study.judged(far, "ekf-uvd")
     xyz, xyz_curves = study.judged(far, "ekf-xyz")
     text = []

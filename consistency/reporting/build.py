@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from pydantic import ValidationError
 
 from consistency.errors import InputError
 from consistency.findings import read_findings
@@ -17,7 +16,7 @@ from consistency.models.motion import dead_reckoning
 from consistency.reporting.distributions import distributions
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.wording import answer, number
-from consistency.results import Results, read_manifest, read_results
+from consistency.results import read_manifest, read_results
 from consistency.scenario import Scenario
 from consistency.simulation import simulate
 from consistency.types import Array, Verdict
@@ -55,7 +54,7 @@ def build_report(folder: Path) -> Report:
 def _study(folder: Path, styles: dict[str, int], said: tuple[tuple[str, str], ...]) -> Study:
     """One folder of results; ``said`` are lines of provenance that the report gives already."""
     results = read_results(folder)
-    scenario = _scenario(results, folder)
+    scenario = results.scenario
     verdicts = analyse(results)
     all_curves = {name: curves(results, name) for name in results.filters}
     runs = np.unique(np.concatenate([c.runs for c in all_curves.values()]))
@@ -132,15 +131,6 @@ def _true_path(truth: pd.DataFrame | None, run: int) -> Array | None:
         return None
     path = truth.loc[truth["run"] == run].sort_values("step")[["x", "y"]].to_numpy(float)
     return path if len(path) else None
-
-
-def _scenario(results: Results, folder: Path) -> Scenario | None:
-    try:
-        return results.scenario
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{folder / 'manifest.json'}: key 'scenario.{key}': {first['msg']}; run it again") from None
 
 
 def _odometry(scenario: Scenario | None, manifest: dict[str, Any], run: int) -> Array | None:

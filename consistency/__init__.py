@@ -9,13 +9,13 @@ if TYPE_CHECKING:
     from consistency.diagnostics import anees, anees_interval, nees
     from consistency.errors import InputError
     from consistency.filters import filter_names, get_filter
-    from consistency.findings import Finding, Study
+    from consistency.findings import Study
     from consistency.judge import analyse
     from consistency.montecarlo import run_trials
     from consistency.results import Results, read_results
     from consistency.scenario import Scenario, load_scenario, scenario_names
     from consistency.simulation import simulate
-    from consistency.types import Control, Gaussian, Info, Observation, Trial, Verdict
+    from consistency.types import Control, Finding, Gaussian, Info, Observation, Trial, Verdict
 
 _HOME = {
     "InputError": "errors",
@@ -32,7 +32,7 @@ _HOME = {
     "anees": "diagnostics",
     "anees_interval": "diagnostics",
     "analyse": "judge",
-    "Finding": "findings",
+    "Finding": "types",
     "Study": "findings",
     "Control": "types",
     "Gaussian": "types",

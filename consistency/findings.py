@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,26 +22,10 @@ from consistency.judge import Curves, analyse, curves
 from consistency.montecarlo import run_trials
 from consistency.results import Results, joined, manifest_of, require_free
 from consistency.scenario import Scenario, data_folder, load_scenario
-from consistency.types import Verdict
+from consistency.table import print_findings
+from consistency.types import Finding, Verdict
 
 REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One published claim and what was measured; ``accept`` was written before the run."""
-
-    id: str
-    source: str  # paper and place
-    claim: str
-    statistic: str  # what is measured
-    published: str
-    measured: str
-    accept: str  # numeric rule and its reason
-    verdict: str  # reproduced | not reproduced | refuted
-    runs: int
-    seed: int
-    scenario: str
 
 
 class Study:
@@ -178,8 +162,6 @@ def _guarded(main: Callable[[Study], list[Finding]], study: Study, ids: Sequence
 
 def script(main: Callable[[Study], list[Finding]], arguments: Sequence[str] | None = None) -> None:
     """What an experiment does when it is run by itself: ``python experiments/eNN_….py [RUNS] [SEED]``."""
-    from consistency.table import print_findings
-
     values = [int(value) for value in (sys.argv[1:] if arguments is None else arguments)]
     print_findings(main(Study(*values)))
 

@@ -53,7 +53,10 @@ def curves(results: Results, filter_name: str) -> Curves:
 
     pose = grid(table[POSE].to_numpy())
     t = np.full(steps, np.nan)
-    t[column] = table["t"]
+    for timed in (results.truth, table):  # where every run of this filter has failed only the truth goes on
+        if timed is not None:
+            after_start = timed[timed["step"] > 0]
+            t[after_start["step"] - 1] = after_start["t"]
     dof = grid(table["nis_dof"].to_numpy(float))
     error = nees = None
     if results.truth is not None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import tomli_w
+from pydantic import ValidationError
 
 from consistency.errors import InputError
 from consistency.results import POSE, controls_table, observations_table, read_parquet, truth_table, write_folder
@@ -21,6 +22,7 @@ from consistency.scenario import (
     SigmaPoints,
     Sigmas,
     Table,
+    explain,
     read_table,
 )
 from consistency.types import Array, Trial
@@ -83,8 +85,8 @@ def read_log(folder: str | Path) -> Log:
     sensor = read_table(path, SensorFile)
     try:
         belief = sensor.belief()
-    except ValueError as error:
-        raise InputError(f"{path}: {str(error).splitlines()[-2].strip().removeprefix('Value error, ')}") from None
+    except ValidationError as error:
+        raise InputError(f"{path}: {explain(error, BelievedSensor)}") from None
     controls, observations = read_parquet(folder, "controls"), read_parquet(folder, "observations")
     tables = {
         name: read_parquet(folder, name) if (folder / f"{name}.parquet").exists() else None

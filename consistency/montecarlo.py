@@ -63,6 +63,8 @@ def run_trials(
     _require_counts(runs, seed)
     require_landmarks_in_view(scenario)
     done = set() if previous is None else previous.finished_runs([name_of(f) for f in chosen])
+    if done and max(done) >= runs:
+        raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
     todo = [run for run in range(runs) if run not in done]
     outcomes, wall, complete = _map(
         lambda run: simulate(scenario, run, seed), todo, chosen, scenario.belief, jobs, timeout
@@ -90,6 +92,9 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
     chosen = [get_filter(f) if isinstance(f, str) else f for f in filters]
     if not chosen:
         raise InputError(f"no filter given; known: {', '.join(filter_names())}")
+    for filter_ in chosen:
+        if not isinstance(filter_, Filter):
+            raise InputError(f"{filter_!r} is no filter: it needs init, predict, update and pose")
     names = [name_of(f) for f in chosen]
     if len(set(names)) < len(names):
         raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
@@ -120,7 +125,9 @@ def _map(
     """Outcomes in order of the runs, wall time in s, and whether all were finished."""
     if jobs == 0 or jobs < -1:
         raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
-    for filter_ in filters:
+    if timeout is not None and not timeout > 0:
+        raise InputError(f"timeout must be positive, got {timeout}")
+    for filter_ in filters if runs else []:
         if isinstance(filter_, CompiledFilter) and not getattr(filter_, "is_compiled", True):
             with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
                 filter_.run(_head(make_trial(runs[0])), belief)

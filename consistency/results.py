@@ -258,10 +258,12 @@ def require_free(folder: Path, overwrite: bool) -> None:
     if folder.exists() or folder.is_symlink():
         if not overwrite:
             raise InputError(f"--out {folder}: exists already; choose another folder or add --overwrite")
-        if not (folder / "manifest.json").is_file():
+        try:
+            read_manifest(folder)
+        except InputError as error:
             raise InputError(
-                f"--out {folder}: is not an output folder of this bench (no manifest.json); not overwritten"
-            )
+                f"--out {folder}: is not an output folder of this bench; not overwritten ({error})"
+            ) from None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}."):
@@ -365,9 +367,11 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
 
 
 def _check_column(path: Path, table: pd.DataFrame, column: str, kind: str) -> None:
-    if kind == "str" or column in NULLABLE:
+    if kind == "str":
         return
     values = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
+    if column in NULLABLE:
+        values = np.where(table[column].isna(), 0.0, values)
     if not np.isfinite(values).all():
         row = int(np.flatnonzero(~np.isfinite(values))[0])
         raise InputError(f"{path}: column '{column}', row {row}: not a finite number ({table[column].iloc[row]})")

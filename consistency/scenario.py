@@ -21,9 +21,10 @@ T = TypeVar("T", bound="Table")
 
 UNITS = {"_deg": np.pi / 180.0, "_px": 1.0, "_m": 1.0, "_s": 1.0}
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(gt=0, strict=True)]
 Triple = tuple[Finite, Finite, Finite]
 Sigmas = tuple[Positive, Positive, Positive]
 Interval = tuple[Finite, Finite]
@@ -125,8 +126,8 @@ class UniformLandmarks(Table):
     """``count`` landmarks drawn once, uniformly in a box, from ``seed``."""
 
     layout: Literal["uniform"]
-    count: Annotated[int, Field(gt=0)]
-    seed: Annotated[int, Field(ge=0)]
+    count: Count
+    seed: Annotated[int, Field(ge=0, strict=True)]
     x: Interval
     y: Interval
     z: Interval
@@ -164,7 +165,7 @@ class TrueMotion(Table):
 class _TrueSensor(Table):
     sigma: Sigmas
     range: Interval  # distance from the sensor
-    image: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] | None = None  # width, height
+    image: tuple[Count, Count] | None = None  # width, height
     principal_point: tuple[Finite, Finite] | None = None  # column, row; the image centre if left out
     f: Positive | None = None
     mount: Mount = Mount()
@@ -206,6 +207,12 @@ class UvdSensor(_TrueSensor):
     B: Positive
     disparity: tuple[Positive, Positive]
 
+    @model_validator(mode="after")
+    def _search_range(self) -> UvdSensor:
+        if self.disparity[0] >= self.disparity[1]:
+            raise ValueError("disparity must be [low, high] with low < high")
+        return self
+
 
 Sensor_ = Annotated[XyzSensor | LinearSensor | UvdSensor, Field(discriminator="model")]
 
@@ -214,7 +221,7 @@ class Truth(Table):
     """What is the case."""
 
     dt: Positive
-    steps: Annotated[int, Field(gt=0)]
+    steps: Count
     path: Path_
     landmarks: Landmarks_
     motion: TrueMotion
@@ -385,9 +392,13 @@ def explain(error: ValidationError, model: type[Table]) -> str:
         text = f"unknown key; allowed here: {', '.join(allowed)}"
     elif first["type"] == "missing":
         text = "missing; it must be given"
-    elif first["type"] in ("union_tag_invalid", "union_tag_not_found"):
+    elif first["type"] == "union_tag_not_found":
         tag = first["ctx"]["discriminator"].strip("'")
-        expected = first["ctx"].get("expected_tags") or "see scenarios/README.md"
+        where = f"key '{'.'.join([*keys, tag])}': "
+        text = "missing; it must be given"
+    elif first["type"] == "union_tag_invalid":
+        tag = first["ctx"]["discriminator"].strip("'")
+        expected = first["ctx"]["expected_tags"]
         where = f"key '{'.'.join([*keys, tag])}': "
         text = f"'{first['ctx'].get('tag', '')}' is not one of {expected}"
     else:

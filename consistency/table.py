@@ -11,8 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from consistency.findings import Finding
-from consistency.types import Verdict
+from consistency.types import Finding, Verdict
 
 COLOURS = {
     "consistent": "green", "overconfident": "red", "conservative": "yellow", "failed": "red",

@@ -123,3 +123,20 @@ class Verdict:
     @property
     def consistent(self) -> bool:
         return self.status == "consistent"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One published claim and what was measured; ``accept`` was written before the run."""
+
+    id: str
+    source: str  # paper and place
+    claim: str
+    statistic: str  # what is measured
+    published: str
+    measured: str
+    accept: str  # numeric rule and its reason
+    verdict: str  # reproduced | not reproduced | refuted
+    runs: int
+    seed: int
+    scenario: str

@@ -52,7 +52,9 @@ class Compiled:
             ([points.alpha, points.beta, points.kappa], float),
         )  # fmt: skip
         # copies: writable and C-contiguous, so that one compiled signature serves every caller
-        out = run_trial(self.rule, self.model, trial.n_landmarks, *(np.array(a, dtype=kind) for a, kind in arrays))
+        out = run_trial(
+            self.rule, self.model, trial.n_landmarks, *(np.array(a, dtype=kind, order="C") for a, kind in arrays)
+        )
         pose, covariance, nis, nis_dof, step, code = out
         failure = Failure(self.name, trial.run, step, REASONS[code]) if step else None
         return Estimates(self.name, trial.run, pose, covariance, nis, nis_dof, failure)

@@ -106,7 +106,8 @@ def run_trial(
                 S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += R[known[i]]
             value = _correct(x, P, n, z[known].ravel() - zhat, S, A)
             if not np.isfinite(value):
-                return pose, covariance, nis, nis_dof, k + 1, 2 if np.isfinite(S.sum() + zhat.sum()) else 1
+                finite = np.isfinite(S.sum() + zhat.sum() + z[known].sum())
+                return pose, covariance, nis, nis_dof, k + 1, 2 if finite else 1
             nis[k], nis_dof[k] = value, 3 * m
         for r in rows:
             if offset[landmark[r]] < 0:

@@ -25,15 +25,13 @@ RANK = {
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
     "results": 6,
     "log": 7,
-    "montecarlo": 8, "judge": 8,
+    "montecarlo": 8, "judge": 8, "table": 8,
     "findings": 9,
-    "table": 10, "plots": 10,
+    "plots": 10,
     "reporting": 11,
     "cli": 12,
     "__main__": 13,
 }  # fmt: skip
-# both inside a function: an experiment that is run by itself prints its findings
-EXCEPTIONS = {("findings", "table")}
 DIAGNOSTICS = {"types", "geometry", "errors", "diagnostics"}
 DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}  # only plots and reporting draw
 IN_EXPERIMENTS = {"consistency", "numpy", "pandas", "scipy"}
@@ -60,7 +58,7 @@ def complaints(room: str, source: str) -> list[str]:
         top, *rest = name.split(".")
         if top == "consistency":
             other = rest[0] if rest else "__init__"
-            allowed = other == room or (RANK.get(other, 99) < RANK[room]) or (room, other) in EXCEPTIONS
+            allowed = other == room or RANK.get(other, 99) < RANK[room]
             if room == "diagnostics":
                 allowed = other in DIAGNOSTICS
             if not allowed:
@@ -106,12 +104,6 @@ FORBIDDEN = [
 @pytest.mark.parametrize(("room", "source"), FORBIDDEN)
 def test_a_forbidden_import_is_caught(room: str, source: str) -> None:
     assert len(complaints(room, source)) == 1
-
-
-def test_exceptions_are_still_needed() -> None:
-    for room, other in EXCEPTIONS:
-        sources = [path.read_text(encoding="utf-8") for name, path in modules() if name == room]
-        assert any(f"consistency.{other}" in list(imported(source)) for source in sources)
 
 
 # --- experiments -----------------------------------------------------------------------------

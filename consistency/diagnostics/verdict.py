@@ -103,7 +103,8 @@ def _judge_nees(s: dict[str, Any]) -> tuple[str, list[str]]:
     if s["judged_steps"] == 0:
         return "failed", ["no step has a pose covariance of full rank to judge"]
     percent = f"{100 * s['confidence']:g} %"
-    text = f"ANEES {s['mean_anees']:.3g} on average ({s['dof']} expected)"
+    mean = s["mean_anees"]
+    text = f"ANEES {mean:{'.0f' if mean >= 100 else '.2f'}} on average ({s['dof']} expected)"
     low, high = s["simultaneous"][s["alive"] > 0][0]
     band = f"the band [{low:.2f}, {high:.2f}] that holds in all steps at once with {percent}"
     if s["first_outside"] is None:

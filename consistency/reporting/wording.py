@@ -29,6 +29,9 @@ VERDICT_COLUMNS = (
 )
 
 
+LISTED = 6  # pairs of filter and scenario that the first paragraph names one by one
+
+
 def number(value: Any, form: str) -> str:
     """A number, or a dash where there is none."""
     return "–" if value is None or not np.isfinite(value) else format(float(value), form)
@@ -43,7 +46,7 @@ def verdict_row(track: Track) -> tuple[str, ...]:
     return (
         track.name,
         track.verdict.status,
-        number(s.get("mean_anees"), ".3g" if s.get("mean_anees", 0) >= 100 else ".2f"),
+        number(s.get("mean_anees"), ".0f" if s.get("mean_anees", 0) >= 100 else ".2f"),
         number(s.get("share_inside"), ".2f"),
         str(first) if first is not None else ("never" if s.get("judged_steps") else "–"),
         " / ".join(number(100 * c, ".1f") for c in covered) if covered and np.isfinite(covered).any() else "–",
@@ -75,7 +78,7 @@ def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
     if any(not study.has_truth for study in studies):
         text.append("Where the truth is not known the innovations alone decide, and they cannot see most pose errors.")
     if findings:
-        text.append(_finding_sentence(findings))
+        text.insert(0, _finding_sentence(findings))
     return " ".join(text) or "This folder holds neither results nor findings."
 
 
@@ -86,6 +89,9 @@ def _status_sentence(status: str, pairs: list[tuple[Track, Study]], studies: int
             by_study.setdefault(study.name, []).append(track.name)
     if not by_study:
         return ""
+    count = sum(map(len, by_study.values()))
+    if count > LISTED:
+        return f"{count} are {status} ({MEANING[status]})."
     where = [listed(names) + (f" in {study}" if studies > 1 else "") for study, names in by_study.items()]
     return f"{status.capitalize()} ({MEANING[status]}): {'; '.join(where)}."
 
@@ -101,7 +107,7 @@ def _failure_sentence(studies: Sequence[Study]) -> str:
 def _finding_sentence(findings: Sequence[dict[str, Any]]) -> str:
     verdicts = [str(finding["verdict"]) for finding in findings]
     counts = [f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts)]
-    return f"Of {_count(len(findings), 'published finding')}, {listed(counts)}."
+    return f"Of {_count(len(findings), 'finding')}, {listed(counts)}."
 
 
 def listed(words: Sequence[str]) -> str:

@@ -1,0 +1,254 @@
+"""The commands as a newcomer types them, in a process of their own, from an empty folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+import consistency as cs
+from consistency.scenario import data_folder
+
+ROOT = Path(__file__).parents[2]
+RUNS = 6
+
+
+def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run the command line; the exit status must be ``status``."""
+    done = subprocess.run(
+        [sys.executable, "-m", "consistency", *arguments], cwd=cwd, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == status, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``sim`` (a simulated log) and ``out`` (results of two filters, all runs)."""
+    at = tmp_path_factory.mktemp("cli")
+    scenario = (data_folder("scenarios") / "herath2007-stereo.toml").read_text()
+    (at / "small.toml").write_text(scenario.replace("steps = 500", "steps = 80"))
+    consistency("simulate", "small.toml", "--runs", "2", "--seed", "3", "--out", "sim", cwd=at)
+    arguments = ("run", "small.toml", "--filter", "ekf-uvd", "--filter", "ukf-uvd", "--runs", str(RUNS), "--seed", "3")
+    consistency(*arguments, "--jobs", "1", "--out", "out", cwd=at)
+    consistency(*arguments, "--jobs", "2", "--out", "out2", cwd=at)
+    return at
+
+
+def test_same_bytes_for_any_number_of_workers(folder: Path) -> None:
+    for name in ("estimates", "truth", "failures", "landmarks"):
+        one, two = ((folder / out / f"{name}.parquet").read_bytes() for out in ("out", "out2"))
+        assert one == two, name
+
+
+def test_a_simulated_log_gives_the_same_estimates(folder: Path) -> None:
+    consistency("run", "--log", "sim", "--filter", "ekf-uvd", "--out", "from-log", cwd=folder)
+    log = pd.read_parquet(folder / "from-log/estimates.parquet")
+    direct = pd.read_parquet(folder / "out/estimates.parquet").query("filter == 'ekf-uvd' and run < 2")
+    pd.testing.assert_frame_equal(log, direct.reset_index(drop=True), check_exact=False, rtol=1e-9)
+
+
+def test_nees_by_hand(folder: Path) -> None:
+    """NEES from the files with nothing but NumPy; ANEES and its interval with SciPy."""
+    table = pd.read_parquet(folder / "out/estimates.parquet")
+    truth = pd.read_parquet(folder / "out/truth.parquet")
+    joined = table.merge(truth, on=["run", "step"], suffixes=("", "_true")).sort_values(["filter", "run", "step"])
+    error = np.stack([joined[f"{axis}_true"] - joined[axis] for axis in ("x", "y", "heading")], axis=1)
+    error[:, 2] = np.arctan2(np.sin(error[:, 2]), np.cos(error[:, 2]))
+    entries = [["P_xx", "P_xy", "P_xh"], ["P_xy", "P_yy", "P_yh"], ["P_xh", "P_yh", "P_hh"]]
+    P = np.array([[joined[name] for name in row] for row in entries]).transpose(2, 0, 1)
+    stored = joined["nees"].to_numpy()
+    judged = np.isfinite(stored)
+    assert set(joined["step"][~judged]) == {1}
+    by_hand = np.array([e @ np.linalg.inv(p) @ e for e, p in zip(error[judged], P[judged], strict=True)])
+    np.testing.assert_allclose(by_hand, stored[judged], rtol=1e-9)
+
+    verdict = json.loads(consistency("analyse", "out", "--json", cwd=folder).stdout)["ekf-uvd"]["statistics"]
+    curve = joined[joined["filter"] == "ekf-uvd"].groupby("step")["nees"].mean().to_numpy()
+    np.testing.assert_allclose(np.array(verdict["anees"][1:], float), curve[1:], rtol=1e-12)
+    band = stats.chi2.ppf([0.025, 0.975], 3 * RUNS) / RUNS
+    np.testing.assert_allclose(verdict["band"][1], band, rtol=1e-12)
+    simultaneous = stats.chi2.ppf([0.025 / 79, 1 - 0.025 / 79], 3 * RUNS) / RUNS
+    np.testing.assert_allclose(verdict["simultaneous"][1], simultaneous, rtol=1e-9)
+
+
+def test_exit_status_of_a_verdict(folder: Path) -> None:
+    arguments = ("run", "herath2007-optimistic", "--filter", "ekf-xyz", "--runs", "5", "--out", "optimistic")
+    consistency(*arguments, cwd=folder)
+    consistency("analyse", "optimistic", cwd=folder)
+    consistency("analyse", "optimistic", "--fail-on", "inconsistent", cwd=folder, status=1)
+
+
+def test_a_report_and_its_refusal_to_overwrite(folder: Path) -> None:
+    consistency("report", "out", "--html", "r.html", cwd=folder)
+    assert (folder / "r.html").stat().st_size < 6 * 2**20
+    assert "r.html" in consistency("report", "out", "--html", "r.html", cwd=folder, status=2).stderr
+
+
+def test_list_names_everything(folder: Path) -> None:
+    listed = json.loads(consistency("list", "--json", cwd=folder).stdout)
+    assert {"herath2007-stereo", "linear-gaussian", "long-loop"} <= set(listed["scenarios"])
+    assert {"kf", "ukf-uvd", "filterpy-ukf-xyz"} <= set(listed["filters"])
+    assert "e04_stereo" in listed["experiments"]
+
+
+def test_reproduce_writes_findings(folder: Path) -> None:
+    consistency("reproduce", "--only", "interval-eq17", "--only", "fig12a", "--out", "found", cwd=folder)
+    findings = json.loads((folder / "found/findings.json").read_text())
+    assert [finding["id"] for finding in findings] == ["interval-eq17", "fig12a"]
+    keys = {"id", "source", "claim", "statistic", "published", "measured", "accept", "verdict"}
+        "id",
+        "source",
+        "claim",
+        "statistic",
+        "published",
+        "measured",
+        "accept",
+        "verdict",
+        "runs",
+        "seed",
+        "scenario",
+    ]
+    assert all(set(finding) == keys | {"runs", "seed", "scenario"} for finding in findings)
+    assert (folder / "found/report.html").exists()
+    assert (folder / "found/report.pdf").read_bytes().startswith(b"%PDF")
+
+
+RUN = ("run", "small.toml", "--filter", "ekf-uvd", "--out", "o")
+BAD = {
+    "unknown scenario": (("run", "herath2007-stereoo", *RUN[2:]), "did you mean 'herath2007-stereo'"),
+    "unknown filter": (("run", "small.toml", "--filter", "ekf-uvdd", "--out", "o"), "did you mean 'ekf-uvd'"),
+    "filter that does not fit": (("run", "small.toml", "--filter", "kf", "--out", "o"), "filters that fit"),
+    "unknown key": (("run", "key.toml", *RUN[2:]), "key.toml: key 'truth.sensor.colour': unknown key"),
+    "negative noise": (("run", "negative.toml", *RUN[2:]), "negative.toml: key 'truth.motion.sigma_v'"),
+    "no landmark in view": (("run", "far.toml", *RUN[2:]), "no landmark comes into view"),
+    "zero runs": ((*RUN, "--runs", "0"), "runs must be at least 1"),
+    "no number": ((*RUN, "--runs", "many"), "--runs"),
+    "no filter": (("run", "small.toml", "--out", "o"), "--filter"),
+    "existing folder": ((*RUN[:-1], "sim"), "exists already"),
+    "folder of somebody else": ((*RUN[:-1], "mine", "--overwrite"), "not overwritten"),
+    "unwritable folder": ((*RUN[:-1], "/proc/nowhere/out"), "cannot be written"),
+    "truncated Parquet": (("run", "--log", "cut", *RUN[2:]), "observations.parquet: cannot be read"),
+    "NaN in a log": (("run", "--log", "nan", *RUN[2:]), "column 'z1', row 7"),
+    "no such results": (("analyse", "nowhere"), "no such folder"),
+    "no such finding": (("reproduce", "--only", "fig99", "--out", "o"), "no such finding"),
+    "unknown command": (("judge",), "judge"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(folder: Path, case: str) -> None:
+    """Exit 2, at most two lines that name what is wrong, and nothing written."""
+    _bad_files(folder)
+    before = sorted(folder.rglob("*"))
+    arguments, expected = BAD[case]
+    stderr = consistency(*arguments, cwd=folder, status=2).stderr
+    assert expected in stderr
+    assert len(stderr.strip().splitlines()) <= 2
+    assert sorted(folder.rglob("*")) == before
+
+
+def _bad_files(folder: Path) -> None:
+    if (folder / "mine").exists():
+        return
+    text = (folder / "small.toml").read_text()
+    (folder / "key.toml").write_text(text.replace("f_px = 150.0", "f_px = 150.0\ncolour = true", 1))
+    (folder / "negative.toml").write_text(text.replace("sigma_v = 0.05", "sigma_v = -0.05", 1))
+    (folder / "far.toml").write_text(text.replace("range_m = [0.5, 4.0]", "range_m = [50.0, 60.0]"))
+    for name in ("cut", "nan"):
+        shutil.copytree(folder / "sim", folder / name)
+    whole = (folder / "cut/observations.parquet").read_bytes()
+    (folder / "cut/observations.parquet").write_bytes(whole[: len(whole) // 2])
+    table = pd.read_parquet(folder / "nan/observations.parquet")
+    table.loc[7, "z1"] = np.nan
+    table.to_parquet(folder / "nan/observations.parquet")
+    (folder / "mine").mkdir()
+    (folder / "mine/thesis.txt").write_text("all of it")
+
+
+def test_the_readme_filter_runs(tmp_path: Path) -> None:
+    """The README's example of a filter of one's own, with fewer runs."""
+    example = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert example is not None
+    (tmp_path / "mine.py").write_text(example[1].replace("runs=50", "runs=4"))
+    done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("dead-reckoning: consistent")
+
+
+class ThrowsInRun7:
+    """Dead reckoning without any uncertainty growth in mind; breaks in step 20 of run 7."""
+
+    name = "throws-in-run-7"
+
+    def __init__(self) -> None:
+        self.inner = cs.get_filter("ekf-uvd")
+
+    def init(self, problem: object) -> object:
+        self.steps = 0
+        return self.inner.init(problem)
+
+    def predict(self, state: object, control: cs.Control) -> object:
+        return self.inner.predict(state, control)
+
+    def update(self, state: object, observation: cs.Observation) -> object:
+        self.steps += 1
+        if self.steps == 20 and np.isclose(observation.z.sum(), MARK["sum"]):
+            raise RuntimeError("diverged")
+        return self.inner.update(state, observation)
+
+    def pose(self, state: object) -> cs.Gaussian:
+        return self.inner.pose(state)
+
+
+MARK: dict[str, float] = {}
+
+
+def test_a_failed_run_is_in_results_verdict_and_report(tmp_path: Path) -> None:
+    scenario = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
+    MARK["sum"] = float(cs.simulate(scenario, run=7, seed=0).observation(20).z.sum())
+    results = cs.run_trials(scenario, [ThrowsInRun7(), "ekf-uvd"], runs=50, jobs=1)
+    assert results.failures.values.tolist() == [["throws-in-run-7", 7, 20, "RuntimeError: diverged"]]
+    verdict = cs.analyse(results)["throws-in-run-7"]
+    assert not verdict.consistent
+    assert any("1 of 50 runs failed, first run 7 in step 20" in reason for reason in verdict.reasons)
+    results.write(tmp_path / "out")
+    consistency("report", "out", "--html", "r.html", cwd=tmp_path)
+    assert "RuntimeError: diverged" in (tmp_path / "r.html").read_text()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_ctrl_c_keeps_what_is_finished(tmp_path: Path) -> None:
+    """Interrupted after the first runs, then resumed: the bytes of an uninterrupted run."""
+    code = f"""
+import signal, sys
+import consistency.montecarlo as mc
+from consistency.cli import main
+one, count = mc._one, []
+def interrupt(trial, *rest):
+    count.append(trial.run)
+    if len(count) == 4:
+        signal.raise_signal(signal.SIGINT)
+    return one(trial, *rest)
+mc._one = interrupt
+main({["run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--jobs", "1", "--out", "out"]!r})
+"""
+    stopped = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert stopped.returncode == 130, stopped.stderr
+    assert "--resume" in stopped.stderr
+    done = cs.read_results(tmp_path / "out").manifest["finished_runs"]
+    assert 0 < done < 6
+    command = ("run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--out")
+    consistency(*command, "out", "--resume", cwd=tmp_path)
+    consistency(*command, "whole", cwd=tmp_path)
+    assert (tmp_path / "out/estimates.parquet").read_bytes() == (tmp_path / "whole/estimates.parquet").read_bytes()

@@ -107,18 +107,6 @@ def test_reproduce_writes_findings(folder: Path) -> None:
     findings = json.loads((folder / "found/findings.json").read_text())
     assert [finding["id"] for finding in findings] == ["interval-eq17", "fig12a"]
     keys = {"id", "source", "claim", "statistic", "published", "measured", "accept", "verdict"}
-        "id",
-        "source",
-        "claim",
-        "statistic",
-        "published",
-        "measured",
-        "accept",
-        "verdict",
-        "runs",
-        "seed",
-        "scenario",
-    ]
     assert all(set(finding) == keys | {"runs", "seed", "scenario"} for finding in findings)
     assert (folder / "found/report.html").exists()
     assert (folder / "found/report.pdf").read_bytes().startswith(b"%PDF")

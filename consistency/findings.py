@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
-import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -20,11 +17,12 @@ import pandas as pd
 from consistency.errors import InputError
 from consistency.judge import Curves, analyse, curves
 from consistency.montecarlo import run_trials
-from consistency.results import Results, joined, manifest_of, require_free
+from consistency.results import Results, joined, manifest_of, require_free, write_folder
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.table import print_findings
 from consistency.types import Finding, Verdict
 
+OURS = "this project"  # how the source of a question begins that no paper asks
 REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"
 
 
@@ -45,6 +43,8 @@ class Study:
         """Results of all ``filters`` so far on a scenario; only those not yet run are run."""
         world = load_scenario(scenario) if isinstance(scenario, str) else scenario
         have = self.kept.get(world.name)
+        if have is not None and have.manifest["scenario_hash"] != world.hash:
+            raise ValueError(f"two different scenarios are named '{world.name}'")
         missing = [name for name in filters if have is None or name not in have.filters]
         if missing:
             print(f"{world.name}: {', '.join(missing)}", file=sys.stderr, flush=True)
@@ -64,26 +64,20 @@ class Study:
 
     def write(self, out: Path, findings: Sequence[Finding], wall: float, overwrite: bool = False) -> None:
         """findings.json, extra tables and a folder a scenario, moved into place as a whole."""
-        require_free(out, overwrite)
-        partial = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}."))
-        try:
+        manifest = manifest_of(seed=self.seed, runs=self.runs, wall=wall, complete=True)
+        manifest["failures"] = sum(len(results.failures) for results in self.kept.values())
+        manifest["studies"] = list(self.kept)
+        manifest["scenarios"] = {name: results.manifest.get("scenario") for name, results in self.kept.items()}
+
+        def contents(folder: Path) -> None:
             for name, results in self.kept.items():
-                results.write(partial / name)
+                results.write(folder / name)
             for name, table in self.tables.items():
-                table.to_parquet(partial / f"{name}.parquet", compression="zstd", index=False)
+                table.to_parquet(folder / f"{name}.parquet", compression="zstd", index=False)
             text = json.dumps([asdict(finding) for finding in findings], indent=2, ensure_ascii=False)
-            (partial / "findings.json").write_text(text + "\n", encoding="utf-8")
-            manifest = manifest_of(seed=self.seed, runs=self.runs, wall=wall, complete=True)
-            manifest["failures"] = sum(len(results.failures) for results in self.kept.values())
-            manifest["studies"] = list(self.kept)
-            (partial / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
-            partial.chmod(0o755)
-            if out.exists():
-                shutil.rmtree(out)
-            os.replace(partial, out)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
+            (folder / "findings.json").write_text(text + "\n", encoding="utf-8")
+
+        write_folder(out, {}, manifest, contents, overwrite)
 
 
 # --- the scripts -----------------------------------------------------------------------------
@@ -144,20 +138,22 @@ def reproduce(
     for module in scripts.values():
         wanted = [name for name in module.FINDINGS if not only or name in only]
         if wanted:
-            findings += [f for f in _guarded(module.main, study, wanted) if f.id in wanted]
+            findings += [f for f in _guarded(module, study, wanted) if f.id in wanted]
     study.write(out, findings, time.monotonic() - started, overwrite)
     return findings
 
 
-def _guarded(main: Callable[[Study], list[Finding]], study: Study, ids: Sequence[str]) -> list[Finding]:
+def _guarded(module: ModuleType, study: Study, ids: Sequence[str]) -> list[Finding]:
     try:
-        return main(study)
+        findings: list[Finding] = module.main(study)
+        return findings
     except InputError:
         raise
     except Exception as error:
-        text = {"source": "", "claim": "", "statistic": "", "published": "", "accept": ""}
-        measured = f"the experiment broke: {type(error).__name__}: {error}"
-        return [study.finding(False, "", id=name, measured=measured, **text) for name in ids]
+        claim = (module.__doc__ or "").strip().splitlines()[0]
+        text = dict.fromkeys(("source", "statistic", "published", "accept"), "the experiment broke before it said")
+        measured = f"{type(error).__name__}: {error}"
+        return [study.finding(False, "none", id=name, claim=claim, measured=measured, **text) for name in ids]
 
 
 def script(main: Callable[[Study], list[Finding]], arguments: Sequence[str] | None = None) -> None:

@@ -69,6 +69,16 @@ def curves(results: Results, filter_name: str) -> Curves:
     )  # fmt: skip
 
 
+def run_means(c: Curves) -> Array:
+    """Mean NEES of each run over its judged steps, shape (R,); infinite for a failed run."""
+    assert c.nees is not None
+    counted = np.isfinite(c.nees)
+    total = np.where(counted, c.nees, 0.0).sum(axis=1)
+    means = np.where(counted.any(axis=1), total / np.maximum(counted.sum(axis=1), 1), np.inf)
+    means[np.isin(c.runs, [failure.run for failure in c.failures])] = np.inf
+    return np.asarray(means)
+
+
 def analyse(results: Results, filters: list[str] | None = None, confidence: float = 0.95) -> dict[str, Verdict]:
     """A verdict for every filter of the results, or for those named.
 

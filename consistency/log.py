@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -27,6 +29,8 @@ from consistency.scenario import (
 )
 from consistency.types import Array, Trial
 
+View = tuple[tuple[int, int], tuple[float, float]]  # image (width, height) and principal point (column, row), px
+
 
 class Start(Table):
     """Pose at step 0, known exactly."""
@@ -39,7 +43,7 @@ class Start(Table):
 class SensorFile(Table):
     """``sensor.toml``: the sensor, its mount and noise, and the noise of the odometry, as believed."""
 
-    model: str
+    model: Literal["xyz", "uvd", "linear"]
     sigma: Sigmas
     f: Positive | None = None
     B: Positive | None = None
@@ -65,6 +69,7 @@ class Log:
     trials: list[Trial]
     belief: Belief
     landmarks: pd.DataFrame | None
+    sha256: dict[str, str] = field(default_factory=dict)  # of the files, for the manifest of what is made of them
 
 
 def read_log(folder: str | Path) -> Log:
@@ -93,6 +98,7 @@ def read_log(folder: str | Path) -> Log:
         for name in ("truth", "landmarks")
     }
     _check(folder, controls, observations, belief)
+    _check_pixels(folder, observations, sensor)
     start = np.array([sensor.start.x, sensor.start.y, sensor.start.heading]) if sensor.start else None
     labels = np.unique(observations["landmark"])
     positions = _positions(folder, tables["landmarks"], labels, belief)
@@ -100,7 +106,9 @@ def read_log(folder: str | Path) -> Log:
         _trial(folder, run, controls[controls["run"] == run], observations, labels, tables["truth"], start, positions)
         for run in sorted({int(run) for run in controls["run"]})
     ]
-    return Log(str(folder), trials, belief, tables["landmarks"])
+    files = [path, *sorted(folder.glob("*.parquet"))]
+    digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    return Log(str(folder), trials, belief, tables["landmarks"], digests)
 
 
 def write_log(
@@ -110,14 +118,15 @@ def write_log(
     landmarks: pd.DataFrame | None,
     manifest: dict[str, object],
     overwrite: bool = False,
+    view: View | None = None,
 ) -> None:
-    """Write trials as a log folder, whole or not at all."""
+    """Write trials as a log folder, whole or not at all; ``view`` is image size and principal point in px."""
     tables = {"controls": controls_table(trials), "observations": observations_table(trials)}
     if trials[0].truth is not None:
         tables["truth"] = truth_table(trials)
     if landmarks is not None:
         tables["landmarks"] = landmarks
-    text = tomli_w.dumps(_sensor_file(belief, trials[0].start))
+    text = tomli_w.dumps(_sensor_file(belief, trials[0].start, view))
     write_folder(folder, tables, manifest, lambda at: _write_text(at / "sensor.toml", text), overwrite)
 
 
@@ -125,13 +134,14 @@ def _write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def _sensor_file(belief: Belief, start: Array) -> dict[str, object]:
+def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, object]:
     sensor = belief.sensor.model_dump(exclude_none=True)
     unit = "sigma_px" if belief.sensor.model == "uvd" else "sigma_m"
     return {
         "model": sensor["model"],
         unit: list(sensor["sigma"]),
         **{key: sensor[key] for key in ("f", "B") if key in sensor},
+        **({"image": list(view[0]), "principal_point": list(view[1])} if view else {}),
         "mount": {key: list(value) for key, value in sensor["mount"].items()},
         "motion": belief.motion.model_dump(),
         "start": dict(zip(POSE, map(float, start), strict=True)),
@@ -162,6 +172,23 @@ def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, bel
     if belief.sensor.model == "uvd" and (observations["z2"] <= 0).any():
         row = int(np.flatnonzero(observations["z2"] <= 0)[0])
         raise InputError(f"{path}: column 'z2', row {row}: a disparity must be positive")
+
+
+def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) -> None:
+    """Pixels must be relative to the principal point: with it they must fall into the image."""
+    if sensor.model != "uvd" or sensor.image is None:
+        return
+    centre = sensor.principal_point or (sensor.image[0] / 2, sensor.image[1] / 2)
+    for column, middle, size, sigma in zip(("z0", "z1"), centre, sensor.image, sensor.sigma, strict=False):
+        pixel = observations[column].to_numpy() + middle
+        outside = (pixel < -6 * sigma) | (pixel > size + 6 * sigma)
+        if outside.any():
+            row = int(np.flatnonzero(outside)[0])
+            value = observations[column].iloc[row]
+            raise InputError(
+                f"{folder / 'observations.parquet'}: column '{column}', row {row}: {value:.1f} px "
+                "is outside the image of sensor.toml; u and v must be relative to the principal point"
+            )
 
 
 def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, belief: Belief) -> Array | None:

@@ -13,11 +13,12 @@ from threadpoolctl import threadpool_limits
 
 from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter
+from consistency.filters.compiled import Compiled
 from consistency.filters.stepping import name_of, run_filter
 from consistency.log import Log, write_log
 from consistency.progress import progress
-from consistency.protocols import CompiledFilter, Filter
-from consistency.results import Results, estimates_table, failures_table, manifest_of, read_results, truth_table
+from consistency.protocols import Filter
+from consistency.results import Results, estimates_table, failures_table, manifest_of, require_free, truth_table
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import draw_landmarks, require_landmarks_in_view, simulate
 from consistency.types import Estimates, Trial
@@ -50,7 +51,7 @@ def run_trials(
     seed : the results are a function of (scenario, filter, seed, run) alone
     jobs : workers; -1 for one a core. Compiled filters share threads, others get processes.
     timeout : seconds a trial, for filters that are not compiled
-    previous : results to go on from; its runs are not done again
+    previous : results of the same scenario, filters and seed to go on from; its runs are not done again
 
     Raises
     ------
@@ -62,7 +63,8 @@ def run_trials(
     chosen = resolve_filters(filters, scenario.belief)
     _require_counts(runs, seed)
     require_landmarks_in_view(scenario)
-    done = set() if previous is None else previous.finished_runs([name_of(f) for f in chosen])
+    names = [name_of(f) for f in chosen]
+    done = set() if previous is None else _same_study(previous, scenario, names, seed).finished_runs(names)
     if done and max(done) >= runs:
         raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
     todo = [run for run in range(runs) if run not in done]
@@ -70,7 +72,7 @@ def run_trials(
         lambda run: simulate(scenario, run, seed), todo, chosen, scenario.belief, jobs, timeout
     )
     results = _gather(outcomes, chosen, previous)
-    manifest = manifest_of(seed=seed, runs=runs, filters=[name_of(f) for f in chosen], wall=wall, complete=complete)
+    manifest = manifest_of(seed=seed, runs=runs, filters=names, wall=wall, complete=complete)
     return _finish(results, manifest | _scenario_entry(scenario), _landmarks_table(scenario))
 
 
@@ -83,7 +85,7 @@ def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: 
     manifest = manifest_of(
         seed=None, runs=len(trials), filters=[name_of(f) for f in chosen], wall=wall, complete=complete
     )
-    manifest |= {"log": log.name, "belief": log.belief.model_dump(mode="json")}
+    manifest |= {"log": log.name, "log_sha256": log.sha256, "belief": log.belief.model_dump(mode="json")}
     return _finish(results, manifest, log.landmarks)
 
 
@@ -128,12 +130,12 @@ def _map(
     if timeout is not None and not timeout > 0:
         raise InputError(f"timeout must be positive, got {timeout}")
     for filter_ in filters if runs else []:
-        if isinstance(filter_, CompiledFilter) and not getattr(filter_, "is_compiled", True):
+        if isinstance(filter_, Compiled) and not filter_.is_compiled:
             with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
                 filter_.run(_head(make_trial(runs[0])), belief)
                 advance(1)
     # kernels release the GIL; filters in Python need processes. One BLAS thread each: bits depend on it
-    threads = all(isinstance(f, CompiledFilter) for f in filters)
+    threads = all(isinstance(f, Compiled) for f in filters)
     workers = {"backend": "threading"} if threads else {"backend": "loky", "inner_max_num_threads": 1}
     n_jobs = min(jobs, max(len(runs), 1)) if jobs > 0 else jobs
     started = time.monotonic()
@@ -196,17 +198,15 @@ def _finish(tables: dict[str, pd.DataFrame], manifest: dict[str, Any], landmarks
     return results
 
 
-def previous_results(folder: Path, scenario: Scenario, filters: Sequence[str | Filter], seed: int) -> Results:
-    """Interrupted results to go on from, refused unless scenario, filters and seed are the same."""
-    previous = read_results(folder)
-    names = [f if isinstance(f, str) else name_of(f) for f in filters]
+def _same_study(previous: Results, scenario: Scenario, names: list[str], seed: int) -> Results:
+    """The results to go on from, refused unless scenario, filters and seed are the same."""
     for key, now, before in (
         ("scenario", scenario.hash, previous.manifest.get("scenario_hash")),
         ("filter", names, previous.manifest.get("filters")),
         ("seed", seed, previous.manifest.get("seed")),
     ):
         if now != before:
-            raise InputError(f"--resume {folder}: was written with another {key}; use the same command as before")
+            raise InputError(f"the results to resume have another {key}; use the same command as before")
     return previous
 
 
@@ -214,11 +214,14 @@ def simulate_log(scenario: Scenario, runs: int, seed: int, out: Path, overwrite:
     """Write ``runs`` simulated trials as a log folder; raises as :func:`run_trials`."""
     _require_counts(runs, seed)
     require_landmarks_in_view(scenario)
+    require_free(out, overwrite)
     started = time.monotonic()
     trials = [simulate(scenario, run, seed) for run in range(runs)]
     manifest = manifest_of(seed=seed, runs=runs, wall=time.monotonic() - started, complete=True)
     manifest |= _scenario_entry(scenario) | {"failures": 0}
-    write_log(out, trials, scenario.belief, _landmarks_table(scenario), manifest, overwrite)
+    sensor = scenario.truth.sensor
+    view = None if sensor.image is None else (sensor.image, sensor.centre)
+    write_log(out, trials, scenario.belief, _landmarks_table(scenario), manifest, overwrite, view)
 
 
 def _require_counts(runs: int, seed: int) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from consistency.scenario import Belief
-from consistency.types import Array, Control, Estimates, Gaussian, Info, Observation, Trial
+from consistency.types import Array, Control, Gaussian, Info, Observation
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,3 @@ class Filter(Protocol):
     def predict(self, state: Any, control: Control) -> Any: ...
     def update(self, state: Any, observation: Observation) -> tuple[Any, Info | None]: ...
     def pose(self, state: Any) -> Gaussian: ...
-
-
-@runtime_checkable
-class CompiledFilter(Filter, Protocol):
-    """A filter that can also do a whole trial at once, with the same numbers."""
-
-    def run(self, trial: Trial, belief: Belief) -> Estimates: ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -80,11 +81,11 @@ class Results:
         ]
         return {int(run) for run in set.intersection(*per_filter)} if per_filter else set()
 
-    def write(self, folder: Path, overwrite: bool = False) -> None:
-        """Write the folder at once: it appears complete or not at all."""
+    def write(self, folder: Path, overwrite: bool = False, keep_others: bool = False) -> None:
+        """Write the folder at once, as :func:`write_folder`: it appears complete or not at all."""
         tables = {"estimates": self.estimates, "failures": self.failures}
         tables |= {n: t for n, t in (("truth", self.truth), ("landmarks", self.landmarks)) if t is not None}
-        write_folder(folder, tables, self.manifest, overwrite=overwrite)
+        write_folder(folder, tables, self.manifest, overwrite=overwrite, keep_others=keep_others)
 
 
 def joined(parts: Sequence[Results]) -> Results:
@@ -225,10 +226,11 @@ def manifest_of(**fields: Any) -> dict[str, Any]:
         except metadata.PackageNotFoundError:
             versions[package] = "not installed"
     wall = fields.pop("wall", None)
+    program = Path(sys.argv[0]).name
     return {
         "schema_version": SCHEMA_VERSION,
         "versions": versions,
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join(["consistency" if program == "__main__.py" else program, *sys.argv[1:]]),
         "git_commit": _git_commit(),
         "wall_time_s": None if wall is None else round(wall, 3),
         **fields,
@@ -236,15 +238,20 @@ def manifest_of(**fields: Any) -> dict[str, Any]:
 
 
 def _git_commit() -> str | None:
-    """Commit of the checkout that the package runs from, if it is one."""
+    """Commit of the checkout that the package runs from, with ``-dirty`` where it was changed; None elsewhere."""
+    root = Path(__file__).parents[1]
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+
     try:
-        out = subprocess.run(
-            ["git", "-C", str(Path(__file__).parents[1]), "rev-parse", "HEAD"],
-            capture_output=True, text=True, timeout=5, check=True,
-        )  # fmt: skip
+        if Path(git("rev-parse", "--show-toplevel")) != root:  # installed inside somebody else's repository
+            return None
+        dirty = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("-dirty" if dirty else "")
     except (OSError, subprocess.SubprocessError):
         return None
-    return out.stdout.strip() or None
 
 
 # --- writing -------------------------------------------------------------------------------------
@@ -264,9 +271,9 @@ def require_free(folder: Path, overwrite: bool) -> None:
             raise InputError(
                 f"--out {folder}: is not an output folder of this bench; not overwritten ({error})"
             ) from None
+    there = next(parent for parent in folder.absolute().parents if parent.exists())
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}."):
+        with tempfile.TemporaryDirectory(dir=there, prefix=f".{folder.name}."):
             pass
     except OSError as error:
         raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from None
@@ -278,31 +285,45 @@ def write_folder(
     manifest: dict[str, Any],
     extra: Callable[[Path], None] | None = None,
     overwrite: bool = False,
+    keep_others: bool = False,
 ) -> None:
-    """Tables as Parquet, the manifest, and whatever ``extra`` writes, moved into place as a whole."""
+    """Tables as Parquet, the manifest, and whatever ``extra`` writes, moved into place as a whole.
+
+    With ``overwrite`` an output folder of this bench is replaced; with ``keep_others`` the files in it that
+    are not written again stay.
+    """
     require_free(folder, overwrite)
     try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+        try:
+            for name, table in tables.items():
+                frame = table[list(COLUMNS[name])].astype(COLUMNS[name])
+                frame.to_parquet(partial / f"{name}.parquet", compression="zstd", index=False)
+            if extra is not None:
+                extra(partial)
+            (partial / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+            partial.chmod(0o755)
+            _put_in_place(partial, folder, keep_others)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from None
-    try:
-        for name, table in tables.items():
-            frame = table[list(COLUMNS[name])].astype(COLUMNS[name])
-            frame.to_parquet(partial / f"{name}.parquet", compression="zstd", index=False)
-        if extra is not None:
-            extra(partial)
-        (partial / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
-        partial.chmod(0o755)
-        if folder.exists():
-            aside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-            os.replace(folder, aside / "old")
-            os.replace(partial, folder)
-            shutil.rmtree(aside)
-        else:
-            os.replace(partial, folder)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+        raise InputError(f"--out {folder}: cannot be written ({error.strerror or error})") from error
+
+
+def _put_in_place(partial: Path, folder: Path, keep_others: bool) -> None:
+    if not folder.exists():
+        os.replace(partial, folder)
+        return
+    if keep_others:
+        for path in folder.iterdir():
+            if not (partial / path.name).exists():
+                copy = shutil.copytree if path.is_dir() else shutil.copy2
+                copy(path, partial / path.name)
+    aside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    os.replace(folder, aside / "old")
+    os.replace(partial, folder)
+    shutil.rmtree(aside)
 
 
 # --- reading -------------------------------------------------------------------------------------

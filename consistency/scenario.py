@@ -19,7 +19,15 @@ from consistency.types import Array
 
 T = TypeVar("T", bound="Table")
 
-UNITS = {"_deg": np.pi / 180.0, "_px": 1.0, "_m": 1.0, "_s": 1.0}
+# units that a key may carry at its end: by key, and sigma's by the sensor's model
+UNITS = {
+    **dict.fromkeys(("heading", "sigma_omega", "turn_rate", "rotation"), "_deg"),
+    **dict.fromkeys(("f", "image", "principal_point", "disparity"), "_px"),
+    **dict.fromkeys(("start", "radius", "length", "width", "corner_radius", "turn_radius", "points"), "_m"),
+    **dict.fromkeys(("x", "y", "z", "position", "range", "B"), "_m"),
+    "dt": "_s",
+}
+SIGMA_UNITS = {"uvd": "_px", "xyz": "_m", "linear": "_m"}
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
@@ -37,7 +45,7 @@ def _scaled(value: Any, factor: float) -> Any:
 
 
 class Table(BaseModel):
-    """A table of the file: unknown keys are refused, a key may end in a unit (``_deg``, ``_px``…)."""
+    """A table of the file: unknown keys are refused, a key may end in its unit (``heading_deg``, ``f_px``…)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -48,10 +56,10 @@ class Table(BaseModel):
             return data
         out: dict[str, Any] = {}
         for key, value in data.items():
-            bare, factor = key, 1.0
-            for suffix, scale in UNITS.items():
-                if key not in cls.model_fields and key.removesuffix(suffix) in cls.model_fields:
-                    bare, factor = key.removesuffix(suffix), scale
+            stem, _, unit = key.rpartition("_")
+            wanted = SIGMA_UNITS.get(str(data.get("model")), f"_{unit}") if stem == "sigma" else UNITS.get(stem)
+            has_unit = key not in cls.model_fields and stem in cls.model_fields and f"_{unit}" == wanted
+            bare, factor = (stem, np.pi / 180.0 if unit == "deg" else 1.0) if has_unit else (key, 1.0)
             if bare in out:
                 raise ValueError(f"key '{bare}' is given twice, with and without its unit")
             out[bare] = _scaled(value, factor)
@@ -117,6 +125,12 @@ class Waypoints(_Path):
     shape: Literal["waypoints"]
     points: Annotated[list[tuple[Finite, Finite]], Field(min_length=1)]
     turn_rate: Positive
+
+    @model_validator(mode="after")
+    def _leads_somewhere(self) -> Waypoints:
+        if all(point == self.start for point in self.points):
+            raise ValueError("points must hold a point other than start")
+        return self
 
 
 Path_ = Annotated[Circle | RoundedRectangle | FigureOfEight | Corridor | Waypoints, Field(discriminator="shape")]

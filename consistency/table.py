@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table as RichTable
 
 from consistency.types import Finding, Verdict
@@ -33,7 +34,7 @@ def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
         s = verdict.statistics
         colour = COLOURS[verdict.status]
         table.add_row(
-            name,
+            escape(name),
             f"[{colour}]{verdict.status}[/{colour}]",
             _number(s.get("mean_anees"), ".2f"),
             _number(s.get("share_inside"), ".2f"),
@@ -58,7 +59,8 @@ def print_findings(findings: Sequence[Finding]) -> None:
         table.add_column(column, overflow="fold")
     for finding in findings:
         colour = COLOURS[finding.verdict]
-        table.add_row(finding.id, finding.published, finding.measured, f"[{colour}]{finding.verdict}[/{colour}]")
+        texts = (escape(text) for text in (finding.id, finding.published, finding.measured))
+        table.add_row(*texts, f"[{colour}]{finding.verdict}[/{colour}]")
     _console().print(table)
 
 

@@ -69,6 +69,14 @@ class Trial:
     truth: Array | None = None  # (T + 1, 3): x, y, heading (not wrapped)
     landmarks: Array | None = None  # (N, 3), true positions in the world
 
+    def __post_init__(self) -> None:
+        # read-only views: one filter cannot change what the next one is given
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                view = value.view()
+                view.flags.writeable = False
+                object.__setattr__(self, name, view)
+
     @property
     def steps(self) -> int:
         return len(self.controls)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import consistency as cs
 from consistency.findings import script
+from consistency.judge import run_means
 
 FINDINGS = ("baseline-reduces-nonlinearity",)
 
@@ -26,8 +27,9 @@ def main(study: cs.Study) -> list[cs.Finding]:
         truth__sensor__disparity=(1.0, 32.0 * BASELINES[1] / BASELINES[0]),
     )
     wide = cs.load_scenario("herath2007-wide-baseline")
-    verdicts = [study.judged(world, "ekf-xyz")[0] for world in (narrow, between, wide)]
-    means = [verdict.statistics["mean_anees"] for verdict in verdicts]
+    judged = [study.judged(world, "ekf-xyz") for world in (narrow, between, wide)]
+    verdicts = [verdict for verdict, _ in judged]
+    means = [float(run_means(curves).mean()) for _, curves in judged]
     best = study.judged(wide, "ekf-uvd")[0]
     return [
         study.finding(

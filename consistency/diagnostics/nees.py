@@ -26,10 +26,15 @@ def nees(error: Array, covariance: Array) -> Array:
         definite; the message names the first index.
     """
     e, P = np.asarray(error, float), np.asarray(covariance, float)
-    if e.ndim < 1 or P.shape[-2:] != (e.shape[-1], e.shape[-1]):
-        raise ValueError(f"error {e.shape} and covariance {P.shape} must be (..., n) and (..., n, n)")
-    e, P = np.broadcast_arrays(e[..., None], P)[0][..., :1], np.broadcast_to(P, (*e.shape[:-1], *P.shape[-2:]))
-    _require(np.isfinite(e).all(axis=(-2, -1)), "the error is not finite")
+    n = e.shape[-1] if e.ndim else 0
+    try:
+        if P.shape[-2:] != (n, n):
+            raise ValueError
+        batch = np.broadcast_shapes(e.shape[:-1], P.shape[:-2])
+        e, P = np.broadcast_to(e, (*batch, n)), np.broadcast_to(P, (*batch, n, n))
+    except ValueError:
+        raise ValueError(f"error {e.shape} and covariance {P.shape} must be (..., n) and (..., n, n)") from None
+    _require(np.isfinite(e).all(axis=-1), "the error is not finite")
     _require(np.isfinite(P).all(axis=(-2, -1)), "the covariance is not finite")
     scale = np.abs(P).max(axis=(-2, -1))
     _require(np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1)) <= 1e-8 * scale, "the covariance is not symmetric")
@@ -39,7 +44,7 @@ def nees(error: Array, covariance: Array) -> Array:
         smallest = np.linalg.eigvalsh(P)[..., 0]
         _require(smallest > 0, "the covariance is not positive definite")
         raise ValueError("a covariance is not positive definite") from None
-    whitened = np.linalg.solve(root, e)[..., 0]
+    whitened = np.linalg.solve(root, e[..., None])[..., 0]
     return np.asarray(np.einsum("...i,...i->...", whitened, whitened))
 
 

@@ -56,9 +56,11 @@ def judge(
 
 def _nees(error: Array, covariance: Array, nees: Array, confidence: float) -> dict[str, Any]:
     n = error.shape[-1]
-    curve, alive = anees(nees), np.isfinite(nees).sum(axis=0)
+    curve, counted = anees(nees), np.isfinite(nees)
+    alive = counted.sum(axis=0)
     judged = alive > 0
-    # steps that a failure emptied are not left out: only those in which no covariance has full rank
+    deficient = (np.isfinite(error).all(axis=-1) & ~counted).any(axis=0)  # left out of every statistic
+    error = np.where(counted[..., None], error, np.nan)
     tail = 1.0 - (1.0 - confidence) / max(int(judged.sum()), 1)
     bands = {
         int(m): (anees_interval(n, int(m), confidence), anees_interval(n, int(m), tail)) for m in set(alive[judged])
@@ -78,7 +80,7 @@ def _nees(error: Array, covariance: Array, nees: Array, confidence: float) -> di
         "band": band,
         "simultaneous": simultaneous,
         "judged_steps": int(judged.sum()),
-        "left_out_steps": [int(k) + 1 for k in np.flatnonzero(~judged)],
+        "left_out_steps": [int(k) + 1 for k in np.flatnonzero(deficient)],
         "mean_anees": float(np.nanmean(curve)) if judged.any() else float("nan"),
         "detectable": detectable_ratio(n, int(alive.max()), tail) if judged.any() else float("nan"),
         "share_inside": float(inside[judged].mean()) if judged.any() else float("nan"),

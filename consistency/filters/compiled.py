@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from consistency.errors import InputError
 from consistency.filters.jit import is_compiled
 from consistency.filters.textbook import ExtendedKalman, sensor_noise
 from consistency.filters.trial import REASONS, run_trial
@@ -44,7 +45,9 @@ class Compiled:
         sensor, points = belief.sensor, belief.sigma_points
         z, R = sensor_noise(trial.z, sensor, converted=sensor.model == "uvd" and not self.twin.uvd)
         linear = sensor.model == "linear"
-        landmarks0 = trial.landmarks if linear and trial.landmarks is not None else np.zeros((trial.n_landmarks, 3))
+        if linear and trial.landmarks is None:
+            raise InputError(f"filter '{self.name}' needs the landmarks that its world is linearised about")
+        landmarks0 = trial.landmarks if linear else np.zeros((trial.n_landmarks, 3))
         arrays = (
             (trial.controls, float), (trial.first, np.int64), (trial.landmark, np.int64), (z, float), (R, float),
             (trial.start, float), (dead_reckoning(trial.start, trial.controls), float), (landmarks0, float),
@@ -52,9 +55,11 @@ class Compiled:
             ([points.alpha, points.beta, points.kappa], float),
         )  # fmt: skip
         # copies: writable and C-contiguous, so that one compiled signature serves every caller
-        out = run_trial(
-            self.rule, self.model, trial.n_landmarks, *(np.array(a, dtype=kind, order="C") for a, kind in arrays)
-        )
+        copies = [np.array(a, dtype=kind, order="C") for a, kind in arrays]
+        try:
+            out = run_trial(self.rule, self.model, trial.n_landmarks, *copies)
+        except SystemError as error:  # Ctrl-C in the main thread comes out of a kernel like this
+            raise KeyboardInterrupt from error
         pose, covariance, nis, nis_dof, step, code = out
         failure = Failure(self.name, trial.run, step, REASONS[code]) if step else None
         return Estimates(self.name, trial.run, pose, covariance, nis, nis_dof, failure)

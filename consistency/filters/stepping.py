@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from consistency.filters.compiled import Compiled
 from consistency.filters.linalg import definiteness
-from consistency.protocols import CompiledFilter, Filter, Problem
+from consistency.protocols import Filter, Problem
 from consistency.scenario import Belief
 from consistency.types import Array, Estimates, Failure, Trial
+
+SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
 
 
 def name_of(filter_: Filter) -> str:
@@ -29,7 +32,7 @@ def run_filter(filter_: Filter, trial: Trial, belief: Belief, timeout: float | N
     An exception, a time-out (``timeout`` seconds a trial), an estimate that is not finite or a pose
     covariance that is not positive definite ends the run as a :class:`Failure` of that step.
     """
-    if isinstance(filter_, CompiledFilter):
+    if isinstance(filter_, Compiled):
         return filter_.run(trial, belief)
     return step_through(filter_, trial, belief, timeout)
 
@@ -51,13 +54,19 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
             estimate = filter_.pose(state)
             mean, P = _shaped(estimate.mean, (3,)), _shaped(estimate.covariance, (3, 3))
             if info is not None and len(info.innovation):
+                np.linalg.cholesky(info.S)
                 nis[step - 1], dof[step - 1] = info.nis, len(info.innovation)
+        except np.linalg.LinAlgError:
+            reason = "the innovation covariance is not positive definite"
+            break
         except Exception as error:  # whatever a user's filter throws is a result
             reason = f"{type(error).__name__}: {error}"
             break
         rank = definiteness(P)
         if not (np.isfinite(mean).all() and np.isfinite(P).all()):
             reason = "the estimate is not finite"
+        elif np.abs(P - P.T).max() > SYMMETRY * np.abs(P).max():
+            reason = "the pose covariance is not symmetric"
         elif rank < 0 or (full_rank and rank == 0):
             reason = "the pose covariance is not positive definite"
         elif timeout is not None and time.monotonic() - started > timeout:

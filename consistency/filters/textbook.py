@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from consistency.errors import InputError
 from consistency.models import motion, point, stereo
 from consistency.protocols import Problem
 from consistency.scenario import Belief, BelievedSensor
@@ -115,6 +116,8 @@ class ExtendedKalman:
         self.motion = Unicycle()
 
     def init(self, problem: Problem) -> SlamState:
+        if problem.belief.sensor.model == "linear" and problem.landmarks is None:
+            raise InputError(f"filter '{self.name}' needs the landmarks that its world is linearised about")
         return SlamState(problem.start.copy(), np.zeros((3, 3)), (), problem, problem.start.copy())
 
     def pose(self, state: SlamState) -> Gaussian:

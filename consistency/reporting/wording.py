@@ -179,7 +179,7 @@ def distribution_caption(d: Distribution) -> str:
     linear, fitted = (float(np.sqrt(g.covariance[0, 0])) for g in (d.linear, d.fitted))
     beyond = f" {100 * d.outside:.1f} % of the samples lie beyond the axes." if d.outside >= 0.0005 else ""
     return (
-        f"Baseline {d.baseline:g} m: {d.samples} samples of eq. 21 for a point at x = 10 m, y = 1 m "
-        f"({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
+        f"Baseline {d.baseline:g} m: {d.samples} samples of eq. 21 within the search range, for a point at x = 10 m, "
+        f"y = 1 m ({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
         f"samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
     )

@@ -58,10 +58,17 @@ def simulate(scenario: Scenario, run: int = 0, seed: int = 0) -> Trial:
 def require_landmarks_in_view(scenario: Scenario) -> None:
     """Raise :class:`InputError` if no landmark comes into view on the planned path."""
     truth = scenario.truth
-    if not _visible(truth, planned_path(truth), draw_landmarks(truth)).any():
+    path, landmarks = planned_path(truth), draw_landmarks(truth)
+    step, landmark = np.nonzero(_visible(truth, path, landmarks))
+    if isinstance(truth.sensor, UvdSensor):
+        d = _measure(truth, _in_sensor(truth, path[step + 1], landmarks[landmark]))[:, 2]
+        low, high = truth.sensor.disparity
+        slack = 6.0 * truth.sensor.sigma[2]
+        step = step[(d > low - slack) & (d < high + slack)]
+    if not len(step):
         raise InputError(
             f"scenario '{scenario.name}': no landmark comes into view in {truth.steps} steps; "
-            "check truth.sensor (range, image, f, mount), truth.landmarks and truth.path"
+            "check truth.sensor (range, image, f, disparity, mount), truth.landmarks and truth.path"
         )
 
 

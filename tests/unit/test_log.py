@@ -271,3 +271,12 @@ def test_counts_are_checked(uvd: cs.Scenario, tmp_path: Path, runs: int, seed: i
     with pytest.raises(cs.InputError, match=complaint):
         simulate_log(uvd, runs, seed, tmp_path / "log")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_raw_pixels_are_refused(folder: Path) -> None:
+    """Columns and rows of the image instead of pixels from the principal point."""
+    path = folder / "observations.parquet"
+    table = pd.read_parquet(path)
+    table.assign(z0=table["z0"] + 160, z1=table["z1"] + 120).to_parquet(path)
+    with pytest.raises(cs.InputError, match=r"observations\.parquet: column 'z0', row \d+: .* principal point"):
+        read_log(folder)

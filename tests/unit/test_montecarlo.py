@@ -14,7 +14,7 @@ import pytest
 import consistency as cs
 from consistency import montecarlo
 from consistency.filters.stepping import run_filter
-from consistency.montecarlo import Interrupted, previous_results
+from consistency.montecarlo import Interrupted
 from consistency.results import joined
 from consistency.types import Control, Gaussian, Observation, Trial
 
@@ -330,7 +330,7 @@ def test_stopped_and_resumed_gives_the_same_bits(
     pd.testing.assert_frame_equal(part.estimates, first, check_exact=True)
     part.write(tmp_path / "out")
     monkeypatch.undo()
-    previous = previous_results(tmp_path / "out", uvd, ["ekf-uvd", "ekf-xyz"], 3)
+    previous = cs.read_results(tmp_path / "out")
     resumed = cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1, previous=previous)
     assert equal(resumed, ten)
     assert resumed.manifest["complete"]
@@ -402,5 +402,66 @@ def test_resuming_something_else_is_refused(
     ten.write(tmp_path / "out")
     scenario = small("herath2007-stereo", **{k: v for k, v in change.items() if k.startswith("truth")})
     filters, seed = change.get("filters", ["ekf-uvd", "ekf-xyz"]), change.get("seed", 3)
-    with pytest.raises(cs.InputError, match=f"--resume .*: was written with another {key}"):
-        previous_results(tmp_path / "out", scenario, filters, seed)
+    with pytest.raises(cs.InputError, match=f"to resume have another {key}"):
+        cs.run_trials(scenario, filters, runs=10, seed=seed, jobs=1, previous=cs.read_results(tmp_path / "out"))
+
+
+class InPlace:
+    """A filter that works on what it is given instead of on a copy."""
+
+    name = "in-place"
+
+    def init(self, problem: Any) -> Any:
+        problem.start += 1.0
+        return problem.start
+
+    def predict(self, state: Any, control: Control) -> Any:
+        return state
+
+    def update(self, state: Any, observation: Observation) -> Any:
+        return state, None
+
+    def pose(self, state: Any) -> Gaussian:
+        return Gaussian(state, np.eye(3))
+
+
+def test_a_filter_cannot_change_what_the_next_one_is_given(xyz: cs.Scenario) -> None:
+    results = cs.run_trials(xyz, [InPlace(), "ekf-xyz"], runs=2, jobs=1)
+    alone = cs.run_trials(xyz, ["ekf-xyz"], runs=2, jobs=1)
+    both = results.estimates[results.estimates["filter"] == "ekf-xyz"].reset_index(drop=True)
+    pd.testing.assert_frame_equal(both, alone.estimates)
+    assert list(results.failures["filter"]) == ["in-place"] * 2
+    assert results.failures["reason"].str.contains("read-only").all()
+
+
+@pytest.mark.parametrize(
+    ("covariance", "innovation", "reason"),
+    [
+        (np.array([[1, 1e-3, 0], [0, 1, 0], [0, 0, 1]]), np.eye(3), "pose covariance is not symmetric"),
+        (np.eye(3), -np.eye(3), "innovation covariance is not positive definite"),
+    ],
+)
+def test_a_broken_covariance_is_a_failed_run(xyz: cs.Scenario, covariance: Any, innovation: Any, reason: str) -> None:
+    class Broken(InPlace):
+        def init(self, problem: Any) -> Any:
+            return problem.start
+
+        def update(self, state: Any, observation: Observation) -> Any:
+            return state, cs.Info(np.ones(3), innovation, np.zeros((3, 3)))
+
+        def pose(self, state: Any) -> Gaussian:
+            return Gaussian(state, covariance)
+
+    results = cs.run_trials(xyz, [Broken()], runs=1, jobs=1)
+    assert results.failures[["step", "reason"]].to_numpy().tolist() == [[1, f"the {reason}"]]
+
+
+def test_ctrl_c_inside_a_kernel_is_ctrl_c(xyz: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba turns it into a SystemError; nothing may take that for a broken filter."""
+
+    def kernel(*_: Any) -> Any:
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr("consistency.filters.compiled.run_trial", kernel)
+    with pytest.raises(KeyboardInterrupt):
+        cs.get_filter("ekf-xyz").run(cs.simulate(xyz), xyz.belief)

@@ -326,4 +326,13 @@ def test_place_that_cannot_be_written(tmp_path: Path) -> None:
 
 def test_asking_whether_a_folder_is_free_leaves_nothing(tmp_path: Path) -> None:
     require_free(tmp_path / "deep" / "out", overwrite=False)
-    assert list((tmp_path / "deep").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_resuming_keeps_what_the_user_put_there(folder: Path) -> None:
+    (folder / "notes.txt").write_text("mine")
+    results = cs.read_results(folder)
+    results.write(folder, overwrite=True, keep_others=True)
+    assert (folder / "notes.txt").read_text() == "mine"
+    results.write(folder, overwrite=True)
+    assert not (folder / "notes.txt").exists()

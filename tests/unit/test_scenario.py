@@ -209,10 +209,15 @@ BAD: dict[str, tuple[tuple[Edit, ...], str]] = {
     "unknown sensor": ((put("truth.sensor.model", "lidar"),), r"'truth\.sensor\.model': 'lidar'.*'xyz'.*'uvd'"),
     "unknown noise target": ((put("truth.motion.noise_on", "wheel"),), r"'truth\.motion\.noise_on'.*'odometry'"),
     "sensors differ": (
-        (put("belief.sensor.model", "xyz"),),
+        (put("belief.sensor.model", "xyz"), drop("belief.sensor.sigma_px"), put("belief.sensor.sigma", [0.1, 0.1, 0.1])),
         r"belief\.sensor\.model is 'xyz'.*'uvd' \(truth\.sensor\.model\)",
     ),
     "rig unknown": ((drop("belief.sensor.B_m"),), r"'belief\.sensor'.*needs f \(px\) and B \(m\)"),
+    "unit of another sensor": (
+        (drop("belief.sensor.sigma_px"), put("belief.sensor.sigma_m", [0.1, 0.1, 0.1])),
+        r"'belief\.sensor\.sigma_m'.*unknown key",
+    ),
+    "unit of another key": ((put("truth.path.speed_deg", 28.6),), r"'truth\.path\.speed_deg'.*unknown key"),
     "range reversed": ((put("truth.sensor.range_m", [4.0, 0.5]),), r"'truth\.sensor'.*range must be"),
     "box reversed": ((put("truth.landmarks.x_m", [8.0, -8.0]),), r"'truth\.landmarks'.*x must be \[low, high\]"),
     "negative disparity": ((put("truth.sensor.disparity_px", [-1.0, 32.0]),), r"'truth\.sensor\.disparity\.0'"),

@@ -302,3 +302,18 @@ def test_linear_world_sees_the_same_in_every_run(linear: cs.Scenario) -> None:
     assert not np.array_equal(a.truth, b.truth)
     expected = seen_by_hand(linear, planned_path(linear.truth), a.landmarks)
     assert set(zip(steps_of(a), a.landmark, strict=True)) == expected
+
+
+def test_a_world_out_of_the_search_range_is_refused() -> None:
+    scenario = cs.load_scenario("herath2007-stereo").variant("near", truth__sensor__disparity=(100.0, 132.0))
+    with pytest.raises(cs.InputError, match=r"no landmark comes into view.*disparity"):
+        cs.run_trials(scenario, ["ekf-uvd"], runs=1)
+
+
+def test_waypoints_that_lead_nowhere_are_refused() -> None:
+    path = {
+        "shape": "waypoints", "points": [(1.0, 2.0)], "turn_rate": 1.0,
+        "start": (1.0, 2.0), "heading": 0.0, "speed": 1.0,
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="other than start"):
+        cs.load_scenario("herath2007-xyz").variant("still", truth__path=path)

@@ -30,6 +30,15 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder written by '
 SCENARIO = "Built-in name (see 'list') or path of a .toml file."
 
 
+@app.callback()
+def _main(version: Annotated[bool, typer.Option("--version", is_eager=True, help="Show it and exit.")] = False) -> None:
+    if version:
+        from importlib.metadata import version as version_of
+
+        print(version_of("filter-consistency"))
+        raise typer.Exit
+
+
 @app.command("list")
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
     """Scenarios, filters and experiments."""
@@ -94,12 +103,16 @@ def run(
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
+    if resume and overwrite:
+        raise InputError("--resume goes on with what --overwrite would replace; give one of them")
     try:
         if log is not None:
             if runs is not None or seed is not None or resume:
                 raise InputError("--runs, --seed and --resume do not go with --log: a log has the runs it has")
             recorded = read_log(log)
             resolve_filters(filters, recorded.belief)
+            if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
+                raise InputError(f"--out {out}: lies in the log; choose another folder")
             require_free(out, overwrite)
             results = run_log(recorded, filters, jobs, timeout)
         else:
@@ -138,7 +151,14 @@ def analyse(
 
     if fail_on not in (None, "inconsistent"):
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
-    verdicts = judge_results(read_results(folder), filters, confidence)
+    results = read_results(folder)
+    verdicts = judge_results(results, filters, confidence)
+    if not results.manifest["complete"]:
+        done, asked = results.manifest["finished_runs"], results.manifest["runs"]
+        text = f"{folder}: only {done} of {asked} runs are there; the same 'consistency run' with --resume goes on"
+        if fail_on:
+            raise InputError(f"--fail-on: {text}")
+        print(f"consistency: {text}", file=sys.stderr)
     if as_json:
         print(verdicts_json(verdicts))
     else:
@@ -193,8 +213,13 @@ def reproduce(
 
 def main(arguments: list[str] | None = None) -> Any:
     """Entry point: unusable input ends in one line and exit status 2."""
+    if arguments is None and len(sys.argv) == 1:
+        arguments = ["--help"]
     try:
         sys.exit(app(arguments, standalone_mode=False))
+    except MemoryError:
+        print("consistency: not enough memory; take fewer steps, landmarks or runs", file=sys.stderr)
+        sys.exit(2)
     except InputError as error:
         print(f"consistency: {error}", file=sys.stderr)
         sys.exit(2)

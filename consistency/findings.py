@@ -64,7 +64,7 @@ class Study:
 
     def write(self, out: Path, findings: Sequence[Finding], wall: float, overwrite: bool = False) -> None:
         """findings.json, extra tables and a folder a scenario, moved into place as a whole."""
-        manifest = manifest_of(seed=self.seed, runs=self.runs, wall=wall, complete=True)
+        manifest = manifest_of(kind="findings", seed=self.seed, runs=self.runs, wall=wall, complete=True)
         manifest["failures"] = sum(len(results.failures) for results in self.kept.values())
         manifest["studies"] = list(self.kept)
         manifest["scenarios"] = {name: results.manifest.get("scenario") for name, results in self.kept.items()}
@@ -132,7 +132,7 @@ def reproduce(
     known = {finding: module for module in scripts.values() for finding in module.FINDINGS}
     if unknown := [name for name in only or () if name not in known]:
         raise InputError(f"--only {unknown[0]}: no such finding; known: {', '.join(known)}")
-    require_free(out, overwrite)
+    require_free(out, overwrite, "findings")
     study, started = Study(runs, seed, jobs), time.monotonic()
     findings: list[Finding] = []
     for module in scripts.values():
@@ -158,8 +158,12 @@ def _guarded(module: ModuleType, study: Study, ids: Sequence[str]) -> list[Findi
 
 def script(main: Callable[[Study], list[Finding]], arguments: Sequence[str] | None = None) -> None:
     """What an experiment does when it is run by itself: ``python experiments/eNN_….py [RUNS] [SEED]``."""
-    values = [int(value) for value in (sys.argv[1:] if arguments is None else arguments)]
-    print_findings(main(Study(*values)))
+    try:
+        values = [int(value) for value in (sys.argv[1:] if arguments is None else arguments)]
+        print_findings(main(Study(*values)))
+    except (InputError, ValueError) as error:
+        print(f"{Path(sys.argv[0]).name} [RUNS] [SEED]: {error}", file=sys.stderr)
+        sys.exit(2)
 
 
 def read_findings(folder: Path) -> list[dict[str, Any]]:

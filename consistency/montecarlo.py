@@ -95,8 +95,11 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
     if not chosen:
         raise InputError(f"no filter given; known: {', '.join(filter_names())}")
     for filter_ in chosen:
-        if not isinstance(filter_, Filter):
-            raise InputError(f"{filter_!r} is no filter: it needs init, predict, update and pose")
+        if isinstance(filter_, type) or not isinstance(filter_, Filter):
+            hint = (
+                "give an object of it, with ()" if isinstance(filter_, type) else "it needs init, predict, update, pose"
+            )
+            raise InputError(f"{filter_!r} is no filter: {hint}")
     names = [name_of(f) for f in chosen]
     if len(set(names)) < len(names):
         raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
@@ -214,10 +217,10 @@ def simulate_log(scenario: Scenario, runs: int, seed: int, out: Path, overwrite:
     """Write ``runs`` simulated trials as a log folder; raises as :func:`run_trials`."""
     _require_counts(runs, seed)
     require_landmarks_in_view(scenario)
-    require_free(out, overwrite)
+    require_free(out, overwrite, "log")
     started = time.monotonic()
     trials = [simulate(scenario, run, seed) for run in range(runs)]
-    manifest = manifest_of(seed=seed, runs=runs, wall=time.monotonic() - started, complete=True)
+    manifest = manifest_of(kind="log", seed=seed, runs=runs, wall=time.monotonic() - started, complete=True)
     manifest |= _scenario_entry(scenario) | {"failures": 0}
     sensor = scenario.truth.sensor
     view = None if sensor.image is None else (sensor.image, sensor.centre)

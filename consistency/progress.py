@@ -39,9 +39,13 @@ def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
         def advance(count: int) -> None:
             bar.advance(task, count)
             speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
-            bar.update(task, rate=f"{speed:.1f} {unit}/s" if speed else "")
+            bar.update(task, rate=_speed(speed, unit) if speed else "")
 
         yield advance
+
+
+def _speed(rate: float, unit: str) -> str:
+    return f"{rate:.1f} {unit}/s" if rate >= 1.0 else f"{1.0 / rate:.1f} s for one"
 
 
 def _lines(label: str, total: int, unit: str, every: float = 5.0) -> Advance:
@@ -56,6 +60,6 @@ def _lines(label: str, total: int, unit: str, every: float = 5.0) -> Advance:
             last = now
             rate = done / max(now - started, 1e-9)
             left = f", {(total - done) / rate:.0f} s left" if done < total else ""
-            print(f"{label}: {done} of {total} {unit}, {rate:.1f} {unit}/s{left}", file=sys.stderr, flush=True)
+            print(f"{label}: {done} of {total} {unit}, {_speed(rate, unit)}{left}", file=sys.stderr, flush=True)
 
     return advance

@@ -204,8 +204,8 @@ def covariances(table: pd.DataFrame) -> Array:
 # --- the manifest --------------------------------------------------------------------------------
 
 
-def manifest_of(**fields: Any) -> dict[str, Any]:
-    """Provenance that every output folder carries."""
+def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
+    """Provenance that every output folder of a ``kind`` (results, log, findings) carries."""
     packages = (
         "filter-consistency",
         "numpy",
@@ -229,6 +229,7 @@ def manifest_of(**fields: Any) -> dict[str, Any]:
     program = Path(sys.argv[0]).name
     return {
         "schema_version": SCHEMA_VERSION,
+        "kind": kind,
         "versions": versions,
         "command": shlex.join(["consistency" if program == "__main__.py" else program, *sys.argv[1:]]),
         "git_commit": _git_commit(),
@@ -257,16 +258,19 @@ def _git_commit() -> str | None:
 # --- writing -------------------------------------------------------------------------------------
 
 
-def require_free(folder: Path, overwrite: bool) -> None:
+def require_free(folder: Path, overwrite: bool, kind: str = "results") -> None:
     """Refuse, before any work, a folder that exists or cannot be made.
 
-    With ``overwrite`` only a folder that this bench wrote (it has a manifest.json) may be replaced.
+    With ``overwrite`` only a folder that this bench wrote may be replaced, and only by one of its own
+    ``kind`` (results, log, findings).
     """
     if folder.exists() or folder.is_symlink():
         if not overwrite:
             raise InputError(f"--out {folder}: exists already; choose another folder or add --overwrite")
         try:
-            read_manifest(folder)
+            before = read_manifest(folder).get("kind")
+            if before != kind:
+                raise InputError(f"it holds {before}, not {kind}")
         except InputError as error:
             raise InputError(
                 f"--out {folder}: is not an output folder of this bench; not overwritten ({error})"
@@ -289,10 +293,12 @@ def write_folder(
 ) -> None:
     """Tables as Parquet, the manifest, and whatever ``extra`` writes, moved into place as a whole.
 
-    With ``overwrite`` an output folder of this bench is replaced; with ``keep_others`` the files in it that
-    are not written again stay.
+    The manifest says what ``kind`` of folder it is, and gets the names of the tables. With ``overwrite``
+    an output folder of this bench is replaced; with ``keep_others`` the files in it that are not written
+    again stay.
     """
-    require_free(folder, overwrite)
+    require_free(folder, overwrite, manifest["kind"])
+    manifest = manifest | {"tables": sorted(tables)}
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
@@ -341,8 +347,8 @@ def read_results(folder: str | Path) -> Results:
     manifest = read_manifest(folder)
     if "filters" not in manifest:
         raise InputError(f"{folder}: holds no estimates; it was not written by 'consistency run'")
-    optional = {name: folder / f"{name}.parquet" for name in ("truth", "landmarks")}
-    tables = {name: read_parquet(folder, name) if path.exists() else None for name, path in optional.items()}
+    wanted = manifest.get("tables", [])
+    tables = {name: read_parquet(folder, name) if name in wanted else None for name in ("truth", "landmarks")}
     return Results(
         read_parquet(folder, "estimates"),
         read_parquet(folder, "failures"),
@@ -356,7 +362,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """``manifest.json`` of an output folder."""
     path = folder / "manifest.json"
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
+        raise InputError(f"{folder}: {'a file, not a folder' if folder.exists() else 'no such folder'}")
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except OSError:
@@ -374,7 +380,7 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
     try:
         table = pq.read_table(path).to_pandas()
     except FileNotFoundError:
-        raise InputError(f"{path}: missing") from None
+        raise InputError(f"{path}: missing; write the folder again") from None
     except (OSError, pa.ArrowException) as error:
         first = str(error).splitlines()[0]
         raise InputError(f"{path}: cannot be read, damaged or cut short ({first})") from None

@@ -367,6 +367,8 @@ def load_scenario(name: str | Path) -> Scenario:
     path = Path(name)
     if str(name) in scenario_names():
         path = data_folder("scenarios") / f"{name}.toml"
+    elif path.is_dir():
+        raise InputError(f"{path}: a folder; give a .toml file in it, or to filter a log --log {path}")
     elif path.suffix != ".toml":
         near = difflib.get_close_matches(str(name), scenario_names(), n=1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""

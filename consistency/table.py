@@ -26,22 +26,24 @@ def _console() -> Console:
 
 
 def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
-    """One row a filter; with ``reasons`` also why."""
+    """One row a filter; with ``reasons`` also why. ``finds``: the covariance ratio that the runs suffice for."""
     table = RichTable(box=None, pad_edge=False)
-    for column in ("filter", "verdict", "ANEES", "share in band", "RMSE m", "RMSE deg", "NIS/dof", "failed"):
+    columns = ("filter", "verdict", "ANEES", "share in band", "RMSE m", "RMSE deg", "NIS/dof", "failed", "finds")
+    for column in columns:
         table.add_column(column, justify="left" if column in ("filter", "verdict") else "right")
     for name, verdict in verdicts.items():
         s = verdict.statistics
         colour = COLOURS[verdict.status]
         table.add_row(
             escape(name),
-            f"[{colour}]{verdict.status}[/{colour}]",
+            f"[{colour}]{verdict.status}[/{colour}]{'' if 'anees' in s else ' (NIS only)'}",
             _number(s.get("mean_anees"), ".2f"),
             _number(s.get("share_inside"), ".2f"),
             _number(s.get("rmse_position"), ".3f"),
             _number(np.rad2deg(s.get("rmse_heading", np.nan)), ".2f"),
             _number(s.get("nis_ratio"), ".3f"),
             f"{len(s['failures'])} of {s['runs']}",
+            f"x{s['detectable']:.2g}" if np.isfinite(s.get("detectable", np.nan)) else "-",
         )
     console = _console()
     console.print(table)

@@ -265,11 +265,13 @@ def command(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int, default=-1, help="workers; -1 is one a core")
     parser.add_argument("--overwrite", action="store_true", help="replace an output folder of this bench")
     given = parser.parse_args(arguments)
-    require_free(given.out, given.overwrite)
+    require_free(given.out, given.overwrite, "findings")
     study, started = cs.Study(runs=1, seed=0, jobs=given.jobs), time.monotonic()
     logs = logs_of(given.data, study.seed)
     wall = time.monotonic() - started
-    manifest = manifest_of(seed=None, runs=1, wall=wall, complete=True, failures=0, origin=ORIGIN, licence=LICENCE)
+    manifest = manifest_of(
+        kind="log", seed=None, runs=1, wall=wall, complete=True, failures=0, origin=ORIGIN, licence=LICENCE
+    )
     findings = measure(study, logs)
     study.write(given.out, findings, time.monotonic() - started, given.overwrite)
     write_log(given.out / "log", logs[MAIN].trials, logs[MAIN].belief, None, manifest, view=conversion.VIEW)

@@ -40,6 +40,8 @@ def get_filter(name: str) -> Any:
         Unknown name.
     """
     if name not in MODULES:
+        if "," in name:
+            raise InputError(f"unknown filter '{name}'; give --filter once for each filter")
         near = difflib.get_close_matches(name, MODULES, n=1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"unknown filter '{name}'{hint}; known: {', '.join(MODULES)}")

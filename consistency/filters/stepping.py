@@ -50,7 +50,10 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
             if step == 1:
                 state = filter_.init(problem_of(trial, belief))
             state = filter_.predict(state, trial.control(step))
-            state, info = filter_.update(state, trial.observation(step))
+            updated = filter_.update(state, trial.observation(step))
+            if not isinstance(updated, tuple) or len(updated) != 2:
+                raise TypeError("update must return (state, info)")
+            state, info = updated
             estimate = filter_.pose(state)
             mean, P = _shaped(estimate.mean, (3,)), _shaped(estimate.covariance, (3, 3))
             if info is not None and len(info.innovation):

@@ -79,7 +79,7 @@ def _study(folder: Path, styles: dict[str, int], said: tuple[tuple[str, str], ..
         nis_log=_wide([t.nis_ratio for t in tracks]),
         is_log=scenario is None,
         provenance=tuple(row for row in _provenance(results.manifest) if row not in said),
-        resolved=json.dumps(resolved, indent=2, ensure_ascii=False),
+        resolved=json.dumps(_rounded(resolved), indent=2, ensure_ascii=False),
     )
 
 
@@ -124,6 +124,15 @@ def _wide(values: list[Array]) -> bool:
     flat = np.concatenate([v.ravel() for v in values]) if values else np.empty(0)
     flat = flat[np.isfinite(flat) & (flat > 0)]
     return bool(flat.size) and bool(flat.max() > DECADE * flat.min())
+
+
+def _rounded(value: Any) -> Any:
+    """Six digits of every number, to read; the manifest has them all."""
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _true_path(truth: pd.DataFrame | None, run: int) -> Array | None:

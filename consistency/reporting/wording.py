@@ -160,7 +160,7 @@ def anees_caption(study: Study) -> str:
     )
     return (
         f"{what}; {n} is expected (line). Shaded: the 95 % band of a single step (eq. 17). Dashed: the band that "
-        f"a consistent filter leaves in any step with probability at most 5 %. Above is overconfident, below "
+        f"a consistent filter leaves anywhere in the run with probability at most 5 %. Above is overconfident, below "
         f"conservative.{extra}"
     )
 

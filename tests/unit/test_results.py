@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 
 import consistency as cs
 from consistency.judge import curves
+from consistency.montecarlo import simulate_log
 from consistency.results import COLUMNS, covariances, require_free
 from consistency.types import Control, Gaussian, Observation
 
@@ -79,7 +81,8 @@ def test_read_gives_back_what_was_written(results: cs.Results, written: Path) ->
     back = cs.read_results(written)
     for name in TABLES:
         pd.testing.assert_frame_equal(getattr(back, name), getattr(results, name), check_exact=True)
-    assert back.manifest == json.loads(json.dumps(results.manifest))
+    tables = {"tables": sorted(TABLES)}
+    assert back.manifest == json.loads(json.dumps(results.manifest)) | tables
     assert len(back.failures) > 0
     assert back.filters == ["ekf-xyz", "sleepy"]
 
@@ -174,12 +177,25 @@ def test_file_missing(folder: Path, name: str) -> None:
         cs.read_results(folder)
 
 
-def test_truth_and_landmarks_may_be_missing(folder: Path) -> None:
-    for name in ("truth", "landmarks"):
-        (folder / f"{name}.parquet").unlink()
-    results = cs.read_results(folder)
-    assert results.truth is None
-    assert "no truth" in cs.analyse(results)["ekf-xyz"].reasons[0]
+def test_results_without_truth_are_judged_by_the_nis(results: cs.Results, tmp_path: Path) -> None:
+    replace(results, truth=None, landmarks=None).write(tmp_path / "out")
+    back = cs.read_results(tmp_path / "out")
+    assert back.truth is None
+    assert "no truth" in cs.analyse(back)["ekf-xyz"].reasons[0]
+
+
+@pytest.mark.parametrize("name", ["truth", "landmarks"])
+def test_a_table_that_was_written_and_is_gone(folder: Path, name: str) -> None:
+    """Without its truth an overconfident filter would pass by the NIS."""
+    (folder / f"{name}.parquet").unlink()
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: missing"):
+        cs.read_results(folder)
+
+
+def test_results_do_not_replace_a_log(folder: Path, uvd: cs.Scenario, tmp_path: Path) -> None:
+    simulate_log(uvd, 1, 0, tmp_path / "log")
+    with pytest.raises(cs.InputError, match="holds log, not results"):
+        cs.read_results(folder).write(tmp_path / "log", overwrite=True)
 
 
 @pytest.mark.parametrize(("name", "column"), [("estimates", "P_xh"), ("estimates", "nis"), ("failures", "reason")])

@@ -209,7 +209,7 @@ BAD: dict[str, tuple[tuple[Edit, ...], str]] = {
     "unknown sensor": ((put("truth.sensor.model", "lidar"),), r"'truth\.sensor\.model': 'lidar'.*'xyz'.*'uvd'"),
     "unknown noise target": ((put("truth.motion.noise_on", "wheel"),), r"'truth\.motion\.noise_on'.*'odometry'"),
     "sensors differ": (
-        (put("belief.sensor.model", "xyz"), drop("belief.sensor.sigma_px"), put("belief.sensor.sigma", [0.1, 0.1, 0.1])),
+        (put("belief.sensor.model", "xyz"), drop("belief.sensor.sigma_px"), put("belief.sensor.sigma", [0.1] * 3)),
         r"belief\.sensor\.model is 'xyz'.*'uvd' \(truth\.sensor\.model\)",
     ),
     "rig unknown": ((drop("belief.sensor.B_m"),), r"'belief\.sensor'.*needs f \(px\) and B \(m\)"),

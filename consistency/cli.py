@@ -15,7 +15,6 @@ UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps i
 
 app = typer.Typer(
     help="Does a stereo-SLAM filter tell the truth about its own uncertainty?",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -30,13 +29,16 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder written by '
 SCENARIO = "Built-in name (see 'list') or path of a .toml file."
 
 
-@app.callback()
-def _main(version: Annotated[bool, typer.Option("--version", is_eager=True, help="Show it and exit.")] = False) -> None:
+@app.callback(invoke_without_command=True)
+def _main(
+    context: typer.Context, version: Annotated[bool, typer.Option("--version", help="Show it and exit.")] = False
+) -> None:
     if version:
         from importlib.metadata import version as version_of
 
         print(version_of("filter-consistency"))
-        raise typer.Exit
+    elif context.invoked_subcommand is None:
+        print(context.get_help())
 
 
 @app.command("list")
@@ -213,8 +215,6 @@ def reproduce(
 
 def main(arguments: list[str] | None = None) -> Any:
     """Entry point: unusable input ends in one line and exit status 2."""
-    if arguments is None and len(sys.argv) == 1:
-        arguments = ["--help"]
     try:
         sys.exit(app(arguments, standalone_mode=False))
     except MemoryError:

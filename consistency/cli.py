@@ -99,8 +99,9 @@ def run(
     from consistency.judge import analyse
     from consistency.log import read_log
     from consistency.montecarlo import Interrupted, resolve_filters, run_log, run_trials
-    from consistency.results import read_results, require_free
+    from consistency.results import read_results
     from consistency.scenario import load_scenario
+    from consistency.storage import require_free
     from consistency.table import print_verdicts
 
     if (scenario is None) == (log is None):

@@ -17,8 +17,9 @@ import pandas as pd
 from consistency.errors import InputError
 from consistency.judge import Curves, analyse, curves
 from consistency.montecarlo import run_trials
-from consistency.results import Results, joined, manifest_of, require_free, write_folder
+from consistency.results import Results, joined
 from consistency.scenario import Scenario, data_folder, load_scenario
+from consistency.storage import manifest_of, require_free, write_folder
 from consistency.table import print_findings
 from consistency.types import Finding, Verdict
 

@@ -13,7 +13,7 @@ import tomli_w
 from pydantic import ValidationError
 
 from consistency.errors import InputError
-from consistency.results import POSE, controls_table, observations_table, read_parquet, truth_table, write_folder
+from consistency.results import POSE, controls_table, observations_table, truth_table
 from consistency.scenario import (
     Belief,
     BelievedMotion,
@@ -27,6 +27,7 @@ from consistency.scenario import (
     explain,
     read_table,
 )
+from consistency.storage import read_parquet, write_folder
 from consistency.types import Array, Trial
 
 View = tuple[tuple[int, int], tuple[float, float]]  # image (width, height) and principal point (column, row), px

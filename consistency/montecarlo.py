@@ -18,9 +18,10 @@ from consistency.filters.stepping import name_of, run_filter
 from consistency.log import Log, write_log
 from consistency.progress import progress
 from consistency.protocols import Filter
-from consistency.results import Results, estimates_table, failures_table, manifest_of, require_free, truth_table
+from consistency.results import Results, estimates_table, failures_table, truth_table
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import draw_landmarks, require_landmarks_in_view, simulate
+from consistency.storage import manifest_of, require_free
 from consistency.types import Estimates, Trial
 
 Outcome = tuple[Trial, list[Estimates]]

@@ -30,7 +30,8 @@ from consistency.log import Log, write_log
 from consistency.models import point, stereo
 from consistency.models.motion import dead_reckoning
 from consistency.montecarlo import run_log
-from consistency.results import Results, joined, manifest_of, require_free
+from consistency.results import Results, joined
+from consistency.storage import manifest_of, require_free
 from consistency.table import print_findings
 from consistency.types import Array, Trial
 

@@ -36,7 +36,7 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     targets = [path for path in (html, pdf) if path is not None]
     if html is not None and pdf is not None and html.absolute() == pdf.absolute():
         raise InputError(f"{html}: is named for both HTML and PDF; name two files")
-    from consistency.results import read_manifest
+    from consistency.storage import read_manifest
 
     read_manifest(Path(folder))
     for path in targets:

@@ -16,9 +16,10 @@ from consistency.models.motion import dead_reckoning
 from consistency.reporting.distributions import distributions
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.wording import answer, number
-from consistency.results import read_manifest, read_results
+from consistency.results import read_results
 from consistency.scenario import Scenario
 from consistency.simulation import simulate
+from consistency.storage import read_manifest
 from consistency.types import Array, Verdict
 
 DECADE = 10.0  # values that span more are drawn on a log axis

@@ -23,7 +23,7 @@ RANK = {
     "scenario": 3,
     "protocols": 4,
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
-    "results": 6,
+    "storage": 5, "results": 6,
     "log": 7,
     "montecarlo": 8, "judge": 8, "table": 8,
     "findings": 9,

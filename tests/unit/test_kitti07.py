@@ -16,6 +16,7 @@ import pytest
 import consistency as cs
 from consistency.log import read_log, write_log
 from consistency.models.stereo import project
+from consistency.storage import manifest_of
 from consistency.types import Array, Trial
 
 ROOT = Path(__file__).parents[2]
@@ -192,7 +193,7 @@ def test_the_recording_becomes_a_log_that_is_read_back(tmp_path: Path) -> None:
     assert trial.truth is not None
     path = np.hypot(*np.diff(trial.truth[:, :2], axis=0).T).sum()
     assert path == pytest.approx(692.0, abs=1.0)
-    write_log(tmp_path / "log", [trial], belief, None, {"schema_version": 1})
+    write_log(tmp_path / "log", [trial], belief, None, manifest_of(kind="log"), view=conversion.VIEW)
     back = read_log(tmp_path / "log")
     np.testing.assert_array_equal(back.trials[0].z, trial.z)
     np.testing.assert_array_equal(back.trials[0].landmark, trial.landmark)

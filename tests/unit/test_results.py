@@ -17,7 +17,8 @@ import pytest
 import consistency as cs
 from consistency.judge import curves
 from consistency.montecarlo import simulate_log
-from consistency.results import COLUMNS, covariances, require_free
+from consistency.results import covariances
+from consistency.storage import COLUMNS, require_free
 from consistency.types import Control, Gaussian, Observation
 
 TABLES = ("estimates", "failures", "truth", "landmarks")

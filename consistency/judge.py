@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from consistency.diagnostics import judge
 from consistency.errors import InputError
@@ -77,6 +78,12 @@ def run_means(c: Curves) -> Array:
     means = np.where(counted.any(axis=1), total / np.maximum(counted.sum(axis=1), 1), np.inf)
     means[np.isin(c.runs, [failure.run for failure in c.failures])] = np.inf
     return np.asarray(means)
+
+
+def wins(a: Curves, b: Curves) -> tuple[int, float]:
+    """Runs in which ``a`` has the lower mean NEES than ``b``, and the two-sided p value of a sign test."""
+    better, worse = (int((run_means(x) < run_means(y)).sum()) for x, y in ((a, b), (b, a)))
+    return better, float(stats.binomtest(better, better + worse).pvalue)
 
 
 def analyse(results: Results, filters: list[str] | None = None, confidence: float = 0.95) -> dict[str, Verdict]:

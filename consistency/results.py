@@ -16,11 +16,10 @@ from consistency.errors import InputError
 from consistency.filters.linalg import definiteness
 from consistency.geometry import pose_error
 from consistency.scenario import Scenario, explain
-from consistency.storage import COLUMNS, read_manifest, read_parquet, write_folder
+from consistency.storage import COLUMNS, COVARIANCE, read_manifest, read_parquet, write_folder
 from consistency.types import Array, Estimates, Failure, Trial
 
 POSE = ["x", "y", "heading"]
-COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
 
 
 @dataclass(frozen=True)

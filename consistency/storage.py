@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from consistency.errors import InputError
 
 SCHEMA_VERSION = 1
-COVARIANCE = ("P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh")
+COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
 COLUMNS: dict[str, dict[str, str]] = {
     "landmarks": {"landmark": "int64", "x": "float64", "y": "float64", "z": "float64"},
     "truth": {"run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64", "heading": "float64"},

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
 
 import consistency as cs
 from consistency.findings import script
-from consistency.judge import Curves, run_means
+from consistency.judge import Curves, run_means, wins
 
 FINDINGS = ("fig11b", "fig13a", "fig13b")
 
@@ -72,12 +71,6 @@ def main(study: cs.Study) -> list[cs.Finding]:
             accept=ACCEPT_13B,
         ),
     ]
-
-
-def wins(a: Curves, b: Curves) -> tuple[int, float]:
-    """Runs in which ``a`` has the lower mean NEES than ``b``, and the two-sided p value of a sign test."""
-    better, worse = (int((run_means(x) < run_means(y)).sum()) for x, y in ((a, b), (b, a)))
-    return better, float(stats.binomtest(better, better + worse).pvalue)
 
 
 def removed(ekf: Curves, ukf: Curves, seed: int) -> tuple[float, float, float]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
 
 import consistency as cs
 from consistency.findings import script
-from consistency.judge import run_means
+from consistency.judge import run_means, wins
 
 FINDINGS = ("long-range",)
 
@@ -28,9 +27,8 @@ def main(study: cs.Study) -> list[cs.Finding]:
     )
     uvd, uvd_curves = study.judged(far, "ekf-uvd")
     xyz, xyz_curves = study.judged(far, "ekf-xyz")
-    worse = run_means(uvd_curves) > run_means(xyz_curves)
-    p_value = float(stats.binomtest(int(worse.sum()), len(worse)).pvalue)
-    text = [f"ekf-uvd higher in {worse.sum()} of {len(worse)} runs"]
+    worse, p_value = wins(xyz_curves, uvd_curves)
+    text = [f"ekf-uvd higher in {worse} of {study.runs} runs"]
     for verdict, curves in ((uvd, uvd_curves), (xyz, xyz_curves)):
         runs = run_means(curves)
         text.append(
@@ -39,7 +37,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
         )
     return [
         study.finding(
-            worse.mean() > 0.5 and p_value < SIGN_TEST,
+            worse > study.runs / 2 and p_value < SIGN_TEST,
             scenario=far.name,
             id="long-range",
             source="this project, beyond Herath 2007 sec. 4.5",

@@ -55,8 +55,6 @@ class FilterpyEkf(ExtendedKalman):
         return replace(state, x=ekf.x, P=ekf.P)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-        if not seen:
-            return state, Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
         ekf = _Ekf(state, lambda x: x)
         zhat, H = self._expected(state, seen)
         ekf.update(z.ravel(), HJacobian=lambda _: H, Hx=lambda _: zhat, R=R)
@@ -81,8 +79,6 @@ class FilterpyUkf(Unscented):
         return replace(state, x=ukf.x, P=ukf.P)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-        if not seen:
-            return state, Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
         at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
         sensor = PointSensor(state.problem.belief.sensor, self.uvd)
         involved = np.concatenate([np.arange(3), at.ravel()])

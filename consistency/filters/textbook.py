@@ -137,7 +137,9 @@ class ExtendedKalman:
         z, R = sensor_noise(observation.z, sensor, converted=sensor.model == "uvd" and not self.uvd)
         is_known = np.array([int(label) in state.landmarks for label in observation.landmarks], dtype=bool)
         seen = [int(label) for label in observation.landmarks[is_known]]
-        state, info = self._correct(state, seen, z[is_known], _block_diagonal(R[is_known]))
+        info = Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
+        if seen:
+            state, info = self._correct(state, seen, z[is_known], _block_diagonal(R[is_known]))
         for i in np.flatnonzero(~is_known):
             state = self._augment(state, int(observation.landmarks[i]), z[i], R[i])
         return state, info
@@ -224,8 +226,6 @@ class Unscented(ExtendedKalman):
         return replace(state, x=x, P=P, reference=self.motion.move(state.reference, control))
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-        if not seen:
-            return state, Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
         at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
         involved = np.concatenate([np.arange(3), at.ravel()])
         points, wm, wc = sigma_points(state.x, state.P, involved, state.problem.belief)

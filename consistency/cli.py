@@ -141,27 +141,60 @@ def run(
 
 @app.command()
 def analyse(
-    folder: Folder,
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="PATH", help="Folder written by 'run', or estimates: .csv, .parquet, .npz, TUM."),
+    ],
+    truth: Annotated[Path | None, typer.Option("--truth", help="Truth of the estimates, in the same form.")] = None,
+    covariance: Annotated[
+        Path | None, typer.Option("--covariance", help="Covariances of a TUM trajectory: t and 36 or 21 numbers.")
+    ] = None,
+    error: Annotated[
+        str | None,
+        typer.Option("--error", help="Error that the covariance is of: so2, vector, left, right, so3 or so3-body."),
+    ] = None,
+    state: Annotated[
+        str | None, typer.Option("--state", metavar="A,B,C", help="Columns that make up the state [x,y,heading].")
+    ] = None,
+    covariance_order: Annotated[
+        str | None,
+        typer.Option("--covariance-order", help="translation-rotation [default] or rotation-translation."),
+    ] = None,
+    max_dt: Annotated[
+        float | None, typer.Option("--max-dt", help="Seconds between an estimate and its truth at most [0.01].")
+    ] = None,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
     confidence: Annotated[float, typer.Option("--confidence", help="Of the verdict, over all steps at once.")] = 0.95,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
 ) -> None:
-    """Judge results: consistent, overconfident, conservative or failed, and why."""
+    """Judge results, or files of another estimator: consistent, overconfident, conservative or failed, and why."""
     from consistency.judge import analyse as judge_results
+    from consistency.recording import analyse_recordings, is_recording, read_recordings
     from consistency.results import read_results
     from consistency.table import print_verdicts, verdicts_json
 
     if fail_on not in (None, "inconsistent"):
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
-    results = read_results(folder)
-    verdicts = judge_results(results, filters, confidence)
-    if not results.manifest["complete"]:
-        done, asked = results.manifest["finished_runs"], results.manifest["runs"]
-        text = f"{folder}: only {done} of {asked} runs are there; the same 'consistency run' with --resume goes on"
-        if fail_on:
-            raise InputError(f"--fail-on: {text}")
-        print(f"consistency: {text}", file=sys.stderr)
+    options: dict[str, Any] = {
+        "truth": truth, "covariance": covariance, "convention": error,
+        "state": None if state is None else [name.strip() for name in state.split(",")],
+        "covariance_order": covariance_order, "max_dt": max_dt,
+    }  # fmt: skip
+    if is_recording(path, **options):
+        recordings = read_recordings(path, **options)
+        verdicts = analyse_recordings(recordings, filters, confidence)
+        for note in dict.fromkeys(note for recording in recordings for note in recording.notes):
+            print(f"consistency: {note}", file=sys.stderr)
+    else:
+        results = read_results(path)
+        verdicts = judge_results(results, filters, confidence)
+        if not results.manifest["complete"]:
+            done, asked = results.manifest["finished_runs"], results.manifest["runs"]
+            text = f"{path}: only {done} of {asked} runs are there; the same 'consistency run' with --resume goes on"
+            if fail_on:
+                raise InputError(f"--fail-on: {text}")
+            print(f"consistency: {text}", file=sys.stderr)
     if as_json:
         print(verdicts_json(verdicts))
     else:

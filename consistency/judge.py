@@ -99,8 +99,17 @@ def analyse(results: Results, filters: list[str] | None = None, confidence: floa
     verdicts = {}
     for name in filters or results.filters:
         c = curves(results, name)
-        verdicts[name] = judge(name, c.error, c.covariance, c.nees, c.nis, c.nis_dof, c.failures, confidence)
+        verdicts[name] = verdict_of(c, 1.0 - confidence)
     return verdicts
+
+
+def verdict_of(c: Curves, false_alarm: float) -> Verdict:
+    """The verdict on one filter's arrays."""
+    verdict = judge(c.filter, c.error, c.covariance, c.nees, c.nis, c.nis_dof, c.failures, false_alarm, axes=POSE)
+    outlier = verdict.statistics.get("outlier")
+    if outlier and outlier["row"] >= 0:
+        outlier["run"] = int(c.runs[outlier["row"]])
+    return verdict
 
 
 def _steps(results: Results) -> int:

@@ -15,7 +15,8 @@ from rich.table import Table as RichTable
 from consistency.types import Finding, Verdict
 
 COLOURS = {
-    "consistent": "green", "overconfident": "red", "conservative": "yellow", "failed": "red",
+    "consistent": "green", "overconfident": "red", "conservative": "yellow", "inconsistent": "red", "failed": "red",
+    "undecided": "yellow",
     "reproduced": "green", "not reproduced": "yellow", "refuted": "red",
 }  # fmt: skip
 
@@ -49,8 +50,9 @@ def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
     console.print(table)
     if reasons:
         for name, verdict in verdicts.items():
-            console.print(f"\n{name}: {verdict.status}", markup=False)
-            for reason in verdict.reasons:
+            first, *rest = verdict.reasons
+            console.print(f"\n{name} is {first}", markup=False)
+            for reason in rest:
                 console.print(f"  - {reason}", markup=False)
 
 

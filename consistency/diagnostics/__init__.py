@@ -3,20 +3,61 @@
 No table, no plot and no file belongs here.
 """
 
-from consistency.diagnostics.coverage import coverage, rmse
+from consistency.diagnostics.bias import Hotelling, hotelling, t_squared
+from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
+from consistency.diagnostics.credibility import noncredibility
+from consistency.diagnostics.distribution import Pit, pit
+from consistency.diagnostics.innovations import NisTest, Whiteness, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
 from consistency.diagnostics.nees import anees, nees
 from consistency.diagnostics.normality import Normality, normality
+from consistency.diagnostics.outliers import Outlier, outliers
+from consistency.diagnostics.planning import detectable_ratio, gate_runs, power_of, required_runs
+from consistency.diagnostics.questions import Answer, answers
+from consistency.diagnostics.scale import Band, MeanTest, mean_test, ratio_interval, simultaneous_band
+from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
 from consistency.diagnostics.verdict import judge
+from consistency.diagnostics.whitening import spread_steps, standardise, whiten
 
 __all__ = [
+    "Answer",
+    "Band",
+    "Hotelling",
+    "MeanTest",
+    "NisTest",
     "Normality",
+    "Outlier",
+    "Pit",
+    "Whiteness",
     "anees",
     "anees_interval",
+    "answers",
     "chi2_mean_interval",
     "coverage",
+    "coverage_interval",
+    "detectable_ratio",
+    "gate_runs",
+    "hotelling",
+    "identity_statistic",
     "judge",
+    "mean_shape",
+    "mean_test",
     "nees",
+    "nis_test",
+    "nis_whiteness",
+    "noncredibility",
     "normality",
+    "outliers",
+    "pit",
+    "power_of",
+    "ratio_interval",
+    "required_runs",
     "rmse",
+    "simultaneous_band",
+    "sphericity",
+    "spread_steps",
+    "standardise",
+    "t_squared",
+    "whiten",
+    "whiteness",
 ]

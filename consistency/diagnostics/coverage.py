@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import stats
 
+from consistency.diagnostics.whitening import spread_steps
 from consistency.types import Array
 
 TWO_SIGMA = 0.9544997361036416  # P(|N(0, 1)| <= 2)
@@ -28,3 +30,23 @@ def rmse(error: Array) -> float:
     squared = np.sum(np.square(np.asarray(error, float)), axis=-1)
     squared = squared[np.isfinite(squared)]
     return float(np.sqrt(squared.mean())) if squared.size else float("nan")
+
+
+def coverage_interval(
+    error: Array, covariance: Array, bound: float = 2.0, confidence: float = 0.95
+) -> tuple[Array, Array]:
+    """Coverage of one step of each run and its exact binomial interval (Clopper & Pearson 1934), for each axis.
+
+    One step a run, spread over the trajectory (:func:`spread_steps`): independent draws, which pooled steps
+    are not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2).
+    """
+    error = np.asarray(error, float)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    chosen = spread_steps((np.isfinite(error) & np.isfinite(sigma)).all(axis=-1))
+    rows = np.flatnonzero(chosen >= 0)
+    inside = (np.abs(error[rows, chosen[rows]]) <= bound * sigma[rows, chosen[rows]]).sum(axis=0)
+    if not len(rows):
+        n = error.shape[-1]
+        return np.full(n, np.nan), np.tile([0.0, 1.0], (n, 1))
+    intervals = [stats.binomtest(int(k), len(rows)).proportion_ci(confidence, "exact") for k in inside]
+    return inside / len(rows), np.array([[i.low, i.high] for i in intervals])

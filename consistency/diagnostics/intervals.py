@@ -25,15 +25,6 @@ def anees_interval(dof: int, runs: int, confidence: float = 0.95) -> tuple[float
     return low * dof, high * dof
 
 
-def detectable_ratio(dof: int, runs: int, confidence: float = 0.95, power: float = 0.95) -> float:
-    """Smallest ratio of true to stated covariance that one step's interval finds with ``power``.
-
-    The average NEES is then the ratio times chi-square(dof runs) / runs, and must exceed the upper end.
-    """
-    _, high = anees_interval(dof, runs, confidence)
-    return high * runs / float(stats.chi2.ppf(1.0 - power, dof * runs))
-
-
 def chi2_mean_interval(dof: float, confidence: float = 0.95) -> tuple[float, float]:
     """Two-sided interval of chi-square over its degrees of freedom, for example of summed NIS."""
     if not 0.0 < confidence < 1.0:

@@ -2,156 +2,367 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from consistency.diagnostics.coverage import TWO_SIGMA, coverage, rmse
-from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval, detectable_ratio
+from consistency.diagnostics import wording
+from consistency.diagnostics.bias import hotelling, t_squared
+from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
+from consistency.diagnostics.credibility import noncredibility
+from consistency.diagnostics.distribution import pit
+from consistency.diagnostics.innovations import nis_test, nis_whiteness, whiteness
+from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
 from consistency.diagnostics.nees import anees
+from consistency.diagnostics.outliers import outliers
+from consistency.diagnostics.planning import detectable_ratio
+from consistency.diagnostics.questions import MAIN, SHARES, Answer, answers
+from consistency.diagnostics.scale import (
+    Band,
+    MeanTest,
+    acceptance,
+    mean_test,
+    ratio_interval,
+    run_means,
+    simultaneous_band,
+)  # fmt: skip
+from consistency.diagnostics.shape import mean_shape, sphericity
+from consistency.diagnostics.whitening import standardise, whiten
 from consistency.types import Array, Failure, Verdict
 
-SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
+POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
+INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
 
 
 def judge(
-    filter_name: str,
-    error: Array | None,
-    covariance: Array,
-    nees: Array | None,
-    nis: Array,
-    nis_dof: Array,
+    name: str,
+    error: Array | None = None,
+    covariance: Array | None = None,
+    nees: Array | None = None,
+    nis: Array | None = None,
+    nis_dof: Array | None = None,
     failures: tuple[Failure, ...] = (),
-    confidence: float = 0.95,
+    false_alarm: float = 0.05,
+    *,
+    dof: int | None = None,
+    axes: Sequence[str] | None = None,
+    subsets: Mapping[str, Sequence[int]] | None = None,
+    allow: str | None = None,
+    method: str = "max",
+    innovations: Array | None = None,
+    innovation_covariances: Array | None = None,
 ) -> Verdict:
-    """Consistent, overconfident, conservative or failed, with reasons and statistics.
+    """Consistent, overconfident, conservative, inconsistent or failed, with reasons and statistics.
 
-    The verdict compares the ANEES curve with a band that holds in all judged steps at once
-    (Bonferroni): N ANEES(k) is chi-square with N n degrees of freedom in every step, so a consistent
-    linear-Gaussian filter leaves that band anywhere with probability at most 1 - confidence, however
-    its steps depend on each other. The pointwise interval (eq. 17) is reported beside it. A filter
-    with failed runs is never consistent. Without truth the NIS is judged instead.
+    Runs are independent, steps are not: every test takes a run as one observation, or holds under any
+    dependence between steps. A filter whose errors are Gaussian with the stated covariance is found at fault in
+    any of the questions (``consistency.diagnostics.questions``) with probability ``false_alarm`` at most;
+    half of that belongs to the mean NEES, for which :func:`required_runs` plans. A filter with failed runs is never
+    consistent. Without truth the innovations are judged alone.
 
     Parameters
     ----------
     error, covariance : (runs, steps, n), (runs, steps, n, n), NaN where a run has no estimate
-    nees : (runs, steps), NaN where the covariance is rank-deficient or the run has failed
-    nis, nis_dof : (runs, steps)
+    nees : (runs, steps), NaN where the covariance is rank-deficient or the run has failed; worked out from
+        error and covariance where it is not given. With ``dof`` it may stand alone.
+    nis, nis_dof : (runs, steps), NaN where there was no innovation
+    axes : names of the n components
+    subsets : further groups of components to look at, name -> indices
+    allow : "conservative" accepts a covariance that is too large
+    method : of the band over all steps, see :func:`simultaneous_band`
+    innovations, innovation_covariances : (runs, steps, m), (runs, steps, m, m), for their whiteness;
+        without them the NIS has to do
+
+    Raises
+    ------
+    ValueError
+        Nothing to judge is given, or shapes or options do not fit.
     """
-    runs, steps = nis.shape
-    statistics: dict[str, Any] = {"runs": runs, "steps": steps, "confidence": confidence}
-    statistics |= _nis(nis, nis_dof, confidence)
-    statistics["failures"] = [[f.run, f.step, f.reason] for f in failures]
-    if error is None or nees is None:
-        status, reasons = _judge_nis(statistics)
+    if allow not in (None, "conservative"):
+        raise ValueError(f"allow must be 'conservative' or None, got '{allow}'")
+    if not 0.0 < false_alarm < 1.0:
+        raise ValueError(f"false_alarm must lie between 0 and 1, got {false_alarm}")
+    if nees is None and error is None and nis is None:
+        raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
+    first = next(array for array in (nis, nees, error) if array is not None)
+    s: dict[str, Any] = {
+        "runs": len(first), "steps": first.shape[1], "false_alarm": false_alarm, "confidence": 1.0 - false_alarm,
+        "allow": allow, "failures": [[f.run, f.step, f.reason] for f in failures],
+    }  # fmt: skip
+    p_values: dict[str, float] = {}
+    if nis is not None and nis_dof is not None:
+        p_values |= _innovations(s, nis, nis_dof, allow, innovations, innovation_covariances)
+    elif innovations is not None and innovation_covariances is not None and allow is None:
+        p_values["innovation whiteness"] = _white(s, whiteness(innovations, innovation_covariances))
+    whitened = None
+    if error is not None and covariance is not None:
+        whitened = whiten(error, covariance)
+        counted = np.asarray(np.isfinite(nees) if nees is not None else np.isfinite(whitened).all(axis=-1))
+        nees = np.where(counted, np.square(whitened).sum(axis=-1), np.nan)
+        whitened = np.where(counted[..., None], whitened, np.nan)
+        dof = error.shape[-1]
+        p_values |= _errors(s, error, covariance, nees, whitened, allow, axes, subsets)
+    band = None
+    if nees is not None:
+        if dof is None:
+            raise ValueError("nees needs dof, the dimension of the error")
+        p_values |= _nees(s, nees, dof, whitened, allow)
+        band = simultaneous_band(nees, dof, _share(p_values, "scale in some step") * false_alarm, method, allow)
+        if nees.shape[1] > 1:
+            p_values["scale in some step"] = band.p_value
+    found = answers(p_values, false_alarm)
+    s["answers"] = [asdict(answer) for answer in found.values()]
+    s["p_value"] = min((a.p_value / a.share for a in found.values()), default=float("nan"))
+    if nees is not None and dof is not None and band is not None:
+        _locate(s, nees, dof, band, found, error, covariance)
+    status = _status(s, found)
+    if failures and (status == "consistent" or s.get("judged_steps") == 0):
+        status = "failed"
+    return Verdict(name, status, tuple(wording.reasons(status, s)), s)
+
+
+# --- what is asked ---------------------------------------------------------------------------------
+
+
+def _innovations(
+    s: dict[str, Any], nis: Array, dof: Array, allow: str | None, vectors: Array | None, covariances: Array | None
+) -> dict[str, float]:
+    test = nis_test(nis, dof)
+    low, high = chi2_mean_interval(test.dof, INTERVAL) if test.dof else (float("nan"), float("nan"))
+    s |= {"nis_ratio": test.ratio, "nis_interval": [low, high], "nis_dof": test.dof}
+    if allow is not None:
+        return {"innovation scale": test.above}
+    if vectors is not None and covariances is not None:
+        white = whiteness(vectors, covariances)
     else:
-        statistics |= _nees(error, covariance, nees, confidence)
-        status, reasons = _judge_nees(statistics)
-    if failures:
-        first = failures[0]
-        reasons.append(
-            f"{len(failures)} of {runs} runs failed, first run {first.run} in step {first.step}: {first.reason}"
-        )
-        status = "failed" if status == "consistent" or statistics.get("judged_steps") == 0 else status
-    return Verdict(filter_name, status, tuple(reasons), statistics)
+        white = nis_whiteness(nis, dof)
+    return {"innovation scale": test.p_value, "innovation whiteness": _white(s, white)}
 
 
-def _nees(error: Array, covariance: Array, nees: Array, confidence: float) -> dict[str, Any]:
+def _white(s: dict[str, Any], white: Any) -> float:
+    s |= {"autocorrelation": white.correlation, "autocorrelation_bound": white.bound}
+    return float(white.p_value)
+
+
+def _errors(
+    s: dict[str, Any],
+    error: Array,
+    covariance: Array,
+    nees: Array,
+    whitened: Array,
+    allow: str | None,
+    axes: Sequence[str] | None,
+    subsets: Mapping[str, Sequence[int]] | None,
+) -> dict[str, float]:
     n = error.shape[-1]
-    curve, counted = anees(nees), np.isfinite(nees)
-    alive = counted.sum(axis=0)
-    judged = alive > 0
-    deficient = (np.isfinite(error).all(axis=-1) & ~counted).any(axis=0)  # left out of every statistic
+    names = tuple(axes) if axes is not None else tuple(f"axis {i}" for i in range(n))
+    if len(names) != n:
+        raise ValueError(f"{len(names)} names of axes for {n} components")
+    counted = np.isfinite(nees)
     error = np.where(counted[..., None], error, np.nan)
-    tail = 1.0 - (1.0 - confidence) / max(int(judged.sum()), 1)
-    bands = {
-        int(m): (anees_interval(n, int(m), confidence), anees_interval(n, int(m), tail)) for m in set(alive[judged])
+    groups = _groups(names, subsets)
+    tests = {key: _subset_test(error, covariance, nees, whitened, index) for key, index in groups.items()}
+    worst = min(((t.above if allow else t.p_value) for t in tests.values()), default=1.0)
+    mean, total = np.nanmean, counted.any(axis=1)
+    of_runs = mean(whitened[total], axis=1) if total.any() else np.empty((0, n))
+    enough = len(of_runs) > n
+    _, bias_steps = t_squared(whitened)
+    asked_steps = np.isfinite(bias_steps)
+    p = {
+        "scale of an axis": min(1.0, worst * len(tests)) if n > 1 else float("nan"),
+        "bias": hotelling(of_runs).p_value if enough else float("nan"),
     }
+    several = nees.shape[1] > 1
+    if several and asked_steps.any():
+        p["bias in some step"] = min(1.0, float(np.nanmin(bias_steps)) * int(asked_steps.sum()))
+    odd = outliers(whitened)
+    p["outliers"] = odd.p_value
+    if allow is None:
+        _, shape_steps = sphericity(whitened)
+        scaled, shape = mean_shape(whitened)
+        s["shape"] = scaled
+        asked = int(np.isfinite(shape_steps).sum())
+        at_step = min(1.0, float(np.nanmin(shape_steps)) * asked) if asked else float("nan")
+        p |= {"shape": shape, "shape in some step": at_step} if several else {"shape": at_step}
+    index, inclination = noncredibility(error, nees)
+    inside, interval = coverage_interval(error, covariance)
+    position = [i for i, axis in enumerate(names) if axis in POSITION]
+    attitude = [i for i, axis in enumerate(names) if axis in ATTITUDE]
+    s |= {
+        "axes": names,
+        "groups": groups,
+        "coverage": [float(c) for c in coverage(error, covariance)],
+        "coverage_one_step": inside,
+        "coverage_interval": interval,
+        "rmse": [rmse(error[..., [i]]) for i in range(n)],
+        "rmse_position": rmse(error[..., position]) if position else float("nan"),
+        "rmse_heading": rmse(error[..., attitude]) if attitude else float("nan"),
+        "nci": float(mean(index)) if np.isfinite(index).any() else float("nan"),
+        "inclination": float(mean(inclination)) if np.isfinite(inclination).any() else float("nan"),
+        "outlier": {"row": odd.run, "run": odd.run, "step": odd.step + 1, "distance": odd.distance},
+        "left_out_steps": [int(k) + 1 for k in np.flatnonzero(_finite_any(covariance, error, counted))],
+    }
+    return p
+
+
+def _finite_any(covariance: Array, error: Array, counted: Array) -> Array:
+    """Steps in which a run has an estimate whose covariance could not be used."""
+    there = np.isfinite(covariance).all(axis=(-2, -1))
+    return np.asarray((there & ~counted).any(axis=0))
+
+
+def _groups(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
+    groups = {axis: [i] for i, axis in enumerate(names)}
+    for label, members in (("position", POSITION), ("attitude", ATTITUDE)):
+        index = [i for i, axis in enumerate(names) if axis in members]
+        if 1 < len(index) < len(names):
+            groups[label] = index
+    for label, chosen in (subsets or {}).items():
+        index = [int(i) for i in chosen]
+        if not index or not all(0 <= i < len(names) for i in index) or len(set(index)) < len(index):
+            raise ValueError(f"subset '{label}': indices must be different and between 0 and {len(names) - 1}")
+        groups[label] = index
+    return groups
+
+
+def _subset(error: Array, covariance: Array, index: list[int]) -> Array:
+    """Whitened errors of a group of components, (runs, steps, len(index))."""
+    if len(index) == 1:
+        return np.asarray(standardise(error, covariance)[..., index])
+    return whiten(error[..., index], covariance[..., index, :][..., index])
+
+
+def _subset_test(error: Array, covariance: Array, nees: Array, whitened: Array, index: list[int]) -> MeanTest:
+    w = _subset(error, covariance, index)
+    return mean_test(np.where(np.isfinite(nees), np.square(w).sum(axis=-1), np.nan), len(index), w)
+
+
+def _nees(s: dict[str, Any], nees: Array, dof: int, whitened: Array | None, allow: str | None) -> dict[str, float]:
+    test = mean_test(nees, dof, whitened)
+    means, counts = run_means(nees)
+    means = means[counts > 0]
+    alive = np.isfinite(nees).sum(axis=0)
+    curve = anees(nees)
+    judged = alive > 0
     band = np.full((len(curve), 2), np.nan)
-    simultaneous = np.full((len(curve), 2), np.nan)
+    intervals = {int(m): anees_interval(dof, int(m), INTERVAL) for m in set(alive[judged])}
     for k in np.flatnonzero(judged):
-        band[k], simultaneous[k] = bands[int(alive[k])]
+        band[k] = intervals[int(alive[k])]
     inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
-    above, below = curve > simultaneous[:, 1], curve < simultaneous[:, 0]
-    outside = np.flatnonzero(above | below)
-    covered = coverage(error, covariance)
-    of_runs = np.nanmean(nees[counted.any(axis=1)], axis=1)
-    return {
-        "dof": n,
+    some = bool(judged.any())
+    ratio, low, high = ratio_interval(means / dof, INTERVAL)
+    share = SHARES[MAIN] * s["false_alarm"]
+    distribution = pit(nees, dof)
+    s |= {
+        "dof": dof,
         "anees": curve,
         "alive": alive,
         "band": band,
-        "simultaneous": simultaneous,
         "judged_steps": int(judged.sum()),
-        "left_out_steps": [int(k) + 1 for k in np.flatnonzero(deficient)],
-        "mean_anees": float(np.nanmean(curve)) if judged.any() else float("nan"),
-        "detectable": detectable_ratio(n, int(alive.max()), tail) if judged.any() else float("nan"),
-        "median_run": float(np.median(of_runs)) if len(of_runs) else float("nan"),
-        "worst_run": float(of_runs.max()) if len(of_runs) else float("nan"),
-        "share_inside": float(inside[judged].mean()) if judged.any() else float("nan"),
+        "mean_anees": test.ratio * dof,
+        "acceptance": acceptance(test, len(means), dof, share, allow) if some else (float("nan"),) * 2,
+        "effective_dof": test.effective_dof,
+        "ratio": ratio,
+        "ratio_interval": (low, high),
+        "detectable": detectable_ratio(dof, len(means), share, two_sided=allow is None) if some else float("nan"),
+        "median_run": float(np.median(means)) if some else float("nan"),
+        "worst_run": float(means.max()) if some else float("nan"),
+        "share_inside": float(inside[judged].mean()) if some else float("nan"),
+        "pit": distribution.values,
+        "pit_half_width": distribution.half_width,
+    }
+    s.setdefault("left_out_steps", [])
+    p = {MAIN: (test.above if allow else test.p_value) if some else float("nan")}
+    return p if allow else p | {"distribution": distribution.p_value}
+
+
+def _share(p_values: Mapping[str, float], question: str) -> float:
+    """Share of the false-alarm rate that a question will have among those asked."""
+    return answers(dict.fromkeys([q for q, p in p_values.items() if np.isfinite(p)] + [question], 1.0), 0.5)[
+        question
+    ].share
+
+
+# --- what is found ---------------------------------------------------------------------------------
+
+
+def _locate(
+    s: dict[str, Any],
+    nees: Array,
+    dof: int,
+    band: Band,
+    found: Mapping[str, Answer],
+    error: Array | None,
+    covariance: Array | None,
+) -> None:
+    """Since when, by how much and where: nothing here decides, the answers have."""
+    above, below = band.above, band.below
+    s |= {
+        "simultaneous": np.stack([band.low, band.high], axis=-1),
         "steps_above": int(above.sum()),
         "steps_below": int(below.sum()),
-        "first_outside": int(outside[0]) + 1 if len(outside) else None,
-        "coverage": [float(c) for c in covered],
-        "rmse_position": rmse(error[..., :2]),
-        "rmse_heading": rmse(error[..., 2:]),
+        "first_outside": int(np.argmax(band.outside)) + 1 if band.outside.any() else None,
+        "first_step": None,
+        "since": None,
+        "subset": None,
     }
+    in_steps = "scale in some step" in found and found["scale in some step"].found
+    late = slice(None)
+    if in_steps and band.outside.any():
+        first = int(np.argmax(band.outside))
+        s["first_step"] = first + 1
+        high = bool(above[first])
+        pointwise = s["anees"] > s["band"][:, 1] if high else s["anees"] < s["band"][:, 0]
+        if pointwise[first:][np.isfinite(s["anees"][first:])].mean() > 0.5:
+            s["since"], late = first + 1, slice(first, None)
+    means, counts = run_means(nees[:, late])
+    if s["since"] is not None:
+        ratio, low, high_end = ratio_interval(means[counts > 0] / dof, INTERVAL)
+        s["ratio"], s["ratio_interval"] = ratio, (low, high_end)
+    if error is None or covariance is None:
+        return
+    groups = s["groups"]
+    confidence = 1.0 - (1.0 - INTERVAL) / len(groups)
+    counted = np.isfinite(nees[:, late])
+    s["of_axes"], standard = {}, standardise(error[:, late], covariance[:, late])
+    for key, index in groups.items():
+        w = standard[..., index] if len(index) == 1 else _subset(error[:, late], covariance[:, late], index)
+        of_runs, count = run_means(np.where(counted, np.square(w).sum(axis=-1), np.nan))
+        s["of_axes"][key] = ratio_interval(of_runs[count > 0] / len(index), confidence)
+    standard = np.where(counted[..., None], standard, np.nan)
+    rows = counted.any(axis=1)
+    if rows.sum() > dof:
+        test = hotelling(np.nanmean(standard[rows], axis=1))
+        s["bias"] = {axis: (test.mean[i], *test.interval[i]) for i, axis in enumerate(s["axes"])}
+    s["subset"] = _main_axes(s)
 
 
-def _nis(nis: Array, dof: Array, confidence: float) -> dict[str, Any]:
-    total = int(np.where(np.isfinite(nis), dof, 0).sum())
-    if total == 0:
-        return {"nis_ratio": float("nan"), "nis_interval": [float("nan")] * 2, "nis_dof": 0}
-    low, high = chi2_mean_interval(total, confidence)
-    return {"nis_ratio": float(np.nansum(nis) / total), "nis_interval": [low, high], "nis_dof": total}
+def _main_axes(s: dict[str, Any]) -> str | None:
+    """The axes that carry the fault; None where no axis stands out or all do."""
+    wrong = {a: s["of_axes"][a] for a in s["axes"] if not s["of_axes"][a][1] <= 1.0 <= s["of_axes"][a][2]}
+    if not wrong:
+        return None
+    largest = max(abs(np.log(max(ratio, 1e-300))) for ratio, _, _ in wrong.values())
+    chief = [a for a, (ratio, _, _) in wrong.items() if abs(np.log(max(ratio, 1e-300))) > 0.5 * largest]
+    return None if len(chief) == len(s["axes"]) else ", ".join(chief)
 
 
-def _judge_nees(s: dict[str, Any]) -> tuple[str, list[str]]:
-    if s["judged_steps"] == 0:
-        return "failed", ["no step has a pose covariance of full rank to judge"]
-    percent = f"{100 * s['confidence']:g} %"
-    mean = s["mean_anees"]
-    text = f"ANEES {_short(mean)} on average ({s['dof']} expected)"
-    if s["worst_run"] > SPREAD * s["median_run"]:
-        text += f", {_short(s['median_run'])} in the median and {_short(s['worst_run'])} in the worst run"
-    low, high = s["simultaneous"][s["alive"] > 0][0]
-    band = f"the band [{low:.2f}, {high:.2f}] that holds in all steps at once with {percent}"
-    if s["first_outside"] is None:
-        status, text = "consistent", f"{text}; never outside {band}"
-        text += f" ({s['alive'].max()} runs find a covariance too small by x{s['detectable']:.2g} with power 0.95)"
-    else:
-        status = "overconfident" if s["steps_above"] else "conservative"
-        where = []
-        if s["steps_above"]:
-            where.append(f"above it in {s['steps_above']}")
-        if s["steps_below"]:
-            where.append(f"below it in {s['steps_below']}")
-        count = f"{' and '.join(where)} of {s['judged_steps']} steps, first in step {s['first_outside']}"
-        text = f"{text}; {band}: {count}"
-    axes = ("x", "y", "heading")
-    covered = ", ".join(f"{axis} {100 * c:.1f} %" for axis, c in zip(axes, s["coverage"], strict=False))
-    return status, [text, f"2-sigma coverage {covered} ({100 * TWO_SIGMA:.1f} % expected)", _nis_sentence(s)]
-
-
-def _judge_nis(s: dict[str, Any]) -> tuple[str, list[str]]:
-    low, high = s["nis_interval"]
-    status = "consistent"
-    if not np.isfinite(s["nis_ratio"]):
-        return "failed", ["neither truth nor innovations to judge"]
-    if s["nis_ratio"] > high:
-        status = "overconfident"
-    elif s["nis_ratio"] < low:
-        status = "conservative"
-    return status, ["no truth: judged by the NIS alone, which cannot see most pose errors", _nis_sentence(s)]
-
-
-def _short(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:.2f}"
-
-
-def _nis_sentence(s: dict[str, Any]) -> str:
-    (low, high), ratio = s["nis_interval"], s["nis_ratio"]
-    if not np.isfinite(ratio):
-        return "no NIS: the filter reports no innovations"
-    note = "" if low <= ratio <= high else "; outside, which the verdict on the pose does not count"
-    return f"NIS per degree of freedom {ratio:.3f} ({low:.3f} to {high:.3f} expected{note if 'anees' in s else ''})"
+def _status(s: dict[str, Any], found: Mapping[str, Answer]) -> str:
+    if not found or s.get("judged_steps") == 0:
+        return "failed"
+    faults = {q for q, a in found.items() if a.found}
+    if not faults:
+        return "consistent"
+    if MAIN in faults:
+        return "overconfident" if s["mean_anees"] > s["dof"] else "conservative"
+    if "scale in some step" in faults:
+        return "overconfident" if s["steps_above"] else "conservative"
+    if "scale of an axis" in faults:
+        sides = {ratio > 1.0 for ratio, low, high in s["of_axes"].values() if not low <= 1.0 <= high}
+        return "inconsistent" if len(sides) != 1 else "overconfident" if sides.pop() else "conservative"
+    if faults <= {"innovation scale", "innovation whiteness"} and "anees" not in s:
+        high = s["nis_ratio"] > 1.0
+        return ("overconfident" if high else "conservative") if "innovation scale" in faults else "inconsistent"
+    return "inconsistent"

@@ -24,7 +24,7 @@ RANK = {
     "protocols": 4,
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
     "storage": 5, "results": 6,
-    "log": 7,
+    "log": 7, "recording": 7,
     "montecarlo": 8, "judge": 8, "table": 8,
     "findings": 9,
     "plots": 10,

@@ -1,0 +1,44 @@
+"""Does the NEES follow its chi-square, with nothing fitted?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from consistency.diagnostics.whitening import spread_steps
+from consistency.types import Array
+
+
+@dataclass(frozen=True)
+class Pit:
+    """Probability integral transform of the NEES against its band."""
+
+    values: Array  # (N,), sorted: uniform between 0 and 1 if the covariance is right
+    half_width: float  # of the simultaneous band around the diagonal
+    statistic: float  # Kolmogorov's distance
+    p_value: float
+
+
+def pit(nees: Array, dof: int, false_alarm: float = 0.05) -> Pit:
+    """Distribution function of the chi-square at the NEES of one step of each run, and Kolmogorov's test.
+
+    One value a run, at steps spread over the trajectory (:func:`spread_steps`), is an independent sample, so
+    the exact distribution of Kolmogorov's distance holds (Marsaglia, Tsang & Wang 2003) and the band holds
+    for the whole empirical distribution function at once.
+
+    Parameters
+    ----------
+    nees : (runs, steps), NaN where a run has no value
+    dof : degrees of freedom, which no data are used to choose
+    """
+    chosen = spread_steps(np.isfinite(nees))
+    rows = np.flatnonzero(chosen >= 0)
+    u = np.sort(stats.chi2.cdf(nees[rows, chosen[rows]], dof))
+    N = len(u)
+    if N == 0:
+        return Pit(u, float("nan"), float("nan"), float("nan"))
+    grid = np.arange(N + 1) / N
+    distance = float(max((grid[1:] - u).max(), (u - grid[:-1]).max()))
+    return Pit(u, float(stats.kstwo.isf(false_alarm, N)), distance, float(stats.kstwo.sf(distance, N)))

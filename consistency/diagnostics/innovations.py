@@ -1,0 +1,100 @@
+"""Innovations of a right filter are white, with the covariance it states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from consistency.diagnostics.whitening import whiten
+from consistency.types import Array
+
+LAGS = 10
+FEWEST = 100  # values; below, the chi-square of the portmanteau is not to be trusted
+
+
+@dataclass(frozen=True)
+class NisTest:
+    """Total NIS against its degrees of freedom."""
+
+    ratio: float  # total NIS over total degrees of freedom
+    dof: int
+    above: float  # one-sided p values
+    below: float
+
+    @property
+    def p_value(self) -> float:
+        return min(1.0, 2.0 * min(self.above, self.below))
+
+
+def nis_test(nis: Array, dof: Array) -> NisTest:
+    """Chi-square test of the total NIS, Bar-Shalom, Li & Kirubarajan (2001) sec. 5.4.
+
+    Innovations of a right filter are independent over steps too, so all runs and steps add up, whatever
+    number of degrees of freedom each step has. Shapes (runs, steps); NaN does not count.
+    """
+    counted = np.isfinite(nis) & (dof > 0)
+    k, total = int(dof[counted].sum()), float(nis[counted].sum())
+    if k == 0:
+        return NisTest(float("nan"), 0, float("nan"), float("nan"))
+    return NisTest(total / k, k, float(stats.chi2.sf(total, k)), float(stats.chi2.cdf(total, k)))
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Autocorrelation over steps, and whether all of it is zero."""
+
+    correlation: Array  # (lags,), of lag 1, 2, ...; mean over components
+    bound: float  # that 95 % of each stay within, if white
+    statistic: float  # portmanteau
+    dof: int
+    p_value: float
+
+
+def whiteness(innovations: Array, covariances: Array, lags: int = LAGS) -> Whiteness:
+    """Are innovations independent over steps? Portmanteau test of their autocorrelation matrices.
+
+    With u the innovations in units of their stated covariance and C_l the mean of u_k u_{k+l}' over the M
+    pairs of all runs, sum M |C_l|^2 / s^4 is chi-square with lags m^2 degrees of freedom (Box & Pierce 1970;
+    Hosking 1980 for vectors), s^2 the mean square of u: a wrong scale alone does not fire it.
+
+    Parameters
+    ----------
+    innovations, covariances : (runs, steps, m), (runs, steps, m, m); NaN where there is none
+    """
+    return _portmanteau(whiten(innovations, covariances), lags)
+
+
+def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
+    """The same of the NIS alone, where no innovations are kept: (nis - dof) / sqrt(2 dof), shapes (runs, steps).
+
+    Correlated innovations show in their squares, with the correlation squared.
+    """
+    counted = np.isfinite(nis) & (dof > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.where(counted, nis / np.where(dof > 0, dof, 1), np.nan)
+        overall = nis[counted].sum() / max(dof[counted].sum(), 1)
+        z = (z / overall - 1.0) * np.sqrt(dof / 2.0) if overall > 0 else z * np.nan
+    return _portmanteau(np.where(counted, z, np.nan)[..., None], lags)
+
+
+def _portmanteau(u: Array, lags: int) -> Whiteness:
+    _, steps, m = u.shape
+    lags = min(lags, max(steps // 4, 1), max(steps - 1, 0))
+    present = np.asarray(np.isfinite(u).all(axis=-1))
+    if lags == 0 or present.sum() < FEWEST:
+        return Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
+    u = np.where(present[..., None], u, 0.0)
+    power = float(np.square(u).sum() / (present.sum() * m))
+    statistic, correlation, pairs = 0.0, np.zeros(lags), 0
+    for lag in range(1, lags + 1):
+        pairs = int((present[:, lag:] & present[:, :-lag]).sum())
+        if pairs == 0 or power == 0:
+            return Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
+        C = np.tensordot(u[:, :-lag], u[:, lag:], axes=((0, 1), (0, 1))) / (pairs * power)
+        correlation[lag - 1] = np.trace(C) / m
+        statistic += pairs * float(np.square(C).sum())
+    dof = lags * m * m
+    bound = 1.96 / np.sqrt(pairs * m)
+    return Whiteness(correlation, float(bound), statistic, dof, float(stats.chi2.sf(statistic, dof)))

@@ -1,0 +1,55 @@
+"""Heavy tails: errors that lie farther from the other runs than a Gaussian allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from consistency.diagnostics.bias import moments
+from consistency.types import Array
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """The error that stands out most."""
+
+    p_value: float  # over all runs and steps
+    run: int  # row
+    step: int  # column
+    distance: float  # from the mean of the runs in that step, in standard deviations of the runs
+
+
+def outliers(whitened: Array) -> Outlier:
+    """Largest distance of any run in any step from the other runs, Wilks (1963).
+
+    The squared Mahalanobis distance D^2 from the sample mean with the sample covariance has D^2 N / (N - 1)^2
+    distributed as Beta(n / 2, (N - n - 1) / 2) for Gaussian errors of any mean and covariance; the
+    smallest p value is multiplied by the number of runs and steps (Bonferroni). p is NaN where no step has
+    n + 3 runs.
+
+    Parameters
+    ----------
+    whitened : (runs, steps, n), NaN where a run has no value
+    """
+    N, mean, S = moments(whitened)
+    n = whitened.shape[-1]
+    usable = np.flatnonzero(n + 3 <= N)
+    usable = usable[np.linalg.det(S[usable]) > 0]
+    if not len(usable):
+        return Outlier(float("nan"), -1, -1, float("nan"))
+    gap = whitened[:, usable] - mean[usable]
+    precision = np.linalg.inv(S[usable])
+    d2 = np.zeros(gap.shape[:2])
+    for i in range(n):
+        for j in range(n):
+            d2 += gap[..., i] * precision[:, i, j] * gap[..., j]
+    d2 = np.where(np.isfinite(d2), d2, 0.0)
+    rows, of_step = d2.argmax(axis=0), d2.max(axis=0)
+    count = N[usable]
+    with np.errstate(invalid="ignore"):
+        p = stats.beta.sf(np.minimum(of_step * count / (count - 1.0) ** 2, 1.0), n / 2, (count - n - 1) / 2)
+    worst = int(p.argmin())
+    p_value = min(1.0, float(p[worst]) * float(count.sum()))
+    return Outlier(p_value, int(rows[worst]), int(usable[worst]), float(np.sqrt(of_step[worst])))

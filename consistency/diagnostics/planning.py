@@ -1,0 +1,78 @@
+"""How many runs a verdict takes, and what a number of runs can find."""
+
+from __future__ import annotations
+
+from scipy import stats
+
+from consistency.diagnostics.questions import MAIN, SHARES
+
+LARGEST = 10**7  # runs; more is refused as a mistake
+
+
+def required_runs(
+    dof: int, ratio: float, false_alarm: float = 0.05, power: float = 0.95, two_sided: bool = True
+) -> int:
+    """Runs that find a covariance wrong by ``ratio`` with ``power`` in the average NEES of one step.
+
+    N times the average is ``ratio`` times chi-square with N ``dof`` degrees of freedom, and is compared with
+    the quantiles of that chi-square (Bar-Shalom, Li & Kirubarajan 2001, sec. 5.4). The mean of a whole
+    trajectory spreads no more than that of one step, so the number suffices there too.
+
+    Parameters
+    ----------
+    dof : dimension of the error
+    ratio : true over stated covariance; above 1 overconfident, below 1 conservative
+    false_alarm : of the test on a consistent filter
+    power : chance that the fault is found
+    two_sided : False spends all of ``false_alarm`` on the side of ``ratio``
+
+    Raises
+    ------
+    ValueError
+        An argument out of its range, or a ratio so near 1 that over 10 million runs are needed.
+    """
+    _require(dof, false_alarm, power)
+    if not 0.0 < ratio < float("inf") or ratio == 1.0:
+        raise ValueError(f"ratio must be positive and not 1, got {ratio}")
+    if power_of(dof, LARGEST, ratio, false_alarm, two_sided) < power:
+        raise ValueError(f"a ratio of {ratio} needs more than {LARGEST} runs; ask for one further from 1")
+    low, high = 0, 1
+    while power_of(dof, high, ratio, false_alarm, two_sided) < power:
+        low, high = high, min(2 * high, LARGEST)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if power_of(dof, middle, ratio, false_alarm, two_sided) >= power else (middle, high)
+    return high
+
+
+def gate_runs(dof: int, detect: float, false_alarm: float = 0.05, power: float = 0.95, allow: str | None = None) -> int:
+    """Runs with which a verdict (:func:`judge`) finds a covariance wrong by ``detect`` in all steps with ``power``.
+
+    As :func:`required_runs` with the half of ``false_alarm`` that a verdict gives to the mean NEES. Raises as that.
+    """
+    return required_runs(dof, detect, SHARES[MAIN] * false_alarm, power, two_sided=allow is None)
+
+
+def power_of(dof: int, runs: int, ratio: float, false_alarm: float = 0.05, two_sided: bool = True) -> float:
+    """Chance that ``runs`` runs find a covariance wrong by ``ratio``; the complement of :func:`required_runs`."""
+    tail, k = false_alarm / (2 if two_sided else 1), dof * runs
+    if ratio > 1.0:
+        return float(stats.chi2.sf(stats.chi2.isf(tail, k) / ratio, k))
+    return float(stats.chi2.cdf(stats.chi2.ppf(tail, k) / ratio, k))
+
+
+def detectable_ratio(
+    dof: int, runs: int, false_alarm: float = 0.05, power: float = 0.95, two_sided: bool = True
+) -> float:
+    """Smallest ratio of true to stated covariance that ``runs`` runs find with ``power``."""
+    _require(dof, false_alarm, power)
+    tail = false_alarm / (2 if two_sided else 1)
+    return float(stats.chi2.isf(tail, dof * runs) / stats.chi2.ppf(1.0 - power, dof * runs))
+
+
+def _require(dof: int, false_alarm: float, power: float) -> None:
+    if dof < 1:
+        raise ValueError(f"dof must be at least 1, got {dof}")
+    for name, value in (("false_alarm", false_alarm), ("power", power)):
+        if not 0.0 < value < 1.0:
+            raise ValueError(f"{name} must lie between 0 and 1, got {value}")

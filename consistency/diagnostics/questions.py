@@ -1,0 +1,71 @@
+"""The questions a verdict asks, what each may cost, and the correction for asking them all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+# Share of the false-alarm rate of each question. Half goes to the mean over the trajectory, so that the
+# number of runs planned for a covariance ratio does not depend on what else is asked.
+MAIN = "scale"
+SHARES = {
+    MAIN: 0.5,
+    "scale in some step": 0.1,
+    "scale of an axis": 0.1,
+    "bias": 0.05,
+    "bias in some step": 0.05,
+    "shape": 0.05,
+    "shape in some step": 0.05,
+    "outliers": 0.025,
+    "distribution": 0.025,
+    "innovation scale": 0.025,
+    "innovation whiteness": 0.025,
+}
+ABOUT = {
+    MAIN: "mean NEES of whole trajectories against its degrees of freedom",
+    "scale in some step": "ANEES of every step against its simultaneous band",
+    "scale of an axis": "the same mean for each axis and subset by itself",
+    "bias": "Hotelling's T-squared of the mean whitened error of a trajectory",
+    "bias in some step": "Hotelling's T-squared of every step",
+    "shape": "mean products of different whitened components over a trajectory",
+    "shape in some step": "Mauchly's sphericity of the whitened errors of every step",
+    "outliers": "Wilks' largest distance of one run from the others in any step",
+    "distribution": "Kolmogorov's distance of the NEES from chi-square, one step a run",
+    "innovation scale": "total NIS against its degrees of freedom",
+    "innovation whiteness": "portmanteau test of the autocorrelation over steps",
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one question found."""
+
+    question: str
+    p_value: float
+    share: float  # of the false-alarm rate; all of a verdict add to 1
+    adjusted: float  # p value corrected for all questions asked
+    found: bool  # adjusted is at most the false-alarm rate of the verdict
+
+
+def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answer]:
+    """Answers corrected for the number of questions: weighted Holm (1979), any dependence.
+
+    The chance that a right filter is found at fault in any question is at most ``false_alarm``. The main question
+    keeps its share; the shares of questions that cannot be asked (p is NaN) go to the other ones. The
+    adjusted p value of a question is the false-alarm rate at which it would just be found.
+    """
+    asked = {q: p for q, p in p_values.items() if np.isfinite(p)}
+    total = sum(SHARES[q] for q in asked if q != MAIN)
+    kept = SHARES[MAIN] if MAIN in asked else 0.0
+    share = {q: kept if q == MAIN else SHARES[q] * (1.0 - kept) / total for q in asked}
+    if set(asked) == {MAIN}:
+        share = {MAIN: 1.0}
+    result: dict[str, Answer] = {}
+    left, least = 1.0, 0.0
+    for question in sorted(asked, key=lambda q: asked[q] / share[q]):
+        least = max(least, min(1.0, asked[question] * left / share[question]))
+        result[question] = Answer(question, asked[question], share[question], least, least <= false_alarm)
+        left -= share[question]
+    return {q: result[q] for q in asked}

@@ -1,0 +1,250 @@
+"""Is the covariance too small or too large? Trials are the unit: they are independent, steps are not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize, special, stats
+
+from consistency.diagnostics.nees import anees
+from consistency.types import Array
+
+FEW = 10  # runs; below, the dependence between steps is not estimated but taken as complete
+BLOCK = 1024  # runs whose scalar products are in memory at once
+
+
+# --- the whole trajectory --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MeanTest:
+    """Test that the mean NEES of whole trajectories is the degrees of freedom."""
+
+    ratio: float  # mean NEES over dof
+    effective_dof: float  # nu of one run: its mean NEES spreads as chi-square(nu) / nu
+    spread: float  # degrees of freedom with which nu is known
+    above: float  # one-sided p value against a covariance too small
+    below: float  # one-sided p value against a covariance too large
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided."""
+        return min(1.0, 2.0 * min(self.above, self.below))
+
+
+def mean_test(nees: Array, dof: int, whitened: Array | None = None) -> MeanTest:
+    """Test of the mean NEES over whole trajectories, with each run one observation.
+
+    A run's mean NEES is a sum of dependent chi-squares. It is approximated by chi-square(nu) / nu with
+    the same mean and variance (Satterthwaite 1946; Box 1954, Theorem 3.1). With the whitened errors w_i of run i,
+    stacked over steps, nu = (tr C)^2 / tr C^2 where C is their covariance, and the mean of (w_i' w_j)^2
+    over pairs of different runs estimates tr C^2 without bias (Chen, Zhang & Zhong 2010). It assumes
+    Gaussian errors, as the chi-square does, and nothing about their dependence. Without the errors nu
+    comes from the spread of the runs' means.
+
+    nu is estimated from the same runs as the mean. The jackknife over runs says how well it is known and how
+    it moves with the mean; it is taken at a mean of 1, one standard error to the safe side, and what
+    doubt remains makes Student's t of the normal. Below ``dof``, its value where all steps of a run are
+    one and the same, nu never lies; there, and with fewer than 10 runs, the test is the chi-square of one step.
+
+    Parameters
+    ----------
+    nees : (runs, steps), NaN where a run has no value
+    dof : dimension of the error
+    whitened : (runs, steps, dof), see :func:`whiten`; NaN in the same places
+    """
+    means, counts = run_means(nees)
+    means, counts = means[counts > 0] / dof, counts[counts > 0]
+    runs = len(means)
+    if runs == 0:
+        return MeanTest(float("nan"), float("nan"), float("inf"), 1.0, 1.0)
+    ratio = float(means.mean())
+    nu, spread = float(dof), float("inf")
+    if runs >= FEW and nees.shape[1] > 1 and ratio > 0:
+        if whitened is not None:
+            w = np.where(np.isfinite(nees)[..., None], whitened, 0.0)[np.isfinite(nees).any(axis=1)]
+            log_nu, left_out = _log_nu_of_errors(w, counts * dof, means)
+            floor = 0.0
+        else:
+            log_nu, left_out = _log_nu_of_means(means)
+            floor = 2.0 / runs
+        log_nu, variance = _at_mean_one(log_nu, left_out, means, floor)
+        if log_nu - np.sqrt(variance) > np.log(dof):
+            nu, spread = float(np.exp(log_nu - np.sqrt(variance))), 2.0 / variance
+    above, below = _tails(ratio, runs * nu, spread)
+    return MeanTest(ratio, nu, spread, above, below)
+
+
+def run_means(nees: Array) -> tuple[Array, Array]:
+    """Mean NEES of each run over the steps it has, and how many those are: (runs, steps) -> (runs,), (runs,)."""
+    present = np.isfinite(nees)
+    count = present.sum(axis=1)
+    total = np.where(present, nees, 0.0).sum(axis=1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
+
+
+def acceptance(
+    test: MeanTest, runs: int, dof: int, false_alarm: float, allow: str | None = None
+) -> tuple[float, float]:
+    """Interval of the mean NEES that :func:`mean_test` accepts at ``false_alarm``."""
+    z = float(stats.t.isf(false_alarm if allow else false_alarm / 2, test.spread))
+    k = runs * test.effective_dof
+    low = 0.0 if allow == "conservative" else float(stats.chi2.ppf(stats.norm.sf(z), k)) * dof / k
+    return low, float(stats.chi2.isf(stats.norm.sf(z), k)) * dof / k
+
+
+def ratio_interval(means: Array, confidence: float = 0.95) -> tuple[float, float, float]:
+    """Ratio of true to stated covariance (1 is right) and its interval, from the runs' mean NEES over dof (runs,).
+
+    The spread between the runs is taken as it is, so that neither dependence between steps nor heavy tails
+    make the interval too short. With fewer than 2 runs the interval is (0, inf).
+    """
+    means = np.asarray(means, float)
+    ratio = float(means.mean()) if len(means) else float("nan")
+    if len(means) < 2 or not means.std() > 0:
+        return ratio, (0.0 if len(means) < 2 else ratio), (float("inf") if len(means) < 2 else ratio)
+    log_nu, left_out = _log_nu_of_means(means)
+    variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
+    z = float(stats.t.isf(0.5 * (1.0 - confidence), 2.0 / variance))
+    k = len(means) * float(np.exp(log_nu))
+    low, high = (float(stats.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
+    return ratio, ratio * k / low, (ratio * k / high if high > 0 else float("inf"))
+
+
+def _log_nu_of_errors(w: Array, size: Array, means: Array) -> tuple[float, Array]:
+    """log((tr C)^2 / tr C^2) from whitened errors (runs, steps, n), and the same with each run left out.
+
+    ``size`` (runs,) counts the values in each run, ``means`` (runs,) their mean squares.
+    """
+    flat = w.reshape(len(w), -1) / np.sqrt(size)[:, None]
+    runs = len(flat)
+    if runs > flat.shape[1]:
+        with_others = np.einsum("ij,ij->i", flat @ (flat.T @ flat), flat)
+    else:
+        blocks = (flat[k : k + BLOCK] @ flat.T for k in range(0, runs, BLOCK))
+        with_others = np.concatenate([np.square(block).sum(axis=1) for block in blocks])
+    with_others = with_others - np.square(means)
+    total = with_others.sum()
+    t2 = np.maximum(total / (runs * (runs - 1)), 1e-300)
+    t2_left = np.maximum((total - 2.0 * with_others) / ((runs - 1) * (runs - 2)), 1e-300)
+    return float(np.log(means.mean() ** 2 / t2)), np.log(_left_out_mean(means) ** 2 / t2_left)
+
+
+def _log_nu_of_means(means: Array) -> tuple[float, Array]:
+    """log(2 / CV^2) of the runs' means (runs,), less its first-order bias, and the same with each run left out."""
+    runs, mean, left = len(means), means.mean(), _left_out_mean(means)
+    squares = np.square(means).sum()
+    cv = means.var(ddof=1) / mean**2
+    variance = (squares - np.square(means) - (runs - 1) * left**2) / max(runs - 2, 1)
+    smallest = 1e-12 * mean**2
+    return float(np.log(2.0 / cv) - np.log1p(cv / runs)), np.log(2.0 * left**2 / np.maximum(variance, smallest))
+
+
+def _left_out_mean(means: Array) -> Array:
+    return np.asarray((means.sum() - means) / (len(means) - 1))
+
+
+def _jackknife(a: Array, b: Array) -> float:
+    """Covariance of two estimates from their values with each run left out (Efron & Stein 1981)."""
+    return float((len(a) - 1) / len(a) * ((a - a.mean()) * (b - b.mean())).sum())
+
+
+def _at_mean_one(log_nu: float, left_out: Array, means: Array, floor: float) -> tuple[float, float]:
+    """log nu moved to where it would be at a mean of 1, and the variance that is left."""
+    log_mean = np.log(_left_out_mean(means))
+    of_mean, both = _jackknife(log_mean, log_mean), _jackknife(left_out, log_mean)
+    slope = both / of_mean if of_mean > 0 else 0.0
+    reach = 2.0 * np.sqrt(of_mean)  # no farther than chance carries the mean
+    variance = max(_jackknife(left_out, left_out) - slope * both, floor, 1e-9)
+    return log_nu - slope * float(np.clip(np.log(means.mean()), -reach, reach)), variance
+
+
+def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
+    """Upper and lower p value of ``ratio`` = chi-square(k) / k, widened from normal to Student's t."""
+    if not np.isfinite(k):
+        return float(ratio <= 1.0), float(ratio >= 1.0)
+    upper, lower = float(stats.chi2.sf(k * ratio, k)), float(stats.chi2.cdf(k * ratio, k))
+    if not np.isfinite(spread):
+        return upper, lower
+    return tuple(float(stats.t.sf(stats.norm.isf(p), spread)) for p in (upper, lower))  # type: ignore[return-value]
+
+
+# --- every step ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Band:
+    """Where the ANEES curve of a consistent filter stays in all steps at once."""
+
+    low: Array  # (steps,), NaN where no run has a value
+    high: Array  # (steps,)
+    p_value: float  # of the curve: the smallest false-alarm rate at which it leaves its band
+    above: Array  # (steps,) of bool
+    below: Array  # (steps,) of bool
+
+    @property
+    def outside(self) -> Array:
+        return np.asarray(self.above | self.below)
+
+
+def simultaneous_band(
+    nees: Array, dof: int, false_alarm: float = 0.05, method: str = "max", allow: str | None = None
+) -> Band:
+    """Band that the ANEES of a consistent filter leaves in any step with probability ``false_alarm`` at most.
+
+    In each step, runs times ANEES is chi-square with runs times ``dof`` degrees of freedom (Bar-Shalom, Li &
+    Kirubarajan 2001, sec. 5.4), turned into a standard normal z. With ``method`` "bonferroni" the rate is
+    divided by the number of steps: exact under any dependence. With "max", the maximum of abs(z), neighbours
+    that move together are counted once: P(max > c) <= sum P(z_k > c) - sum P(z_k > c, z_k+1 > c) (Hunter
+    1976; Worsley 1982), with the second term from the bivariate normal with the correlation of the NEES in
+    neighbouring steps over the runs, in Owen's (1956) T function: 2 Q(c) + 4 sum T(c, a_k), a_k^2 =
+    (1 - rho_k) / (1 + rho_k).
+
+    Parameters
+    ----------
+    nees : (runs, steps), NaN where a run has no value
+    allow : "conservative" leaves the lower side open
+
+    Raises
+    ------
+    ValueError
+        Unknown method.
+    """
+    if method not in ("max", "bonferroni"):
+        raise ValueError(f"method must be 'max' or 'bonferroni', got '{method}'")
+    alive = np.isfinite(nees).sum(axis=0)
+    judged = np.flatnonzero(alive > 0)
+    low, high = np.full(nees.shape[1], np.nan), np.full(nees.shape[1], np.nan)
+    none = np.zeros(nees.shape[1], bool)
+    if not len(judged):
+        return Band(low, high, 1.0, none, none)
+    sides = 1 if allow == "conservative" else 2
+    slopes = _slopes(nees[:, judged]) if method == "max" and len(nees) >= FEW else None
+
+    def exceedance(c: float) -> float:
+        if slopes is None:
+            return sides * len(judged) * float(special.ndtr(-c))
+        return sides * float(special.ndtr(-c) + 2.0 * special.owens_t(c, slopes).sum())
+
+    c = float(optimize.brentq(lambda x: exceedance(x) - min(false_alarm, 0.999 * exceedance(0.0)), 0.0, 38.0))
+    curve, k = anees(nees), alive[judged] * dof
+    upper, lower = stats.chi2.sf(alive[judged] * curve[judged], k), stats.chi2.cdf(alive[judged] * curve[judged], k)
+    smallest = float(upper.min() if sides == 1 else min(upper.min(), lower.min()))
+    p_value = min(1.0, exceedance(max(float(-special.ndtri(smallest)), 0.0))) if smallest > 0 else 0.0
+    low[judged] = 0.0 if sides == 1 else stats.chi2.ppf(special.ndtr(-c), k) / alive[judged]
+    high[judged] = stats.chi2.isf(special.ndtr(-c), k) / alive[judged]
+    with np.errstate(invalid="ignore"):
+        return Band(low, high, p_value, curve > high, curve < low)
+
+
+def _slopes(nees: Array) -> Array:
+    """sqrt((1 - rho) / (1 + rho)) of neighbouring steps, (runs, steps) -> (steps - 1,); rho from 0 to 1."""
+    both = np.isfinite(nees[:, 1:]) & np.isfinite(nees[:, :-1])
+    count = np.maximum(both.sum(axis=0), 1)
+    a, b = (np.where(both, part, 0.0) for part in (nees[:, :-1], nees[:, 1:]))
+    a, b = (np.where(both, part - part.sum(axis=0) / count, 0.0) for part in (a, b))
+    scale = np.sqrt((a * a).sum(axis=0) * (b * b).sum(axis=0))
+    rho = np.where((scale > 0) & (count >= FEW), (a * b).sum(axis=0) / np.where(scale > 0, scale, 1.0), 0.0)
+    rho = np.clip(rho, 0.0, 1.0)
+    return np.sqrt((1.0 - rho) / (1.0 + rho))

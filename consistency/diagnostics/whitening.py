@@ -1,0 +1,49 @@
+"""Errors in units of what the covariance says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consistency.types import Array
+
+
+def whiten(error: Array, covariance: Array) -> Array:
+    """L^-1 error with L L' = covariance: standard normal, independent components, if the covariance is right.
+
+    Shapes (..., n) and (..., n, n) -> (..., n). Rows that hold a NaN, or whose covariance is not positive
+    definite, come back as NaN.
+    """
+    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    n = e.shape[-1]
+    out = np.empty(e.shape)
+    L = np.zeros((n, n), object)  # of arrays over the batch: n is small, the batch is not
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for i in range(n):
+            for j in range(i + 1):
+                rest = P[..., i, j] - sum(L[i, k] * L[j, k] for k in range(j))
+                L[i, j] = rest / L[j, j] if j < i else np.sqrt(np.where(rest > 0, rest, np.nan))
+            out[..., i] = (e[..., i] - sum(L[i, k] * out[..., k] for k in range(i))) / L[i, i]
+    out[~np.isfinite(out).all(axis=-1)] = np.nan
+    return out
+
+
+def standardise(error: Array, covariance: Array) -> Array:
+    """Each component over its own standard deviation, (..., n) and (..., n, n) -> (..., n)."""
+    return np.asarray(np.asarray(error, float) / np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
+
+
+def spread_steps(present: Array) -> Array:
+    """One step of each run, spread over the trajectory: (runs, steps) of bool -> (runs,), -1 where none.
+
+    Runs are independent and steps are not, so one value of each run is an independent sample. Run i takes
+    the step at the i-th point of the golden-ratio sequence, which fills the trajectory evenly for any
+    number of runs and does not depend on the data.
+    """
+    present = np.asarray(present, bool)
+    runs, steps = present.shape
+    count = present.sum(axis=1)
+    place = np.mod(0.5 + np.arange(runs) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0)
+    rank = np.minimum((place * count).astype(int), np.maximum(count - 1, 0))
+    nth = np.cumsum(present, axis=1) - 1
+    chosen = np.argmax(present & (nth == rank[:, None]), axis=1) if steps else np.zeros(runs, int)
+    return np.where(count > 0, chosen, -1)

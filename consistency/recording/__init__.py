@@ -1,0 +1,148 @@
+"""Files of estimators that are not ours, read as errors and covariances; docs/files.md describes them.
+
+No filter, no scenario and no results folder of this package belongs here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from consistency.errors import InputError
+from consistency.recording.archive import read_archive
+from consistency.recording.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
+from consistency.recording.record import Recording
+from consistency.recording.table import read_tables
+from consistency.recording.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
+from consistency.types import Verdict
+
+__all__ = [
+    "CONVENTIONS",
+    "ORDERS",
+    "Recording",
+    "analyse_recordings",
+    "is_recording",
+    "planar_error",
+    "read_recordings",
+    "se2_log",
+    "se3_log",
+    "spatial_error",
+]
+
+CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *SPATIAL)))
+TABLES = (".csv", ".parquet", ".pq")
+
+
+def is_recording(path: Path, **options: Any) -> bool:
+    """Whether a path is something :func:`read_recordings` reads, and not a folder of ``consistency run``.
+
+    Raises
+    ------
+    InputError
+        It is such a folder, and one of the ``options`` of other files is given with it.
+    """
+    if path.is_dir() and not (path / "manifest.json").exists():
+        recording = bool(trajectory_files(path)) or any(value is not None for value in options.values())
+    else:
+        recording = path.is_file() or (path.suffix != "" and not path.exists())
+    if not recording and path.exists():
+        given = [name for name, value in options.items() if value is not None]
+        if given:
+            name = {"convention": "error"}.get(given[0], given[0].replace("_", "-"))
+            raise InputError(f"--{name}: does not go with {path}, a folder of 'consistency run'")
+    return recording
+
+
+def read_recordings(
+    estimates: Path,
+    truth: Path | None = None,
+    covariance: Path | None = None,
+    convention: str | None = None,
+    *,
+    state: Sequence[str] | None = None,
+    covariance_order: str | None = None,
+    max_dt: float | None = None,
+) -> list[Recording]:
+    """What estimators said, from CSV, Parquet, TUM or NumPy files: one recording for each estimator.
+
+    Parameters
+    ----------
+    estimates : .csv, .parquet, .npz, or a TUM trajectory, or a folder of these with one for each run
+    truth : of the same kind; not with .npz
+    covariance : of a TUM trajectory
+    convention : of the error, one of ``CONVENTIONS``; None is the default of the kind
+    state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
+    covariance_order : one of ``ORDERS``, of the 6 x 6 covariance of a trajectory
+    max_dt : s, between an estimate and its truth; None is 0.01, half a period of a 50 Hz truth
+
+    Raises
+    ------
+    InputError
+        Something cannot be used: names file, line, column or option, and what is allowed.
+    """
+    estimates = Path(estimates)
+    if convention is not None and convention not in CONVENTIONS:
+        raise InputError(f"--error {convention}: must be one of {', '.join(CONVENTIONS)}")
+    if max_dt is not None and not (math.isfinite(max_dt) and max_dt >= 0):
+        raise InputError(f"--max-dt {max_dt:g}: must be 0 or more, in s")
+    if not estimates.exists():
+        raise InputError(f"{estimates}: no such file")
+    suffix = estimates.suffix.lower()
+    own: dict[str, object] = {"state": state, "max-dt": max_dt, "covariance": covariance, "truth": truth}
+    own["covariance-order"] = covariance_order
+    if suffix == ".npz":
+        _refuse(estimates, own, ("state", "max-dt", "covariance", "covariance-order", "truth"))
+        return read_archive(estimates, convention)
+    if suffix in TABLES:
+        _refuse(estimates, own, ("covariance", "covariance-order"))
+        if state is not None and (len(set(state)) < len(state) or not all(state)):
+            raise InputError(f"--state {','.join(state)}: needs names of columns, each once")
+        return read_tables(estimates, truth, convention, state, max_dt)
+    if suffix not in SUFFIXES and not estimates.is_dir():
+        known = ", ".join((*TABLES, ".npz", *SUFFIXES))
+        raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
+    _refuse(estimates, own, ("state",))
+    return read_tum(estimates, truth, covariance, convention, covariance_order, max_dt)
+
+
+def _refuse(path: Path, options: dict[str, object], names: Sequence[str]) -> None:
+    for name in names:
+        if options[name] is not None:
+            raise InputError(f"--{name}: does not go with {path}")
+
+
+def analyse_recordings(
+    recordings: Sequence[Recording], filters: Sequence[str] | None = None, confidence: float = 0.95
+) -> dict[str, Verdict]:
+    """A verdict for every recording, or for those named.
+
+    Raises
+    ------
+    InputError
+        No recording of that name, or a confidence outside (0, 1).
+    """
+    from consistency.diagnostics import judge
+
+    if not 0.0 < confidence < 1.0:
+        raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
+    named = {recording.name: recording for recording in recordings}
+    for name in filters or ():
+        if name not in named:
+            raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
+    verdicts = {}
+    for name in filters or named:
+        r = named[name]
+        verdict = judge(
+            name, r.error, r.covariance, r.nees, r.nis, r.nis_dof, r.failures, 1.0 - confidence,
+            dof=r.dof or None, axes=r.axes,
+        )  # fmt: skip
+        said: dict[str, Any] = {"axes": list(r.axes), "convention": r.convention or None, "notes": list(r.notes)}
+        said["left_out_steps"] = r.left_out_steps
+        outlier = verdict.statistics.get("outlier")
+        if outlier and outlier["row"] >= 0:
+            outlier["run"] = int(r.runs[outlier["row"]])
+        verdicts[name] = replace(verdict, statistics=verdict.statistics | said)
+    return verdicts

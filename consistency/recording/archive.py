@@ -1,0 +1,173 @@
+"""NumPy archives (.npz): arrays over (runs, steps)."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.recording.conventions import PLANAR, planar_error
+from consistency.recording.record import Recording, Track, assemble, symmetric
+from consistency.types import Array, Failure
+
+KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
+NEEDED = (("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof"))
+OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths"}
+
+
+def read_archive(path: Path, convention: str | None) -> list[Recording]:
+    """The recording of an archive.
+
+    ``errors`` (runs, steps, n) with ``covariances`` (runs, steps, n, n); or ``estimates`` and ``truth``, both
+    (runs, steps, n), with ``covariances``; or ``nees`` (runs, steps) with ``dof``. One run may lack the first
+    dimension. Optional: ``nis`` and ``nis_dof`` (runs, steps), ``axes`` (n,), ``t`` (steps,), and ``lengths``
+    (runs,), the number of steps of each run, where they differ.
+    """
+    arrays = _load(path)
+    kind = next((keys for keys in NEEDED if set(keys) <= set(arrays)), None)
+    if kind is None:
+        raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(arrays)) or 'nothing'}")
+    unknown = sorted(set(arrays) - set(kind) - OPTIONAL)
+    if unknown:
+        raise InputError(f"{path}: key '{unknown[0]}' does not go with {', '.join(kind)}; needs {KINDS}")
+    if convention is not None and kind != NEEDED[1]:
+        raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")
+    if kind == NEEDED[2]:
+        return [_of_nees(path, arrays)]
+    covariances = _shaped(path, arrays, "covariances", 4)
+    if kind == NEEDED[0]:
+        error, chosen = _shaped(path, arrays, "errors", 3), ""
+    else:
+        estimates, truth = (_shaped(path, arrays, key, 3) for key in ("estimates", "truth"))
+        if estimates.shape != truth.shape:
+            raise InputError(f"{path}: key 'truth' has shape {truth.shape}, 'estimates' {estimates.shape}")
+        chosen = convention or "vector"
+        n = estimates.shape[-1]
+        if chosen not in PLANAR or (chosen != "vector" and n != 3):
+            raise InputError(f"--error {chosen}: here it is 'vector', or so2, left or right for x, y, heading")
+        _require_truth(path, truth, estimates)
+        error = planar_error(truth, estimates, chosen) if n == 3 else truth - estimates
+    runs, steps, n = error.shape
+    if covariances.shape != (runs, steps, n, n):
+        raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {(runs, steps, n, n)}")
+    lengths = _lengths(path, arrays, runs, steps)
+    nis, dof = _nis(path, arrays, (runs, steps))
+    tracks = []
+    for run, length in enumerate(lengths):
+        place = [f"{path}, run {run}, step {k + 1}" for k in range(length)]
+        P = symmetric(covariances[run, :length], place.__getitem__)
+        cut = (None if values is None else values[run, :length] for values in (nis, dof))
+        tracks.append(Track(run, np.arange(length), place, error[run, :length], P, *cut))
+    notes = [f"error convention {chosen}: {PLANAR[chosen]}"] if chosen else []
+    return [assemble(path.stem, tracks, _times(path, arrays, steps), _axes(path, arrays, n), str(path), chosen, notes)]
+
+
+def _load(path: Path) -> dict[str, Array]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not hasattr(archive, "files"):
+                raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {KINDS}")
+            return {key: archive[key] for key in archive.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except InputError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        what = "damaged or cut short" if path.read_bytes()[:2] == b"PK" else "or holds Python objects"
+        raise InputError(f"{path}: is not a NumPy archive, {what}; write it with numpy.savez") from None
+
+
+def _shaped(path: Path, arrays: dict[str, Array], key: str, dimensions: int) -> Array:
+    """An array of floats; one run without its dimension gets it."""
+    array = arrays[key]
+    names = ("runs", "steps", "n", "n")[:dimensions]
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{path}: key '{key}' holds {array.dtype}, not numbers")
+    if array.ndim == dimensions - 1:
+        array = array[None]
+    if array.ndim != dimensions or not array.size:
+        raise InputError(f"{path}: key '{key}' has shape {array.shape}, needs ({', '.join(names)})")
+    return np.asarray(array, float)
+
+
+def _require_truth(path: Path, truth: Array, estimates: Array) -> None:
+    bad = np.isfinite(estimates).all(axis=-1) & ~np.isfinite(truth).all(axis=-1)
+    if bad.any():
+        run, step = np.argwhere(bad)[0]
+        raise InputError(f"{path}: key 'truth', run {run}, step {step + 1}: not finite")
+
+
+def _lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> list[int]:
+    if "lengths" not in arrays:
+        return [steps] * runs
+    lengths = np.atleast_1d(arrays["lengths"])
+    if lengths.shape != (runs,) or lengths.dtype.kind not in "iu" or ((lengths < 1) | (lengths > steps)).any():
+        raise InputError(f"{path}: key 'lengths' must be {runs} whole numbers from 1 to {steps}")
+    return [int(length) for length in lengths]
+
+
+def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[Array | None, Array | None]:
+    if "nis" not in arrays:
+        return None, None
+    if "nis_dof" not in arrays:
+        raise InputError(f"{path}: key 'nis_dof' is missing; it is the number of measurements in each nis")
+    nis = _shaped(path, arrays, "nis", 2)
+    if nis.shape != shape:
+        raise InputError(f"{path}: key 'nis' has shape {nis.shape}, needs {shape}")
+    try:
+        dof = np.broadcast_to(np.asarray(arrays["nis_dof"], float), shape)
+    except ValueError:
+        raise InputError(f"{path}: key 'nis_dof' must be one number or of shape {shape}") from None
+    known = np.isfinite(nis)
+    if (nis < 0).any() or np.isinf(nis).any() or not (dof[known] == np.round(np.abs(dof[known]))).all():
+        raise InputError(f"{path}: keys 'nis', 'nis_dof': nis must be 0 or more, nis_dof whole numbers of 0 or more")
+    return nis, np.where(known, dof, 0.0)
+
+
+def _times(path: Path, arrays: dict[str, Array], steps: int) -> Array:
+    if "t" not in arrays:
+        return np.full(steps, np.nan)
+    t = arrays["t"]
+    if t.shape != (steps,) or t.dtype.kind not in "fiu" or not (np.diff(t) > 0).all():
+        raise InputError(f"{path}: key 't' must be {steps} increasing numbers, in s")
+    return np.asarray(t, float)
+
+
+def _axes(path: Path, arrays: dict[str, Array], n: int) -> tuple[str, ...]:
+    if "axes" not in arrays:
+        return tuple(f"e{i + 1}" for i in range(n))
+    axes = tuple(str(axis) for axis in np.atleast_1d(arrays["axes"]))
+    if len(axes) != n:
+        raise InputError(f"{path}: key 'axes' names {len(axes)} components, the error has {n}")
+    return axes
+
+
+def _of_nees(path: Path, arrays: dict[str, Array]) -> Recording:
+    """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
+    nees = _shaped(path, arrays, "nees", 2).copy()
+    dof = arrays["dof"]
+    if dof.ndim or dof.dtype.kind not in "fiu" or dof < 1 or dof != round(float(dof)):
+        raise InputError(f"{path}: key 'dof' must be one whole number of 1 or more, the dimension of the error")
+    if (nees < 0).any():
+        run, step = np.argwhere(nees < 0)[0]
+        raise InputError(f"{path}: key 'nees', run {run}, step {step + 1}: {nees[run, step]:g} is negative")
+    runs, steps = nees.shape
+    n = int(dof)
+    nis, nis_dof = _nis(path, arrays, (runs, steps))
+    failures = []
+    for run, length in enumerate(_lengths(path, arrays, runs, steps)):
+        nees[run, length:] = np.nan
+        finite = np.isfinite(nees[run, :length])
+        first = int(np.argmax(finite)) if finite.any() else 0
+        broken = np.flatnonzero(~finite[first:])
+        if len(broken):
+            step = first + int(broken[0])
+            nees[run, step:] = np.nan
+            failures.append(Failure(path.stem, run, step + 1, "NEES is not finite"))
+    axes = _axes(path, arrays, n)
+    t = _times(path, arrays, steps)
+    empty = Recording(path.stem, np.arange(runs), t, None, None, nees, n, nis, nis_dof, axes, ())
+    return replace(empty, failures=tuple(failures))

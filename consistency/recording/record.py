@@ -1,0 +1,250 @@
+"""Runs of an estimator as arrays over (runs, steps), with what failed and what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.diagnostics import nees
+from consistency.errors import InputError
+from consistency.types import Array, Failure, Indices
+
+DEFAULT_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
+DEFICIENT = 1e-12  # eigenvalue of a correlation matrix below which a direction carries no uncertainty
+ZERO = 1e-24  # variance that counts as none, as in the filters of this package
+ROUNDED = 1e-4  # a singular matrix in a text file of few digits has an eigenvalue of either sign up to this
+ASYMMETRY = 1e-6  # of the largest entry: text files of seven digits pass
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What one estimator said in a number of runs, and how far it was from the truth.
+
+    Where the start is known exactly the covariance is singular: covariance and NEES are NaN in those steps, the
+    error is not. From the step of a failure on, everything is NaN.
+    """
+
+    name: str
+    runs: Indices  # (R,)
+    t: Array  # (T,), s; NaN where the runs have no common clock
+    error: Array | None  # (R, T, n), truth minus estimate in the declared convention; NaN where there is no estimate
+    covariance: Array | None  # (R, T, n, n)
+    nees: Array | None  # (R, T), NaN where the covariance is singular; from the file if that gives it and no error
+    dof: int  # n, of the NEES; 0 where only the NIS is known
+    nis: Array | None  # (R, T)
+    nis_dof: Array | None  # (R, T)
+    axes: tuple[str, ...]  # (n,)
+    failures: tuple[Failure, ...]  # Failure.step counts the columns from 1, as the verdict does
+    convention: str = ""
+    notes: tuple[str, ...] = ()  # what a reader must know: the convention, what was left out
+
+    @property
+    def left_out_steps(self) -> list[int]:
+        """Steps, counted from 1, in which the covariance of some run is not of full rank yet."""
+        if self.error is None or self.nees is None:
+            return []
+        skipped = np.isfinite(self.error).all(axis=-1) & np.isnan(self.nees)
+        return [int(k) + 1 for k in np.flatnonzero(skipped.any(axis=0))]
+
+
+@dataclass(frozen=True)
+class Track:
+    """One run as it stands in a file: its rows in order, each with the step it belongs to."""
+
+    run: int
+    column: Indices  # (k,), increasing, 0..T-1
+    place: Sequence[str]  # (k,), "est.csv, line 7"
+    error: Array | None = None  # (k, n), NaN where the estimate is
+    covariance: Array | None = None  # (k, n, n)
+    nis: Array | None = None  # (k,)
+    nis_dof: Array | None = None  # (k,)
+    nees: Array | None = None  # (k,)
+
+
+def assemble(
+    name: str,
+    tracks: Sequence[Track],
+    t: Array,
+    axes: tuple[str, ...],
+    file: str,
+    convention: str = "",
+    notes: Sequence[str] = (),
+) -> Recording:
+    """Tracks on the common steps; failures found; exactly known starts left out.
+
+    Raises
+    ------
+    InputError
+        No covariance of any run has full rank.
+    """
+    tracks = sorted(tracks, key=lambda track: track.run)
+    notes = list(notes)
+    failures, parts, skipped = [], [], 0
+    for track in tracks:
+        start, end, reason = _judged(track)
+        if reason:
+            failures.append(Failure(name, track.run, int(track.column[end]) + 1, f"{reason} ({track.place[end]})"))
+        skipped += start
+        parts.append(_cut(track, start, end))
+    if not failures and all(part.nees is not None and np.isnan(part.nees).all() for part in parts):
+        raise InputError(_singular(file, tracks, axes))
+    if skipped:
+        notes.append(f"{name}: {skipped} estimates before the covariance has full rank are left out")
+    short = [part.run for part in parts if len(part.column) and part.column[-1] < len(t) - 1]
+    short = [run for run in short if run not in {failure.run for failure in failures}]
+    if short:
+        notes.append(
+            f"{name}: {count(len(short), 'run')} of {len(parts)} ({listed(short)}) end before step {len(t)}; "
+            "if the filter broke down there, write a row of NaN, so that the failure counts"
+        )
+
+    def grid(pick: Callable[[Track], Array | None]) -> Array | None:
+        values = [value for part in parts if (value := pick(part)) is not None]
+        if not values:
+            return None
+        out = np.full((len(parts), len(t), *values[0].shape[1:]), np.nan)
+        for row, (part, value) in enumerate(zip(parts, values, strict=True)):
+            out[row, part.column] = value
+        return out
+
+    error = grid(lambda part: part.error)
+    return Recording(
+        name=name,
+        runs=np.array([part.run for part in parts], dtype=np.int64),
+        t=t,
+        error=error,
+        covariance=grid(lambda part: part.covariance),
+        nees=grid(lambda part: part.nees),
+        dof=len(axes) if error is not None else 0,
+        nis=grid(lambda part: part.nis),
+        nis_dof=grid(lambda part: part.nis_dof),
+        axes=axes,
+        failures=tuple(failures),
+        convention=convention,
+        notes=tuple(notes),
+    )
+
+
+def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
+    """Columns of every run and the step number of every column: the different steps, in order."""
+    numbers = np.unique(np.concatenate(steps))
+    return [np.searchsorted(numbers, own).astype(np.int64) for own in steps], numbers
+
+
+def common_times(times: Sequence[Array], tolerance: float = 1e-6) -> tuple[list[Indices], Array]:
+    """Columns of every run and the time of every column, from timestamps in s.
+
+    Where every run keeps to the timestamps of the longest one the columns are its timestamps. Else, as with
+    recordings of different days, estimates are counted from the first on, and no column has a time.
+    """
+    longest = max(times, key=len)
+    columns = []
+    for own in times:
+        near = np.clip(np.searchsorted(longest, own - tolerance), 0, len(longest) - 1)
+        if (np.abs(longest[near] - own) > tolerance).any():
+            return [np.arange(len(each)) for each in times], np.full(len(longest), np.nan)
+        columns.append(near.astype(np.int64))
+    return columns, longest
+
+
+def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, Indices]:
+    """Indices of timestamps and of their nearest neighbours in ``reference``, both increasing, in s.
+
+    Pairs further apart than ``max_dt`` are left out. Where two timestamps have the same neighbour the nearer one
+    keeps it.
+    """
+    right = np.clip(np.searchsorted(reference, times), 1, max(len(reference) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(reference) - 1)
+    nearest = np.where(np.abs(reference[left] - times) <= np.abs(reference[right] - times), left, right)
+    distance = np.abs(reference[nearest] - times)
+    order = np.lexsort((distance, nearest))
+    order = order[distance[order] <= max_dt + 1e-6]  # a double holds the seconds since 1970 to a quarter of that
+    _, first = np.unique(nearest[order], return_index=True)
+    own = np.sort(order[first])
+    return own, nearest[own]
+
+
+def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
+    """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
+    gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
+    bad = np.flatnonzero(gap > ASYMMETRY * np.abs(covariance).max(axis=(-2, -1)))  # false for NaN
+    if len(bad):
+        raise InputError(f"{place(int(bad[0]))}: the covariance is not symmetric; write P = (P + P') / 2")
+    return np.asarray(0.5 * (covariance + np.swapaxes(covariance, -1, -2)))
+
+
+def smallest_correlation(covariance: Array) -> Array:
+    """Smallest eigenvalue of the correlation matrices (k, n, n); zero for a variance of zero, NaN for NaN.
+
+    -1 where a variance is negative or a correlation is beyond 1.
+    """
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    none = np.abs(variance) <= ZERO
+    scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
+    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
+    finite = np.isfinite(covariance).all(axis=(-2, -1))
+    with np.errstate(invalid="ignore"):
+        wrong = ((variance < 0) & ~none).any(axis=-1)
+        wrong |= (np.abs(correlation) > 1.0 + ROUNDED).any(axis=(-2, -1))
+    out = np.full(len(covariance), np.nan)
+    out[finite] = np.linalg.eigvalsh(correlation[finite])[:, 0]
+    out[finite & none.any(axis=-1)] = np.minimum(out[finite & none.any(axis=-1)], 0.0)
+    out[finite & wrong] = -1.0
+    return out
+
+
+def _judged(track: Track) -> tuple[int, int, str]:
+    """First row with a covariance of full rank, first broken row, and why it is broken."""
+    rows = len(track.column)
+    error_ok: Array = np.all(np.isfinite(np.zeros((rows, 1)) if track.error is None else track.error), axis=1)
+    size = np.ones(rows) if track.covariance is None else smallest_correlation(track.covariance)
+    full: Array = np.asarray(size > DEFICIENT)
+    start = int(np.argmax(full)) if full.any() else rows
+    bad: Array = ~error_ok | ~full
+    bad[:start] = ~error_ok[:start] | ~(size[:start] >= -ROUNDED)
+    if not bad.any():
+        return start, rows, ""
+    end = int(np.argmax(bad))
+    if not error_ok[end]:
+        reason = "estimate is not finite"
+    elif np.isnan(size[end]):
+        reason = "covariance is not finite"
+    else:
+        reason = "covariance is not positive definite"
+    return min(start, end), end, reason
+
+
+def _cut(track: Track, start: int, end: int) -> Track:
+    """Rows before ``end``, with their NEES from ``start`` on."""
+    error, P, nis, dof = (
+        None if v is None else v[:end] for v in (track.error, track.covariance, track.nis, track.nis_dof)
+    )
+    values = None
+    if error is not None and P is not None:
+        values = np.full(end, np.nan)
+        values[start:] = nees(error[start:], P[start:])
+        P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
+    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values)
+
+
+def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
+    variances = [np.diagonal(t.covariance, axis1=-2, axis2=-1) for t in tracks if t.covariance is not None]
+    none = (np.abs(np.concatenate(variances)) <= ZERO).all(axis=0)
+    if none.all():
+        return f"{file}: the covariance is zero in every step; nothing to judge"
+    of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})" * bool(none.any())
+    return (
+        f"{file}: the covariance is singular in every step{of}; "
+        "write only the states that the filter estimates, as CSV with --state"
+    )
+
+
+def count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
+def listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers[:5])) + ", …" * (len(numbers) > 5)

@@ -1,0 +1,163 @@
+"""Text files and Parquet tables, with the place of every row for messages."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from consistency.errors import InputError
+from consistency.types import Array, Indices
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table and where each of its rows stands in the file."""
+
+    path: Path
+    data: pd.DataFrame
+    line: Indices  # (N,), line of a text file, row of a Parquet file
+    unit: str  # line | row
+
+    def __contains__(self, column: str) -> bool:
+        return column in self.data.columns
+
+    @property
+    def columns(self) -> str:
+        """The names of the first columns, for messages."""
+        names = [str(name) for name in self.data.columns]
+        return ", ".join(names[:12]) + ", …" * (len(names) > 12)
+
+    def place(self, row: int) -> str:
+        return f"{self.path}, {self.unit} {self.line[row]}"
+
+    def numbers(self, column: str, finite: bool = False, whole: bool = False) -> Array:
+        """A column as floats, NaN where empty; refused where it is text, or not finite or whole as asked for."""
+        given = self.data[column]
+        values: Array = pd.to_numeric(given, errors="coerce").to_numpy(float)
+        bad = np.isnan(values) & ~given.isna().to_numpy()
+        what = "not a number"
+        if not bad.any() and (finite or whole):
+            bad, what = ~np.isfinite(values), "not a finite number"
+        if not bad.any() and whole:
+            bad, what = values != np.round(values), "not a whole number"
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            raise InputError(f"{self.place(row)}: column '{column}': {what} ({given.iloc[row]})")
+        return values
+
+    def rows(self, keep: Array) -> Sheet:
+        """The rows of a mask or of indices."""
+        index = np.arange(len(self.data))[keep]
+        return Sheet(self.path, self.data.iloc[index], self.line[index], self.unit)
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The numbers of a text file."""
+
+    path: Path
+    values: Array  # (N, columns), the first of which is t
+    line: Indices  # (N,)
+
+    @property
+    def t(self) -> Array:
+        return self.values[:, 0]
+
+    def place(self, row: int) -> str:
+        return f"{self.path}, line {self.line[row]}"
+
+
+def read_sheet(path: Path) -> Sheet:
+    """A CSV file (comma, semicolon or tab; # comments) or a Parquet file."""
+    sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
+    if sheet.data.empty:
+        raise InputError(f"{path}: holds no row")
+    return sheet
+
+
+def _read_parquet(path: Path) -> Sheet:
+    try:
+        data = pq.read_table(path).to_pandas()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{path}: cannot be read as Parquet ({str(error).splitlines()[0]})") from None
+    return Sheet(path, data.reset_index(drop=True), np.arange(len(data)), "row")
+
+
+def read_text(path: Path) -> list[tuple[int, str]]:
+    """Lines with their numbers, without comments and empty lines."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; known are .csv, .parquet, .npz, and .txt or .tum") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    numbered = enumerate(text.splitlines(), 1)
+    return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _read_csv(path: Path) -> Sheet:
+    lines = read_text(path)
+    if not lines:
+        raise InputError(f"{path}: is empty")
+    header = lines[0][1]
+    separator = max(",;\t", key=header.count)
+    names = [name.strip().strip('"') for name in header.split(separator)]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise InputError(f"{path}: column '{sorted(twice)[0]}' is there twice")
+    for number, line in lines[1:]:
+        fields = line.count(separator) + 1
+        if fields != len(names) and '"' not in line:
+            raise InputError(f"{path}, line {number}: has {fields} columns, the header has {len(names)}")
+    body = "\n".join(line for _, line in lines[1:])
+    if not body:
+        raise InputError(f"{path}: holds no row under its header")
+    try:
+        data = pd.read_csv(
+            io.StringIO(body), sep=separator, header=None, names=names, index_col=False,
+            skipinitialspace=True, float_precision="round_trip",
+        )  # fmt: skip
+    except pd.errors.ParserError as error:
+        raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]})") from None
+    return Sheet(path, data, np.array([number for number, _ in lines[1:]]), "line")
+
+
+def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
+    """A text file of numbers, every line of the same one of the ``widths``, the first column increasing."""
+    numbered = read_text(path)
+    if not numbered:
+        raise InputError(f"{path}: is empty; each line should be {layout}")
+    rows: list[list[float]] = []
+    for number, line in numbered:
+        fields = line.replace(",", " ").split()
+        if len(fields) not in widths:
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns; should be {layout}")
+        if rows and len(fields) != len(rows[0]):
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the lines before {len(rows[0])}")
+        try:
+            rows.append([float(field) for field in fields])
+        except ValueError:
+            raise InputError(
+                f"{path}, line {number}: not a number in '{line.strip()[:60]}'; should be {layout}"
+            ) from None
+    lines = Lines(path, np.array(rows), np.array([number for number, _ in numbered]))
+    wrong = np.flatnonzero(~np.isfinite(lines.t))
+    if len(wrong):
+        raise InputError(f"{lines.place(int(wrong[0]))}: the timestamp is not finite")
+    wrong = np.flatnonzero(np.diff(lines.t) <= 0)
+    if len(wrong):
+        row = int(wrong[0]) + 1
+        what = "is there twice" if lines.t[row] == lines.t[row - 1] else "is less than the one before"
+        raise InputError(f"{lines.place(row)}: timestamp {lines.t[row]:.10g} {what}; they must increase")
+    return lines

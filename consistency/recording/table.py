@@ -1,0 +1,281 @@
+"""Estimates and truth as CSV or Parquet tables, one row a run and step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.recording.conventions import PLANAR, planar_error
+from consistency.recording.record import (
+    DEFAULT_DT,
+    Recording,
+    Track,
+    assemble,
+    associate,
+    common_steps,
+    common_times,
+    count,
+    listed,
+    smallest_correlation,
+    symmetric,
+)
+from consistency.recording.sheet import Sheet, read_sheet
+from consistency.storage import COVARIANCE
+from consistency.types import Array, Indices
+
+POSE = ("x", "y", "heading")
+OWN_NAMES = {(POSE[i], POSE[j]): name for name, (i, j) in COVARIANCE.items()}
+
+
+def read_tables(
+    estimates: Path, truth: Path | None, convention: str | None, state: Sequence[str] | None, max_dt: float | None
+) -> list[Recording]:
+    """Recordings of the estimators in a table, one for each value of its column ``filter``.
+
+    Raises
+    ------
+    InputError
+        A file, column, line or option that cannot be used, and what is allowed.
+    """
+    sheet = read_sheet(estimates)
+    axes = tuple(state) if state else POSE
+    convention = _convention(convention, axes, truth)
+    other = read_sheet(truth) if truth is not None else None
+    if other is None and not {"nis", "nis_dof"} <= set(sheet.data.columns):
+        raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
+    key = _key(sheet, other, max_dt)
+    names = [estimates.stem]
+    if "filter" in sheet:
+        empty = np.flatnonzero(sheet.data["filter"].isna())
+        if len(empty):
+            raise InputError(f"{sheet.place(int(empty[0]))}: column 'filter' is empty")
+        names = [str(name) for name in sheet.data["filter"].unique()]
+    recordings = []
+    for name in names:
+        own = sheet.rows((sheet.data["filter"].astype(str) == name).to_numpy()) if "filter" in sheet else sheet
+        recordings.append(_recording(name, own, other, key, axes, convention, max_dt))
+    return recordings
+
+
+def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | None) -> str:
+    if convention is not None and truth is None:
+        raise InputError("--error needs --truth: without truth there is no error")
+    if axes == POSE:
+        if convention not in (None, *PLANAR):
+            raise InputError(f"--error {convention}: for x, y, heading it is one of {', '.join(PLANAR)}")
+        return convention or "so2"
+    if convention not in (None, "vector"):
+        raise InputError(f"--error {convention}: needs the states x,y,heading; for {','.join(axes)} it is 'vector'")
+    return "vector"
+
+
+def _key(sheet: Sheet, truth: Sheet | None, max_dt: float | None) -> str:
+    """The column that says which estimate belongs to which truth."""
+    for key in ("step", "t"):
+        if key in sheet and (truth is None or key in truth):
+            if max_dt is not None and not ("t" in sheet and truth is not None and "t" in truth):
+                raise InputError("--max-dt: needs a column t in the estimates and in the truth")
+            return key
+    if truth is not None and ("step" in sheet or "t" in sheet):
+        has = "step" if "step" in sheet else "t"
+        raise InputError(f"{truth.path}: column '{has}' is missing; {sheet.path} is numbered by it")
+    raise InputError(f"{sheet.path}: column 'step' or 't' is missing; there are: {sheet.columns}")
+
+
+def _recording(
+    name: str,
+    sheet: Sheet,
+    truth: Sheet | None,
+    key: str,
+    axes: tuple[str, ...],
+    convention: str,
+    max_dt: float | None,
+) -> Recording:
+    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet.data), int)
+    order = _order(sheet, runs, key)
+    sheet, runs = sheet.rows(order), runs[order]
+    keys = sheet.numbers(key, finite=True)
+    error = covariance = None
+    keep = np.ones(len(runs), bool)
+    notes: list[str] = []
+    if truth is None:
+        broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *_present(sheet, axes)])).all(axis=1)
+        error = None if not broken.any() else np.where(broken, np.nan, 0.0)[:, None]
+    else:
+        covariance = _covariance(sheet, axes)
+        keep, true, notes = _matched(name, sheet, truth, runs, keys, key, axes, max_dt)
+        estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
+        estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
+        error = planar_error(true, estimate, convention) if axes == POSE else true - estimate
+        notes.append(f"error convention {convention}: {PLANAR[convention]}")
+        if key == "step":
+            keep &= ~_exact_start(keys, covariance)
+    nis, dof = _nis(sheet)
+    numbers = [int(run) for run in np.unique(runs[keep])]
+    members = [np.flatnonzero(keep & (runs == run)) for run in numbers]
+    if key == "step":
+        columns, steps = common_steps([keys[rows] for rows in members])
+        t = np.full(len(steps), np.nan)
+        if "t" in sheet:
+            times = sheet.numbers("t")
+            for rows, column in zip(reversed(members), reversed(columns), strict=True):
+                t[column] = times[rows]
+        if not np.array_equal(steps, np.arange(1, len(steps) + 1)):
+            notes.append(f"{name}: step k below is the k-th step of the file, which has {steps[0]:g} to {steps[-1]:g}")
+    else:
+        columns, t = common_times([keys[rows] for rows in members])
+    tracks = [
+        Track(
+            run,
+            column,
+            [sheet.place(int(row)) for row in rows],
+            *(None if values is None else values[rows] for values in (error, covariance, nis, dof)),
+        )
+        for run, rows, column in zip(numbers, members, columns, strict=True)
+    ]
+    made = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
+    return made if truth is not None else replace(made, error=None, dof=0)
+
+
+def _order(sheet: Sheet, runs: Array, key: str) -> Indices:
+    """Rows by run and step. Timestamps must be in order already: a jump back is another run or another clock."""
+    values = sheet.numbers(key, finite=True, whole=key == "step")
+    order = np.argsort(runs, kind="stable") if key == "t" else np.lexsort((values, runs))
+    same = np.diff(runs[order]) == 0
+    stuck = np.flatnonzero(same & (np.diff(values[order]) <= 0))
+    if len(stuck):
+        row = int(order[stuck[0] + 1])
+        of = f" of run {runs[row]}" if "run" in sheet else ""
+        what = "is there twice" if values[order[stuck[0]]] == values[row] else "is less than the one before"
+        hint = "" if "run" in sheet else "; several runs need a column 'run'"
+        hint += "" if "filter" in sheet else "; several estimators need a column 'filter'" if "run" in sheet else ""
+        raise InputError(f"{sheet.place(row)}: {key} {values[row]:.10g}{of} {what}{hint}")
+    return order
+
+
+def _matched(
+    name: str,
+    sheet: Sheet,
+    truth: Sheet,
+    runs: Array,
+    keys: Array,
+    key: str,
+    axes: tuple[str, ...],
+    max_dt: float | None,
+) -> tuple[Array, Array, list[str]]:
+    """Which rows have a truth, (N,), that truth, (N, n), and what to say about it."""
+    _require(truth, axes)
+    values = np.column_stack([truth.numbers(axis, finite=True) for axis in axes])
+    true_runs = truth.numbers("run", whole=True).astype(int) if "run" in truth else None
+    order = _order(truth, true_runs if true_runs is not None else np.zeros(len(values), int), key)
+    true_keys = truth.numbers(key)
+    tolerance = 0.0 if key == "step" else _default_dt(max_dt)
+    keep, true = np.zeros(len(keys), bool), np.full((len(keys), len(axes)), np.nan)
+    partner, furthest = np.full(len(keys), -1), 0.0
+    for run in np.unique(runs):
+        rows = np.flatnonzero(runs == run)
+        there = order if true_runs is None else order[true_runs[order] == run]
+        if not len(there):
+            has = ", ".join(map(str, np.unique(true_runs)[:5])) if true_runs is not None else ""
+            raise InputError(f"{truth.path}: holds no run {run} (it has {has}); without a column 'run' it serves all")
+        own, match = associate(keys[rows], true_keys[there], tolerance)
+        if key == "step":
+            exact = keys[rows][own] == true_keys[there][match]
+            own, match = own[exact], match[exact]
+        if not len(own):
+            spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (keys[rows], true_keys[there])]
+            within = f" within {tolerance:g} s (--max-dt)" if key == "t" else ""
+            raise InputError(
+                f"{sheet.path}: no {key} of run {run} ({spans[0]}) is in {truth.path} ({spans[1]}){within}"
+            )
+        keep[rows[own]], true[rows[own]], partner[rows[own]] = True, values[there[match]], there[match]
+        furthest = max(furthest, float(np.abs(keys[rows[own]] - true_keys[there[match]]).max()))
+    if key == "step" and "t" in sheet and "t" in truth:
+        _same_instants(sheet, truth, keep, partner, _default_dt(max_dt))
+    notes = []
+    absent = [] if true_runs is None else sorted({int(run) for run in true_runs} - {int(run) for run in runs})
+    if absent:
+        notes.append(
+            f"{name}: no estimates of {count(len(absent), 'run')} of the truth ({listed(absent)}); "
+            "if the filter broke down there, write a row of NaN, so that the failure counts"
+        )
+    if not keep.all():
+        notes.append(f"{name}: {int((~keep).sum())} of {len(keep)} estimates have no truth and are left out")
+    if furthest > 1e-6:
+        notes.append(f"{name}: estimates and truth are up to {furthest:.2g} s apart; the truth is not interpolated")
+    return keep, true, notes
+
+
+def _default_dt(max_dt: float | None) -> float:
+    return DEFAULT_DT if max_dt is None else max_dt
+
+
+def _same_instants(sheet: Sheet, truth: Sheet, keep: Array, partner: Array, max_dt: float) -> None:
+    own = sheet.numbers("t")[keep]
+    other = truth.numbers("t")[partner[keep]]
+    off = np.flatnonzero(np.abs(own - other) > max_dt + 1e-6)
+    if len(off):
+        row = int(np.flatnonzero(keep)[off[0]])
+        raise InputError(
+            f"{sheet.place(row)}: t is {own[off[0]]:.10g}, but {other[off[0]]:.10g} in the same step of {truth.path}; "
+            "number the same instants by the same step, or raise --max-dt"
+        )
+
+
+def _exact_start(steps: Array, covariance: Array) -> Array:
+    """Rows of step 0 where no run is uncertain yet: the start, not an estimate."""
+    start: Array = steps == 0
+    if not start.any() or (steps < 0).any() or not (smallest_correlation(covariance[start]) <= 0).all():
+        return np.zeros(len(steps), bool)
+    return start
+
+
+def _covariance(sheet: Sheet, axes: tuple[str, ...]) -> Array:
+    """(N, n, n) from the upper triangle; a lower triangle beside it must agree."""
+    _require(sheet, axes)
+    n = len(axes)
+    out = np.empty((len(sheet.data), n, n))
+    for i in range(n):
+        for j in range(i, n):
+            upper = [f"P_{axes[i]}_{axes[j]}", *([OWN_NAMES[axes[i], axes[j]]] if axes == POSE else [])]
+            lower = [f"P_{axes[j]}_{axes[i]}"]
+            there = [column for column in (*upper, *lower) if column in sheet]
+            if not there:
+                wanted = upper[-1]
+                raise InputError(
+                    f"{sheet.path}: column '{wanted}' is missing; the covariance of {', '.join(axes)} needs its "
+                    "upper triangle, zeros included"
+                )
+            out[:, i, j], out[:, j, i] = sheet.numbers(there[0]), sheet.numbers(there[-1])
+    return symmetric(out, sheet.place)
+
+
+def _require(sheet: Sheet, axes: tuple[str, ...]) -> None:
+    missing = [axis for axis in axes if axis not in sheet]
+    if missing:
+        hint = "; name other states with --state a,b,c" if axes == POSE else ""
+        raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}{hint}")
+
+
+def _present(sheet: Sheet, axes: tuple[str, ...]) -> list[Array]:
+    return [sheet.numbers(axis) for axis in axes if axis in sheet]
+
+
+def _nis(sheet: Sheet) -> tuple[Array | None, Array | None]:
+    if "nis" not in sheet:
+        return None, None
+    if "nis_dof" not in sheet:
+        raise InputError(f"{sheet.path}: column 'nis_dof' is missing; it is the number of measurements in each nis")
+    nis, dof = sheet.numbers("nis"), sheet.numbers("nis_dof")
+    bad = (nis < 0) | np.isinf(nis) | (np.isfinite(nis) & ~((dof >= 0) & (dof == np.round(dof))))
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise InputError(
+            f"{sheet.place(row)}: nis {nis[row]:g} with nis_dof {dof[row]:g}; "
+            "nis must be 0 or more, nis_dof a whole number of 0 or more"
+        )
+    return nis, np.where(np.isfinite(nis), dof, 0.0)

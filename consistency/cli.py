@@ -26,6 +26,9 @@ Seed = Annotated[int, typer.Option("--seed", help="Seed of the noise.")]
 Jobs = Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core. The result does not depend on it.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output folder of this bench.")]
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder written by 'run'.")]
+Power = Annotated[float, typer.Option("--power", help="Chance to find that ratio.")]
+FalseAlarm = Annotated[float, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none.")]
+DETECT_HELP = "ratio of true to stated covariance that must be found"
 SCENARIO = "Built-in name (see 'list') or path of a .toml file."
 
 
@@ -86,6 +89,14 @@ def run(
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
     runs: Annotated[int | None, typer.Option("--runs", help="Number of Monte Carlo runs [default: 50].")] = None,
+    until_decided: Annotated[
+        bool, typer.Option("--until-decided", help="As many runs as the verdict takes, instead of --runs.")
+    ] = False,
+    max_runs: Annotated[int | None, typer.Option("--max-runs", help="Most runs of --until-decided.")] = None,
+    detect: Annotated[float | None, typer.Option("--detect", help=f"For --until-decided: {DETECT_HELP} [1.5]")] = None,
+    false_alarm: Annotated[
+        float | None, typer.Option("--false-alarm", help="For --until-decided: chance to fail a right filter [0.05].")
+    ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the noise [default: 0].")] = None,
     jobs: Jobs = -1,
     timeout: Annotated[
@@ -101,17 +112,27 @@ def run(
     from consistency.montecarlo import Interrupted, resolve_filters, run_log, run_trials
     from consistency.results import read_results
     from consistency.scenario import load_scenario
+    from consistency.sequential import run_until_decided
     from consistency.storage import require_free
     from consistency.table import print_verdicts
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
+    planned: dict[str, Any] = {"max_runs": max_runs, "detect": detect, "false_alarm": false_alarm}
+    planned = {key: value for key, value in planned.items() if value is not None}
+    if planned and not until_decided:
+        raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
+    if until_decided and runs is not None:
+        raise InputError("--until-decided finds the number of runs; give --max-runs instead of --runs")
+    verdicts = None
     if resume and overwrite:
         raise InputError("--resume goes on with what --overwrite would replace; give one of them")
     try:
         if log is not None:
-            if runs is not None or seed is not None or resume:
-                raise InputError("--runs, --seed and --resume do not go with --log: a log has the runs it has")
+            if runs is not None or seed is not None or resume or until_decided:
+                raise InputError(
+                    "--runs, --seed, --resume and --until-decided do not go with --log: a log has the runs it has"
+                )
             recorded = read_log(log)
             resolve_filters(filters, recorded.belief)
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
@@ -124,7 +145,12 @@ def run(
             resolve_filters(filters, world.belief)
             require_free(out, overwrite or resume)
             previous = read_results(out) if resume else None
-            results = run_trials(world, filters, runs, seed, jobs, timeout, previous)
+            if until_decided:
+                results, verdicts = run_until_decided(
+                    world, filters, seed=seed, jobs=jobs, timeout=timeout, previous=previous, **planned
+                )
+            else:
+                results = run_trials(world, filters, runs, seed, jobs, timeout, previous)
     except Interrupted as stop:
         done = stop.results.manifest["finished_runs"]
         if not done:
@@ -135,7 +161,7 @@ def run(
             print(f"stopped: {done} finished runs are in {out}; {how}", file=sys.stderr)
         raise typer.Exit(130) from None
     results.write(out, overwrite or resume, keep_others=resume)
-    print_verdicts(analyse(results))
+    print_verdicts(verdicts or analyse(results))
     print(f"results in {out}; next: consistency report {out}")
 
 
@@ -164,13 +190,16 @@ def analyse(
         float | None, typer.Option("--max-dt", help="Seconds between an estimate and its truth at most [0.01].")
     ] = None,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
-    confidence: Annotated[float, typer.Option("--confidence", help="Of the verdict, over all steps at once.")] = 0.95,
+    confidence: Annotated[
+        float | None, typer.Option("--confidence", help="1 less the false-alarm rate of the verdict [0.95].")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
 ) -> None:
     """Judge results, or files of another estimator: consistent, overconfident, conservative or failed, and why."""
     from consistency.judge import analyse as judge_results
-    from consistency.recording import analyse_recordings, is_recording, read_recordings
+    from consistency.judge import analyse_recordings
+    from consistency.recording import is_recording, read_recordings
     from consistency.results import read_results
     from consistency.table import print_verdicts, verdicts_json
 
@@ -201,6 +230,77 @@ def analyse(
         print_verdicts(verdicts, reasons=True)
     if fail_on and not all(verdict.consistent for verdict in verdicts.values()):
         raise typer.Exit(1)
+
+
+@app.command()
+def plan(
+    detect: Annotated[float, typer.Option("--detect", help=f"{DETECT_HELP.capitalize()}.")] = 1.5,
+    dof: Annotated[int, typer.Option("--dof", help="Dimension of the error; 3 for a planar pose.")] = 3,
+    false_alarm: FalseAlarm = 0.05,
+    power: Power = 0.95,
+    allow: Annotated[
+        str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """How many runs a verdict takes."""
+    from consistency.judge import plan as plan_runs
+    from consistency.table import print_plan
+
+    planned = plan_runs(dof, detect, false_alarm, power, allow)
+    if as_json:
+        print(json.dumps(planned, indent=2))
+    else:
+        print_plan(planned)
+
+
+@app.command()
+def compare(
+    folder: Folder,
+    other: Annotated[
+        Path | None, typer.Argument(metavar="[OTHER]", help="Earlier results, or a file of 'baseline'.")
+    ] = None,
+    filters: Annotated[
+        list[str] | None,
+        typer.Option("--filter", help="Without OTHER: the first against the rest. With it: this filter in both."),
+    ] = None,
+    false_alarm: FalseAlarm = 0.05,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,
+) -> None:
+    """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
+    from consistency.comparison import compare_filters, compare_with, read_baseline
+    from consistency.table import comparisons_json, print_comparisons
+
+    if fail_on not in (None, "worse"):
+        raise InputError(f"--fail-on must be 'worse', got '{fail_on}'")
+    if not 0.0 < false_alarm < 1.0:
+        raise InputError(f"--false-alarm must lie between 0 and 1, got {false_alarm}")
+    new = read_baseline(folder)
+    if other is None:
+        compared = compare_filters(new, filters or [], false_alarm)
+    else:
+        compared = compare_with(new, read_baseline(other), filters or [], false_alarm)
+    if as_json:
+        print(comparisons_json(compared))
+    else:
+        print_comparisons(compared)
+    if fail_on and any(each.worse for each in compared):
+        raise typer.Exit(1)
+
+
+@app.command()
+def baseline(
+    folder: Folder,
+    out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
+) -> None:
+    """Keep what a later 'compare' needs of results, one row a run."""
+    from consistency.comparison import write_baseline
+    from consistency.results import read_results
+
+    write_baseline(read_results(folder), out, overwrite)
+    print(f"baseline in {out}; next: consistency compare NEW {out}")
 
 
 @app.command()

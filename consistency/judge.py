@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.diagnostics import judge
+from consistency.diagnostics import Design, gate_runs, judge, required_runs, sequential_design
 from consistency.errors import InputError
 from consistency.geometry import pose_error
+from consistency.recording import Recording
 from consistency.results import POSE, Results, covariances
 from consistency.types import Array, Failure, Indices, Verdict
+
+CONFIDENCE = 0.95
+OPTION = {
+    "ratio": "detect",
+    "false_alarm": "false-alarm",
+    "max_runs": "max-runs",
+}  # of the plan, as the command calls it
 
 
 @dataclass(frozen=True)
@@ -86,30 +96,97 @@ def wins(a: Curves, b: Curves) -> tuple[int, float]:
     return better, float(stats.binomtest(better, better + worse).pvalue)
 
 
-def analyse(results: Results, filters: list[str] | None = None, confidence: float = 0.95) -> dict[str, Verdict]:
+def analyse(
+    results: Results, filters: Sequence[str] | None = None, confidence: float | None = None
+) -> dict[str, Verdict]:
     """A verdict for every filter of the results, or for those named.
+
+    Parameters
+    ----------
+    confidence : 1 less the false-alarm rate of a verdict; 0.95 where None. Results of a run until decided are then
+        judged as the last look at them was.
 
     Raises
     ------
     InputError
         Unknown filter, or a confidence outside (0, 1).
     """
-    if not 0.0 < confidence < 1.0:
-        raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
+    design = None if confidence is not None else design_of(results)
+    false_alarm = design.look_false_alarm if design else _false_alarm(confidence)
     verdicts = {}
     for name in filters or results.filters:
-        c = curves(results, name)
-        verdicts[name] = verdict_of(c, 1.0 - confidence)
+        verdict = verdict_of(curves(results, name), false_alarm)
+        verdicts[name] = design.settle(verdict) if design else verdict
     return verdicts
+
+
+def design_of(results: Results) -> Design | None:
+    """The group-sequential plan that the results were run by, if they were."""
+    plan = results.manifest.get("until_decided")
+    try:
+        return sequential_design(**plan) if plan else None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"manifest.json: key 'until_decided': {error}") from None
 
 
 def verdict_of(c: Curves, false_alarm: float) -> Verdict:
     """The verdict on one filter's arrays."""
-    verdict = judge(c.filter, c.error, c.covariance, c.nees, c.nis, c.nis_dof, c.failures, false_alarm, axes=POSE)
-    outlier = verdict.statistics.get("outlier")
-    if outlier and outlier["row"] >= 0:
-        outlier["run"] = int(c.runs[outlier["row"]])
-    return verdict
+    return judge(
+        c.filter, c.error, c.covariance, c.nees, c.nis, c.nis_dof, c.failures, false_alarm,
+        axes=POSE, run_numbers=c.runs,
+    )  # fmt: skip
+
+
+def analyse_recordings(
+    recordings: Sequence[Recording], filters: Sequence[str] | None = None, confidence: float | None = None
+) -> dict[str, Verdict]:
+    """A verdict for every recording, or for those named; raises as :func:`analyse`."""
+    false_alarm = _false_alarm(confidence)
+    named = {recording.name: recording for recording in recordings}
+    verdicts = {}
+    for name in filters or named:
+        if name not in named:
+            raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
+        r = named[name]
+        verdict = judge(
+            name, r.error, r.covariance, r.nees, r.nis, r.nis_dof, r.failures, false_alarm,
+            dof=r.dof or None, axes=r.axes, run_numbers=r.runs,
+        )  # fmt: skip
+        said = {
+            "axes": list(r.axes), "convention": r.convention or None, "notes": list(r.notes),
+            "left_out_steps": r.left_out_steps,
+        }  # fmt: skip
+        verdicts[name] = replace(verdict, statistics=verdict.statistics | said)
+    return verdicts
+
+
+def plan(dof: int, detect: float, false_alarm: float, power: float, allow: str | None = None) -> dict[str, Any]:
+    """Runs that a verdict takes (``runs``), those of one chi-square test (``one_step``), and the looks.
+
+    Raises
+    ------
+    InputError
+        A number out of its range.
+    """
+    if allow not in (None, "conservative"):
+        raise InputError(f"--allow must be 'conservative', got '{allow}'")
+    try:
+        return {
+            "dof": dof, "detect": detect, "false_alarm": false_alarm, "power": power, "allow": allow,
+            "runs": gate_runs(dof, detect, false_alarm, power, allow),
+            "one_step": required_runs(dof, detect, false_alarm, power, two_sided=allow is None),
+            "looks": list(sequential_design(dof, detect, false_alarm, power).looks),
+        }  # fmt: skip
+    except ValueError as error:
+        name, rest = str(error).split(" ", 1)
+        raise InputError(f"--{OPTION.get(name, name)} {rest}") from None
+
+
+def _false_alarm(confidence: float | None) -> float:
+    confidence = CONFIDENCE if confidence is None else confidence
+    if not 0.0 < confidence < 1.0:
+        raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
+    return 1.0 - confidence
 
 
 def _steps(results: Results) -> int:

@@ -95,6 +95,19 @@ def _git_commit() -> str | None:
         return None
 
 
+def plain(value: Any) -> Any:
+    """Arrays as lists, not finite numbers as None: what JSON can hold."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
 # --- writing -------------------------------------------------------------------------------------
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
+from consistency.comparison import Compared
+from consistency.storage import plain
 from consistency.types import Finding, Verdict
 
 COLOURS = {
@@ -51,9 +54,9 @@ def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
     if reasons:
         for name, verdict in verdicts.items():
             first, *rest = verdict.reasons
-            console.print(f"\n{name} is {first}", markup=False)
+            console.print(f"\n{name} is {first}", markup=False, soft_wrap=not console.is_terminal)
             for reason in rest:
-                console.print(f"  - {reason}", markup=False)
+                console.print(f"  - {reason}", markup=False, soft_wrap=not console.is_terminal)
 
 
 def print_findings(findings: Sequence[Finding]) -> None:
@@ -77,17 +80,49 @@ def verdicts_json(verdicts: dict[str, Verdict]) -> str:
     return json.dumps(data, indent=2, allow_nan=False)
 
 
-def plain(value: Any) -> Any:
-    """Arrays as lists, not finite numbers as None: what JSON can hold."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def print_plan(planned: dict[str, Any]) -> None:
+    """Runs that a verdict takes, in two lines."""
+    p = planned
+    side = "small" if p["detect"] > 1.0 else "large"
+    factor = p["detect"] if p["detect"] > 1.0 else 1.0 / p["detect"]
+    print(
+        f"{p['runs']} runs: a verdict at false alarm {p['false_alarm']:g} then finds a covariance too {side} by "
+        f"x{factor:.3g} with power {p['power']:g}"
+    )
+    print(
+        f"{p['one_step']} runs would do for a single chi-square test of one step, at the same rates; "
+        f"--until-decided looks at {', '.join(map(str, p['looks']))} runs"
+    )
+
+
+def print_comparisons(compared: Sequence[Compared]) -> None:
+    """One table a pair: both values, their ratio or difference with its interval, and a sentence."""
+    console = _console()
+    for each in compared:
+        c = each.comparison
+        table = RichTable(box=None, pad_edge=False)
+        heads = (each.a, f"{each.b} (reference)") if each.a != each.b else ("now", "reference")
+        for column in ("", *heads, "ratio", "difference", "95 % interval"):
+            table.add_column(escape(column), justify="left" if not column else "right")
+        for d in c.differences:
+            share = "coverage" in d.name
+            values = (f"{100 * v:.1f} %" if share else f"{v:.3g}" for v in (d.a, d.b))
+            ratio = "" if share else f"x{d.difference:.3g}"
+            gap = f"{100 * d.difference:+.1f} %" if share else ""
+            ends = f"{100 * d.low:+.1f} to {100 * d.high:+.1f} %" if share else f"{d.low:.3g} to {d.high:.3g}"
+            table.add_row(d.name, *values, ratio, gap, ends)
+        console.print(table)
+        console.print(each.sentence + "\n", markup=False, soft_wrap=not console.is_terminal)
+
+
+def comparisons_json(compared: Sequence[Compared]) -> str:
+    """Every pair with its differences; NaN becomes null."""
+    data = [
+        {"a": each.a, "b": each.b, "worse": each.worse, "sentence": each.sentence, "failures": each.failures}
+        | {key: plain(value) for key, value in asdict(each.comparison).items()}
+        for each in compared
+    ]
+    return json.dumps(data, indent=2, allow_nan=False)
 
 
 def _number(value: Any, form: str) -> str:

@@ -5,9 +5,11 @@
 - ``independent``: NEES values drawn from chi-square(3), no errors given;
 - ``autocorrelated``: Gaussian errors with lag-1 correlation 0.95 and a covariance that changes from step to step;
 - ``linear-gaussian``: the Kalman filter on 100 steps of that scenario. The runs are drawn once; gates for false
-  alarms are disjoint groups of them, gates for power are drawn without replacement within a gate.
+  alarms are disjoint groups of them; where they are too few for that (power, several looks) each gate draws its
+  runs from all of them without replacement.
 
-The number of runs of a gate is what ``gate_runs`` plans for the ratio. A fault of ratio r is a stated covariance r
+The number of runs of a gate is what ``gate_runs`` plans for the ratio; for false alarms that of ratio 2, the fewest and
+so the hardest. Rows with several looks are ``--until-decided``. A fault of ratio r is a stated covariance r
 times smaller than the right one.
 """
 
@@ -18,6 +20,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +29,14 @@ import numpy as np
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import gate_runs, judge
+from consistency.diagnostics import gate_runs, judge, sequential_design
 from consistency.judge import curves
 
 GATES, STEPS, DOF, SEED = 2000, 100, 3, 20070101
 FALSE_ALARMS = (0.05, 0.01)
 RATIOS = (1.2, 1.5, 2.0, 0.67)
 HARDEST = 2.0  # ratio whose plan takes the fewest runs: there calibration is hardest
+STOPPING = 1.5  # ratio for which --until-decided plans
 POWER = 0.95
 CORRELATION = 0.95  # of the errors in neighbouring steps
 CHUNK = 2000  # runs of the Kalman filter in memory at once
@@ -40,22 +45,46 @@ BATCH = 25  # gates handed to a worker at once
 Gate = dict[str, Any]  # arguments of judge
 
 
+@dataclass(frozen=True)
+class Case:
+    """One row of the table: a world, a fault and a way of judging."""
+
+    world: str
+    ratio: float  # of true to stated covariance
+    false_alarm: float
+    looks: tuple[int, ...]  # runs at each; one look is a gate
+    look_false_alarm: float
+
+    @property
+    def wanted(self) -> str | None:
+        """The status that is right; None: any fault found is a false alarm."""
+        return None if self.ratio == 1.0 else "overconfident" if self.ratio > 1.0 else "conservative"
+
+
+def cases() -> list[Case]:
+    """All rows."""
+    rows = []
+    for world in WORLDS:
+        for false_alarm in FALSE_ALARMS:
+            runs = gate_runs(DOF, HARDEST, false_alarm, POWER)
+            rows.append(Case(world, 1.0, false_alarm, (runs,), false_alarm))
+        for ratio in RATIOS:
+            runs = gate_runs(DOF, ratio, FALSE_ALARMS[0], POWER)
+            rows.append(Case(world, ratio, FALSE_ALARMS[0], (runs,), FALSE_ALARMS[0]))
+        design = sequential_design(DOF, STOPPING, FALSE_ALARMS[0], POWER)
+        for ratio in (1.0, STOPPING):
+            rows.append(Case(world, ratio, FALSE_ALARMS[0], design.looks, design.look_false_alarm))
+    return rows
+
+
 def main(gates: int = GATES, power_gates: int | None = None, workers: int = 2) -> dict[str, Any]:
     """The table, as a JSON document."""
     started = time.monotonic()
-    power_gates = power_gates or gates // 2
-    rows = []
+    every = cases()
+    of_pool = max(case.looks[-1] for case in every if case.ratio == 1.0 and len(case.looks) == 1)
     with ProcessPoolExecutor(workers) as pool:
-        pool_of_runs = kalman_runs(gates * max(gate_runs(DOF, HARDEST, a, POWER) for a in FALSE_ALARMS))
-        for world in WORLDS:
-            for false_alarm in FALSE_ALARMS:
-                runs = gate_runs(DOF, HARDEST, false_alarm, POWER)
-                drawn = WORLDS[world](np.random.default_rng((SEED, 1)), gates, runs, pool_of_runs, True)
-                rows.append(_row(pool, world, drawn, 1.0, runs, false_alarm, gates))
-            for ratio in RATIOS:
-                runs = gate_runs(DOF, ratio, FALSE_ALARMS[0], POWER)
-                drawn = WORLDS[world](np.random.default_rng((SEED, 2)), power_gates, runs, pool_of_runs, False)
-                rows.append(_row(pool, world, drawn, ratio, runs, FALSE_ALARMS[0], power_gates))
+        kalman = kalman_runs(gates * of_pool)
+        rows = [_row(pool, case, gates if case.ratio == 1.0 else power_gates or gates // 2, kalman) for case in every]
     return {
         "steps": STEPS, "dof": DOF, "seed": SEED, "power": POWER, "rows": rows,
         "wall_time_s": round(time.monotonic() - started, 1),
@@ -65,65 +94,60 @@ def main(gates: int = GATES, power_gates: int | None = None, workers: int = 2) -
 def promises_kept(row: dict[str, Any], confidence: float = 0.99) -> bool:
     """Is the row within its promise, as far as its number of gates can tell?
 
-    False alarms: not above the stated rate (upper binomial quantile) and not below a fifth of it (lower
+    False alarms: not above the stated rate (upper binomial quantile) and, of a gate, not below a fifth of it (lower
     quantile). Power: at least the stated one minus 2 points (lower quantile).
     """
     gates, found, rate = row["gates"], row["found"], row["false_alarm"]
     if row["ratio"] == 1.0:
-        high = stats.binom.ppf(confidence, gates, rate)
-        return bool(stats.binom.ppf(1 - confidence, gates, rate / 5) <= found <= high)
+        low = 0.0 if row["looks"] > 1 else stats.binom.ppf(1 - confidence, gates, rate / 5)
+        return bool(low <= found <= stats.binom.ppf(confidence, gates, rate))
     return bool(found >= stats.binom.ppf(1 - confidence, gates, row["power"] - 0.02))
 
 
-def _row(
-    pool: ProcessPoolExecutor,
-    world: str,
-    drawn: Iterator[Gate],
-    ratio: float,
-    runs: int,
-    false_alarm: float,
-    gates: int,
-) -> dict[str, Any]:
-    wanted = None if ratio == 1.0 else "overconfident" if ratio > 1.0 else "conservative"
-    found = 0
-    pending = []
-    for batch in _batches(drawn, ratio, false_alarm):
-        pending.append(pool.submit(_statuses, batch))
+def _row(pool: ProcessPoolExecutor, case: Case, gates: int, kalman: Any) -> dict[str, Any]:
+    runs = case.looks[-1]
+    rng = np.random.default_rng((SEED, 1 if case.ratio == 1.0 else 2, len(case.looks)))
+    disjoint = gates * runs <= len(kalman[0])
+    drawn = WORLDS[case.world](rng, gates, runs, kalman, disjoint)
+    pending, answers = [], []
+    while batch := list(islice(drawn, BATCH)):
+        pending.append(pool.submit(_judged, case, batch))
         if len(pending) > 8:
-            found += _count(pending.pop(0).result(), wanted)
-    found += sum(_count(future.result(), wanted) for future in pending)
+            answers += pending.pop(0).result()
+    for future in pending:
+        answers += future.result()
+    found = sum(status != "consistent" if case.wanted is None else status == case.wanted for status, _ in answers)
     row = {
-        "world": world, "ratio": ratio, "runs": runs, "false_alarm": false_alarm, "power": POWER, "gates": gates,
-        "found": found,
+        "world": case.world, "ratio": case.ratio, "runs": runs, "looks": len(case.looks),
+        "mean_runs": round(float(np.mean([used for _, used in answers])), 1), "false_alarm": case.false_alarm,
+        "power": POWER, "gates": gates, "found": found,
     }  # fmt: skip
-    print(f"{world:<16} ratio {ratio:<4} {runs:>4} runs, false alarm {false_alarm}: {found} of {gates}", flush=True)
+    print(
+        f"{case.world:<16} ratio {case.ratio:<4} {runs:>4} runs in {len(case.looks)} looks, false alarm "
+        f"{case.false_alarm}: {found} of {gates}", flush=True,
+    )  # fmt: skip
     return row
 
 
-def _batches(drawn: Iterator[Gate], ratio: float, false_alarm: float) -> Iterator[list[Gate]]:
-    batch: list[Gate] = []
-    for gate in drawn:
-        if "nees" in gate:
-            gate["nees"] = gate["nees"] * ratio
-        else:
-            gate["covariance"] = gate["covariance"] / ratio
-        batch.append(gate | {"false_alarm": false_alarm})
-        if len(batch) == BATCH:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
+def _judged(case: Case, batch: list[Gate]) -> list[tuple[str, int]]:
+    """Status and runs used of each gate, at the first look that finds a fault or the last."""
+    answers = []
+    for gate in batch:
+        status, used = "consistent", 0
+        for used in case.looks:
+            status = judge("gate", **_first(gate, used, case.ratio), false_alarm=case.look_false_alarm).status
+            if status != "consistent":
+                break
+        answers.append((status, used))
+    return answers
 
 
-def _statuses(batch: list[Gate]) -> list[str]:
-    for gate in batch:  # one covariance for all runs, sent once
-        if "covariance" in gate:
-            gate["covariance"] = np.broadcast_to(gate["covariance"], (len(gate["error"]), *gate["covariance"].shape))
-    return [judge("gate", **gate).status for gate in batch]
-
-
-def _count(statuses: list[str], wanted: str | None) -> int:
-    return sum(status != "consistent" if wanted is None else status == wanted for status in statuses)
+def _first(gate: Gate, runs: int, ratio: float) -> Gate:
+    """The first runs of a gate, with a stated covariance that is ``ratio`` times too small."""
+    if "nees" in gate:
+        return gate | {"nees": gate["nees"][:runs] * ratio}
+    error, covariance = gate["error"][:runs], gate["covariance"] / ratio  # one covariance for all runs
+    return {"error": error, "covariance": np.broadcast_to(covariance, (len(error), *covariance.shape))}
 
 
 # --- worlds ------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ No table, no plot and no file belongs here.
 """
 
 from consistency.diagnostics.bias import Hotelling, hotelling, t_squared
+from consistency.diagnostics.comparison import Comparison, Difference, RunSummary, compare, summary
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
 from consistency.diagnostics.distribution import Pit, pit
@@ -15,6 +16,7 @@ from consistency.diagnostics.outliers import Outlier, outliers
 from consistency.diagnostics.planning import detectable_ratio, gate_runs, power_of, required_runs
 from consistency.diagnostics.questions import Answer, answers
 from consistency.diagnostics.scale import Band, MeanTest, mean_test, ratio_interval, simultaneous_band
+from consistency.diagnostics.sequential import Design, sequential_design
 from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
 from consistency.diagnostics.verdict import judge
 from consistency.diagnostics.whitening import spread_steps, standardise, whiten
@@ -22,17 +24,22 @@ from consistency.diagnostics.whitening import spread_steps, standardise, whiten
 __all__ = [
     "Answer",
     "Band",
+    "Comparison",
+    "Design",
+    "Difference",
     "Hotelling",
     "MeanTest",
     "NisTest",
     "Normality",
     "Outlier",
     "Pit",
+    "RunSummary",
     "Whiteness",
     "anees",
     "anees_interval",
     "answers",
     "chi2_mean_interval",
+    "compare",
     "coverage",
     "coverage_interval",
     "detectable_ratio",
@@ -53,10 +60,12 @@ __all__ = [
     "ratio_interval",
     "required_runs",
     "rmse",
+    "sequential_design",
     "simultaneous_band",
     "sphericity",
     "spread_steps",
     "standardise",
+    "summary",
     "t_squared",
     "whiten",
     "whiteness",

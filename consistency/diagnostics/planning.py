@@ -35,7 +35,7 @@ def required_runs(
     if not 0.0 < ratio < float("inf") or ratio == 1.0:
         raise ValueError(f"ratio must be positive and not 1, got {ratio}")
     if power_of(dof, LARGEST, ratio, false_alarm, two_sided) < power:
-        raise ValueError(f"a ratio of {ratio} needs more than {LARGEST} runs; ask for one further from 1")
+        raise ValueError(f"ratio of {ratio} needs more than {LARGEST} runs; ask for one further from 1")
     low, high = 0, 1
     while power_of(dof, high, ratio, false_alarm, two_sided) < power:
         low, high = high, min(2 * high, LARGEST)
@@ -50,6 +50,7 @@ def gate_runs(dof: int, detect: float, false_alarm: float = 0.05, power: float =
 
     As :func:`required_runs` with the half of ``false_alarm`` that a verdict gives to the mean NEES. Raises as that.
     """
+    _require(dof, false_alarm, power)
     return required_runs(dof, detect, SHARES[MAIN] * false_alarm, power, two_sided=allow is None)
 
 

@@ -30,7 +30,7 @@ from consistency.diagnostics.scale import (
 )  # fmt: skip
 from consistency.diagnostics.shape import mean_shape, sphericity
 from consistency.diagnostics.whitening import standardise, whiten
-from consistency.types import Array, Failure, Verdict
+from consistency.types import Array, Failure, Indices, Verdict
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
 INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
@@ -53,6 +53,7 @@ def judge(
     method: str = "max",
     innovations: Array | None = None,
     innovation_covariances: Array | None = None,
+    run_numbers: Indices | None = None,
 ) -> Verdict:
     """Consistent, overconfident, conservative, inconsistent or failed, with reasons and statistics.
 
@@ -74,6 +75,7 @@ def judge(
     method : of the band over all steps, see :func:`simultaneous_band`
     innovations, innovation_covariances : (runs, steps, m), (runs, steps, m, m), for their whiteness;
         without them the NIS has to do
+    run_numbers : (runs,), what to call the runs; 0, 1, ... otherwise
 
     Raises
     ------
@@ -104,6 +106,8 @@ def judge(
         whitened = np.where(counted[..., None], whitened, np.nan)
         dof = error.shape[-1]
         p_values |= _errors(s, error, covariance, nees, whitened, allow, axes, subsets)
+    if "outlier" in s and run_numbers is not None and s["outlier"]["run"] >= 0:
+        s["outlier"]["run"] = int(run_numbers[s["outlier"]["run"]])
     band = None
     if nees is not None:
         if dof is None:
@@ -201,7 +205,7 @@ def _errors(
         "rmse_heading": rmse(error[..., attitude]) if attitude else float("nan"),
         "nci": float(mean(index)) if np.isfinite(index).any() else float("nan"),
         "inclination": float(mean(inclination)) if np.isfinite(inclination).any() else float("nan"),
-        "outlier": {"row": odd.run, "run": odd.run, "step": odd.step + 1, "distance": odd.distance},
+        "outlier": {"run": odd.run, "step": odd.step + 1, "distance": odd.distance},
         "left_out_steps": [int(k) + 1 for k in np.flatnonzero(_finite_any(covariance, error, counted))],
     }
     return p

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,11 @@ from consistency.recording.conventions import PLANAR, SPATIAL, planar_error, se2
 from consistency.recording.record import Recording
 from consistency.recording.table import read_tables
 from consistency.recording.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
-from consistency.types import Verdict
 
 __all__ = [
     "CONVENTIONS",
     "ORDERS",
     "Recording",
-    "analyse_recordings",
     "is_recording",
     "planar_error",
     "read_recordings",
@@ -112,37 +109,3 @@ def _refuse(path: Path, options: dict[str, object], names: Sequence[str]) -> Non
     for name in names:
         if options[name] is not None:
             raise InputError(f"--{name}: does not go with {path}")
-
-
-def analyse_recordings(
-    recordings: Sequence[Recording], filters: Sequence[str] | None = None, confidence: float = 0.95
-) -> dict[str, Verdict]:
-    """A verdict for every recording, or for those named.
-
-    Raises
-    ------
-    InputError
-        No recording of that name, or a confidence outside (0, 1).
-    """
-    from consistency.diagnostics import judge
-
-    if not 0.0 < confidence < 1.0:
-        raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
-    named = {recording.name: recording for recording in recordings}
-    for name in filters or ():
-        if name not in named:
-            raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
-    verdicts = {}
-    for name in filters or named:
-        r = named[name]
-        verdict = judge(
-            name, r.error, r.covariance, r.nees, r.nis, r.nis_dof, r.failures, 1.0 - confidence,
-            dof=r.dof or None, axes=r.axes,
-        )  # fmt: skip
-        said: dict[str, Any] = {"axes": list(r.axes), "convention": r.convention or None, "notes": list(r.notes)}
-        said["left_out_steps"] = r.left_out_steps
-        outlier = verdict.statistics.get("outlier")
-        if outlier and outlier["row"] >= 0:
-            outlier["run"] = int(r.runs[outlier["row"]])
-        verdicts[name] = replace(verdict, statistics=verdict.statistics | said)
-    return verdicts

@@ -1,0 +1,182 @@
+"""Filters against each other on the same trials, and against a baseline kept from an earlier release."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.diagnostics import Comparison, RunSummary, compare, summary
+from consistency.errors import InputError
+from consistency.judge import curves
+from consistency.results import POSE, Results, read_results
+from consistency.storage import SCHEMA_VERSION, manifest_of, plain
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """One row a run of every filter: what a later comparison needs, and where it came from."""
+
+    name: str
+    scenario: str | None
+    origin: tuple[Any, Any]  # scenario hash and seed: the same trials have the same
+    filters: dict[str, RunSummary]
+    failures: dict[str, int]
+    manifest: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Filter ``a`` against ``b``."""
+
+    a: str
+    b: str
+    comparison: Comparison
+    failures: tuple[int, int]
+    note: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """What the comparison says."""
+        c = self.comparison
+        way = "run by run on the same trials" if c.paired else "as independent samples"
+        text = f"{self.a} is {'less consistent' if c.worse else 'not found less consistent'} than {self._reference}"
+        text += f": {c.runs} runs, {way}, p {c.p_value:.2g}"
+        if c.distance == c.standard_error == 0.0:
+            text += "; every run is the same in both"
+        elif not c.worse:
+            text += f"; {c.needed_runs()} runs find a covariance farther off by x1.5 with power 0.95"
+        if any(self.failures):
+            text += f"; failed runs {self.failures[0]}, {self.failures[1]} in the reference"
+        return f"{text}. {self.note}".rstrip(". ") if self.note else text
+
+    @property
+    def _reference(self) -> str:
+        return self.b if self.a != self.b else "the reference"
+
+    @property
+    def worse(self) -> bool:
+        """Less consistent, or, on the same trials, with more failed runs."""
+        return self.comparison.worse or (self.comparison.paired and self.failures[0] > self.failures[1])
+
+
+def baseline_of(results: Results, name: str = "results") -> Baseline:
+    """Summaries of all filters.
+
+    Raises
+    ------
+    InputError
+        The results have no truth.
+    """
+    filters, failures = {}, {}
+    for each in results.filters:
+        c = curves(results, each)
+        if c.nees is None or c.error is None:
+            raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
+        filters[each] = summary(c.nees, len(POSE), c.error, c.covariance, c.runs)
+        failures[each] = len(c.failures)
+    scenario = results.scenario
+    m = results.manifest
+    origin = (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed"))
+    return Baseline(name, scenario.name if scenario else None, origin, filters, failures, m)
+
+
+def write_baseline(results: Results, path: Path, overwrite: bool = False) -> None:
+    """Keep the summaries of results as a small JSON file, for version control.
+
+    Raises
+    ------
+    InputError
+        The file exists or cannot be written, or the results have no truth.
+    """
+    if path.exists() and not overwrite:
+        raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
+    base = baseline_of(results, str(path))
+    data = manifest_of(
+        kind="baseline",
+        scenario=base.scenario,
+        origin=list(base.origin),
+        filters={
+            name: {key: plain(value) for key, value in vars(s).items()} | {"failures": base.failures[name]}
+            for name, s in base.filters.items()
+        },
+    )
+    try:
+        partial = path.with_name(f".{path.name}.partial")
+        partial.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
+
+
+def read_baseline(path: Path) -> Baseline:
+    """A results folder, or a file of :func:`write_baseline`.
+
+    Raises
+    ------
+    InputError
+        Neither, or damaged.
+    """
+    if path.is_dir():
+        return baseline_of(read_results(path), str(path))
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not valid JSON ({error})") from None
+    if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")
+    try:
+        filters = {
+            name: RunSummary(
+                np.asarray(s["runs"], np.int64),
+                int(s["dof"]),
+                *(np.asarray(s[key], float).reshape(len(s["runs"]), *rest) for key, rest in SHAPES.items()),
+            )
+            for name, s in data["filters"].items()
+        }
+        failures = {name: int(s["failures"]) for name, s in data["filters"].items()}
+        first, second = data["origin"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged ({type(error).__name__}: {error}); write it again") from None
+    return Baseline(str(path), data.get("scenario"), (first, second), filters, failures, data)
+
+
+SHAPES: dict[str, tuple[int, ...]] = {"nees": (), "squared": (-1,), "covered": (-1,)}
+
+
+def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = 0.05) -> list[Compared]:
+    """The first filter against each of the others, on the same trials."""
+    names = list(filters) or list(base.filters)
+    if len(names) < 2:
+        raise InputError(
+            f"{base.name}: give two filters with --filter, or another folder or a baseline to compare with"
+        )
+    return [_compared(base, names[0], base, other, true_pairs=True, false_alarm=false_alarm) for other in names[1:]]
+
+
+def compare_with(new: Baseline, old: Baseline, filters: Sequence[str], false_alarm: float = 0.05) -> list[Compared]:
+    """Each filter of ``new`` against the same in ``old``; run by run only where the trials are the same."""
+    names = list(filters) or [name for name in new.filters if name in old.filters]
+    if not names:
+        raise InputError(f"{new.name} and {old.name} have no filter in common; name one with --filter")
+    same = None not in new.origin and new.origin == old.origin
+    note = "" if same else "Scenario or seed differ: the trials are not the same"
+    return [replace(_compared(new, name, old, name, same, false_alarm), note=note) for name in names]
+
+
+def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, false_alarm: float) -> Compared:
+    for base, name in ((a, of_a), (b, of_b)):
+        if name not in base.filters:
+            raise InputError(f"--filter {name}: is not in {base.name}; there are: {', '.join(base.filters)}")
+    paired = None if true_pairs else False
+    try:
+        comparison = compare(a.filters[of_a], b.filters[of_b], false_alarm, tuple(POSE), paired)
+    except ValueError as error:
+        raise InputError(f"{of_a} against {of_b}: {error}") from None
+    return Compared(of_a, of_b, comparison, (a.failures[of_a], b.failures[of_b]))

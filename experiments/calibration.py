@@ -6,7 +6,8 @@
 - ``autocorrelated``: Gaussian errors with lag-1 correlation 0.95 and a covariance that changes from step to step;
 - ``linear-gaussian``: the Kalman filter on 100 steps of that scenario. The runs are drawn once; gates for false
   alarms are disjoint groups of them; where they are too few for that (power, several looks) each gate draws its
-  runs from all of them without replacement.
+  runs from all of them without replacement;
+- ``fully dependent``: the same error in all steps of a run, where a trajectory is worth no more than one step.
 
 The number of runs of a gate is what ``gate_runs`` plans for the ratio; for false alarms that of ratio 2, the fewest and
 so the hardest. Rows with several looks are ``--until-decided``. A fault of ratio r is a stated covariance r
@@ -171,6 +172,13 @@ def autocorrelated(rng: np.random.Generator, gates: int, runs: int, pool: Any, d
         yield {"error": (root @ w[..., None])[..., 0], "covariance": covariance}
 
 
+def fully_dependent(rng: np.random.Generator, gates: int, runs: int, pool: Any, disjoint: bool) -> Iterator[Gate]:
+    """One error a run, the same in every step: the worst case that the plan is for."""
+    for _ in range(gates):
+        error = np.repeat(rng.standard_normal((runs, 1, DOF)), STEPS, axis=1)
+        yield {"error": error, "covariance": np.broadcast_to(np.eye(DOF), (STEPS, DOF, DOF))}
+
+
 def linear_gaussian(
     rng: np.random.Generator, gates: int, runs: int, pool: tuple[np.ndarray, np.ndarray], disjoint: bool
 ) -> Iterator[Gate]:
@@ -197,6 +205,7 @@ WORLDS: dict[str, Callable[..., Iterator[Gate]]] = {
     "independent": independent,
     "autocorrelated": autocorrelated,
     "linear-gaussian": linear_gaussian,
+    "fully dependent": fully_dependent,
 }
 
 

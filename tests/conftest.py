@@ -11,6 +11,8 @@ from hypothesis import settings
 
 import consistency as cs
 
+pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
+
 settings.register_profile("bench", deadline=None, max_examples=60, derandomize=True, database=None)
 settings.load_profile("bench")
 

@@ -68,7 +68,8 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
     count = present.sum(axis=1)[present.any(axis=1)]
     M = np.swapaxes(w, -1, -2) @ w / np.maximum(count, 1)[:, None, None]
     mean = M.mean(axis=0) if len(M) else np.full((n, n), np.nan)
-    scaled = mean * n / np.trace(mean)
+    trace = float(np.trace(mean))
+    scaled = mean * n / trace if trace > 0 else mean
     size = n * (n - 1) // 2
     if n == 1 or len(M) < 3 * size + 3:
         return scaled, float("nan")

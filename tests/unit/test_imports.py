@@ -26,11 +26,12 @@ RANK = {
     "storage": 5, "results": 6,
     "log": 7, "recording": 7,
     "montecarlo": 8, "judge": 8,
-    "findings": 9, "sequential": 9, "comparison": 9,
+    "sequential": 9, "comparison": 9,
     "plots": 10, "table": 10,
-    "reporting": 11,
-    "cli": 12,
-    "__main__": 13,
+    "findings": 11,
+    "reporting": 12, "gating": 12,
+    "cli": 13, "testing": 13, "pytest_plugin": 13,
+    "__main__": 14,
 }  # fmt: skip
 DIAGNOSTICS = {"types", "geometry", "errors", "diagnostics"}
 DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}  # only plots and reporting draw
@@ -97,6 +98,8 @@ FORBIDDEN = [
     ("montecarlo", "from consistency.judge import analyse"),
     ("montecarlo", "import matplotlib.pyplot as plt"),
     ("plots", "from consistency.reporting import write_reports"),
+    ("gating", "from consistency.testing import assert_consistent"),
+    ("testing", "from consistency.pytest_plugin import Gates"),
     ("results", "if TYPE_CHECKING:\n    from consistency.log import Log"),
 ]
 
@@ -139,6 +142,16 @@ def test_diagnostics_load_arrays_and_distributions_only() -> None:
     modules_ = loaded("import consistency.diagnostics")
     assert {"numpy", "scipy"} <= modules_
     assert not modules_ & {"pandas", "matplotlib", "numba", "pydantic", "joblib", "bokeh"}
+
+
+def test_gates_need_arrays_only() -> None:
+    modules_ = loaded("import consistency.testing")
+    assert {"numpy", "scipy"} <= modules_
+    assert not modules_ & {"pytest", "_pytest", "pandas", "matplotlib", "numba", "pydantic", "joblib", "rich"}
+
+
+def test_the_pytest_plugin_loads_nothing_heavy() -> None:
+    assert not loaded("import consistency.pytest_plugin") & {"numpy", "scipy", "pandas", "numba", "pydantic", "rich"}
 
 
 def test_the_package_itself_loads_nothing_heavy() -> None:

@@ -1,0 +1,216 @@
+"""What a gate is given: checked, named by run and step where it cannot be used, and put before the referee."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from consistency.diagnostics import judge, whiten
+from consistency.types import Array, Failure, Indices, Verdict
+
+if TYPE_CHECKING:
+    from consistency.results import Results
+
+ASYMMETRY = 1e-8  # of a covariance, relative to its largest entry
+SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix; below, its inverse is rounding error
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The runs of one estimator, as the referee takes them."""
+
+    name: str
+    runs: int
+    planned_dof: int  # degrees of freedom that one run is sure to bring
+    arrays: Mapping[str, Any]  # of judge
+    failures: tuple[Failure, ...] = ()
+
+    def judge(self, false_alarm: float, allow: str | None) -> Verdict:
+        """See :func:`consistency.diagnostics.judge`."""
+        return judge(self.name, failures=self.failures, false_alarm=false_alarm, allow=allow, **self.arrays)
+
+
+def evidence(
+    name: str,
+    errors: ArrayLike | None,
+    covariances: ArrayLike | None,
+    nees: ArrayLike | None,
+    dof: int | None,
+    nis: ArrayLike | None,
+    nis_dof: ArrayLike | None,
+    innovations: ArrayLike | None,
+    innovation_covariances: ArrayLike | None,
+    axes: Sequence[str] | None,
+    subsets: Mapping[str, Sequence[int]] | None,
+    method: str,
+) -> Evidence:
+    """Checked arrays of one estimator; shapes and errors as :func:`consistency.testing.assert_consistent`."""
+    given: dict[str, Any] = {"axes": axes, "subsets": subsets, "method": method}
+    if (errors is None) != (covariances is None):
+        there, missing = ("covariances", "errors") if errors is None else ("errors", "covariances")
+        raise ValueError(f"{there} without {missing}: give both")
+    if errors is not None and nees is not None:
+        raise ValueError("give errors and covariances, or nees and dof, not both")
+    if errors is not None and covariances is not None:
+        given["error"], given["covariance"] = pair(errors, covariances)
+        n = given["error"].shape[-1]
+        if dof is not None and dof != n:
+            raise ValueError(f"dof is {dof}, but the errors have {n} components")
+        dof = n
+    elif nees is not None:
+        if dof is None:
+            raise ValueError("nees without dof: give dof, the dimension of the error")
+        if dof < 1:
+            raise ValueError(f"dof must be at least 1, got {dof}")
+        given |= {"nees": values("nees", nees), "dof": dof}
+        for key in ("axes", "subsets"):
+            if given[key] is not None:
+                raise ValueError(f"{key} needs errors and covariances: the nees does not know its components")
+    given |= _innovations(nis, nis_dof, innovations, innovation_covariances)
+    first = next((given[key] for key in ("error", "nees", "nis") if key in given), None)
+    if first is None:
+        raise ValueError("nothing to judge: give errors and covariances, or nees and dof, or nis and nis_dof")
+    for key in ("nis", "innovations"):
+        if key in given and given[key].shape[:2] != first.shape[:2]:
+            raise ValueError(f"{key} has {given[key].shape[:2]} runs and steps, the errors have {first.shape[:2]}")
+    if dof is None or ("error" not in given and "nees" not in given):
+        dof = max(1, int(given["nis_dof"].sum(axis=1).min()))
+    return Evidence(name, len(first), dof, given)
+
+
+def of_results(
+    results: Results,
+    filter_name: str | None,
+    name: str | None = None,
+    subsets: Mapping[str, Sequence[int]] | None = None,
+    method: str = "max",
+) -> Evidence:
+    """One filter of the bench's own results, with its failed runs.
+
+    Steps whose covariance is rank-deficient are left out, as everywhere in the bench.
+
+    Raises
+    ------
+    ValueError
+        No results, no such filter, or more than one to choose from.
+    """
+    from consistency.judge import curves
+    from consistency.results import POSE, Results
+
+    if not isinstance(results, Results):
+        raise ValueError("filter names one in the results of consistency.run_trials; give those in place of errors")
+    if filter_name is None:
+        if len(results.filters) != 1:
+            raise ValueError(f"filter: name one of {', '.join(results.filters)}")
+        filter_name = results.filters[0]
+    c = curves(results, filter_name)
+    arrays = {
+        "error": c.error, "covariance": c.covariance, "nees": c.nees, "nis": c.nis, "nis_dof": c.nis_dof,
+        "axes": POSE, "run_numbers": c.runs, "subsets": subsets, "method": method,
+    }  # fmt: skip
+    dof = len(POSE) if c.error is not None else max(1, int(c.nis_dof.sum(axis=1).min()))
+    return Evidence(name or filter_name, len(c.runs), dof, arrays, c.failures)
+
+
+# --- arrays ----------------------------------------------------------------------------------------
+
+
+def pair(errors: ArrayLike, covariances: ArrayLike, name: str = "errors", of: str = "covariances") -> tuple[Any, Any]:
+    """Errors (runs, steps, n) and covariances (runs, steps, n, n) that can be judged.
+
+    Raises
+    ------
+    ValueError
+        Shapes do not fit; a value is not finite, a covariance not symmetric or not positive definite: named by
+        run (from 0) and step (from 1).
+    """
+    e, P = array(name, errors), array(of, covariances)
+    if e.ndim != 3 or 0 in e.shape:
+        hint = "; of a single step: errors[:, None, :]" if e.ndim == 2 else ""
+        raise ValueError(f"{name} must have shape (runs, steps, n), got {e.shape}{hint}")
+    if P.shape != (*e.shape, e.shape[-1]):
+        raise ValueError(f"{of} must have shape {(*e.shape, e.shape[-1])} to fit {name} {e.shape}, got {P.shape}")
+    require(np.isfinite(e).all(axis=-1), f"{name}: not finite")
+    covariance(P, of)
+    return e, P
+
+
+def covariance(P: Array, name: str, there: Array | None = None) -> None:
+    """Refuse covariances (runs, steps, n, n) that are none; ``there`` (runs, steps) says which to look at."""
+    there = np.ones(P.shape[:2], bool) if there is None else there
+    require(np.isfinite(P).all(axis=(-2, -1)) | ~there, f"{name}: not finite")
+    scale = np.abs(P).max(axis=(-2, -1))
+    twist = np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1))
+    require((twist <= ASYMMETRY * scale) | ~there, f"{name}: not symmetric")
+    variance = np.diagonal(P, axis1=-2, axis2=-1)
+    require((variance > 0).all(axis=-1) | ~there, f"{name}: not positive definite (a variance is not positive)")
+    sigma = np.sqrt(np.where(there[..., None], variance, 1.0))
+    R = np.where(there[..., None, None], P / sigma[..., None] / sigma[..., None, :], np.eye(P.shape[-1]))
+    smallest = np.linalg.eigvalsh(R)[..., 0]
+    require(smallest > -SINGULAR, f"{name}: not positive definite")
+    require(smallest > SINGULAR, f"{name}: singular; leave out steps in which a component is known exactly")
+
+
+def values(name: str, given: ArrayLike, there: Array | None = None) -> Array:
+    """Squared norms (runs, steps): finite and not negative, where ``there``."""
+    v = array(name, given)
+    if v.ndim != 2 or 0 in v.shape:
+        raise ValueError(f"{name} must have shape (runs, steps), got {v.shape}")
+    there = np.ones(v.shape, bool) if there is None else there
+    require(np.isfinite(v) | ~there, f"{name}: not finite")
+    require((v >= 0) | ~there, f"{name}: negative")
+    return v
+
+
+def array(name: str, given: ArrayLike) -> Array:
+    """Floats, or a ValueError with the name of the argument."""
+    try:
+        return np.asarray(given, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: not an array of numbers with as many steps in each run") from None
+
+
+def require(good: Any, what: str) -> None:
+    """Raise with the first run (from 0) and step (from 1) that is not good, (runs, steps) of bool."""
+    if not good.all():
+        run, step = (int(i) for i in np.argwhere(~good)[0])
+        raise ValueError(f"{what} in run {run}, step {step + 1}")
+
+
+def _innovations(
+    nis: ArrayLike | None, nis_dof: ArrayLike | None, vectors: ArrayLike | None, covariances: ArrayLike | None
+) -> dict[str, Any]:
+    if (nis is None) != (nis_dof is None):
+        raise ValueError("give nis and nis_dof together")
+    if (vectors is None) != (covariances is None):
+        raise ValueError("give innovations and innovation_covariances together")
+    given: dict[str, Any] = {}
+    if vectors is not None and covariances is not None:
+        v, S = array("innovations", vectors), array("innovation_covariances", covariances)
+        if v.ndim != 3 or 0 in v.shape or S.shape != (*v.shape, v.shape[-1]):
+            raise ValueError(
+                "innovations and innovation_covariances must have shapes (runs, steps, m) and (runs, steps, m, m), "
+                f"got {v.shape} and {S.shape}"
+            )
+        there: Array = ~np.asarray(np.isnan(v).all(axis=-1))  # a step without a measurement has no innovation
+        require(np.isfinite(v).all(axis=-1) | ~there, "innovations: not finite")
+        covariance(S, "innovation_covariances", there)
+        given |= {"innovations": v, "innovation_covariances": S}
+        if nis is None:
+            u = np.where(there[..., None], whiten(v, np.where(there[..., None, None], S, np.eye(v.shape[-1]))), np.nan)
+            given |= {"nis": np.square(u).sum(axis=-1), "nis_dof": np.where(there, v.shape[-1], 0).astype(np.int64)}
+    if nis is not None and nis_dof is not None:
+        dof = array("nis_dof", nis_dof)
+        shape = np.shape(nis)
+        if dof.ndim not in (0, 2) or (dof.ndim == 2 and dof.shape != shape):
+            raise ValueError(f"nis_dof must be a number or have the shape of nis, {shape}, got {dof.shape}")
+        dof = np.broadcast_to(dof, shape)
+        if not (np.isfinite(dof).all() and (dof >= 0).all() and (dof == np.round(dof)).all()):
+            raise ValueError("nis_dof must hold whole numbers, 0 where there was no innovation")
+        counts: Indices = dof.astype(np.int64)
+        given |= {"nis": values("nis", nis, counts > 0), "nis_dof": counts}
+    return given

@@ -1,0 +1,140 @@
+"""A candidate and its reference, from arrays or from the bench's own results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from consistency.diagnostics import Comparison, RunSummary, compare, summary, whiten
+from consistency.gating.checks import Evidence, evidence, of_results
+
+if TYPE_CHECKING:
+    from consistency.comparison import Baseline
+    from consistency.results import Results
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Two filters to compare."""
+
+    candidate: Evidence
+    a: RunSummary
+    b: RunSummary
+    name_b: str
+    axes: tuple[str, ...] | None
+    paired: bool
+    failures: tuple[int, int] = (0, 0)
+
+    @property
+    def failed_more(self) -> bool:
+        """a has more failed runs than b on the same trials."""
+        return self.paired and self.failures[0] > self.failures[1]
+
+    @property
+    def usable_runs(self) -> int:
+        """Runs that both have, or the fewer of the two where they are not paired."""
+        a, b = (x.runs[np.isfinite(x.nees)] for x in (self.a, self.b))
+        return len(np.intersect1d(a, b)) if self.paired else min(len(a), len(b))
+
+    def compare(self, false_alarm: float) -> Comparison:
+        """See :func:`consistency.diagnostics.compare`."""
+        return compare(self.a, self.b, false_alarm, self.axes, self.paired)
+
+    def reasons(self, c: Comparison) -> list[str]:
+        """A sentence, then each quantity of both."""
+        anees = c.differences[0]
+        found = "worse" if c.worse or self.failed_more else "not worse"
+        lines = [
+            f"{found} than {self.name_b}: mean NEES {anees.a:.3g} against {anees.b:.3g}, {self.a.dof} expected; "
+            f"its ratio to {self.a.dof} is {'farther from' if c.distance > 0 else 'nearer to'} 1 "
+            f"by x{np.exp(abs(c.distance)):.3g} (p {c.p_value:.2g}, {c.runs} {'paired runs' if c.paired else 'runs'})"
+        ]
+        if self.failed_more:
+            lines.append(f"{self.failures[0]} runs failed, of {self.name_b} {self.failures[1]}")
+        lines += [
+            f"{d.name} {d.a:.4g} against {d.b:.4g}: {'difference' if 'coverage' in d.name else 'ratio'} "
+            f"{d.difference:.3g} [{d.low:.3g}, {d.high:.3g}]"
+            for d in c.differences
+        ]
+        return lines
+
+
+def of_arrays(
+    name: str,
+    errors_a: ArrayLike | None,
+    covariances_a: ArrayLike | None,
+    errors_b: ArrayLike | None,
+    covariances_b: ArrayLike | None,
+    nees_a: ArrayLike | None,
+    nees_b: ArrayLike | None,
+    dof: int | None,
+    axes: Sequence[str] | None,
+) -> Sides:
+    """Both sides from arrays, row i of both the same trial; errors as :func:`consistency.testing.assert_not_worse`."""
+    a, row_a = _side("candidate a", name, errors_a, covariances_a, nees_a, dof, axes)
+    b, row_b = _side("reference b", name, errors_b, covariances_b, nees_b, dof, axes)
+    if a.runs != b.runs:
+        raise ValueError(f"the candidate has {a.runs} runs and the reference {b.runs}; row i of both must be one trial")
+    if a.planned_dof != b.planned_dof:
+        raise ValueError(f"the errors have {a.planned_dof} and {b.planned_dof} components")
+    return Sides(a, row_a, row_b, "the reference", None if axes is None else tuple(axes), paired=True)
+
+
+def _side(
+    side: str,
+    name: str,
+    errors: ArrayLike | None,
+    covariances: ArrayLike | None,
+    nees: ArrayLike | None,
+    dof: int | None,
+    axes: Sequence[str] | None,
+) -> tuple[Evidence, RunSummary]:
+    try:
+        given = evidence(name, errors, covariances, nees, dof, None, None, None, None, axes, None, "max")
+    except ValueError as error:
+        raise ValueError(f"{side}: {error}") from None
+    e, P = given.arrays.get("error"), given.arrays.get("covariance")
+    values = given.arrays["nees"] if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
+    return given, summary(values, given.planned_dof, e, P)
+
+
+def of_filters(
+    results: Results,
+    filter_name: str | None,
+    than: str | None,
+    reference: Results | Baseline | str | Path | None,
+    name: str | None,
+) -> Sides:
+    """Both sides from results, or from results and a baseline of an earlier state.
+
+    Raises
+    ------
+    ValueError
+        No such filter, nothing to compare with, or a baseline that cannot be read.
+    """
+    from consistency.comparison import Baseline, baseline_of, read_baseline
+    from consistency.results import POSE
+
+    if reference is None and than is None:
+        raise ValueError("than: name the filter to compare with, or give other results as reference")
+    candidate = of_results(results, filter_name, name)
+    new = baseline_of(results)
+    if reference is None:
+        old = new
+    elif isinstance(reference, Baseline):
+        old = reference
+    else:
+        old = read_baseline(Path(reference)) if isinstance(reference, str | Path) else baseline_of(reference)
+    of_a = filter_name or results.filters[0]
+    of_b = than or of_a
+    if of_b not in old.filters:
+        raise ValueError(f"filter '{of_b}' is not in the reference; there are: {', '.join(old.filters)}")
+    paired = old is new or (None not in new.origin and new.origin == old.origin)
+    label = of_b if old is new else f"{of_b} in {old.name}"
+    failures = (new.failures[of_a], old.failures[of_b])
+    return Sides(candidate, new.filters[of_a], old.filters[of_b], label, tuple(POSE), paired, failures)

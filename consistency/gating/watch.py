@@ -1,0 +1,122 @@
+"""What a gate and the test session around it tell each other; standard library only, so that a plugin loads fast."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from consistency.gating.budget import in_place_rate
+
+# of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose
+DEFAULTS: dict[str, Any] = {"dof": 3, "detect": 1.5, "false_alarm": 1e-3, "power": 0.95, "allow": None}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What one gate found, in words and numbers that JSON holds; not finite numbers are None."""
+
+    gate: str  # assert_consistent | assert_not_worse
+    name: str  # of the filter
+    outcome: str  # passed | fault found | too few runs
+    status: str  # of the verdict; better or worse of a comparison
+    p_value: float | None  # false-alarm rate at which a fault is just found
+    false_alarm: float  # rate that the gate was judged at
+    in_budget: bool  # the rate is provisional: the session decides at its end
+    in_place: float  # rate at which a gate of a budget may fail at once; 0 if it must wait
+    runs: int
+    needed: int
+    dof: int
+    detect: float
+    power: float
+    allow: str | None
+    reasons: list[str]  # the first is a sentence
+    statistic: float | None = None
+    threshold: list[float | None] = field(default_factory=list)
+    inflation: float | None = None
+    inflation_interval: list[float | None] = field(default_factory=list)
+    first_step: int | None = None
+    subset: str | None = None
+    faults: list[str] = field(default_factory=list)
+    distance: float | None = None  # of a comparison
+    standard_error: float | None = None
+    late: dict[str, Any] = field(default_factory=dict)  # what changes here if the end of the session finds the fault
+    statistics: dict[str, Any] = field(default_factory=dict)  # all of the verdict
+    test: str = ""
+    test_outcome: str = ""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What a gate asks, once arguments, marker, budget and defaults are put together."""
+
+    false_alarm: float
+    detect: float
+    power: float
+    allow: str | None
+    budget: float | None = None  # of the whole session; ``false_alarm`` is then provisional
+    may_fail: bool = True  # in place
+
+    @property
+    def planned(self) -> float:
+        """Largest false-alarm rate that this gate can end with."""
+        return self.false_alarm if self.budget is None else self.budget
+
+
+@dataclass
+class Watch:
+    """One running test: what its gates are told, and where their entries go."""
+
+    marked: Mapping[str, Any] = field(default_factory=dict)  # of the marker, only what was said
+    budget: float | None = None
+    tests: int = 1  # collected
+    budgeted: int = 0  # gates of this test that ran on the budget
+    keep: Callable[[Entry], None] = lambda entry: None
+
+
+_watches: list[Watch] = []  # the running test is last; tests of a process run one after the other
+
+
+def current() -> Watch:
+    """The watch of the running test; outside a session one that tells nothing."""
+    return _watches[-1] if _watches else Watch()
+
+
+@contextlib.contextmanager
+def watching(watch: Watch) -> Iterator[None]:
+    """Make ``watch`` the current one."""
+    _watches.append(watch)
+    try:
+        yield
+    finally:
+        _watches.remove(watch)
+
+
+def terms(false_alarm: float | None, detect: float | None, power: float | None, allow: str | None) -> Terms:
+    """Arguments first, then the marker of the running test, then the session's budget, then the defaults.
+
+    Raises
+    ------
+    ValueError
+        An argument out of its range.
+    """
+    watch = current()
+    said: dict[str, Any] = {"false_alarm": false_alarm, "detect": detect, "power": power, "allow": allow}
+    chosen: dict[str, Any] = dict(watch.marked) | {key: value for key, value in said.items() if value is not None}
+    asked = DEFAULTS | chosen
+    for key in ("false_alarm", "power"):
+        if not 0.0 < asked[key] < 1.0:
+            raise ValueError(f"{key} must lie between 0 and 1, got {asked[key]}")
+    if not 0.0 < asked["detect"] < float("inf") or asked["detect"] == 1.0:
+        raise ValueError(f"detect must be a positive ratio of true to stated covariance, not 1; got {asked['detect']}")
+    if asked["allow"] not in (None, "conservative"):
+        raise ValueError(f"allow must be 'conservative' or None, got '{asked['allow']}'")
+    if asked["allow"] == "conservative" and asked["detect"] < 1.0:
+        raise ValueError(f"detect {asked['detect']} is a covariance too large, which allow='conservative' accepts")
+    rest = float(asked["detect"]), float(asked["power"]), asked["allow"]
+    if watch.budget is None or "false_alarm" in chosen:
+        return Terms(float(asked["false_alarm"]), *rest)
+    rate = in_place_rate(watch.budget, watch.tests, watch.budgeted)
+    watch.budgeted += 1
+    return Terms(rate or in_place_rate(watch.budget, watch.tests), *rest, budget=watch.budget, may_fail=rate > 0)

@@ -1,0 +1,184 @@
+"""The pytest plugin: runs to simulate, a record of every gate, and one false-alarm rate for a whole session.
+
+Nothing heavy is imported here: a session without gates pays for this file alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from consistency.gating.budget import in_place_rate
+from consistency.gating.report import refusal, write
+from consistency.gating.session import PROPERTY, STATISTICS, Ledger, lines, to_property
+from consistency.gating.watch import DEFAULTS, Entry, Watch, watching
+
+NAME = "consistency-gates"
+MARKER = (
+    "consistency(dof=3, detect=1.5, false_alarm=0.001, power=0.95, allow=None): "
+    "what the gates of a test ask; plans the number of runs that the fixture consistency_runs gives"
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("consistency", "statistical gates of estimators")
+    group.addoption(
+        "--consistency-runs", type=int, metavar="N", help="runs to simulate, in place of the number planned for a test"
+    )
+    group.addoption("--consistency-report", metavar="FILE", help="write all gates to FILE.json or FILE.html")
+    rate = "false-alarm rate of the whole session, split over the gates that state none of their own"
+    group.addoption("--consistency-false-alarm", type=float, metavar="RATE", help=rate)
+    parser.addini("consistency_false_alarm", rate)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", MARKER)
+    runs = config.getoption("--consistency-runs")
+    if runs is not None and runs < 1:
+        raise pytest.UsageError(f"--consistency-runs must be at least 1, got {runs}")
+    report = config.getoption("--consistency-report")
+    path = None if report is None else config.invocation_params.dir / report
+    worker = hasattr(config, "workerinput")
+    if path is not None and not worker and (why := refusal(path)):
+        raise pytest.UsageError(why)
+    config.pluginmanager.register(Gates(config, runs, path, _budget(config), worker), NAME)
+
+
+def _budget(config: pytest.Config) -> float | None:
+    given, source = config.getoption("--consistency-false-alarm"), "--consistency-false-alarm"
+    if given is None:
+        given, source = config.getini("consistency_false_alarm") or None, "ini option consistency_false_alarm"
+    try:
+        budget = None if given is None else float(given)
+    except ValueError:
+        raise pytest.UsageError(f"{source} must be a number, got '{given}'") from None
+    if budget is not None and not 0.0 < budget < 1.0:
+        raise pytest.UsageError(f"{source} must lie between 0 and 1, got {budget}")
+    return budget
+
+
+@pytest.fixture
+def consistency_runs(request: pytest.FixtureRequest) -> int:
+    """Number of runs that this test should simulate for its gates.
+
+    What --consistency-runs says; otherwise what ``consistency plan`` says for the values of the test's marker.
+    """
+    gates = request.config.pluginmanager.get_plugin(NAME)
+    assert isinstance(gates, Gates)
+    return gates.runs_of(request.node)
+
+
+def marked(item: pytest.Item) -> tuple[dict[str, Any], str]:
+    """Values of the test's markers, of which the nearest counts, and what is wrong with them ('' if nothing)."""
+    said: dict[str, Any] = {}
+    for mark in reversed(list(item.iter_markers("consistency"))):
+        unknown = [*map(repr, mark.args), *(key for key in mark.kwargs if key not in DEFAULTS)]
+        if unknown:
+            return {}, f"marker consistency: takes {', '.join(DEFAULTS)} as keywords, got {', '.join(unknown)}"
+        said |= mark.kwargs
+    return said, ""
+
+
+class Gates:
+    """The hooks of one session; in an xdist worker those of its tests, in the controller those of the session."""
+
+    def __init__(
+        self, config: pytest.Config, runs: int | None, path: Path | None, budget: float | None, worker: bool
+    ) -> None:
+        self.config, self.runs, self.path, self.worker = config, runs, path, worker
+        self.budget = budget
+        self.collected = 1
+        self.ledger = Ledger(budget)
+        self.statistics: list[Any] = []  # of the gates of the running test, where the report wants them
+
+    # --- a test ---
+
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        self.collected = max(1, len(session.items))
+
+    def runs_of(self, item: pytest.Item) -> int:
+        """Runs given on the command line, or planned for the marker of a test."""
+        from consistency.diagnostics import gate_runs
+
+        if self.runs is not None:
+            return self.runs
+        said, _ = marked(item)
+        asked = DEFAULTS | said
+        if self.budget is not None and "false_alarm" not in said:  # enough whatever else will run
+            asked["false_alarm"] = in_place_rate(self.budget, self.collected)
+        return gate_runs(asked["dof"], asked["detect"], asked["false_alarm"], asked["power"], asked["allow"])
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
+        watch = Watch(budget=self.budget, tests=self.collected, keep=lambda entry: self._keep(item, entry))
+        item.stash[WATCH] = watch
+        with watching(watch):
+            return (yield)
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_setup(self, item: pytest.Item) -> None:
+        watch, self.statistics = item.stash[WATCH], []
+        watch.budgeted = 0
+        item.user_properties[:] = [pair for pair in item.user_properties if pair[0] != PROPERTY]  # of an earlier try
+        watch.marked, why = marked(item)
+        if why:
+            pytest.fail(why, pytrace=False)
+
+    def _keep(self, item: pytest.Item, entry: Entry) -> None:
+        item.user_properties.append(to_property(entry))
+        if self.path is not None and self.path.suffix.lower() == ".json":
+            from consistency.storage import plain
+
+            self.statistics.append(plain(entry.statistics))
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+        report = yield
+        if self.statistics:
+            setattr(report, STATISTICS, json.dumps(self.statistics, allow_nan=False))
+        return report
+
+    # --- the session ---
+
+    def pytest_report_header(self) -> str | None:
+        return None if self.budget is None else f"consistency: false-alarm budget {self.budget:g} for the session"
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if not self.worker and not hasattr(report, LATE):
+            self.ledger.take(report)
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        if self.worker:
+            return
+        for tested, texts in self.ledger.settle():
+            self._fail(tested.nodeid, tested.location, "\n\n".join(texts))
+            if session.exitstatus == pytest.ExitCode.OK:
+                session.exitstatus = pytest.ExitCode.TESTS_FAILED
+        if self.path is not None and not self.config.option.collectonly:
+            write(self.ledger, self.path)
+
+    def _fail(self, nodeid: str, location: tuple[str, int | None, str], text: str) -> None:
+        """Report a test as failed that has passed before its gates could be judged."""
+        terminal = self.config.pluginmanager.get_plugin("terminalreporter")
+        if terminal is not None:  # one outcome a test
+            terminal.stats["passed"] = [r for r in terminal.stats.get("passed", []) if r.nodeid != nodeid]
+        report = pytest.TestReport(nodeid, location, {}, "failed", text, "call")
+        setattr(report, LATE, True)
+        self.config.hook.pytest_runtest_logreport(report=report)
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        if self.ledger.tests:
+            terminalreporter.section("consistency gates")
+            for line in lines(self.ledger):
+                terminalreporter.write_line(line)
+            if self.path is not None:
+                terminalreporter.write_line(f"report in {self.path}")
+
+
+LATE = "consistency_late"
+WATCH = pytest.StashKey[Watch]()

@@ -1,0 +1,299 @@
+"""Statistical gates for the tests of any estimator, with or without pytest; numpy and scipy are enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from consistency.diagnostics import Comparison, gate_runs
+from consistency.diagnostics.comparison import FEWEST
+from consistency.gating.checks import Evidence, evidence, of_results
+from consistency.gating.comparing import Sides, of_arrays, of_filters
+from consistency.gating.watch import Entry, Terms, current, terms
+from consistency.gating.wording import fault_text, few_text, plan_command
+from consistency.types import Verdict
+
+if TYPE_CHECKING:
+    from consistency.comparison import Baseline
+    from consistency.results import Results
+
+
+class ConsistencyError(AssertionError):
+    """A fault at the stated false-alarm rate, or runs that failed; carries the verdict and, of two, the comparison."""
+
+    def __init__(self, message: str, verdict: Verdict | None = None, comparison: Comparison | None = None) -> None:
+        super().__init__(message)
+        self.verdict = verdict
+        self.comparison = comparison
+
+
+class InsufficientTrials(ValueError):
+    """No fault, but too few runs to have found one; carries the number needed and the verdict so far."""
+
+    def __init__(self, message: str, needed: int = 0, runs: int = 0, verdict: Verdict | None = None) -> None:
+        super().__init__(message)
+        self.needed = needed
+        self.runs = runs
+        self.verdict = verdict
+
+
+def assert_consistent(
+    errors: ArrayLike | Results | None = None,
+    covariances: ArrayLike | None = None,
+    *,
+    filter: str | None = None,
+    nees: ArrayLike | None = None,
+    dof: int | None = None,
+    false_alarm: float | None = None,
+    detect: float | None = None,
+    power: float | None = None,
+    allow: str | None = None,
+    axes: Sequence[str] | None = None,
+    subsets: Mapping[str, Sequence[int]] | None = None,
+    method: str = "max",
+    innovations: ArrayLike | None = None,
+    innovation_covariances: ArrayLike | None = None,
+    nis: ArrayLike | None = None,
+    nis_dof: ArrayLike | None = None,
+    name: str | None = None,
+) -> Verdict:
+    """Pass an estimator whose errors have the covariance that it states, with enough runs to know.
+
+    The referee is :func:`consistency.diagnostics.judge`: a run is one observation, and a right filter is found at
+    fault in any question with probability ``false_alarm`` at most.
+
+    Parameters
+    ----------
+    errors : (runs, steps, n), truth minus estimate, angles wrapped; or the results of ``consistency.run_trials``,
+        with ``filter`` the name of one in them
+    covariances : (runs, steps, n, n), in the squared units of the errors
+    nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances
+    false_alarm : chance to fail a right filter; 0.001 where neither argument, marker nor session says
+    detect : ratio of true to stated covariance, in all steps, that must be found (1.5)
+    power : chance to find it (0.95)
+    allow : "conservative" accepts a covariance that is too large
+    axes, subsets, method : see :func:`consistency.diagnostics.judge`
+    innovations, innovation_covariances : (runs, steps, m), (runs, steps, m, m); all NaN in steps without any
+    nis, nis_dof : (runs, steps); nis_dof is 0 in steps without any, and may be one number
+    name : of the estimator, for messages
+
+    Returns
+    -------
+    The verdict, of status "consistent"
+
+    Raises
+    ------
+    ConsistencyError
+        A fault at the stated false-alarm rate, however few the runs; or failed runs in results.
+    InsufficientTrials
+        No fault, and fewer runs than :func:`consistency.diagnostics.gate_runs` asks for.
+    ValueError
+        Input that cannot be judged, named by run (from 0) and step (from 1); options that do not fit.
+    """
+    __tracebackhide__ = True
+    asked = terms(false_alarm, detect, power, allow)
+    arrays: dict[str, Any] = {
+        "covariances": covariances, "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
+        "innovations": innovations, "innovation_covariances": innovation_covariances, "axes": axes,
+    }  # fmt: skip
+    if filter is not None or hasattr(errors, "estimates"):
+        _refuse(arrays, "results bring their own")
+        given = of_results(cast("Results", errors), filter, name, subsets, method)
+    else:
+        if nees is not None and dof is None:
+            arrays["dof"] = current().marked.get("dof")
+        given = evidence(name or "the estimator", cast(ArrayLike, errors), subsets=subsets, method=method, **arrays)
+
+    def look(rate: float) -> _Look:
+        verdict = given.judge(rate, asked.allow)
+        sure = bool(given.failures) or verdict.status == "failed"
+        return _Look(not verdict.consistent, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
+
+    def needed(rate: float) -> int:
+        return gate_runs(given.planned_dof, asked.detect, rate, asked.power, asked.allow)
+
+    seen = _settle("assert_consistent", given, asked, look, needed)
+    assert seen.verdict is not None
+    return seen.verdict
+
+
+def assert_not_worse(
+    errors_a: ArrayLike | Results | None = None,
+    covariances_a: ArrayLike | None = None,
+    errors_b: ArrayLike | None = None,
+    covariances_b: ArrayLike | None = None,
+    *,
+    filter: str | None = None,
+    than: str | None = None,
+    reference: Results | Baseline | str | Path | None = None,
+    nees_a: ArrayLike | None = None,
+    nees_b: ArrayLike | None = None,
+    dof: int | None = None,
+    false_alarm: float | None = None,
+    detect: float | None = None,
+    power: float | None = None,
+    axes: Sequence[str] | None = None,
+    name: str | None = None,
+) -> Comparison:
+    """Pass a candidate a that is not less consistent than a reference b on the same trials, row by row.
+
+    Worse means farther from consistent, in either direction: abs(log(ANEES / dof)), compared run by run
+    (:func:`consistency.diagnostics.compare`).
+
+    Parameters
+    ----------
+    errors_a, covariances_a, errors_b, covariances_b : as in :func:`assert_consistent`; row i of both is one trial
+    nees_a, nees_b, dof : (runs, steps) and the dimension of the error, in place of them
+    filter, than : names in results given as ``errors_a``: the candidate and its reference
+    reference : other results, or a baseline or its file, in place of the same results; ``than`` is then ``filter``
+        unless it is given. Trials of another scenario or seed are compared as independent samples.
+    false_alarm : chance to fail a candidate that is as consistent as the reference
+    detect : a covariance ratio farther from 1 by this factor must be found
+    power : chance to find it
+    axes : names of the components
+    name : of the candidate, for messages
+
+    Raises
+    ------
+    ConsistencyError
+        The candidate is worse at the stated false-alarm rate, or has more failed runs on the same trials.
+    InsufficientTrials
+        Not worse, and fewer runs than ``detect`` and ``power`` take at the spread between these.
+    ValueError
+        As :func:`assert_consistent`; different numbers of runs.
+    """
+    __tracebackhide__ = True
+    asked = terms(false_alarm, detect, power, None)
+    arrays: dict[str, Any] = {
+        "covariances_a": covariances_a, "errors_b": errors_b, "covariances_b": covariances_b, "nees_a": nees_a,
+        "nees_b": nees_b, "dof": dof, "axes": axes,
+    }  # fmt: skip
+    if filter is not None or hasattr(errors_a, "estimates"):
+        _refuse(arrays, "results bring their own; the reference is named by than and reference")
+        sides = of_filters(cast("Results", errors_a), filter, than, reference, name)
+    else:
+        if than is not None or reference is not None:
+            raise ValueError("than and reference need results in place of errors_a")
+        if nees_a is not None and dof is None:
+            arrays["dof"] = current().marked.get("dof")
+        sides = of_arrays(name or "the candidate", cast(ArrayLike, errors_a), **arrays)
+    return _compare(sides, asked)
+
+
+def _compare(sides: Sides, asked: Terms) -> Comparison:
+    __tracebackhide__ = True
+    if sides.usable_runs < FEWEST:
+        if sides.failed_more:
+            found = f"worse than {sides.name_b}: {sides.failures[0]} runs failed, of {sides.name_b} {sides.failures[1]}"
+            verdict = sides.candidate.judge(asked.false_alarm, None)
+            raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [found]), verdict)
+        raise InsufficientTrials(
+            f"assert_not_worse: {sides.usable_runs} runs are too few for a standard error; simulate {FEWEST} at least",
+            FEWEST,
+            sides.usable_runs,
+        )
+
+    def look(rate: float) -> _Look:
+        comparison = sides.compare(rate)
+        worse = comparison.worse or sides.failed_more
+        status = "worse" if worse else "not worse"
+        reasons = sides.reasons(comparison)
+        return _Look(worse, sides.failed_more, comparison.p_value, status, reasons, None, comparison)
+
+    def needed(rate: float) -> int:
+        return sides.compare(rate).needed_runs(asked.detect, asked.power)
+
+    seen = _settle("assert_not_worse", sides.candidate, asked, look, needed)
+    assert seen.comparison is not None
+    return seen.comparison
+
+
+# --- what both do ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What is found at one false-alarm rate."""
+
+    bad: bool
+    sure: bool  # bad at any rate
+    p_value: float
+    status: str
+    reasons: list[str]
+    verdict: Verdict | None
+    comparison: Comparison | None = None
+
+
+def _settle(
+    gate: str, given: Evidence, asked: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
+) -> _Look:
+    """Record what a gate found, and raise where that is settled now."""
+    __tracebackhide__ = True
+    seen, late = look(asked.false_alarm), None
+    fault = seen.bad and (asked.may_fail or seen.sure)
+    if not fault and asked.budget is not None and seen.p_value <= asked.budget:
+        late = look(max(seen.p_value, 1e-300))  # in case the end of the session finds it
+    least = needed(asked.planned)
+    few = not fault and given.runs < least
+    outcome = "fault found" if fault else "too few runs" if few else "passed"
+    if few and asked.budget is not None:  # ask for what is enough at the end of the session too
+        least = needed(asked.false_alarm)
+    current().keep(_entry(gate, given, asked, seen, late, outcome, least))
+    if fault:
+        verdict = seen.verdict or given.judge(asked.false_alarm, asked.allow)
+        raise ConsistencyError(fault_text(gate, given.name, seen.reasons), verdict, seen.comparison)
+    if few:
+        plan = asked.detect, asked.false_alarm, asked.power
+        command = None if seen.comparison else plan_command(given.planned_dof, *plan, asked.allow)
+        raise InsufficientTrials(
+            few_text(gate, given.name, given.runs, least, *plan, command), least, given.runs, seen.verdict
+        )
+    return seen
+
+
+def _entry(
+    gate: str, given: Evidence, asked: Terms, seen: _Look, late: _Look | None, outcome: str, least: int
+) -> Entry:
+    statistics = seen.verdict.statistics if seen.verdict is not None else {}
+    fields = _found(seen)
+    if (c := seen.comparison) is not None:
+        fields |= {"distance": _finite(c.distance), "standard_error": _finite(c.standard_error)}
+        statistics = {"differences": [vars(d) for d in c.differences]}
+    return Entry(
+        gate=gate, name=given.name, outcome=outcome, p_value=_finite(seen.p_value),
+        false_alarm=asked.false_alarm, in_budget=asked.budget is not None,
+        in_place=asked.false_alarm if asked.budget is not None and asked.may_fail else 0.0,
+        runs=given.runs, needed=least, dof=given.planned_dof, detect=asked.detect, power=asked.power,
+        allow=asked.allow, late={} if late is None else _found(late), statistics=statistics, **fields,
+    )  # fmt: skip
+
+
+def _found(look: _Look) -> dict[str, Any]:
+    found: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
+    if look.comparison is not None:
+        return found | {"statistic": _finite(look.comparison.differences[0].a)}
+    assert look.verdict is not None
+    v = look.verdict
+    return found | {
+        "statistic": _finite(v.statistic), "threshold": [_finite(x) for x in v.threshold],
+        "inflation": _finite(v.inflation), "inflation_interval": [_finite(x) for x in v.inflation_interval],
+        "first_step": v.first_step, "subset": v.subset, "faults": list(v.faults),
+    }  # fmt: skip
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _refuse(arrays: Mapping[str, Any], why: str) -> None:
+    extra = [key for key, value in arrays.items() if value is not None]
+    if extra:
+        raise ValueError(f"{', '.join(extra)}: {why}")
+
+
+__all__ = ["ConsistencyError", "InsufficientTrials", "assert_consistent", "assert_not_worse"]

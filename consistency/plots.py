@@ -13,9 +13,10 @@ from typing import Any
 
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from consistency.types import Array, Indices
 
@@ -32,6 +33,7 @@ DASHES: tuple[tuple[float, ...], ...] = (
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 BESIDE = 0.66  # of the figure's width is left of a legend that stands beside the axes
 AXES = (("x", "m"), ("y", "m"), ("heading", "deg"))
+Interval = tuple[float, float, float]  # value, low, high; the ends may be infinite
 
 
 @dataclass(frozen=True)
@@ -144,6 +146,78 @@ def nis(axes: Axes, steps: Indices, ratio: Array, look: Style, log: bool = False
     _frame(axes)
 
 
+def forest(
+    axes: Axes,
+    looks: Sequence[Style],
+    rows: Sequence[tuple[str, Sequence[Interval | None]]],
+    expected: float,
+    window: tuple[float, float],
+    log: bool = False,
+) -> None:
+    """Values with intervals, a row for each axis of the pose and in it a line for each filter.
+
+    Parameters
+    ----------
+    looks : a style a filter
+    rows : a label, and for each filter value, low and high, or None
+    window : drawn range; an interval that goes on beyond it ends in an arrow
+    """
+    axes.axvline(expected, color="#555555", linewidth=0.8, zorder=1)
+    for row, (_, intervals) in enumerate(rows):
+        if row % 2:
+            axes.axhspan(row - 0.5, row + 0.5, color="#f5f5f5", linewidth=0, zorder=0)
+        for slot, (look, interval) in enumerate(zip(looks, intervals, strict=True)):
+            if interval is not None:
+                _interval(axes, row + dodge(slot, len(looks)), interval, window, look)
+    if log:
+        axes.set_xscale("log")
+        _plain_numbers(axes.xaxis, *window)
+    axes.set(xlim=window, ylim=(len(rows) - 0.5, -0.5), yticks=range(len(rows)))
+    axes.set_yticklabels([label for label, _ in rows], parse_math=False)
+    axes.tick_params(axis="y", length=0, pad=7)
+    _frame(axes)
+    axes.grid(visible=False, axis="y")
+
+
+def dodge(slot: int, slots: int) -> float:
+    """Place of a filter beside the others, from -0.5 to 0.5 around a common mark."""
+    return 0.76 * ((slot + 0.5) / slots - 0.5)
+
+
+def _interval(axes: Axes, y: float, interval: Interval, window: tuple[float, float], look: Style) -> None:
+    value, low, high = interval
+    ends = [max(low, window[0]), min(high, window[1])]
+    axes.plot(ends, [y, y], color=look.colour, linewidth=1.3, solid_capstyle="butt", zorder=3)
+    for beyond, end, arrow in ((low < window[0], ends[0], "<"), (high > window[1], ends[1], ">")):
+        mark, size = (arrow, 4.5) if beyond else ("|", 4.0)
+        axes.plot([end], [y], mark, color=look.colour, markersize=size, clip_on=False, zorder=4)
+    axes.plot([value], [y], look.marker, color=look.colour, markersize=4.2, markeredgewidth=0.8, zorder=5)
+
+
+def distribution(axes: Axes, x: Array, y: Array, half_width: float, look: Style) -> None:
+    """Empirical distribution function (x, y of each step) against the diagonal and its simultaneous band."""
+    corners = sorted({0.0, half_width, 1.0 - half_width, 1.0})
+    low, high = ([min(max(u + side, 0.0), 1.0) for u in corners] for side in (-half_width, half_width))
+    axes.fill_between(corners, low, high, color=BAND, linewidth=0, zorder=0)
+    axes.plot([0, 1], [0, 1], color="#555555", linewidth=0.8, zorder=1)
+    axes.plot(x, y, color=look.colour, linewidth=1.3, drawstyle="steps-post", zorder=3)
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
+    axes.set_aspect("equal", adjustable="box")
+    _frame(axes)
+
+
+def autocorrelation(axes: Axes, values: Array, bound: float, look: Style) -> None:
+    """Autocorrelation of lag 1, 2, ... (lags,) and the bound that each stays within."""
+    axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0)
+    axes.axhline(0.0, color="#555555", linewidth=0.8, zorder=1)
+    number = range(1, len(values) + 1)
+    axes.vlines(number, 0.0, values, color=look.colour, linewidth=1.3, zorder=3)
+    axes.plot(number, values, look.marker, color=look.colour, markersize=3.6, markeredgewidth=0.8, zorder=4)
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.set(xlabel="lag (steps)", ylabel="correlation", xlim=(0.4, len(values) + 0.6))
+    _frame(axes)
+
+
 def samples(axes: Axes, points: Array, linear: Array, fitted: Array) -> None:
     """Transformed points (n, 2) in m with two ellipses (m, 2), as Herath et al. (2007) fig. 12."""
     axes.plot(*points.T, ".", color="#555555", markersize=2.0, markeredgewidth=0, alpha=0.6)
@@ -188,10 +262,14 @@ def title(axes: Axes, text: str) -> None:
 
 def _log_scale(axes: Axes) -> None:
     axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 200 * low else (1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    _plain_numbers(axes.yaxis, *axes.get_ylim())
+
+
+def _plain_numbers(axis: Axis, low: float, high: float) -> None:
+    """Labels of a log axis without powers of ten, as many as there is room for."""
+    axis.set_major_locator(LogLocator(subs=(1.0,) if high > 200 * low else (1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _frame(axes: Axes) -> None:

@@ -179,7 +179,7 @@ class Band:
 
     low: Array  # (steps,), NaN where no run has a value
     high: Array  # (steps,)
-    p_value: float  # of the curve: the smallest false-alarm rate at which it leaves its band
+    p_value: float  # of the curve: the smallest false-alarm rate at which it leaves its band; NaN without a step
     above: Array  # (steps,) of bool
     below: Array  # (steps,) of bool
 
@@ -218,7 +218,7 @@ def simultaneous_band(
     low, high = np.full(nees.shape[1], np.nan), np.full(nees.shape[1], np.nan)
     none = np.zeros(nees.shape[1], bool)
     if not len(judged):
-        return Band(low, high, 1.0, none, none)
+        return Band(low, high, float("nan"), none, none)
     sides = 1 if allow == "conservative" else 2
     slopes = _slopes(nees[:, judged]) if method == "max" and len(nees) >= FEW else None
 

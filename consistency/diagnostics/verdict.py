@@ -118,7 +118,7 @@ def judge(
             p_values["scale in some step"] = band.p_value
     found = answers(p_values, false_alarm)
     s["answers"] = [asdict(answer) for answer in found.values()]
-    s["p_value"] = min((a.p_value / a.share for a in found.values()), default=float("nan"))
+    s["p_value"] = min((min(1.0, a.p_value / a.share) for a in found.values()), default=float("nan"))
     if nees is not None and dof is not None and band is not None:
         _locate(s, nees, dof, band, found, error, covariance)
     status = _status(s, found)

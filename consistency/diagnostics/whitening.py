@@ -28,8 +28,9 @@ def whiten(error: Array, covariance: Array) -> Array:
 
 
 def standardise(error: Array, covariance: Array) -> Array:
-    """Each component over its own standard deviation, (..., n) and (..., n, n) -> (..., n)."""
-    return np.asarray(np.asarray(error, float) / np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
+    """Each component over its own standard deviation, (..., n) and (..., n, n) -> (..., n); NaN where that is 0."""
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    return np.asarray(np.asarray(error, float) / np.sqrt(np.where(variance > 0, variance, np.nan)))
 
 
 def spread_steps(present: Array) -> Array:

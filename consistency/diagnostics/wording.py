@@ -145,7 +145,10 @@ def _level(s: Mapping[str, Any]) -> str:
 def _coverage(s: Mapping[str, Any]) -> list[str]:
     if "axes" not in s:
         return []
-    covered = ", ".join(f"{axis} {100 * c:.1f} %" for axis, c in zip(s["axes"], s["coverage"], strict=True))
+    known = [(axis, c) for axis, c in zip(s["axes"], s["coverage"], strict=True) if np.isfinite(c)]
+    if not known:
+        return []
+    covered = ", ".join(f"{axis} {100 * c:.1f} %" for axis, c in known)
     text = f"2-sigma coverage {covered} ({100 * TWO_SIGMA:.1f} % expected)"
     if np.isfinite(s["nci"]):
         text += f"; noncredibility index {s['nci']:.1f} dB, inclination {s['inclination']:+.1f} dB"

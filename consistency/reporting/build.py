@@ -13,6 +13,7 @@ from consistency.errors import InputError
 from consistency.findings import read_findings
 from consistency.judge import Curves, analyse, curves
 from consistency.models.motion import dead_reckoning
+from consistency.reporting.calibration import calibration
 from consistency.reporting.distributions import distributions
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.wording import answer, number
@@ -48,7 +49,7 @@ def build_report(folder: Path) -> Report:
     name = "reproduction" if "studies" in manifest else studies[0].name
     return Report(
         f"Filter consistency: {name}", answer(studies, findings), studies, findings,
-        distributions(folder / "fig12.parquet"), provenance,
+        distributions(folder / "fig12.parquet"), calibration(), provenance,
     )  # fmt: skip
 
 
@@ -94,6 +95,7 @@ def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | 
     known = np.isfinite(c.nis) & (c.nis_dof > 0)
     dof = np.where(known, c.nis_dof, 0).sum(axis=0)
     total = np.where(known, c.nis, 0.0).sum(axis=0)
+    ratio = np.where(dof > 0, total / np.maximum(dof, 1), np.nan)
     empty = np.full((steps, 3), np.nan)
     return Track(
         name=c.filter,
@@ -106,7 +108,8 @@ def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | 
         band=band,
         simultaneous=s.get("simultaneous"),
         own_band=bool(c.failures) and not _same(band, common),
-        nis_ratio=np.where(dof > 0, total / np.maximum(dof, 1), np.nan),
+        nis_ratio=ratio,
+        nis_log=_wide([ratio]),
     )
 
 

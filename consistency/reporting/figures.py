@@ -11,10 +11,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from consistency import plots
+from consistency.reporting import diagnosis
 from consistency.reporting.model import Distribution, Study
 from consistency.reporting.thin import thin
 
 WIDTH = 6.7  # inches, the text width of the page
+PANELS = 4  # small ones beside each other
 LINE = 0.16  # inches, a line of a legend
 RC: Any = {
     "font.family": "DejaVu Sans", "font.size": 7.5, "axes.titlesize": 8, "axes.labelsize": 7.5, "legend.fontsize": 7.5,
@@ -119,29 +121,68 @@ def anees(study: Study) -> Figure:
     if common is not None:
         entries = [
             ("95 % band, one step", Patch(color=plots.BAND)),
-            ("95 % band, all steps", Line2D([], [], color="#333333", linewidth=0.9, dashes=(4, 3))),
+            ("band of all steps at once", Line2D([], [], color="#333333", linewidth=0.9, dashes=(4, 3))),
             ("expected", Line2D([], [], color="#555555", linewidth=0.8)),
         ]
     _key(figure, entries + _filters(study))
     return figure
 
 
-def nis(study: Study) -> Figure:
-    """NIS per degree of freedom, a panel for each filter on common axes."""
-    count = len(study.tracks)
-    columns = count if count < 4 else 2 if count == 4 else 3
-    rows = -(-count // columns)
-    figure, axes = _figure(0.35 + 1.0 * rows, rows, columns, sharex=True, sharey=True)
-    for track, panel in zip(study.tracks, axes.flat, strict=False):
-        keep = thin(track.nis_ratio)
-        plots.nis(panel, study.steps[keep], track.nis_ratio[keep], plots.style(track.style), study.nis_log)
-        panel.set_xlim(0, len(study.steps))
-        plots.title(panel, _wrapped(track.name))
+def innovations(study: Study) -> list[Figure]:
+    """One row for each filter on axes of its own: NIS per degree of freedom, and the autocorrelation."""
+    of_filters = [diagnosis.lags(track) for track in study.tracks]
+    columns = 2 if any(of_filters) else 1
+    rows = []
+    for track, lags in zip(study.tracks, of_filters, strict=True):
+        figure, axes = _figure(1.3, columns=columns, width_ratios=(2.4, 1.0)[:columns])
+        keep, look = thin(track.nis_ratio), plots.style(track.style)
+        plots.nis(axes[0, 0], study.steps[keep], track.nis_ratio[keep], look, track.nis_log)
+        axes[0, 0].set_xlim(0, len(study.steps))
+        plots.title(axes[0, 0], _wrapped(track.name, 90))
+        if lags is not None:
+            plots.autocorrelation(axes[0, 1], *lags, look)
+        elif columns == 2:
+            axes[0, 1].set_axis_off()
+            axes[0, 1].text(0.5, 0.5, "too few innovations", transform=axes[0, 1].transAxes, ha="center")
+        rows.append(figure)
+    return rows
+
+
+def by_axis(study: Study) -> Figure | None:
+    """Covariance ratio, bias and coverage by axis, panels side by side; None where there is nothing to show."""
+    parts = diagnosis.forests(study)
+    if not parts:
+        return None
+    labels, looks = diagnosis.aligned(parts), [plots.style(track.style) for track in study.tracks]
+    height = 0.55 + len(labels) * (0.12 + 0.08 * len(looks))
+    figure, axes = _figure(height, columns=len(parts), sharey=True)
+    nothing = (None,) * len(looks)
+    for panel, part in zip(axes[0], parts, strict=True):
+        found = dict(part.rows)
+        rows = [(_wrapped(label, 16), found.get(label, nothing)) for label in labels]
+        plots.forest(panel, looks, rows, part.expected, part.window, part.log)
+        panel.set_xlabel(part.label)
         panel.label_outer()
-    for empty in range(count - rows * columns, 0):
-        axes[-1, empty].set_axis_off()
-        axes[-2, empty].tick_params(labelbottom=True)
-        axes[-2, empty].set_xlabel("step")
+    marks = [Line2D([], [], color=k.colour, marker=k.marker, markersize=4.2, linewidth=1.3) for k in looks]
+    _key(figure, [(track.name, mark) for track, mark in zip(study.tracks, marks, strict=True)])
+    return figure
+
+
+def nees_distribution(study: Study) -> Figure | None:
+    """Empirical distribution of the NEES, a panel for each filter; None where there is no NEES."""
+    found = [(track, of) for track in study.tracks if (of := diagnosis.steps(track, thin)) is not None]
+    if not found:
+        return None
+    rows = -(-len(found) // PANELS)
+    figure, axes = _figure(0.2 + 1.6 * rows, rows, PANELS)
+    for panel in axes.flat[len(found) :]:
+        panel.set_axis_off()
+    for number, ((track, of), panel) in enumerate(zip(found, axes.flat, strict=False)):
+        plots.distribution(panel, of.x, of.y, of.half_width, plots.style(track.style))
+        plots.title(panel, _wrapped(track.name, 20))
+        if number % PANELS == 0:
+            panel.set_ylabel("share of runs")
+        panel.set_xlabel("chi-square cdf")
     return figure
 
 

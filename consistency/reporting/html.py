@@ -10,8 +10,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from consistency.plots import style
-from consistency.reporting import wording
+from consistency.reporting import captions, diagnosis, wording
 from consistency.reporting.charts import MARKERS, distribution_charts, study_charts
+from consistency.reporting.diagnosis_charts import diagnosis_charts
 from consistency.reporting.model import Report
 from consistency.reporting.thin import LIMIT
 
@@ -20,7 +21,7 @@ SCRIPT = 1_400_000  # bytes of Bokeh itself, style and words
 CHART = 16_000  # bytes of a chart before its data
 POINT = 5.4  # bytes of one number in base64
 LEAST = 120  # points a line below which a curve is no curve
-NUMBERS = 22  # columns of all charts of one filter
+NUMBERS = 26  # columns of all charts of one filter
 
 
 def render_html(report: Report) -> str:
@@ -28,7 +29,8 @@ def render_html(report: Report) -> str:
     limit = points_a_line(report)
     groups: list[dict[str, Any]] = []
     for index, study in enumerate(report.studies):
-        groups.append({f"s{index}-{name}": chart for name, chart in study_charts(study, index, limit).items()})
+        charts = study_charts(study, index, limit) | diagnosis_charts(study, index, limit)
+        groups.append({f"s{index}-{name}": chart for name, chart in charts.items()})
     for index, distribution in enumerate(report.distributions):
         pair = distribution_charts(distribution)
         groups.append({f"d{index}-cloud": pair[0], f"d{index}-histogram": pair[1]})
@@ -41,6 +43,8 @@ def render_html(report: Report) -> str:
     return environment.get_template("report.html.j2").render(
         report=report,
         wording=wording,
+        captions=captions,
+        diagnosis=diagnosis,
         style=style,
         shapes=MARKERS,
         thinned=limit if any(len(study.steps) > limit for study in report.studies) else None,
@@ -53,6 +57,6 @@ def render_html(report: Report) -> str:
 def points_a_line(report: Report) -> int:
     """Points that a line may have so that the file stays below its greatest size."""
     tracks = sum(len(study.tracks) for study in report.studies)
-    charts = 6 * len(report.studies) + 2 * len(report.distributions)
+    charts = 11 * len(report.studies) + 2 * len(report.distributions)
     room = MAXIMUM - SCRIPT - CHART * charts - 30_000 * len(report.distributions)
     return int(min(LIMIT, max(LEAST, room / (POINT * NUMBERS * max(tracks, 1)))))

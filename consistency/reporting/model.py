@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from consistency.reporting.calibration import Calibration
 from consistency.types import Array, Gaussian, Indices, Verdict
 
-STATUSES = ("consistent", "overconfident", "conservative", "failed")
+STATUSES = ("consistent", "overconfident", "conservative", "inconsistent", "undecided", "failed")
 SINGLE_RUN = 1
 
 
@@ -26,6 +27,7 @@ class Track:
     simultaneous: Array | None  # (T, 2), where it lies in all steps at once
     own_band: bool  # failed runs have made the bands differ from those of the study
     nis_ratio: Array  # (T,), NIS of all runs over their degrees of freedom
+    nis_log: bool
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ class Report:
     studies: tuple[Study, ...]
     findings: tuple[dict[str, Any], ...]
     distributions: tuple[Distribution, ...]
+    calibration: Calibration | None
     provenance: tuple[tuple[str, str], ...]
 
     @property

@@ -6,6 +6,7 @@ import json
 import re
 import tempfile
 import warnings
+from collections.abc import Callable
 from importlib import resources
 from io import BytesIO
 from itertools import zip_longest
@@ -15,12 +16,13 @@ from typing import Any
 import matplotlib as mpl
 import typst
 
-from consistency.reporting import figures, wording
+from consistency.reporting import captions, diagnosis, figures, wording
 from consistency.reporting.model import Report, Study
 
 TEMPLATE = "report.typ"
 SHORT = 4000  # characters of settings that surely fit on one page
-FILES = ("image", "errors")  # keys of file names
+FILES = ("image", "images")  # keys of file names
+Save = Callable[[str, Any], str]  # name, figure -> file name
 LONG_WORD = re.compile(r"[^\s\u200b]{14}")
 
 
@@ -31,10 +33,11 @@ def render_pdf(report: Report) -> bytes:
         data = {
             "title": report.title,
             "answer": report.answer,
-            "columns": list(wording.VERDICT_COLUMNS),
+            "method": captions.method(report),
             "studies": [_study(study, f"s{i}", folder) for i, study in enumerate(report.studies)],
             "findings": [{key: str(value) for key, value in finding.items()} for finding in report.findings],
             "distributions": [_distribution(d, f"d{i}", folder) for i, d in enumerate(report.distributions)],
+            "calibration": _calibration(report),
             "provenance": [list(row) for row in report.provenance],
         }
         (folder / "data.json").write_text(json.dumps(_soft(data), ensure_ascii=False), encoding="utf-8")
@@ -53,34 +56,59 @@ def _study(study: Study, prefix: str, folder: Path) -> dict[str, Any]:
         "summary": study.summary,
         "runs": study.runs,
         "steps": len(study.steps),
-        "shown_run": study.shown_run,
-        "statistic": study.statistic,
         "verdicts": [list(wording.verdict_row(track)) for track in study.tracks],
         "reasons": [
-            {"filter": track.name, "status": track.verdict.status, "reasons": list(track.verdict.reasons)}
+            {"filter": track.name, "sentence": track.verdict.reasons[0], "reasons": list(track.verdict.reasons[1:])}
             for track in study.tracks
         ],
         "failures": [[name, str(run), str(step), why] for name, run, step, why in study.failures],
-        "map": {"image": save("map", figures.scenario(study)), "caption": wording.scenario_caption(study)},
-        "errors": [],
+        "map": {"image": save("map", figures.scenario(study)), "caption": captions.scenario_caption(study)},
+        "errors": None,
         "anees": None,
-        "nis": {"image": save("nis", figures.nis(study)), "caption": wording.nis_caption(study)},
-        "no_truth": None if study.has_truth else wording.no_truth(study),
-        "error_caption": wording.error_caption(study),
+        "innovations": _rows(figures.innovations(study), "nis", captions.innovation_caption(study, True), save),
+        "no_truth": None if study.has_truth else captions.no_truth(study),
+        "diagnosis": _diagnosis(study, save),
         "provenance": [list(row) for row in study.provenance],
         "resolved": _settings(json.loads(study.resolved)),
         "short": len(study.resolved) < SHORT,
     }
     if study.has_truth:
-        rows = figures.pose_errors(study)
-        entry["errors"] = [save(f"error-{i}", row) for i, row in enumerate(rows)]
-        entry["anees"] = {"image": save("anees", figures.anees(study)), "caption": wording.anees_caption(study)}
+        entry["errors"] = _rows(figures.pose_errors(study), "error", captions.error_caption(study), save)
+        entry["anees"] = {"image": save("anees", figures.anees(study)), "caption": captions.anees_caption(study)}
     return entry
+
+
+def _rows(rows: list[Any], name: str, caption: str, save: Save) -> dict[str, Any]:
+    return {"images": [save(f"{name}-{i}", row) for i, row in enumerate(rows)], "caption": caption}
+
+
+def _diagnosis(study: Study, save: Save) -> dict[str, Any]:
+    rows = [
+        [question, about, [list(wording.answer_cell(answer)) for answer in answers]]
+        for question, about, answers in diagnosis.asked(study)
+    ]
+    figure, distribution = figures.by_axis(study), figures.nees_distribution(study)
+    return {
+        "filters": [track.name for track in study.tracks],
+        "questions": rows,
+        "caption": captions.question_caption(study),
+        "figures": [list(wording.figure_row(track)) for track in study.tracks] if study.has_truth else [],
+        "figure_caption": captions.figure_caption(),
+        "by_axis": figure and {"image": save("axes", figure), "caption": captions.axis_caption(study)},
+        "nees": distribution and {"image": save("nees", distribution), "caption": captions.nees_caption(study)},
+    }
+
+
+def _calibration(report: Report) -> dict[str, Any] | None:
+    if report.calibration is None:
+        return None
+    rows = [list(row) for row in wording.calibration_rows(report.calibration)]
+    return {"text": captions.calibration_text(report.calibration), "rows": rows}
 
 
 def _distribution(distribution: Any, prefix: str, folder: Path) -> dict[str, str]:
     image = _svg(figures.distribution(distribution), folder / f"{prefix}.svg")
-    return {"image": image, "caption": wording.distribution_caption(distribution)}
+    return {"image": image, "caption": captions.distribution_caption(distribution)}
 
 
 def _svg(figure: Any, path: Path) -> str:

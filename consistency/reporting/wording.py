@@ -7,28 +7,46 @@ from typing import Any
 
 import numpy as np
 
-from consistency.reporting.model import STATUSES, Distribution, Study, Track
+from consistency.diagnostics.wording import short
+from consistency.reporting.calibration import Calibration, Rate
+from consistency.reporting.model import STATUSES, Study, Track
 
 MEANING = {
     "consistent": "the errors are as large as the covariance says",
     "overconfident": "the errors are larger than the covariance says",
     "conservative": "the errors are smaller than the covariance says",
+    "inconsistent": "the errors are otherwise than the covariance says, in more than their size",
+    "undecided": "the runs do not suffice to say",
     "failed": "a run broke down, or there was nothing to judge",
 }
 VERDICT_COLUMNS = (
     "Filter",
     "Verdict",
     "Mean ANEES",
-    "Share of steps in the pointwise band",
-    "First step outside the simultaneous band",
-    "2-sigma coverage x / y / heading (%)",
+    "Covariance to multiply by",
+    "Mainly",
+    "Since step",
     "RMSE position (m)",
     "RMSE heading (deg)",
     "NIS / dof",
     "Failed runs",
 )
-
-
+FIGURE_COLUMNS = (
+    "Filter",
+    "Mean ANEES accepted",
+    "Covariance ratio that would be found",
+    "2-sigma coverage, all steps (%)",
+    "Noncredibility (dB)",
+    "Inclination (dB)",
+    "NIS / dof, 95 % expected",
+)
+FOUND, NOT_FOUND, NOT_ASKED = "✗", "○", "–"
+SMALLEST = 1e-6  # p value below which digits say nothing
+WORLDS = {
+    "independent": "independent NEES values",
+    "autocorrelated": "errors correlated over steps",
+    "linear-gaussian": "Kalman filter, linear world",
+}
 LISTED = 6  # pairs of filter and scenario that the first paragraph names one by one
 
 
@@ -40,21 +58,62 @@ def number(value: Any, form: str) -> str:
 def verdict_row(track: Track) -> tuple[str, ...]:
     """Cells of the verdict table, as VERDICT_COLUMNS."""
     s = track.verdict.statistics
-    covered = s.get("coverage")
-    heading = s.get("rmse_heading")
-    first = s.get("first_outside")
+    since, heading = s.get("since"), s.get("rmse_heading")
     return (
         track.name,
         track.verdict.status,
-        number(s.get("mean_anees"), ".0f" if s.get("mean_anees", 0) >= 100 else ".2f"),
-        number(s.get("share_inside"), ".2f"),
-        str(first) if first is not None else ("never" if s.get("judged_steps") else "–"),
-        " / ".join(number(100 * c, ".1f") for c in covered) if covered and np.isfinite(covered).any() else "–",
+        _short(s.get("mean_anees")),
+        inflation(track),
+        s.get("subset") or "–",
+        "–" if since is None else str(since),
         number(s.get("rmse_position"), ".3f"),
         number(None if heading is None else np.rad2deg(heading), ".2f"),
         number(s.get("nis_ratio"), ".3f"),
         f"{len(s['failures'])} of {s['runs']}",
     )
+
+
+def inflation(track: Track) -> str:
+    """Factor that makes the stated covariance that of the errors, with its interval."""
+    s = track.verdict.statistics
+    ratio, (low, high) = s.get("ratio"), s.get("ratio_interval", (0.0, np.inf))
+    if ratio is None or not np.isfinite(ratio):
+        return "–"
+    return f"×{_short(ratio)} [{_short(low)}, {_short(high)}]"
+
+
+def _short(value: float | None) -> str:
+    if value is None or np.isnan(value):
+        return "–"
+    if value == 0 or not np.isfinite(value):
+        return "∞" if value else "0"
+    return short(value)
+
+
+def figure_row(track: Track) -> tuple[str, ...]:
+    """Cells of the table of further figures, as FIGURE_COLUMNS."""
+    s = track.verdict.statistics
+    low, high = s.get("acceptance", (None, None))
+    expected = s.get("nis_interval", (np.nan, np.nan))
+    covered = s.get("coverage", ())
+    detectable = number(s.get("detectable"), ".2g")
+    return (
+        track.name,
+        "–" if low is None or np.isnan(low) else f"{_short(low)} to {_short(high)}",
+        detectable if detectable == "–" else f"×{detectable}",
+        " / ".join(number(100 * c, ".1f") for c in covered) if np.isfinite(covered).any() else "–",
+        number(s.get("nci"), ".1f"),
+        number(s.get("inclination"), "+.1f"),
+        f"{number(s.get('nis_ratio'), '.3f')} ({number(expected[0], '.3f')} to {number(expected[1], '.3f')})",
+    )
+
+
+def answer_cell(answer: dict[str, Any] | None) -> tuple[str, str]:
+    """Mark and corrected p value of one filter's answer to one question."""
+    if answer is None:
+        return NOT_ASKED, ""
+    p = float(answer["adjusted"])
+    return FOUND if answer["found"] else NOT_FOUND, "< 1e-6" if p < SMALLEST else f"{p:.2g}"
 
 
 def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
@@ -119,67 +178,23 @@ def _count(value: int, noun: str) -> str:
     return f"{value} {noun}{'s' * (value != 1)}"
 
 
-def no_truth(study: Study) -> str:
-    """Why there are no error plots."""
+CALIBRATION_COLUMNS = ("World", "True / stated covariance", "Runs", "Promised", "Gates", "Measured", "99 % interval")
+
+
+def calibration_rows(c: Calibration) -> list[tuple[str, ...]]:
+    """Cells of the appendix, as CALIBRATION_COLUMNS: false alarms, then power."""
+    return [_rate_row(rate, "≤") for rate in c.false_alarms] + [_rate_row(rate, "≥") for rate in c.power]
+
+
+def _rate_row(rate: Rate, bound: str) -> tuple[str, ...]:
+    low, high = rate.interval
+    runs = str(rate.runs) if rate.looks == 1 else f"{rate.mean_runs:.0f} of {rate.runs}, {rate.looks} looks"
     return (
-        f"The truth of {study.name} is not known, so there are no pose errors and no NEES to show; "
-        "the innovations below are what the filter can be judged by."
-    )
-
-
-def scenario_caption(study: Study) -> str:
-    """What the map shows."""
-    parts = []
-    if study.true_path is not None:
-        parts.append("true path solid black with its start as a circle")
-    if study.odometry is not None:
-        parts.append("path by odometry alone dashed grey")
-    if study.landmarks is not None:
-        parts.append(f"{len(study.landmarks)} landmarks as stars")
-    parts.append("estimates in the filters' colours")
-    note = "" if study.odometry is not None else " The odometry path is left out: results of a log hold no controls."
-    return f"{study.name} from above, run {study.shown_run}: {', '.join(parts)}.{note}"
-
-
-def error_caption(study: Study) -> str:
-    """What the error charts show."""
-    return (
-        f"Pose error (truth minus estimate) of run {study.shown_run}, the lowest run number, with the filter's own "
-        "2-sigma bounds (dashed). An honest filter's error stays inside about 95 % of the time."
-    )
-
-
-def anees_caption(study: Study) -> str:
-    """What the ANEES chart shows."""
-    what = f"NEES of the single run {study.shown_run}" if study.single else f"Average NEES over {study.runs} runs"
-    common = study.common_band
-    n = common.verdict.statistics["dof"] if common else 3
-    own = [track.name for track in study.tracks if track.own_band]
-    extra = (
-        f" Fewer runs carry the curve of {listed(own)}; its wider bands are thin lines in its colour." if own else ""
-    )
-    return (
-        f"{what}; {n} is expected (line). Shaded: the 95 % band of a single step (eq. 17). Dashed: the band that "
-        f"a consistent filter leaves anywhere in the run with probability at most 5 %. Above is overconfident, below "
-        f"conservative.{extra}"
-    )
-
-
-def nis_caption(study: Study) -> str:
-    """What the NIS chart shows."""
-    return (
-        "Normalized innovation squared over its degrees of freedom, one point a step"
-        + ("" if study.single else f", summed over {study.runs} runs")
-        + "; not smoothed. 1 is expected (line)."
-    )
-
-
-def distribution_caption(d: Distribution) -> str:
-    """What one panel pair of fig. 12 shows, with its numbers."""
-    linear, fitted = (float(np.sqrt(g.covariance[0, 0])) for g in (d.linear, d.fitted))
-    beyond = f" {100 * d.outside:.1f} % of the samples lie beyond the axes." if d.outside >= 0.0005 else ""
-    return (
-        f"Baseline {d.baseline:g} m: {d.samples} samples of eq. 21 within the search range, for a point at x = 10 m, "
-        f"y = 1 m ({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
-        f"samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
+        WORLDS.get(rate.world, rate.world),
+        "1, right" if rate.ratio == 1.0 else f"{rate.ratio:g}",
+        runs,
+        f"{bound} {100 * rate.promised:g} %",
+        str(rate.gates),
+        f"{100 * rate.measured:.1f} %",
+        f"{100 * low:.1f} to {100 * high:.1f} %",
     )

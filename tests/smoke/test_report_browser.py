@@ -105,6 +105,49 @@ def test_a_checkbox_hides_a_filter_in_all_charts(browser):
     assert all(browser.execute_script(VISIBLE, "0:0"))
 
 
+def test_the_diagnosis_is_drawn_for_every_filter(browser):
+    marks = browser.execute_script(
+        """
+        const of = (chart) => [chart.below[0].axis_label,
+          [...new Set(chart.renderers.flatMap((r) => r.tags))].sort()];
+        return Bokeh.documents[0].roots().map(of);
+        """
+    )
+    drawn = dict(marks)
+    for label in ("covariance ratio (truth / stated)", "within 2 sigma (%)", "lag (steps)"):
+        assert drawn[label] == ["0:0", "0:1"], label
+    cells = browser.find_elements("css selector", "table.questions td")
+    assert len(cells) >= 2 * 6
+    assert all(cell.text[0] in "✗○–" for cell in cells)
+
+
+def test_the_innovations_of_the_filters_left_fill_the_chart(browser):
+    reach = """
+    const chart = Bokeh.documents[0].roots().find((c) => c.left[0].axis_label === 'NIS / dof');
+    return [chart.y_range.start, chart.y_range.end];
+    """
+    boxes = browser.find_elements("css selector", "fieldset input[type=checkbox]")
+    low, high = browser.execute_script(reach)
+    boxes[1].send_keys(" ")
+    try:
+        wait_for(lambda: browser.execute_script(reach) != [low, high], 10)
+        less = browser.execute_script(reach)
+        assert low <= less[0] < less[1] <= high
+    finally:
+        boxes[1].send_keys(" ")
+    wait_for(lambda: browser.execute_script(reach) == [low, high], 10)
+
+
+@pytest.mark.parametrize("width", [1200, 400])
+def test_nothing_runs_over_the_edge(browser, width):
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        wait_for(lambda: browser.execute_script("return document.documentElement.scrollWidth") <= width, 10)
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def test_hovering_shows_step_and_the_odd_name_as_text(browser):
     from selenium.webdriver import ActionChains
 

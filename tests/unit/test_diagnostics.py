@@ -10,8 +10,7 @@ from scipy import stats
 from scipy.spatial.distance import mahalanobis
 
 import consistency as cs
-from consistency.diagnostics import chi2_mean_interval, coverage, normality, rmse
-from consistency.diagnostics.intervals import detectable_ratio
+from consistency.diagnostics import chi2_mean_interval, coverage, detectable_ratio, normality, rmse
 from consistency.types import Array
 
 # exact 95 % intervals of chi-square(3 N) / N, computed outside this project
@@ -179,10 +178,13 @@ def test_interval_refuses_a_confidence_outside_zero_to_one(confidence: float) ->
 def test_detectable_ratio_is_detected_with_its_power() -> None:
     """The NEES of a covariance that is too small by the ratio is the ratio times chi-square."""
     for runs, power in ((50, 0.95), (400, 0.9)):
-        ratio = detectable_ratio(3, runs, 0.99, power)
+        ratio = detectable_ratio(3, runs, 0.01, power)
         _, high = cs.anees_interval(3, runs, 0.99)
         assert stats.chi2.sf(high * runs / ratio, 3 * runs) == pytest.approx(power)
         assert ratio > 1
+        one_sided = detectable_ratio(3, runs, 0.01, power, two_sided=False)
+        assert stats.chi2.sf(stats.chi2.isf(0.01, 3 * runs) / one_sided, 3 * runs) == pytest.approx(power)
+        assert one_sided < ratio
 
 
 # --- coverage and error ----------------------------------------------------------------------------

@@ -104,6 +104,49 @@ def test_scenario_draws_the_truth_solid_and_the_odometry_dashed(axes):
     np.testing.assert_array_equal(start.get_xydata()[0], path[0])
 
 
+def test_a_forest_has_a_row_for_each_axis_and_an_arrow_where_an_interval_goes_on(axes):
+    rows = [("$x$", [(2.0, 1.5, 3.0), (0.5, 0.0, np.inf)]), ("y", [None, (1.0, 0.9, 1.2)])]
+    plots.forest(axes, [plots.style(0), plots.style(1)], rows, expected=1.0, window=(0.1, 10.0), log=True)
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["$x$", "y"]
+    assert axes.get_ylim() == (1.5, -0.5)  # the first row is on top
+    assert axes.get_xscale() == "log"
+    bars = [list(line.get_xdata()) for line in axes.lines if line.get_linestyle() == "-" and len(line.get_xdata()) == 2]
+    assert bars == [[1, 1], [1.5, 3.0], [0.1, 10.0], [0.9, 1.2]]  # the line at 1 first
+    arrows = [(line.get_marker(), float(line.get_xdata()[0])) for line in axes.lines if line.get_marker() in "<>"]
+    assert arrows == [("<", 0.1), (">", 10.0)]
+    places = [float(line.get_ydata()[0]) for line in axes.lines if line.get_marker() == plots.style(1).marker]
+    np.testing.assert_allclose(places, [plots.dodge(1, 2), 1 + plots.dodge(1, 2)])
+
+
+def test_filters_in_a_row_keep_apart_and_stay_in_it():
+    for slots in range(1, 7):
+        offsets = [plots.dodge(slot, slots) for slot in range(slots)]
+        assert len(set(offsets)) == slots
+        assert max(map(abs, offsets)) < 0.5
+        assert sum(offsets) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("half_width", [0.2, 0.5, 0.9])
+def test_the_band_of_a_distribution_follows_the_diagonal_and_stays_a_probability(axes, half_width):
+    x, y = np.array([0.0, 0.3, 0.8, 1.0]), np.array([0.0, 0.5, 1.0, 1.0])
+    plots.distribution(axes, x, y, half_width, plots.style(0))
+    edge = axes.collections[0].get_paths()[0].vertices
+    assert edge.min() == 0.0
+    assert edge.max() == 1.0
+    for corner, value in ((0.0, half_width), (1.0, 1.0 - half_width)):
+        assert np.isclose(edge, [corner, value]).all(axis=1).any()
+    curve = axes.lines[1]
+    assert curve.get_drawstyle() == "steps-post"
+    np.testing.assert_array_equal(curve.get_ydata(), y)
+
+
+def test_autocorrelation_starts_at_lag_one_within_its_bound(axes):
+    plots.autocorrelation(axes, np.array([0.5, -0.1, 0.0]), 0.2, plots.style(3))
+    np.testing.assert_array_equal(axes.lines[-1].get_xdata(), [1, 2, 3])
+    np.testing.assert_array_equal(axes.lines[-1].get_ydata(), [0.5, -0.1, 0.0])
+    assert (axes.patches[0].get_y(), axes.patches[0].get_height()) == (-0.2, 0.4)
+
+
 def test_other_figures_draw_what_they_are_given(axes):
     plots.nis(axes, STEPS, np.ones(5), plots.style(2))
     assert axes.lines[0].get_marker() == plots.style(2).marker

@@ -12,12 +12,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 import consistency as cs
+from consistency.diagnostics.wording import short
 from consistency.findings import Finding
 from consistency.montecarlo import run_log, simulate_log
-from consistency.reporting import build, html, pdf, wording, write_reports
+from consistency.reporting import build, captions, diagnosis, html, pdf, wording, write_reports
 from consistency.reporting.build import build_report
+from consistency.reporting.calibration import calibration
 from consistency.reporting.thin import thin
 from consistency.results import read_results
 
@@ -129,10 +132,149 @@ def test_the_odometry_is_that_of_the_trial(folder, uvd):
 def test_verdict_cells_are_the_statistics(folder):
     (study,) = build_report(folder).studies
     cells, s = wording.verdict_row(study.tracks[0]), study.tracks[0].verdict.statistics
-    assert cells[2] == f"{s['mean_anees']:.2f}"
+    assert cells[2] == short(s["mean_anees"])
+    assert cells[3].startswith(f"×{short(s['ratio'])} [")
+    assert cells[3].endswith(f", {short(s['ratio_interval'][1])}]")
+    assert cells[5] == ("–" if s["since"] is None else str(s["since"]))
     assert cells[7] == f"{np.rad2deg(s['rmse_heading']):.2f}"
     assert cells[9] == "0 of 4"
     assert len(cells) == len(wording.VERDICT_COLUMNS)
+    cells = wording.figure_row(study.tracks[0])
+    assert cells[3] == " / ".join(f"{100 * share:.1f}" for share in s["coverage"])
+    assert len(cells) == len(wording.FIGURE_COLUMNS)
+
+
+def test_an_interval_that_says_nothing_is_shown_as_such(folder):
+    (study,) = build_report(folder).studies
+    track = study.tracks[0]
+    s = track.verdict.statistics | {"ratio": 2.5, "ratio_interval": (0.0, np.inf)}
+    assert wording.inflation(replace(track, verdict=replace(track.verdict, statistics=s))) == "×2.50 [0, ∞]"
+
+
+def test_the_diagnosis_is_what_the_verdict_holds(folder):
+    (study,) = build_report(folder).studies
+    questions = {question: answers for question, _, answers in diagnosis.asked(study)}
+    by_name = {part.name: dict(part.rows) for part in diagnosis.forests(study)}
+    for number, track in enumerate(study.tracks):
+        s = track.verdict.statistics
+        assert {q for q, answers in questions.items() if answers[number]} == {a["question"] for a in s["answers"]}
+        for answer in s["answers"]:
+            assert questions[answer["question"]][number] is answer
+        assert by_name["ratio"]["x"][number] == pytest.approx(s["of_axes"]["x"])
+        assert by_name["ratio"][diagnosis.WHOLE][number] == pytest.approx((s["ratio"], *s["ratio_interval"]))
+        assert by_name["coverage"]["y"][number][0] == pytest.approx(100 * s["coverage_one_step"][1])
+        if "bias" in s:
+            assert by_name["bias"]["heading"][number] == pytest.approx(s["bias"]["heading"])
+        of = diagnosis.steps(track, lambda values: np.arange(len(values)))
+        np.testing.assert_array_equal(of.x[1:-1], s["pit"])
+        np.testing.assert_allclose(of.y, [0, 0.25, 0.5, 0.75, 1, 1])
+    text = "".join(Page(html.render_html(build_report(folder))).text)
+    assert all(question in text and about in text for question, about, _ in diagnosis.asked(study))
+
+
+@pytest.mark.parametrize(
+    ("answer", "cell"),
+    [
+        (None, ("–", "")),
+        ({"adjusted": 3e-7, "found": True}, ("✗", "< 1e-6")),
+        ({"adjusted": 0.0123, "found": True}, ("✗", "0.012")),
+        ({"adjusted": 1.0, "found": False}, ("○", "1")),
+    ],
+)
+def test_answers_have_a_mark_and_not_colour_alone(answer, cell):
+    assert wording.answer_cell(answer) == cell
+
+
+@pytest.mark.parametrize("ends", [(0.0, np.inf), (1e-12, 1e12), (19.0, 21.0)])
+def test_windows_are_finite_and_hold_every_value(folder, ends):
+    (study,) = build_report(folder).studies
+    track = study.tracks[0]
+    s = track.verdict.statistics | {"of_axes": {"x": (20.0, *ends)}, "ratio": 0.5, "ratio_interval": ends}
+    s["bias"] = {"x": (-4.0, -ends[1], ends[1])}
+    study = replace(study, tracks=(replace(track, verdict=replace(track.verdict, statistics=s)),))
+    for part in diagnosis.forests(study):
+        low, high = part.window
+        assert np.isfinite(part.window).all()
+        values = [interval[0] for _, row in part.rows for interval in row if interval] + [part.expected]
+        assert low < min(values) <= max(values) < high
+
+
+@pytest.mark.parametrize("empty", [{}, {"ratio": np.nan, "pit": np.empty(0), "pit_half_width": np.nan}])
+def test_a_verdict_without_figures_is_drawn_all_the_same(folder, empty):
+    report = build_report(folder)
+    (study,) = report.studies
+    tracks = tuple(
+        replace(
+            t, verdict=replace(t.verdict, status="undecided", statistics=least(t.verdict.statistics) | empty),
+            anees=None, band=None, simultaneous=None,
+        )
+        for t in study.tracks
+    )  # fmt: skip
+    report = replace(report, studies=(replace(study, tracks=tracks),))
+    assert "There was nothing to ask" in html.render_html(report)
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def least(statistics):
+    """What every verdict has."""
+    return {key: statistics[key] for key in ("runs", "steps", "false_alarm", "failures")} | {"answers": []}
+
+
+def test_nees_alone_without_axes(folder):
+    report = build_report(folder)
+    (study,) = report.studies
+    whole = cs.diagnostics.judge("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3)
+    track = replace(study.tracks[0], verdict=whole)
+    study = replace(study, tracks=(track,))
+    (part,) = diagnosis.forests(study)
+    assert [label for label, _ in part.rows] == [diagnosis.WHOLE]
+    assert pdf.render_pdf(replace(report, studies=(study,))).startswith(b"%PDF")
+
+
+def test_the_captions_state_the_rates_in_force(folder):
+    report = build_report(folder)
+    s = report.studies[0].tracks[0].verdict.statistics
+    (share,) = (a["share"] for a in s["answers"] if a["question"] == "scale in some step")
+    assert f"at most {100 * share * s['false_alarm']:.2g} %" in captions.anees_caption(report.studies[0])
+    assert "probability 5 % at most" in captions.method(report)
+
+
+CALIBRATION = {
+    "steps": 100, "dof": 3, "seed": 1, "power": 0.95, "wall_time_s": 1.0,
+    "rows": [
+        {"world": "independent", "ratio": 1.0, "runs": 21, "false_alarm": 0.05, "power": 0.95, "gates": 200,
+         "found": 9},
+        {"world": "elsewhere", "ratio": 1.5, "runs": 61, "false_alarm": 0.05, "power": 0.95, "gates": 100,
+         "found": 100},
+        {"world": "independent", "ratio": 1.5, "runs": 73, "looks": 3, "mean_runs": 19.0, "false_alarm": 0.05,
+         "power": 0.95, "gates": 100, "found": 99},
+    ],
+}  # fmt: skip
+
+
+def test_the_calibration_is_a_table_of_rates_with_intervals(folder, tmp_path):
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(CALIBRATION))
+    found = calibration(path)
+    assert found.gates == 400
+    alarm, power, looks = wording.calibration_rows(found)
+    # Clopper & Pearson of 9 in 200 at 99 %
+    low, high = stats.beta.ppf(0.005, 9, 192), stats.beta.ppf(0.995, 10, 191)
+    interval = f"{100 * low:.1f} to {100 * high:.1f} %"
+    assert alarm == ("independent NEES values", "1, right", "21", "≤ 5 %", "200", "4.5 %", interval)
+    assert power[:6] == ("elsewhere", "1.5", "61", "≥ 95 %", "100", "100.0 %")
+    assert looks[2] == "19 of 73, 3 looks"
+    assert {len(row) for row in (alarm, power, looks)} == {len(wording.CALIBRATION_COLUMNS)}
+    report = replace(build_report(folder), calibration=found)
+    assert "How far the referee can be trusted" in html.render_html(report)
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def test_without_a_calibration_the_appendix_says_nothing(folder, tmp_path):
+    assert calibration(tmp_path / "none.json") is None
+    report = replace(build_report(folder), calibration=None)
+    assert "How far the referee" not in html.render_html(report)
+    assert pdf.render_pdf(report).startswith(b"%PDF")
 
 
 def test_the_answer_names_every_filter(folder):

@@ -1,0 +1,171 @@
+"""What stands under a figure or a table, the same in every format."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consistency.reporting.calibration import Calibration
+from consistency.reporting.diagnosis import forests, lags
+from consistency.reporting.model import Distribution, Report, Study, Track
+from consistency.reporting.wording import FOUND, NOT_ASKED, NOT_FOUND, listed
+
+
+def no_truth(study: Study) -> str:
+    """Why there are no error plots."""
+    return (
+        f"The truth of {study.name} is not known, so there are no pose errors and no NEES to show; "
+        "the innovations below are what the filter can be judged by."
+    )
+
+
+def scenario_caption(study: Study) -> str:
+    """What the map shows."""
+    parts = []
+    if study.true_path is not None:
+        parts.append("true path solid black with its start as a circle")
+    if study.odometry is not None:
+        parts.append("path by odometry alone dashed grey")
+    if study.landmarks is not None:
+        parts.append(f"{len(study.landmarks)} landmarks as stars")
+    parts.append("estimates in the filters' colours")
+    note = "" if study.odometry is not None else " The odometry path is left out: results of a log hold no controls."
+    return f"{study.name} from above, run {study.shown_run}: {', '.join(parts)}.{note}"
+
+
+def error_caption(study: Study) -> str:
+    """What the error charts show."""
+    return (
+        f"Pose error (truth minus estimate) of run {study.shown_run}, the lowest run number, with the filter's own "
+        "2-sigma bounds (dashed). An honest filter's error stays inside about 95 % of the time."
+    )
+
+
+def anees_caption(study: Study) -> str:
+    """What the ANEES chart shows."""
+    what = f"NEES of the single run {study.shown_run}" if study.single else f"Average NEES over {study.runs} runs"
+    common = study.common_band
+    n = common.verdict.statistics["dof"] if common else 3
+    own = [track.name for track in study.tracks if track.own_band]
+    extra = (
+        f" Fewer runs carry the curve of {listed(own)}; its wider bands are thin lines in its colour." if own else ""
+    )
+    rate = _step_rate(common) if common else None
+    others = f", drawn for {common.name}: dependence between steps moves it a little" if common else ""
+    simultaneous = (
+        " Dashed: the band of all steps at once, which a consistent filter leaves anywhere in the run with "
+        f"probability at most {100 * rate:.2g} %, its share of the verdict's false-alarm rate"
+        f"{others if len(study.tracks) > 1 else ''}."
+        if rate is not None
+        else ""
+    )
+    return (
+        f"{what}; {n} is expected (line). Shaded: the 95 % band of a single step (eq. 17), which is not judged."
+        f"{simultaneous} Above is overconfident, below conservative.{extra}"
+    )
+
+
+def _step_rate(track: Track) -> float | None:
+    """Share of the false-alarm rate that the band over all steps has."""
+    s = track.verdict.statistics
+    shares = [a["share"] for a in s.get("answers", ()) if a["question"] == "scale in some step"]
+    return float(shares[0] * s["false_alarm"]) if shares else None
+
+
+def innovation_caption(study: Study, panels: bool) -> str:
+    """What the figures of innovations show; ``panels``: each filter has axes of its own."""
+    text = (
+        "Normalized innovation squared over its degrees of freedom, one point a step"
+        + ("" if study.single else f", summed over {study.runs} runs")
+        + "; not smoothed. 1 is expected (line)."
+    )
+    if panels:
+        text += " Axes differ between filters."
+    if any(lags(track) for track in study.tracks):
+        text += (" Right: " if panels else " Below: ") + (
+            "autocorrelation over steps; of white innovations 95 % of the lags stay within the shaded bound."
+        )
+    return text
+
+
+def distribution_caption(d: Distribution) -> str:
+    """What one panel pair of fig. 12 shows, with its numbers."""
+    linear, fitted = (float(np.sqrt(g.covariance[0, 0])) for g in (d.linear, d.fitted))
+    beyond = f" {100 * d.outside:.1f} % of the samples lie beyond the axes." if d.outside >= 0.0005 else ""
+    return (
+        f"Baseline {d.baseline:g} m: {d.samples} samples of eq. 21 within the search range, for a point at x = 10 m, "
+        f"y = 1 m ({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
+        f"samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
+    )
+
+
+def method(report: Report) -> str:
+    """How a verdict comes about, in one paragraph."""
+    rates = [t.verdict.statistics["false_alarm"] for study in report.studies for t in study.tracks]
+    rate = f"{100 * rates[0]:.2g} %" if rates else "the false-alarm rate"
+    text = (
+        "A run is one observation: runs are independent, steps are not. The questions of a verdict together find a "
+        f"fault in a right filter with probability {rate} at most, whatever they have to do with each other "
+        "(Holm 1979, weighted)."
+    )
+    if any(study.has_truth for study in report.studies):
+        text += (
+            " Half of that rate belongs to the mean NEES of whole runs, for which the number of runs is planned; the "
+            "other questions share the rest. Where the ANEES leaves its band and stays out, the factor and the axes "
+            "are those since that step."
+        )
+    return text
+
+
+def question_caption(study: Study) -> str:
+    """How to read the table of questions."""
+    rate = 100 * study.tracks[0].verdict.statistics["false_alarm"] if study.tracks else 5.0
+    return (
+        f"{FOUND} a fault was found, {NOT_FOUND} none was found, {NOT_ASKED} could not be asked. The number is the "
+        f"corrected p value: the false-alarm rate of the whole verdict at which the fault would just be found "
+        f"({rate:.2g} % or less is a fault)."
+    )
+
+
+def axis_caption(study: Study) -> str:
+    """What the figure of axes shows."""
+    parts = {part.name for part in forests(study)}
+    text = "By axis of the pose. Covariance ratio: 1 is right (line), above is overconfident; log axis."
+    if any(track.verdict.statistics.get("since") is not None for track in study.tracks):
+        text += " Ratio and bias are those since the step that the verdict names."
+    if "bias" in parts:
+        text += " Bias: mean error in units of the stated sigma; 0 is right."
+    if "coverage" in parts:
+        text += " Coverage: share of runs within 2 sigma, in one step of each; 95.4 % is right."
+    return (
+        f"{text} Bars: 95 % intervals, of ratio and bias for all axes at once, of coverage exact for each axis; an "
+        "arrow goes on beyond the drawn range. The questions decide, not the bars."
+    )
+
+
+def nees_caption(study: Study) -> str:
+    """What the figure of the distribution shows."""
+    return (
+        "Distribution of the NEES: chi-square probability of the NEES in one step of each run, with nothing fitted. "
+        "On the diagonal the covariance is right; a curve below it has too many large values (overconfident), above it "
+        "too many small ones. Shaded: where the whole curve of a right filter lies with probability 95 %."
+    )
+
+
+def figure_caption() -> str:
+    """What the columns of further figures are."""
+    return (
+        "Noncredibility index and inclination (Li & Zhao 2006): 0 dB is credible, 10 dB a covariance wrong by a factor "
+        "of 10; inclination above 0 is overconfident. The ratio that would be found: with power 0.95 by these runs."
+    )
+
+
+def calibration_text(c: Calibration) -> str:
+    """What the appendix on the referee measures."""
+    return (
+        "A gate is one verdict on one group of runs. A false alarm is a gate that finds a fault where the covariance "
+        "is exactly right; power is the share of gates that find a stated covariance which is wrong by the ratio "
+        "given, with as many runs as are planned for it. A gate with several looks ends at the look that finds a "
+        f"fault; its mean number of runs stands first. Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees "
+        f"of freedom, seed {c.seed}), with exact binomial intervals. The promise is broken where the whole interval of "
+        "a false-alarm rate lies above it, or that of a power below it."
+    )

@@ -1,0 +1,146 @@
+"""Does the referee keep its promises? A reduced calibration, and the cases that are hardest for single questions.
+
+Random numbers are fresh in every run (the seed is printed when a test fails). Every row and every count has binomial
+limits at 1e-5 or further out: under 40 of them, together under 1 false failure in 2,000 runs of this file.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from consistency.diagnostics import judge, mean_shape, mean_test, nis_whiteness, simultaneous_band
+from consistency.types import Array
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+import calibration  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+SURE = 1 - 1e-5
+GATES, POWER_GATES = 300, 60
+DOF = 3
+
+
+@pytest.fixture
+def fresh() -> np.random.Generator:
+    seed = np.random.SeedSequence().entropy
+    print(f"seed {seed}")
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    seed = int(np.random.SeedSequence().generate_state(1)[0]) % 10**8
+    print(f"seed {seed}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibration, "SEED", seed)
+        return list(calibration.main(gates=GATES, power_gates=POWER_GATES)["rows"])
+
+
+def test_rates_and_power_are_as_stated(rows: list[dict[str, Any]]) -> None:
+    """300 gates see a false-alarm rate of 5 % that is really 14 % with 97 %; 60 gates a power of 0.93 that is 0.66."""
+    broken = [row for row in rows if not calibration.promises_kept(row, SURE)]
+    assert not broken
+    assert {row["world"] for row in rows} == set(calibration.WORLDS)
+
+
+def test_a_broken_promise_is_seen(rows: list[dict[str, Any]]) -> None:
+    """Negative control of the rule above."""
+    alarms = next(row for row in rows if row["ratio"] == 1.0 and row["looks"] == 1)
+    power = next(row for row in rows if row["ratio"] != 1.0)
+    assert not calibration.promises_kept(alarms | {"found": round(0.15 * GATES)}, SURE)
+    assert not calibration.promises_kept(power | {"found": round(0.65 * POWER_GATES)}, SURE)
+
+
+# --- single questions where they are hardest -------------------------------------------------------------
+
+RUNS, STEPS = 20, 40
+
+
+def constant_axis(rng: np.random.Generator) -> Array:
+    """Nine tenths of an axis are one and the same error in all steps: a mean of few, skewed squares."""
+    w = rng.standard_normal((RUNS, STEPS, DOF))
+    w[..., 0] = np.sqrt(0.9) * rng.standard_normal((RUNS, 1)) + np.sqrt(0.1) * w[..., 0]
+    return w
+
+
+def nearly_constant(rng: np.random.Generator) -> Array:
+    return np.sqrt(0.97) * rng.standard_normal((RUNS, 1, DOF)) + np.sqrt(0.03) * rng.standard_normal((RUNS, STEPS, DOF))
+
+
+def independent(rng: np.random.Generator) -> Array:
+    return rng.standard_normal((RUNS, STEPS, DOF))
+
+
+def few_runs(rng: np.random.Generator) -> Array:
+    return constant_axis(rng)[:10]
+
+
+def one_run_of_one_step(rng: np.random.Generator) -> Array:
+    w = independent(rng)
+    w[0, 1:] = np.nan
+    return w
+
+
+def ever_longer(rng: np.random.Generator) -> Array:
+    w = independent(rng)
+    for run in range(RUNS):
+        w[run, 1 + 2 * run :] = np.nan
+    return w
+
+
+def no_common_step(rng: np.random.Generator) -> Array:
+    w = np.full((RUNS, STEPS, DOF), np.nan)
+    for run in range(RUNS):
+        w[run, 2 * run : 2 * run + 2] = rng.standard_normal((2, DOF))
+    return w
+
+
+WORLDS = [constant_axis, nearly_constant, independent, few_runs, one_run_of_one_step, ever_longer, no_common_step]
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_no_question_alarms_more_often_than_it_may(
+    fresh: np.random.Generator, world: Callable[[np.random.Generator], Array]
+) -> None:
+    """1,500 draws at the level that a verdict at 5 % gives the mean, and at a tenth of it."""
+    draws = 1500
+    p: dict[str, list[float]] = {"errors": [], "nees alone": [], "band": [], "shape": []}
+    for _ in range(draws):
+        w = world(fresh)
+        nees = np.square(w).sum(axis=-1)
+        p["errors"].append(mean_test(nees, DOF, w).p_value)
+        p["nees alone"].append(mean_test(nees, DOF).p_value)
+        p["band"].append(simultaneous_band(nees, DOF).p_value)
+        p["shape"].append(mean_shape(w)[1])
+    for level in (0.025, 0.0025):
+        limit = stats.binom.ppf(1 - 1e-7, draws, level)
+        counts = {question: int((np.array(values) <= level).sum()) for question, values in p.items()}
+        assert max(counts.values()) <= limit, (level, limit, counts)
+
+
+def test_the_nis_alone_is_white_far_out_in_the_tail(fresh: np.random.Generator) -> None:
+    """Squares have long tails and their correlations too: 3,000 draws at 0.001."""
+    dof = np.full((20, 30), 2)
+    count = sum(nis_whiteness(fresh.chisquare(2, (20, 30)), dof).p_value <= 1e-3 for _ in range(3000))
+    assert count <= stats.binom.ppf(SURE, 3000, 1e-3)
+
+
+@pytest.mark.parametrize("options", [{}, {"allow": "conservative"}, {"method": "bonferroni"}])
+@pytest.mark.parametrize("world", [constant_axis, few_runs, ever_longer])
+def test_whole_verdicts_alarm_no_more_than_stated(
+    fresh: np.random.Generator, world: Callable[[np.random.Generator], Array], options: dict[str, str]
+) -> None:
+    """200 verdicts at 10 %."""
+    alarms = 0
+    for _ in range(200):
+        w = world(fresh)
+        alarms += not judge("f", w, np.broadcast_to(np.eye(DOF), (*w.shape, DOF)), false_alarm=0.1, **options).consistent
+    assert alarms <= stats.binom.ppf(SURE, 200, 0.1)

@@ -17,7 +17,8 @@ def coverage(error: Array, covariance: Array, bound: float = 2.0) -> Array:
     Shapes (..., n) and (..., n, n) -> (n,); rows with NaN do not count.
     """
     error = np.asarray(error, float)
-    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
     valid = np.isfinite(error) & np.isfinite(sigma)
     inside = valid & (np.abs(np.where(valid, error, 0.0)) <= bound * np.where(valid, sigma, 0.0))
     axes = tuple(range(error.ndim - 1))
@@ -41,8 +42,9 @@ def coverage_interval(
     are not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2).
     """
     error = np.asarray(error, float)
-    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    chosen = spread_steps((np.isfinite(error) & np.isfinite(sigma)).all(axis=-1))
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    chosen = spread_steps(np.asarray((np.isfinite(error) & np.isfinite(sigma)).all(axis=-1)))
     rows = np.flatnonzero(chosen >= 0)
     inside = (np.abs(error[rows, chosen[rows]]) <= bound * sigma[rows, chosen[rows]]).sum(axis=0)
     if not len(rows):

@@ -11,7 +11,7 @@ from consistency.diagnostics.whitening import whiten
 from consistency.types import Array
 
 LAGS = 10
-FEWEST = 100  # values; below, the chi-square of the portmanteau is not to be trusted
+FEWEST = 400  # values; below, the chi-square of the portmanteau is not to be trusted
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class NisTest:
 
     @property
     def p_value(self) -> float:
-        return min(1.0, 2.0 * min(self.above, self.below))
+        return float(np.minimum(1.0, 2.0 * np.minimum(self.above, self.below)))
 
 
 def nis_test(nis: Array, dof: Array) -> NisTest:
@@ -67,7 +67,8 @@ def whiteness(innovations: Array, covariances: Array, lags: int = LAGS) -> White
 
 
 def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
-    """The same of the NIS alone, where no innovations are kept: (nis - dof) / sqrt(2 dof), shapes (runs, steps).
+    """The same of the NIS alone, where no innovations are kept: its cube root,
+    which is nearly Gaussian (Wilson & Hilferty 1931), shapes (runs, steps).
 
     Correlated innovations show in their squares, with the correlation squared.
     """
@@ -75,7 +76,8 @@ def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(counted, nis / np.where(dof > 0, dof, 1), np.nan)
         overall = nis[counted].sum() / max(dof[counted].sum(), 1)
-        z = (z / overall - 1.0) * np.sqrt(dof / 2.0) if overall > 0 else z * np.nan
+        spread = 2.0 / (9.0 * np.where(dof > 0, dof, 1))
+        z = (np.cbrt(z / overall) - 1.0 + spread) / np.sqrt(spread) if overall > 0 else z * np.nan
     return _portmanteau(np.where(counted, z, np.nan)[..., None], lags)
 
 

@@ -18,7 +18,7 @@ class Outlier:
     p_value: float  # over all runs and steps
     run: int  # row
     step: int  # column
-    distance: float  # from the mean of the runs in that step, in standard deviations of the runs
+    distance: float  # from the mean of the other runs in that step, in their standard deviations
 
 
 def outliers(whitened: Array) -> Outlier:
@@ -52,4 +52,7 @@ def outliers(whitened: Array) -> Outlier:
         p = stats.beta.sf(np.minimum(of_step * count / (count - 1.0) ** 2, 1.0), n / 2, (count - n - 1) / 2)
     worst = int(p.argmin())
     p_value = min(1.0, float(p[worst]) * float(count.sum()))
-    return Outlier(p_value, int(rows[worst]), int(usable[worst]), float(np.sqrt(of_step[worst])))
+    n_runs = float(count[worst])
+    share = min(float(of_step[worst]) * n_runs / (n_runs - 1.0) ** 2, 1.0 - 1e-12)
+    left_out = share / (1.0 - share) * n_runs * (n_runs - 2.0) / (n_runs - 1.0)  # without the run itself
+    return Outlier(p_value, int(rows[worst]), int(usable[worst]), float(np.sqrt(left_out)))

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+MAIN = "scale"
+SCALE = (MAIN, "scale in some step", "scale of an axis")
+BIAS = ("bias", "bias in some step")
+SHAPE = ("shape", "shape in some step")
 # Share of the false-alarm rate of each question. Half goes to the mean over the trajectory, so that the
 # number of runs planned for a covariance ratio does not depend on what else is asked.
-MAIN = "scale"
 SHARES = {
     MAIN: 0.5,
     "scale in some step": 0.1,

@@ -10,7 +10,8 @@ from scipy import optimize, special, stats
 from consistency.diagnostics.nees import anees
 from consistency.types import Array
 
-FEW = 10  # runs; below, the dependence between steps is not estimated but taken as complete
+FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete
+REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
 BLOCK = 1024  # runs whose scalar products are in memory at once
 
 
@@ -29,8 +30,8 @@ class MeanTest:
 
     @property
     def p_value(self) -> float:
-        """Two-sided."""
-        return min(1.0, 2.0 * min(self.above, self.below))
+        """Two-sided; NaN where there is nothing to judge."""
+        return float(np.minimum(1.0, 2.0 * np.minimum(self.above, self.below)))
 
 
 def mean_test(nees: Array, dof: int, whitened: Array | None = None) -> MeanTest:
@@ -45,8 +46,10 @@ def mean_test(nees: Array, dof: int, whitened: Array | None = None) -> MeanTest:
 
     nu is estimated from the same runs as the mean. The jackknife over runs says how well it is known and how
     it moves with the mean; it is taken at a mean of 1, one standard error to the safe side, and what
-    doubt remains makes Student's t of the normal. Below ``dof``, its value where all steps of a run are
-    one and the same, nu never lies; there, and with fewer than 10 runs, the test is the chi-square of one step.
+    doubt remains makes Student's t of the normal. From the spread of the means alone it is taken two standard
+    errors to the safe side: skewed means hide their spread. nu lies between ``dof``, its value where all steps of a
+    run are one and the same, and that times the number of steps. With fewer than 20 runs, or where runs have
+    values in different steps, nu is ``dof``: the test is the chi-square of one step.
 
     Parameters
     ----------
@@ -58,20 +61,23 @@ def mean_test(nees: Array, dof: int, whitened: Array | None = None) -> MeanTest:
     means, counts = means[counts > 0] / dof, counts[counts > 0]
     runs = len(means)
     if runs == 0:
-        return MeanTest(float("nan"), float("nan"), float("inf"), 1.0, 1.0)
+        return MeanTest(float("nan"), float("nan"), float("inf"), float("nan"), float("nan"))
     ratio = float(means.mean())
     nu, spread = float(dof), float("inf")
-    if runs >= FEW and nees.shape[1] > 1 and ratio > 0:
+    present = np.isfinite(nees)
+    present = present[present.any(axis=1)]
+    if runs >= FEW and counts[0] > 1 and ratio > 0 and (present == present[0]).all():
         if whitened is not None:
             w = np.where(np.isfinite(nees)[..., None], whitened, 0.0)[np.isfinite(nees).any(axis=1)]
             log_nu, left_out = _log_nu_of_errors(w, counts * dof, means)
-            floor = 0.0
+            floor, caution = 0.0, 1.0
         else:
             log_nu, left_out = _log_nu_of_means(means)
-            floor = 2.0 / runs
+            floor, caution = 2.0 / runs, 2.0
         log_nu, variance = _at_mean_one(log_nu, left_out, means, floor)
-        if log_nu - np.sqrt(variance) > np.log(dof):
-            nu, spread = float(np.exp(log_nu - np.sqrt(variance))), 2.0 / variance
+        log_nu = min(log_nu - caution * np.sqrt(variance), float(np.log(dof * counts[0])))
+        if log_nu > np.log(dof):
+            nu, spread = float(np.exp(log_nu)), 2.0 / variance
     above, below = _tails(ratio, runs * nu, spread)
     return MeanTest(ratio, nu, spread, above, below)
 
@@ -135,7 +141,7 @@ def _log_nu_of_means(means: Array) -> tuple[float, Array]:
     """log(2 / CV^2) of the runs' means (runs,), less its first-order bias, and the same with each run left out."""
     runs, mean, left = len(means), means.mean(), _left_out_mean(means)
     squares = np.square(means).sum()
-    cv = means.var(ddof=1) / mean**2
+    cv = max(means.var(ddof=1) / mean**2, 1e-12)
     variance = (squares - np.square(means) - (runs - 1) * left**2) / max(runs - 2, 1)
     smallest = 1e-12 * mean**2
     return float(np.log(2.0 / cv) - np.log1p(cv / runs)), np.log(2.0 * left**2 / np.maximum(variance, smallest))
@@ -151,13 +157,14 @@ def _jackknife(a: Array, b: Array) -> float:
 
 
 def _at_mean_one(log_nu: float, left_out: Array, means: Array, floor: float) -> tuple[float, float]:
-    """log nu moved to where it would be at a mean of 1, and the variance that is left."""
+    """log nu moved to where it would be at a mean of 1, up by one standard error at most; the variance that is left."""
     log_mean = np.log(_left_out_mean(means))
     of_mean, both = _jackknife(log_mean, log_mean), _jackknife(left_out, log_mean)
     slope = both / of_mean if of_mean > 0 else 0.0
-    reach = 2.0 * np.sqrt(of_mean)  # no farther than chance carries the mean
+    reach = REACH * np.sqrt(of_mean)  # no farther than chance carries the mean
     variance = max(_jackknife(left_out, left_out) - slope * both, floor, 1e-9)
-    return log_nu - slope * float(np.clip(np.log(means.mean()), -reach, reach)), variance
+    shift = -slope * float(np.clip(np.log(means.mean()), -reach, reach))
+    return log_nu + min(shift, abs(slope) * np.sqrt(of_mean)), variance
 
 
 def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from consistency.diagnostics.planning import gate_runs
 from consistency.types import Verdict
 
-FIRST = 12  # runs at the first look at least: the fewest for which the tests estimate what they need
+FIRST = 12  # runs at the first look at least; with fewer hardly anything but a failed run would be found
 
 
 @dataclass(frozen=True)

@@ -32,12 +32,12 @@ def sphericity(whitened: Array) -> tuple[Array, Array]:
 
     (runs, steps, n) -> statistic and p value, (steps,) each; the mean and the scale may be anything. Box's
     second-order expansion of the null distribution (Anderson 2003, sec. 10.7.4). NaN where fewer than
-    2 n + 2 runs are left, or n is 1.
+    4 n runs are left, or n is 1.
     """
     N, _, S = moments(whitened)
     n = whitened.shape[-1]
     statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
-    good = 2 * n + 2 <= N
+    good = (4 * n <= N) & (np.trace(S, axis1=-2, axis2=-1) > 0)
     if n == 1 or not good.any():
         return statistic, p_value
     m = N[good] - 1.0
@@ -71,7 +71,7 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
     trace = float(np.trace(mean))
     scaled = mean * n / trace if trace > 0 else mean
     size = n * (n - 1) // 2
-    if n == 1 or len(M) < 3 * size + 3:
+    if n == 1 or len(M) < 3 * size + 3 or not trace > 0:
         return scaled, float("nan")
     i, j = np.triu_indices(n, 1)
     return scaled, hotelling(M[:, i, j]).p_value

@@ -15,12 +15,12 @@ from consistency.diagnostics.credibility import noncredibility
 from consistency.diagnostics.distribution import pit
 from consistency.diagnostics.innovations import nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.diagnostics.location import INTERVAL, locate, locate_axes, subset
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.outliers import outliers
 from consistency.diagnostics.planning import detectable_ratio
 from consistency.diagnostics.questions import MAIN, SHARES, Answer, answers
 from consistency.diagnostics.scale import (
-    Band,
     MeanTest,
     acceptance,
     mean_test,
@@ -29,11 +29,10 @@ from consistency.diagnostics.scale import (
     simultaneous_band,
 )  # fmt: skip
 from consistency.diagnostics.shape import mean_shape, sphericity
-from consistency.diagnostics.whitening import standardise, whiten
+from consistency.diagnostics.whitening import whiten
 from consistency.types import Array, Failure, Indices, Verdict
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
-INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
 
 
 def judge(
@@ -86,23 +85,23 @@ def judge(
         raise ValueError(f"allow must be 'conservative' or None, got '{allow}'")
     if not 0.0 < false_alarm < 1.0:
         raise ValueError(f"false_alarm must lie between 0 and 1, got {false_alarm}")
-    if nees is None and error is None and nis is None:
-        raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
-    first = next(array for array in (nis, nees, error) if array is not None)
+    if nis is None and innovations is not None and innovation_covariances is not None:
+        u = whiten(innovations, innovation_covariances)
+        nis, nis_dof = np.square(u).sum(axis=-1), np.where(np.isfinite(u[..., 0]), u.shape[-1], 0)
+    runs, steps = _shape_of(error, covariance, nees, nis, nis_dof)
     s: dict[str, Any] = {
-        "runs": len(first), "steps": first.shape[1], "false_alarm": false_alarm, "confidence": 1.0 - false_alarm,
+        "runs": runs, "steps": steps, "false_alarm": false_alarm, "confidence": 1.0 - false_alarm,
         "allow": allow, "failures": [[f.run, f.step, f.reason] for f in failures],
     }  # fmt: skip
     p_values: dict[str, float] = {}
     if nis is not None and nis_dof is not None:
         p_values |= _innovations(s, nis, nis_dof, allow, innovations, innovation_covariances)
-    elif innovations is not None and innovation_covariances is not None and allow is None:
-        p_values["innovation whiteness"] = _white(s, whiteness(innovations, innovation_covariances))
     whitened = None
     if error is not None and covariance is not None:
         whitened = whiten(error, covariance)
         counted = np.asarray(np.isfinite(nees) if nees is not None else np.isfinite(whitened).all(axis=-1))
         nees = np.where(counted, np.square(whitened).sum(axis=-1), np.nan)
+        s["impossible"] = _impossible(error, covariance, counted)
         whitened = np.where(counted[..., None], whitened, np.nan)
         dof = error.shape[-1]
         p_values |= _errors(s, error, covariance, nees, whitened, allow, axes, subsets)
@@ -114,17 +113,39 @@ def judge(
             raise ValueError("nees needs dof, the dimension of the error")
         p_values |= _nees(s, nees, dof, whitened, allow)
         band = simultaneous_band(nees, dof, _share(p_values, "scale in some step") * false_alarm, method, allow)
-        if nees.shape[1] > 1:
+        if nees.shape[1] > 1 and s["judged_steps"] > 0:
             p_values["scale in some step"] = band.p_value
     found = answers(p_values, false_alarm)
     s["answers"] = [asdict(answer) for answer in found.values()]
     s["p_value"] = min((min(1.0, a.p_value / a.share) for a in found.values()), default=float("nan"))
     if nees is not None and dof is not None and band is not None:
-        _locate(s, nees, dof, band, found, error, covariance)
+        step = found.get("scale in some step")
+        if step is not None and step.found and not band.outside.any():  # found by what Holm's correction left over
+            band = simultaneous_band(nees, dof, np.nextafter(step.p_value, 1.0) * (1 + 1e-6), method, allow)
+        locate(s, nees, dof, band, found)
+        if error is not None and covariance is not None and whitened is not None:
+            locate_axes(s, nees, error, covariance, whitened, found)
     status = _status(s, found)
-    if failures and (status == "consistent" or s.get("judged_steps") == 0):
+    if (failures or s.get("impossible")) and (status == "consistent" or s.get("judged_steps") == 0):
         status = "failed"
     return Verdict(name, status, tuple(wording.reasons(status, s)), s)
+
+
+def _shape_of(*arrays: Array | None) -> tuple[int, int]:
+    """Runs and steps that all arrays agree on; ``arrays`` are error, covariance, nees, nis and nis_dof."""
+    if all(array is None for array in (arrays[0], *arrays[2:])):
+        raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
+    names = {"error": 3, "covariance": 4, "nees": 2, "nis": 2, "nis_dof": 2}
+    shapes = {n: np.shape(a) for n, a in zip(names, arrays, strict=True) if a is not None}
+    for name, shape in shapes.items():
+        if len(shape) != names[name]:
+            raise ValueError(f"{name} must be (runs, steps{', n' * (names[name] - 2)}), got shape {shape}")
+    if len({shape[:2] for shape in shapes.values()}) > 1:
+        raise ValueError(f"runs and steps differ: {', '.join(f'{n} {shape}' for n, shape in shapes.items())}")
+    if "error" in shapes and "covariance" in shapes and shapes["covariance"][2:] != shapes["error"][2:] * 2:
+        raise ValueError(f"error {shapes['error']} and covariance {shapes['covariance']} do not fit")
+    runs, steps = next(iter(shapes.values()))[:2]
+    return int(runs), int(steps)
 
 
 # --- what is asked ---------------------------------------------------------------------------------
@@ -168,19 +189,20 @@ def _errors(
     error = np.where(counted[..., None], error, np.nan)
     groups = _groups(names, subsets)
     tests = {key: _subset_test(error, covariance, nees, whitened, index) for key, index in groups.items()}
-    worst = min(((t.above if allow else t.p_value) for t in tests.values()), default=1.0)
+    worst = float(np.min([t.above if allow else t.p_value for t in tests.values()], initial=1.0))
     mean, total = np.nanmean, counted.any(axis=1)
     of_runs = mean(whitened[total], axis=1) if total.any() else np.empty((0, n))
     enough = len(of_runs) > n
     _, bias_steps = t_squared(whitened)
     asked_steps = np.isfinite(bias_steps)
     p = {
-        "scale of an axis": min(1.0, worst * len(tests)) if n > 1 else float("nan"),
+        "scale of an axis": float(np.minimum(1.0, worst * len(tests))) if n > 1 else float("nan"),
         "bias": hotelling(of_runs).p_value if enough else float("nan"),
     }
     several = nees.shape[1] > 1
     if several and asked_steps.any():
         p["bias in some step"] = min(1.0, float(np.nanmin(bias_steps)) * int(asked_steps.sum()))
+        s["bias_step"] = int(np.nanargmin(bias_steps)) + 1
     odd = outliers(whitened)
     p["outliers"] = odd.p_value
     if allow is None:
@@ -189,6 +211,7 @@ def _errors(
         s["shape"] = scaled
         asked = int(np.isfinite(shape_steps).sum())
         at_step = min(1.0, float(np.nanmin(shape_steps)) * asked) if asked else float("nan")
+        s["shape_step"] = int(np.nanargmin(shape_steps)) + 1 if asked else None
         p |= {"shape": shape, "shape in some step": at_step} if several else {"shape": at_step}
     index, inclination = noncredibility(error, nees)
     inside, interval = coverage_interval(error, covariance)
@@ -211,6 +234,15 @@ def _errors(
     return p
 
 
+def _impossible(error: Array, covariance: Array, counted: Array) -> list[list[int]]:
+    """[row, step] of what no filter may say: an infinite error, or a covariance with a negative variance."""
+    odd = np.asarray(np.isinf(error).any(axis=-1) | np.isinf(covariance).any(axis=(-2, -1)))
+    suspect = ~counted & ~odd & np.isfinite(covariance).all(axis=(-2, -1))
+    P = covariance[suspect]
+    odd[suspect] = np.linalg.eigvalsh(P)[:, 0] < -1e-9 * np.abs(P).max(axis=(-2, -1)) if len(P) else False
+    return [[int(row), int(step) + 1] for row, step in np.argwhere(odd)]
+
+
 def _finite_any(covariance: Array, error: Array, counted: Array) -> Array:
     """Steps in which a run has an estimate whose covariance could not be used."""
     there = np.isfinite(covariance).all(axis=(-2, -1))
@@ -231,15 +263,8 @@ def _groups(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None)
     return groups
 
 
-def _subset(error: Array, covariance: Array, index: list[int]) -> Array:
-    """Whitened errors of a group of components, (runs, steps, len(index))."""
-    if len(index) == 1:
-        return np.asarray(standardise(error, covariance)[..., index])
-    return whiten(error[..., index], covariance[..., index, :][..., index])
-
-
 def _subset_test(error: Array, covariance: Array, nees: Array, whitened: Array, index: list[int]) -> MeanTest:
-    w = _subset(error, covariance, index)
+    w = subset(error, covariance, index)
     return mean_test(np.where(np.isfinite(nees), np.square(w).sum(axis=-1), np.nan), len(index), w)
 
 
@@ -287,70 +312,6 @@ def _share(p_values: Mapping[str, float], question: str) -> float:
     return answers(dict.fromkeys([q for q, p in p_values.items() if np.isfinite(p)] + [question], 1.0), 0.5)[
         question
     ].share
-
-
-# --- what is found ---------------------------------------------------------------------------------
-
-
-def _locate(
-    s: dict[str, Any],
-    nees: Array,
-    dof: int,
-    band: Band,
-    found: Mapping[str, Answer],
-    error: Array | None,
-    covariance: Array | None,
-) -> None:
-    """Since when, by how much and where: nothing here decides, the answers have."""
-    above, below = band.above, band.below
-    s |= {
-        "simultaneous": np.stack([band.low, band.high], axis=-1),
-        "steps_above": int(above.sum()),
-        "steps_below": int(below.sum()),
-        "first_outside": int(np.argmax(band.outside)) + 1 if band.outside.any() else None,
-        "first_step": None,
-        "since": None,
-        "subset": None,
-    }
-    in_steps = "scale in some step" in found and found["scale in some step"].found
-    late = slice(None)
-    if in_steps and band.outside.any():
-        first = int(np.argmax(band.outside))
-        s["first_step"] = first + 1
-        high = bool(above[first])
-        pointwise = s["anees"] > s["band"][:, 1] if high else s["anees"] < s["band"][:, 0]
-        if pointwise[first:][np.isfinite(s["anees"][first:])].mean() > 0.5:
-            s["since"], late = first + 1, slice(first, None)
-    means, counts = run_means(nees[:, late])
-    if s["since"] is not None:
-        ratio, low, high_end = ratio_interval(means[counts > 0] / dof, INTERVAL)
-        s["ratio"], s["ratio_interval"] = ratio, (low, high_end)
-    if error is None or covariance is None:
-        return
-    groups = s["groups"]
-    confidence = 1.0 - (1.0 - INTERVAL) / len(groups)
-    counted = np.isfinite(nees[:, late])
-    s["of_axes"], standard = {}, standardise(error[:, late], covariance[:, late])
-    for key, index in groups.items():
-        w = standard[..., index] if len(index) == 1 else _subset(error[:, late], covariance[:, late], index)
-        of_runs, count = run_means(np.where(counted, np.square(w).sum(axis=-1), np.nan))
-        s["of_axes"][key] = ratio_interval(of_runs[count > 0] / len(index), confidence)
-    standard = np.where(counted[..., None], standard, np.nan)
-    rows = counted.any(axis=1)
-    if rows.sum() > dof:
-        test = hotelling(np.nanmean(standard[rows], axis=1))
-        s["bias"] = {axis: (test.mean[i], *test.interval[i]) for i, axis in enumerate(s["axes"])}
-    s["subset"] = _main_axes(s)
-
-
-def _main_axes(s: dict[str, Any]) -> str | None:
-    """The axes that carry the fault; None where no axis stands out or all do."""
-    wrong = {a: s["of_axes"][a] for a in s["axes"] if not s["of_axes"][a][1] <= 1.0 <= s["of_axes"][a][2]}
-    if not wrong:
-        return None
-    largest = max(abs(np.log(max(ratio, 1e-300))) for ratio, _, _ in wrong.values())
-    chief = [a for a, (ratio, _, _) in wrong.items() if abs(np.log(max(ratio, 1e-300))) > 0.5 * largest]
-    return None if len(chief) == len(s["axes"]) else ", ".join(chief)
 
 
 def _status(s: dict[str, Any], found: Mapping[str, Answer]) -> str:

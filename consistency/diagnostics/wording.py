@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from consistency.diagnostics.coverage import TWO_SIGMA
-from consistency.diagnostics.questions import ABOUT, MAIN
+from consistency.diagnostics.questions import ABOUT, BIAS, MAIN, SCALE, SHAPE
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
+NOTABLE = 0.3  # difference of correlations that stands out in one step
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
-SCALE = (MAIN, "scale in some step", "scale of an axis")
-BIAS = ("bias", "bias in some step")
-SHAPE = ("shape", "shape in some step")
 
 
 def reasons(status: str, s: Mapping[str, Any]) -> list[str]:
@@ -24,7 +22,14 @@ def reasons(status: str, s: Mapping[str, Any]) -> list[str]:
     if s["failures"]:
         (run, step, why), count = s["failures"][0], len({f[0] for f in s["failures"]})
         lines.append(f"{count} of {s['runs']} runs failed, first run {run} in step {step}: {why}")
-    if not s["answers"]:
+    if s.get("impossible"):
+        row, step = s["impossible"][0]
+        count = len({r for r, _ in s["impossible"]})
+        lines.append(
+            f"{count} of {s['runs']} runs have an infinite error or a covariance with a negative variance, first run "
+            f"{row} in step {step}; those steps are left out"
+        )
+    if not s["answers"] or s.get("judged_steps") == 0:
         if "anees" in s:
             lines.append("no step has a covariance of full rank to judge")
         else:
@@ -45,7 +50,15 @@ def reasons(status: str, s: Mapping[str, Any]) -> list[str]:
 
 def short(value: float) -> str:
     """Three digits, as a person says them."""
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+    return (
+        f"{value:.1e}"
+        if value >= 1e4
+        else f"{value:.0f}"
+        if value >= 100
+        else f"{value:.1f}"
+        if value >= 10
+        else f"{value:.2f}"
+    )
 
 
 def factor(ratio: float, low: float, high: float) -> str:
@@ -64,25 +77,26 @@ def _sentence(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     if not found:
         return f"no fault found; {_runs(s)} would show a covariance too small by x{s['detectable']:.2g} with power 0.95"
     parts = []
-    if any(q in found for q in SCALE):
-        parts.append(_scale(s, found))
     if any(q in found for q in BIAS):
         parts.append(_bias(s, "bias" not in found))
-    elif any(a["question"] in BIAS for a in s["answers"]):
-        parts.append("no bias found")
+    if any(q in found for q in SCALE):
+        parts.append(_scale(s, found))
     if any(q in found for q in SHAPE):
-        parts.append(_shape(s))
+        parts.append(_shape(s, found))
     if "outliers" in found:
         o = s["outlier"]
-        parts.append(
-            f"heavy tails: run {o['run']} lies {short(o['distance'])} sigma from the other runs in step {o['step']}"
-        )
+        text = f"heavy tails: run {o['run']} lies {short(o['distance'])} sigma from the other runs in step {o['step']}"
+        low, high = s["ratio_interval"]
+        parts.insert(0 if low <= 1.0 <= high or not high < UNCERTAIN * low else len(parts), text)
     if "distribution" in found and len(found) == 1:
         parts.append("the NEES does not follow the chi-square distribution")
     if "innovation scale" in found:
         parts.append(f"innovations {'larger' if s['nis_ratio'] > 1 else 'smaller'} than stated")
     if "innovation whiteness" in found:
         parts.append("innovations correlated over steps")
+    asked = {a["question"] for a in s["answers"]}
+    if any(q in found for q in SCALE) and asked & set(BIAS) and not set(found) & set(BIAS):
+        parts.append("no bias found")
     return "; ".join(parts)
 
 
@@ -93,13 +107,14 @@ def _scale(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
         sure = {a: i for a, i in sure.items() if a in s["axes"]} or sure
         wrong = [f"{a} {_side(i[0])} by {factor(*i)}" for a, i in sure.items()]
         return f"covariance of {', '.join(wrong) if wrong else 'an axis'}" + ("" if wrong else " wrong")
-    if s["since"] is None and MAIN not in found:
+    if not s["lasting"] and MAIN not in found:
         count = s["steps_above"] + s["steps_below"]
         side = "too small" if s["steps_above"] else "too large"
         return f"covariance {side} in {count} of {s['judged_steps']} steps, first in step {s['first_step']}"
     text = f"covariance {_side(ratio)} by {factor(ratio, low, high)}"
     if not high < UNCERTAIN * low:
-        text = f"covariance {_side(ratio)} by x{short(max(ratio, 1 / ratio))} in the mean, which a few runs make"
+        size = short(max(ratio, 1.0 / max(ratio, 1e-300)))
+        text = f"covariance {_side(ratio)} by x{size} in the mean, which a few runs make"
     elif low <= 1.0 <= high:
         text += ", an interval that holds 1: the runs differ more than Gaussian errors would"
     if s.get("subset"):
@@ -112,21 +127,21 @@ def _side(ratio: float) -> str:
 
 
 def _bias(s: Mapping[str, Any], in_steps: bool) -> str:
+    if in_steps:
+        return f"biased in step {s['bias_step']}, mainly {s['bias_axis']}"
     sure = [f"{a} {m:+.2f} sigma [{lo:+.2f}, {hi:+.2f}]" for a, (m, lo, hi) in s["bias"].items() if not lo <= 0 <= hi]
-    if sure and not in_steps:
-        return f"biased: {', '.join(sure)}"
-    return "biased in some steps" if in_steps else "biased in a combination of axes"
+    ratio, low, high = s["ratio_without_bias"]
+    rest = f"; without the bias the covariance ratio is {short(ratio)} [{short(low)}, {short(high)}]"
+    return f"biased: {', '.join(sure) if sure else 'in a combination of axes'}{rest}"
 
 
-def _shape(s: Mapping[str, Any]) -> str:
-    C = np.asarray(s["shape"])
-    d = np.sqrt(np.maximum(np.diag(C), 1e-300))
-    R = C / np.outer(d, d) - np.eye(len(C))
-    i, j = np.unravel_index(np.abs(R).argmax(), R.shape)
-    text = "covariance of the wrong shape"
-    if abs(R[i, j]) > np.abs(np.log(np.diag(C))).max() / 2:
-        a, b = sorted((int(i), int(j)))
-        return f"{text}: {s['axes'][a]} and {s['axes'][b]} correlate otherwise than stated"
+def _shape(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+    where = "" if "shape" in found else f" in step {s['shape_step']}"
+    text = f"covariance of the wrong shape{where}"
+    i, j, actual, stated = s["correlation"]
+    if "shape" in found or abs(actual - stated) > NOTABLE:
+        a, b = s["axes"][i], s["axes"][j]
+        return f"{text}: {a} and {b} are correlated {actual:+.2f}, stated {stated:+.2f}"
     return f"{text}: axes are wrong by different factors"
 
 

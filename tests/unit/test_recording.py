@@ -22,8 +22,8 @@ import consistency as cs
 from consistency.cli import main
 from consistency.diagnostics import nees
 from consistency.errors import InputError
+from consistency.judge import analyse_recordings
 from consistency.recording import (
-    analyse_recordings,
     planar_error,
     read_recordings,
     se2_log,

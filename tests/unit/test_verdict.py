@@ -28,7 +28,9 @@ class Case:
     nis: Array
     nis_dof: Array
 
-    def verdict(self, failures: tuple[Failure, ...] = (), false_alarm: float = FALSE_ALARM, **options: Any) -> cs.Verdict:
+    def verdict(
+        self, failures: tuple[Failure, ...] = (), false_alarm: float = FALSE_ALARM, **options: Any
+    ) -> cs.Verdict:
         return judge(
             "f", self.error, self.covariance, self.nees, self.nis, self.nis_dof, failures, false_alarm, **options
         )

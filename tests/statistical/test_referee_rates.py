@@ -19,12 +19,12 @@ from consistency.diagnostics import judge, mean_shape, mean_test, nis_whiteness,
 from consistency.types import Array
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-import calibration  # noqa: E402
+import calibration
 
 pytestmark = pytest.mark.slow
 
 SURE = 1 - 1e-5
-GATES, POWER_GATES = 300, 60
+GATES, POWER_GATES = 200, 60
 DOF = 3
 
 
@@ -41,11 +41,12 @@ def rows() -> list[dict[str, Any]]:
     print(f"seed {seed}")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibration, "SEED", seed)
+        patch.setattr(calibration, "RATIOS", (2.0, 0.67))  # the plans of few runs: the others cost a hundred times that
         return list(calibration.main(gates=GATES, power_gates=POWER_GATES)["rows"])
 
 
 def test_rates_and_power_are_as_stated(rows: list[dict[str, Any]]) -> None:
-    """300 gates see a false-alarm rate of 5 % that is really 14 % with 97 %; 60 gates a power of 0.93 that is 0.66."""
+    """Seen with 9 in 10: a rate of 5 % that is really 16 % (200 gates), a power of 0.93 that is really 0.65 (60)."""
     broken = [row for row in rows if not calibration.promises_kept(row, SURE)]
     assert not broken
     assert {row["world"] for row in rows} == set(calibration.WORLDS)
@@ -55,7 +56,7 @@ def test_a_broken_promise_is_seen(rows: list[dict[str, Any]]) -> None:
     """Negative control of the rule above."""
     alarms = next(row for row in rows if row["ratio"] == 1.0 and row["looks"] == 1)
     power = next(row for row in rows if row["ratio"] != 1.0)
-    assert not calibration.promises_kept(alarms | {"found": round(0.15 * GATES)}, SURE)
+    assert not calibration.promises_kept(alarms | {"found": round(0.2 * GATES)}, SURE)
     assert not calibration.promises_kept(power | {"found": round(0.65 * POWER_GATES)}, SURE)
 
 
@@ -110,8 +111,8 @@ WORLDS = [constant_axis, nearly_constant, independent, few_runs, one_run_of_one_
 def test_no_question_alarms_more_often_than_it_may(
     fresh: np.random.Generator, world: Callable[[np.random.Generator], Array]
 ) -> None:
-    """1,500 draws at the level that a verdict at 5 % gives the mean, and at a tenth of it."""
-    draws = 1500
+    """1,000 draws at the level that a verdict at 5 % gives the mean, and at a tenth of it."""
+    draws = 1000
     p: dict[str, list[float]] = {"errors": [], "nees alone": [], "band": [], "shape": []}
     for _ in range(draws):
         w = world(fresh)
@@ -142,5 +143,7 @@ def test_whole_verdicts_alarm_no_more_than_stated(
     alarms = 0
     for _ in range(200):
         w = world(fresh)
-        alarms += not judge("f", w, np.broadcast_to(np.eye(DOF), (*w.shape, DOF)), false_alarm=0.1, **options).consistent
+        alarms += not judge(
+            "f", w, np.broadcast_to(np.eye(DOF), (*w.shape, DOF)), false_alarm=0.1, **options
+        ).consistent
     assert alarms <= stats.binom.ppf(SURE, 200, 0.1)

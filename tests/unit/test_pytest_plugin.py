@@ -51,7 +51,9 @@ def gate(values, **options):
 def session(pytester: pytest.Pytester) -> pytest.Pytester:
     """A folder with a module of samples; plugins of the outer session that inner ones do not need are off."""
     pytester.makepyfile(samples=SAMPLES)
-    pytester.makeini("[pytest]\naddopts = --strict-markers -p no:cacheprovider\nfilterwarnings = error")
+    # in this process modules of the distribution may be loaded before the inner session looks at them
+    filters = "error\n    ignore:Module already imported so cannot be rewritten"
+    pytester.makeini(f"[pytest]\naddopts = --strict-markers -p no:cacheprovider\nfilterwarnings =\n    {filters}")
     return pytester
 
 

@@ -105,6 +105,20 @@ def promises_kept(row: dict[str, Any], confidence: float = 0.99) -> bool:
     return bool(found >= stats.binom.ppf(1 - confidence, gates, row["power"] - 0.02))
 
 
+def markdown(table: dict[str, Any]) -> str:
+    """The table as docs/referee.md has it."""
+    lines = ["| world | runs | looks | stated | measured | gates |", "| --- | --- | --- | --- | --- | --- |"]
+    for row in table["rows"]:
+        rate = f"{100 * row['found'] / row['gates']:.1f} %"
+        if row["ratio"] == 1.0:
+            stated = f"false alarm {100 * row['false_alarm']:g} %"
+        else:
+            stated = f"x{row['ratio']:g} found with {100 * row['power']:g} %"
+        looks = "1" if row["looks"] == 1 else f"{row['looks']}, {row['mean_runs']:.0f} runs on average"
+        lines.append(f"| {row['world']} | {row['runs']} | {looks} | {stated} | {rate} | {row['gates']} |")
+    return "\n".join(lines)
+
+
 def _row(pool: ProcessPoolExecutor, case: Case, gates: int, kalman: Any) -> dict[str, Any]:
     runs = case.looks[-1]
     rng = np.random.default_rng((SEED, 1 if case.ratio == 1.0 else 2, len(case.looks)))

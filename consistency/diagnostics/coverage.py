@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from consistency.diagnostics.whitening import spread_steps
 from consistency.types import Array
@@ -50,5 +50,7 @@ def coverage_interval(
     if not len(rows):
         n = error.shape[-1]
         return np.full(n, np.nan), np.tile([0.0, 1.0], (n, 1))
-    intervals = [stats.binomtest(int(k), len(rows)).proportion_ci(confidence, "exact") for k in inside]
-    return inside / len(rows), np.array([[i.low, i.high] for i in intervals])
+    N, tail = len(rows), 0.5 * (1.0 - confidence)
+    low = np.where(inside > 0, special.betaincinv(np.maximum(inside, 1), N - inside + 1, tail), 0.0)
+    high = np.where(inside < N, special.betaincinv(inside + 1, np.maximum(N - inside, 1), 1.0 - tail), 1.0)
+    return inside / N, np.stack([low, high], axis=-1)

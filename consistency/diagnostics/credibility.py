@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.diagnostics.nees import nees as squared
+from consistency.diagnostics.whitening import whiten
 from consistency.types import Array
 
 
@@ -39,7 +39,7 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
     good &= np.linalg.cond(np.where(good[:, None, None], correlation, np.eye(n))) < 1e12
     if not good.any():
         return index, inclination
-    actual = squared(e[:, good] / unit[good], correlation[good])
+    actual = np.square(whiten(e[:, good] / unit[good], correlation[good])).sum(axis=-1)
     here = present[:, good]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(here, 10.0 * np.log10(np.where(here, nees[:, good], 1.0) / np.where(here, actual, 1.0)), 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy import stats
@@ -41,4 +42,9 @@ def pit(nees: Array, dof: int, false_alarm: float = 0.05) -> Pit:
         return Pit(u, float("nan"), float("nan"), float("nan"))
     grid = np.arange(N + 1) / N
     distance = float(max((grid[1:] - u).max(), (u - grid[:-1]).max()))
-    return Pit(u, float(stats.kstwo.isf(false_alarm, N)), distance, float(stats.kstwo.sf(distance, N)))
+    return Pit(u, _half_width(false_alarm, N), distance, float(stats.kstwo.sf(distance, N)))
+
+
+@lru_cache
+def _half_width(false_alarm: float, N: int) -> float:
+    return float(stats.kstwo.isf(false_alarm, N))

@@ -171,10 +171,11 @@ def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
     """Upper and lower p value of ``ratio`` = chi-square(k) / k, widened from normal to Student's t."""
     if not np.isfinite(k):
         return float(ratio <= 1.0), float(ratio >= 1.0)
-    upper, lower = float(stats.chi2.sf(k * ratio, k)), float(stats.chi2.cdf(k * ratio, k))
+    upper, lower = special.chdtrc(k, k * ratio), special.chdtr(k, k * ratio)
     if not np.isfinite(spread):
-        return upper, lower
-    return tuple(float(stats.t.sf(stats.norm.isf(p), spread)) for p in (upper, lower))  # type: ignore[return-value]
+        return float(upper), float(lower)
+    above, below = (special.stdtr(spread, float(special.ndtri(p))) for p in (upper, lower))
+    return float(above), float(below)
 
 
 # --- every step ------------------------------------------------------------------------------------

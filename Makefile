@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: reproduce test test-all lint format clean
+.PHONY: reproduce test test-all bench lint format clean
 
 .venv/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -16,6 +16,9 @@ test: .venv/.done
 
 test-all: .venv/.done
 	$(BIN)/python -m pytest -n 2
+
+bench: .venv/.done
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python experiments/bench.py
 
 lint: .venv/.done
 	$(BIN)/ruff check .

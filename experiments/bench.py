@@ -199,7 +199,8 @@ def program(effort: Effort) -> Iterator[Row]:
 def memory(effort: Effort, full: bool = False) -> Iterator[Row]:
     """Peak of a process that runs, gathers and writes; extrapolated unless ``full``."""
     points = whole.memory((effort.full_runs,) if full else effort.memory_runs)
-    peak = whole.extrapolated(points, effort.full_runs) / 1024
+    mib = whole.extrapolated(points, effort.full_runs)
+    peak = None if mib is None else mib / 1024
     how = "measured" if full else "extrapolated from"
     note = f"{how} " + ", ".join(f"{p['runs']:.0f} runs: {p['peak_mib']:.0f} MiB" for p in points)
     what = f"peak memory, {effort.full_runs} runs x 500 steps x 2 filters"

@@ -105,8 +105,19 @@ def child(runs: int, steps: int) -> dict[str, float]:
         results = cs.run_trials(world, FILTERS, runs)
         results.write(Path(scratch) / "out")
         size = (Path(scratch) / "out" / "estimates.parquet").stat().st_size
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (MIB if sys.platform == "darwin" else 1024.0)
-    return {"runs": runs, "peak_mib": peak, "rows": len(results.estimates), "bytes": size}
+    return {"runs": runs, "peak_mib": peak_mib(), "rows": len(results.estimates), "bytes": size}
+
+
+def peak_mib() -> float:
+    """Peak resident memory of this process.
+
+    Linux starts ``ru_maxrss`` at what the parent had when it forked, and the bench has more than its children.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        kib = next(line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return float(kib) / 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (MIB if sys.platform == "darwin" else 1024.0)
 
 
 def memory(runs: tuple[int, ...], steps: int = 500) -> list[dict[str, float]]:
@@ -114,11 +125,13 @@ def memory(runs: tuple[int, ...], steps: int = 500) -> list[dict[str, float]]:
     return [json.loads(_process([__file__, str(count), str(steps)])) for count in runs]
 
 
-def extrapolated(points: list[dict[str, float]], runs: int) -> float:
-    """Peak in MiB at ``runs`` runs, on the line through the first and the last point."""
+def extrapolated(points: list[dict[str, float]], runs: int) -> float | None:
+    """Peak in MiB at ``runs`` runs, on the line through the first and the last point; None if it does not rise."""
     a, b = points[0], points[-1]
-    if a["runs"] == b["runs"]:
+    if b["runs"] == runs:
         return b["peak_mib"]
+    if b["peak_mib"] <= a["peak_mib"]:
+        return None
     return a["peak_mib"] + (b["peak_mib"] - a["peak_mib"]) / (b["runs"] - a["runs"]) * (runs - a["runs"])
 
 

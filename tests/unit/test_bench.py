@@ -21,6 +21,7 @@ import bench_whole as whole
 from bench_peers import WARM, FilterpyEkf, FilterpyUkf, stone_soup
 from bench_trials import Case, Unequal, growing, grown, interleaved, require_equal, steady
 
+EXPERIMENTS = Path(bench.__file__).parent
 TINY = bench.Effort(
     repeats=1,
     steps=12,
@@ -166,7 +167,16 @@ def test_the_clock_takes_time_and_goes_away() -> None:
 def test_memory_lies_on_a_line() -> None:
     points = [{"runs": 100, "peak_mib": 300.0}, {"runs": 200, "peak_mib": 350.0}]
     assert whole.extrapolated(points, 1000) == pytest.approx(750.0)
-    assert whole.extrapolated(points[1:], 200) == 350.0
+    assert whole.extrapolated(points[1:], 200) == 350.0, "measured"
+    assert whole.extrapolated([*points, {"runs": 300, "peak_mib": 300.0}], 1000) is None, "no rise, no line"
+
+
+def test_peak_memory_is_the_childs_own() -> None:
+    """Not the parent's, which the bench has made large before."""
+    large = np.ones(100_000_000)  # 800 MB
+    code = f"import sys; sys.path.insert(0, {str(EXPERIMENTS)!r}); import bench_whole; print(bench_whole.peak_mib())"
+    assert float(whole._process(["-c", code])) < 700.0 < large.nbytes / 2**20
+    assert whole.peak_mib() > 700.0
 
 
 def test_a_process_that_breaks_is_no_measurement() -> None:

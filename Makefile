@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: reproduce calibrate test test-all lint format clean
+.PHONY: reproduce calibrate test test-all bench lint format clean
 
 .venv/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -19,6 +19,9 @@ test-all: .venv/.done
 
 calibrate: .venv/.done
 	$(BIN)/python experiments/calibration.py 2000 reports/reference/calibration.json
+
+bench: .venv/.done
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python experiments/bench.py
 
 lint: .venv/.done
 	$(BIN)/ruff check .

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import joblib
+import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
@@ -117,7 +119,10 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
 
 
 def _one(trial: Trial, filters: list[Filter], belief: Belief, timeout: float | None) -> Outcome:
-    return trial, [run_filter(f, trial, belief, timeout) for f in filters]
+    estimates = [run_filter(f, trial, belief, timeout) for f in filters]
+    # the observations are most of a trial, and no table of results needs them
+    none = np.zeros(0, np.int64)
+    return replace(trial, first=np.zeros_like(trial.first), landmark=none, z=np.zeros((0, 3))), estimates
 
 
 def _map(
@@ -171,25 +176,24 @@ def _head(trial: Trial) -> Trial:
 
 
 def _gather(outcomes: list[Outcome], filters: list[Filter], previous: Results | None) -> dict[str, pd.DataFrame]:
-    order = [name_of(f) for f in filters]
+    """Tables in order of the filters, then of the runs, as ``outcomes`` are."""
     tables = {
         "estimates": estimates_table(outcomes),
         "truth": truth_table([trial for trial, _ in outcomes]),
-        "failures": failures_table([e.failure for _, estimates in outcomes for e in estimates if e.failure]),
+        "failures": failures_table(
+            [each.failure for said in zip(*(e for _, e in outcomes), strict=True) for each in said if each.failure]
+        ),
     }
-    if previous is not None:
-        for name, before in (
-            ("estimates", previous.estimates),
-            ("truth", previous.truth),
-            ("failures", previous.failures),
-        ):
-            tables[name] = pd.concat([t for t in (before, tables[name]) if t is not None and len(t)] or [tables[name]])
-    for name in ("estimates", "failures"):
-        table = tables[name]
-        rank = table["filter"].map({n: i for i, n in enumerate(order)})
-        tables[name] = table.assign(_rank=rank).sort_values(["_rank", "run", "step"]).drop(columns="_rank")
-    tables["truth"] = tables["truth"].sort_values(["run", "step"])
-    return {name: table.reset_index(drop=True) for name, table in tables.items()}
+    if previous is None:
+        return tables
+    rank = {name_of(f): i for i, f in enumerate(filters)}
+    for name, before in (("estimates", previous.estimates), ("truth", previous.truth), ("failures", previous.failures)):
+        both = pd.concat([t for t in (before, tables[name]) if t is not None and len(t)] or [tables[name]])
+        if name != "truth":
+            both = both.assign(_rank=both["filter"].map(rank)).sort_values(["_rank", "run", "step"])
+        tables[name] = both.drop(columns="_rank", errors="ignore").reset_index(drop=True)
+    tables["truth"] = tables["truth"].sort_values(["run", "step"], ignore_index=True)
+    return tables
 
 
 def _finish(tables: dict[str, pd.DataFrame], manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import platform
@@ -39,6 +40,10 @@ COLUMNS: dict[str, dict[str, str]] = {
     "failures": {"filter": "str", "run": "int64", "step": "int64", "reason": "str"},
 }  # fmt: skip
 NULLABLE = {"nees", "nis"}
+PACKAGES = (
+    "filter-consistency", "numpy", "scipy", "numba", "filterpy", "pandas", "pyarrow", "joblib", "bokeh", "matplotlib",
+    "typst",
+)  # fmt: skip
 
 
 # --- the manifest --------------------------------------------------------------------------------
@@ -46,36 +51,29 @@ NULLABLE = {"nees", "nis"}
 
 def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
     """Provenance that every output folder of a ``kind`` (results, log, findings) carries."""
-    packages = (
-        "filter-consistency",
-        "numpy",
-        "scipy",
-        "numba",
-        "filterpy",
-        "pandas",
-        "pyarrow",
-        "joblib",
-        "bokeh",
-        "matplotlib",
-        "typst",
-    )
-    versions = {"python": platform.python_version()}
-    for package in packages:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = "not installed"
     wall = fields.pop("wall", None)
     program = Path(sys.argv[0]).name
     return {
         "schema_version": SCHEMA_VERSION,
         "kind": kind,
-        "versions": versions,
+        "versions": dict(_versions()),
         "command": shlex.join(["consistency" if program == "__main__.py" else program, *sys.argv[1:]]),
         "git_commit": _git_commit(),
         "wall_time_s": None if wall is None else round(wall, 3),
         **fields,
     }
+
+
+@functools.cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    """Python and the packages that results depend on; reading them takes milliseconds, so once a process."""
+    found = [("python", platform.python_version())]
+    for package in PACKAGES:
+        try:
+            found.append((package, metadata.version(package)))
+        except metadata.PackageNotFoundError:
+            found.append((package, "not installed"))
+    return tuple(found)
 
 
 def _git_commit() -> str | None:

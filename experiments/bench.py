@@ -1,0 +1,279 @@
+"""How fast is it? Ours against filterpy, Stone Soup, bare BLAS and its own targets, side by side in one run.
+
+``bench.py [--out FILE] [--full] [--only GROUP ...]`` prints a table and writes it as JSON. The ratios are the result:
+seconds are those of one machine, medians of interleaved repetitions on one BLAS thread. docs/bench.md says how to
+read it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import bench_whole as whole
+import numpy as np
+from bench_peers import WARM, FilterpyEkf, FilterpyUkf, Peer, stone_soup
+from bench_trials import LANDMARKS, SEEN, Case, growing, grown, interleaved, require_equal, steady
+from scipy.linalg import blas, lapack
+
+import consistency as cs
+from consistency.filters.stepping import run_filter
+
+NAMES = {"ekf": "ekf-uvd", "ukf": "ukf-uvd"}
+AGAINST_FILTERPY = {"ekf": 25.0, "ukf": 120.0}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table; no target: for information. No value: the note says why."""
+
+    group: str
+    what: str
+    value: float | None
+    unit: str
+    target: float | None = None
+    at_most: bool = False
+    note: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.target is None:
+            return ""
+        if self.value is None or not np.isfinite(self.value):
+            return "missed"
+        return "met" if (self.value <= self.target if self.at_most else self.value >= self.target) else "missed"
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured; the tests take less."""
+
+    repeats: int = 7
+    steps: int = 300  # of the trial that times a step of ours
+    peer_steps: tuple[int, int] = (40, 5)  # of a peer's EKF and UKF
+    landmarks: tuple[int, ...] = (50, 100, 200, 400, 1000)
+    stride: int = 1
+    growth_repeats: int = 3
+    size: tuple[int, int] = (LANDMARKS, SEEN)
+    runs: int = 50
+    run_steps: int = 500
+    memory_runs: tuple[int, ...] = (150, 300)
+    full_runs: int = 10_000
+
+
+# --- steps --------------------------------------------------------------------------------------------
+
+
+def peers(effort: Effort) -> Iterator[Row]:
+    """Whole steps against other people's filters, asserted equal."""
+    case = steady(effort.steps, *effort.size)
+    for kind, steps in zip(NAMES, effort.peer_steps, strict=True):
+        for who, peer in (
+            ("filterpy", (FilterpyEkf if kind == "ekf" else FilterpyUkf)(case, steps)),
+            ("Stone Soup", stone_soup(kind, case, steps)),
+        ):
+            target = AGAINST_FILTERPY[kind] if who == "filterpy" else None
+            what = f"{kind.upper()} step, {effort.size[0]} landmarks, {effort.size[1]} seen: {who} / ours"
+            if isinstance(peer, str):
+                yield Row("peers", what, None, "x", target, note=peer)
+            else:
+                yield _against(what, peer, case, target, effort.repeats)
+        yield _against_adapter(kind, case, WARM + steps, effort.repeats)
+
+
+def _against(what: str, peer: Peer, case: Case, target: float | None, repeats: int) -> Row:
+    gap = require_equal(what, *peer(), case.run(peer.filter), WARM)
+    seconds = interleaved({"peer": peer, "ours": lambda: case.run(peer.filter)}, repeats)
+    theirs, ours = seconds["peer"] / peer.steps, seconds["ours"] / case.trial.steps
+    return Row("peers", what, theirs / ours, "x", target, note=f"{_us(theirs)} / {_us(ours)}, equal to {gap:.0e}")
+
+
+def _against_adapter(kind: str, case: Case, steps: int, repeats: int) -> Row:
+    """filterpy as the package ships it: a new filter object in each operation, and readable models."""
+    head, start, adapter = case.head(steps), case.head(WARM), cs.get_filter(f"filterpy-{NAMES[kind]}")
+    said = run_filter(adapter, head.trial, head.belief)
+    gap = require_equal(adapter.name, said.pose[WARM:], said.covariance[WARM:], case.run(NAMES[kind]), WARM)
+    seconds = interleaved(
+        {
+            "start": lambda: run_filter(adapter, start.trial, start.belief),
+            "peer": lambda: run_filter(adapter, head.trial, head.belief),
+            "ours": lambda: case.run(NAMES[kind]),
+        },
+        max(repeats // 2, 1),
+        warm=False,
+    )
+    theirs, ours = (seconds["peer"] - seconds["start"]) / (steps - WARM), seconds["ours"] / case.trial.steps
+    note = f"{_us(theirs)} / {_us(ours)}, equal to {gap:.0e}"
+    return Row("peers", f"{kind.upper()} step, the same: filter '{adapter.name}' / ours", theirs / ours, "x", note=note)
+
+
+def bare_update(n: int, m: int) -> Callable[[], None]:
+    """dpotrf of S (m, m), dtrsm of A (m, n), dsyrk of P (n, n), in place; S = I leaves A as it is."""
+    S, P = np.eye(m, order="F"), np.eye(n, order="F")
+    A = np.asfortranarray(1e-3 * np.random.default_rng(0).standard_normal((m, n)))
+
+    def update() -> None:
+        lapack.dpotrf(S, lower=1, clean=0, overwrite_a=1)
+        blas.dtrsm(1.0, S, A, lower=1, overwrite_b=1)
+        blas.dsyrk(-1.0, A, beta=1.0, c=P, trans=1, lower=1, overwrite_c=1)
+
+    return update
+
+
+def kernels(effort: Effort) -> Iterator[Row]:
+    """Ours against the bare linear algebra and against each other."""
+    (landmarks, seen), count = effort.size, effort.steps
+    case, blind = steady(count, landmarks, seen), steady(count, landmarks, seen=0)
+    update = bare_update(3 + 3 * landmarks, 3 * seen)
+    s = interleaved(
+        {
+            "ekf": lambda: case.run("ekf-uvd"),
+            "ekf blind": lambda: blind.run("ekf-uvd"),
+            "ukf": lambda: case.run("ukf-uvd"),
+            "bare": lambda: [update() for _ in range(count)],
+        },
+        2 * effort.repeats,
+    )
+    t = {name: seconds / count for name, seconds in s.items()}
+    ours = t["ekf"] - t["ekf blind"]
+    note = f"{_us(ours)} ({seen} seen minus 0 seen: with Jacobians and H P) / {_us(t['bare'])}"
+    yield Row("kernels", "EKF update / bare dpotrf + dtrsm + dsyrk", ours / t["bare"], "x", 1.4, True, note)
+    note = f"{_us(t['ukf'])} / {_us(t['ekf'])}"
+    yield Row("kernels", "UKF step / EKF step", t["ukf"] / t["ekf"], "x", 2.5, True, note)
+
+
+def growth(effort: Effort) -> Iterator[Row]:
+    """How the time of a step grows with the map, on a path that keeps moving."""
+    cases = {str(n): growing(n, effort.stride) for n in effort.landmarks}
+    s = interleaved({n: partial(c.run, "ekf-xyz") for n, c in cases.items()}, effort.growth_repeats, warm=False)
+    step = [s[n] / case.trial.steps for n, case in cases.items()]
+    exponent = float(np.polyfit(np.log(effort.landmarks), np.log(step), 1)[0])
+    low, high = effort.landmarks[0], effort.landmarks[-1]
+    note = "step averaged over the path: " + ", ".join(
+        f"{n}: {_us(t)}" for n, t in zip(effort.landmarks, step, strict=True)
+    )
+    what = f"exponent of the EKF step's time, {low} to {high} landmarks, {SEEN} in view"
+    yield Row("growth", what, exponent, "", 1.2, True, note)
+
+    update, short, long = bare_update(3 + 3 * high, 3 * SEEN), grown(high, 5), grown(high, 25)
+    s = interleaved(
+        {
+            "short": lambda: short.run("ekf-xyz"),
+            "long": lambda: long.run("ekf-xyz"),
+            "bare": lambda: [update() for _ in range(5)],
+        },
+        effort.growth_repeats,
+    )
+    ours, dense = (s["long"] - s["short"]) / 20, s["bare"] / 5
+    note = f"{_us(dense)} (bare dpotrf + dtrsm + dsyrk: no dense update is faster) / {_us(ours)}"
+    if dense < 2 * ours:
+        note += "; no local updating seen"
+    yield Row("growth", f"at {high} landmarks: dense update / our EKF step", dense / ours, "x", 8.0, note=note)
+
+
+# --- the whole program ---------------------------------------------------------------------------------
+
+
+def program(effort: Effort) -> Iterator[Row]:
+    """Workers, and time outside simulation and filters."""
+    s = whole.workers(effort.runs // 2, effort.repeats // 2 + 2, effort.run_steps)
+    free = s["one thread"] / s["two threads"]
+    note = f"{s['1']:.2f} s / {s['2']:.2f} s; meanwhile 2 threads of bare dgemm were {free:.2f} x faster than 1"
+    yield Row("program", "1 worker / 2 workers", s["1"] / s["2"], "x", 1.85, note=note)
+    for filters, target in ((["ekf-uvd"], 5.0), (whole.FILTERS, None)):
+        share = 100 * whole.share_outside(effort.runs, effort.run_steps, filters, effort.growth_repeats)
+        what = f"time outside simulation and filter, {effort.runs} x {effort.run_steps}, {' + '.join(filters)}"
+        yield Row("program", what, share, "%", target, True)
+
+
+def memory(effort: Effort, full: bool = False) -> Iterator[Row]:
+    """Peak of a process that runs, gathers and writes; extrapolated unless ``full``."""
+    points = whole.memory((effort.full_runs,) if full else effort.memory_runs)
+    mib = whole.extrapolated(points, effort.full_runs)
+    peak = None if mib is None else mib / 1024
+    how = "measured" if full else "extrapolated from"
+    note = f"{how} " + ", ".join(f"{p['runs']:.0f} runs: {p['peak_mib']:.0f} MiB" for p in points)
+    what = f"peak memory, {effort.full_runs} runs x 500 steps x 2 filters"
+    yield Row("memory", what, peak, "GiB", 1.5, True, note)
+    last = points[-1]
+    note = f"estimates.parquet, {last['rows']:.0f} rows"
+    yield Row("memory", "a row of estimates on disk", last["bytes"] / last["rows"], "bytes", 110.0, True, note)
+
+
+def start(effort: Effort) -> Iterator[Row]:
+    """What a user waits for."""
+    yield Row("start", "consistency --help", whole.help_seconds(), "s", 0.4, True, "median of 5 processes")
+    first, second = whole.first_and_second_run(effort.runs)
+    note = f"1 filter, {effort.runs} runs x 500 steps, nothing compiled before"
+    yield Row("start", "first consistency run", first, "s", 60.0, True, note)
+    yield Row("start", "second consistency run", second, "s", 3.0, True, "the same command; median of 3")
+
+
+# --- the table -----------------------------------------------------------------------------------------
+
+GROUPS: dict[str, Callable[[Effort], Iterator[Row]]] = {
+    "peers": peers, "kernels": kernels, "growth": growth, "program": program, "memory": memory, "start": start,
+}  # fmt: skip
+
+
+def document(rows: list[Row], wall: float) -> dict[str, Any]:
+    """The JSON document."""
+    versions = {name: metadata.version(name) for name in ("numpy", "scipy", "numba", "filterpy")}
+    machine = {"cores": os.cpu_count(), "architecture": platform.machine(), "load": os.getloadavg()[0]}
+    return {
+        "rows": [asdict(row) | {"verdict": row.verdict} for row in rows],
+        "machine": machine,
+        "versions": {"python": platform.python_version()} | versions,
+        "openblas_threads": os.environ.get("OPENBLAS_NUM_THREADS"),
+        "wall_time_s": round(wall, 1),
+    }
+
+
+def line(row: Row) -> str:
+    """One row as text."""
+    value = "-" if row.value is None else f"{row.value:.3g} {row.unit}".strip()
+    target = "" if row.target is None else f"{'<=' if row.at_most else '>='} {row.target:g}"
+    return f"{row.what:<72} {value:>10}  {target:<8} {row.verdict:<7} {row.note}".rstrip()
+
+
+def _us(seconds: float) -> str:
+    return f"{1e6 * seconds:.0f} us" if seconds < 0.01 else f"{1e3 * seconds:.0f} ms"
+
+
+def main(arguments: list[str] | None = None) -> list[Row]:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("reports/bench.json"), help="JSON file to write")
+    parser.add_argument(
+        "--full", action="store_true", help="measure the memory of 10,000 runs instead of extrapolating"
+    )
+    parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS), help="groups of rows")
+    chosen = parser.parse_args(arguments)
+    started, effort, rows = time.monotonic(), Effort(), []
+    for group in chosen.only:
+        for row in memory(effort, chosen.full) if group == "memory" else GROUPS[group](effort):
+            print(line(row), flush=True)
+            rows.append(row)
+    chosen.out.parent.mkdir(parents=True, exist_ok=True)
+    written = document(rows, time.monotonic() - started)
+    chosen.out.write_text(json.dumps(written, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    aims = [row.verdict for row in rows if row.target is not None]
+    print(f"{aims.count('missed')} of {len(aims)} targets missed; {written['wall_time_s']} s; {chosen.out}")
+    return rows
+
+
+if __name__ == "__main__":
+    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":  # read once, when the library is loaded: start again
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+        os.execv(sys.executable, [sys.executable, *sys.argv])
+    main()

@@ -1,0 +1,163 @@
+"""Other people's filters on the trials of ``bench.py``: filterpy and, where it is installed, Stone Soup.
+
+Each is written to be fast: one filter object for the whole trial, models in NumPy over all landmarks at once,
+the library's own Cholesky root. For the sigma points to be ours the state is put in our order (robot, seen, rest)
+before a step, which costs a copy of P. The adapters in ``consistency/filters`` are written to be read instead.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from bench_trials import Case, twin_state
+from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+from consistency.filters.textbook import PointSensor, Unicycle, process_noise
+from consistency.models import point, stereo
+from consistency.scenario import Belief
+from consistency.types import Array, Control
+
+WARM = 5  # steps before the peers take over: the start is known exactly, and their roots need full rank
+Said = tuple[Array, Array]  # poses (K, 3), covariances (K, 3, 3)
+
+
+class Models:
+    """f, h and their Jacobians over the whole state."""
+
+    def __init__(self, belief: Belief) -> None:
+        self.belief, self.motion = belief, Unicycle()
+        self.sensor = PointSensor(belief.sensor, uvd=True)
+
+    def f(self, x: Array, control: Control) -> Array:
+        moved = x.copy()
+        moved[:3] = self.motion.move(x[:3], control)
+        return moved
+
+    def noise(self, x: Array, control: Control, Q: Array) -> Array:
+        """Q (n, n) <- G Q G' of the pose, zero elsewhere."""
+        Q[:3, :3] = process_noise(self.motion.jacobians(x[:3], control)[1], self.belief)
+        return Q
+
+    def h(self, x: Array, at: Array) -> Array:
+        """Landmarks whose components lie at ``at`` (m, 3), as (3 m,)."""
+        return self.sensor.measure(x[:3], x[at]).ravel()
+
+    def H(self, x: Array, at: Array) -> Array:
+        """Jacobian (3 m, n) of h."""
+        s, m = self.sensor, len(at)
+        bx, by, bz = point.to_robot(*x[:3], *x[at].T)
+        J = stereo.project_jacobian(*point.to_sensor(bx, by, bz, s.mount), s.f, s.B)
+        turned = np.stack(np.broadcast_arrays(*J), axis=-1).reshape(m, 3, 3) @ s.turn.T
+        c, sn = np.cos(x[2]), np.sin(x[2])
+        to_robot = np.array([[c, sn, 0.0], [-sn, c, 0.0], [0.0, 0.0, 1.0]])
+        d_pose = np.zeros((m, 3, 3))
+        d_pose[:, :, :2] = -to_robot[:, :2]
+        d_pose[:, 0, 2], d_pose[:, 1, 2] = by, -bx
+        H = np.zeros((m, 3, len(x)))
+        H[:, :, :3] = turned @ d_pose
+        np.put_along_axis(H, np.repeat(at[:, None, :], 3, axis=1), turned @ to_robot, axis=2)
+        return H.reshape(3 * m, len(x))
+
+
+class Peer:
+    """Steps ``WARM`` + 1 .. ``WARM`` + ``steps`` of a case by somebody else's filter; a call does them all."""
+
+    filter = "ekf-uvd"  # ours, which it must equal
+    reorders = False
+
+    def __init__(self, case: Case, steps: int) -> None:
+        self.trial, self.models, self.steps = case.trial, Models(case.belief), steps
+        self.R = np.diag(np.tile(np.square(case.belief.sensor.sigma), len(case.trial.observation(WARM + 1).z)))
+        self.start = twin_state(case, self.filter, WARM)
+        self.n = len(self.start[0])
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Make the filter object."""
+
+    def step(self, x: Array, P: Array, control: Control, at: Array, z: Array) -> Said:
+        raise NotImplementedError
+
+    def __call__(self) -> Said:
+        x, P = self.start
+        place = np.arange(self.n)  # where a variable of the state is now
+        pose, covariance = np.empty((self.steps, 3)), np.empty((self.steps, 3, 3))
+        for k in range(self.steps):
+            seen = self.trial.observation(WARM + k + 1)
+            at = place[3 + 3 * seen.landmarks[:, None] + np.arange(3)]  # step 1 saw all: their order is the state's
+            if self.reorders:
+                rest = np.ones(self.n, bool)
+                rest[:3] = rest[at] = False
+                order = np.concatenate([np.arange(3), at.ravel(), np.flatnonzero(rest)])
+                x, P = x[order], P[np.ix_(order, order)]
+                now = np.empty(self.n, np.int64)
+                now[order] = np.arange(self.n)
+                place, at = now[place], now[at]
+            x, P = self.step(x, P, self.trial.control(WARM + k + 1), at, seen.z.ravel())
+            pose[k], covariance[k] = x[:3], P[:3, :3]
+        return pose, covariance
+
+
+class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
+    f: Callable[[Array], Array]
+    x: Array
+
+    def predict_x(self, u: Any = 0) -> None:
+        self.x = self.f(self.x)
+
+
+class FilterpyEkf(Peer):
+    """filterpy's ExtendedKalmanFilter."""
+
+    def prepare(self) -> None:
+        self.ekf = _Ekf(dim_x=self.n, dim_z=len(self.R))
+        self.ekf.F, self.ekf.Q, self.ekf.R = np.eye(self.n), np.zeros((self.n, self.n)), self.R
+
+    def step(self, x: Array, P: Array, control: Control, at: Array, z: Array) -> Said:
+        ekf, m = self.ekf, self.models
+        ekf.x, ekf.P, ekf.f = x, P, lambda x: m.f(x, control)
+        ekf.F[:3, :3] = m.motion.jacobians(x[:3], control)[0]
+        m.noise(x, control, ekf.Q)
+        ekf.predict()
+        ekf.update(z, HJacobian=lambda x: m.H(x, at), Hx=lambda x: m.h(x, at))
+        return ekf.x, ekf.P
+
+
+class FilterpyUkf(Peer):
+    """filterpy's UnscentedKalmanFilter; one object a transform, for each has its own spread."""
+
+    filter = "ukf-uvd"
+    reorders = True
+
+    def prepare(self) -> None:
+        self.first = self._ukf(3)
+        self.second = self._ukf(3 + len(self.R))
+        self.Q = np.zeros((self.n, self.n))
+
+    def _ukf(self, involved: int) -> UnscentedKalmanFilter:
+        s = self.models.belief.sigma_points
+        # filterpy's spread is alpha sqrt(n + kappa): this kappa makes it alpha sqrt(L + the belief's kappa)
+        points = MerweScaledSigmaPoints(self.n, s.alpha, s.beta, involved + s.kappa - self.n)
+        return UnscentedKalmanFilter(self.n, len(self.R), dt=1.0, hx=None, fx=None, points=points)
+
+    def step(self, x: Array, P: Array, control: Control, at: Array, z: Array) -> Said:
+        first, second, m = self.first, self.second, self.models
+        first.x, first.P, first.Q = x, P, m.noise(x, control, self.Q)
+        first.predict(fx=lambda x, dt: m.f(x, control))
+        second.x, second.P = first.x, first.P
+        second.sigmas_f = second.points_fn.sigma_points(second.x, second.P)
+        second.update(z, R=self.R, hx=lambda x: m.h(x, at))
+        return second.x, second.P
+
+
+def stone_soup(kind: str, case: Case, steps: int) -> Peer | str:
+    """Stone Soup's filter, ``ekf`` or ``ukf``, or why there is none."""
+    if importlib.util.find_spec("stonesoup") is None:
+        return "not installed; pip install -e '.[bench]'"
+    peers = importlib.import_module("bench_stonesoup")
+    peer: Peer = getattr(peers, {"ekf": "StoneSoupEkf", "ukf": "StoneSoupUkf"}[kind])(case, steps)
+    return peer

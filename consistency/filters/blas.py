@@ -27,6 +27,7 @@ from consistency.filters.jit import inner
 ROUTINES = {"dgemm": cython_blas, "dgemv": cython_blas, "dsyrk": cython_blas, "dtrsm": cython_blas}
 ROUTINES |= {"dpotrf": cython_lapack}
 _intrinsic: Callable[[Any], Any] = numba.extending.intrinsic
+_llvm: Any = cgutils  # untyped
 
 
 def _capsule(name: str, result: Any, *arguments: Any) -> Any:
@@ -50,18 +51,18 @@ def _call(routine: str, flags: bytes, arguments: tuple[Any, ...], has_info: bool
     """Signature and code of a call by reference: flags, then arrays as pointers and numbers through the stack."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        slots = [cgutils.alloca_once_value(builder, ir.Constant(ir.IntType(8), flag)) for flag in flags]
+        slots = [_llvm.alloca_once_value(builder, ir.Constant(ir.IntType(8), flag)) for flag in flags]
         for kind, value in zip(signature.args, values, strict=True):
             if isinstance(kind, types.Array):
                 slots.append(context.make_array(kind)(context, builder, value).data)
             else:
                 to = types.float64 if isinstance(kind, types.Float) else types.int32
-                slots.append(cgutils.alloca_once_value(builder, context.cast(builder, value, kind, to)))
-        info = cgutils.alloca_once_value(builder, ir.Constant(ir.IntType(32), 0))
+                slots.append(_llvm.alloca_once_value(builder, context.cast(builder, value, kind, to)))
+        info = _llvm.alloca_once_value(builder, ir.Constant(ir.IntType(32), 0))
         slots += [info] if has_info else []
-        kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t] * len(slots))
-        function = cgutils.get_or_insert_function(builder.module, kind, f"consistency_{routine}")
-        builder.call(function, [builder.bitcast(slot, cgutils.voidptr_t) for slot in slots])
+        kind = ir.FunctionType(ir.VoidType(), [_llvm.voidptr_t] * len(slots))
+        function = _llvm.get_or_insert_function(builder.module, kind, f"consistency_{routine}")
+        builder.call(function, [builder.bitcast(slot, _llvm.voidptr_t) for slot in slots])
         if has_info:
             return builder.load(info)
         return context.get_dummy_value()
@@ -104,7 +105,7 @@ def _dgemv_n(
 
 
 @inner
-def _row(A: Any) -> int:
+def _row(A: Any) -> Any:
     """Numbers from one row to the next, or from one number of a vector to the next."""
     return A.strides[0] // A.itemsize
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from consistency.filters.blas import add_gram
+from consistency.filters.blas import add_gram, upper_cholesky
 from consistency.filters.jit import inner
+from consistency.filters.linalg import DEFICIENT
 
 
 @inner
@@ -26,6 +27,17 @@ def gather_rows(P: Any, n: int, at: Any, m: int, rows: Any) -> None:
         r1[o + 1 : n] = P[o + 1, o + 1 : n]
         r2[o + 2 : n] = P[o + 2, o + 2 : n]
         r1[o], r2[o], r2[o + 1] = r0[o + 1], r0[o + 2], r1[o + 2]
+
+
+@inner
+def definite_root(A: Any, scale: Any) -> Any:
+    """Upper half of A <- its root; False if it has none or a pivot is lost to rounding. ``scale`` <- its diagonal."""
+    for i in range(len(A)):
+        scale[i] = A[i, i]
+    definite = upper_cholesky(A)
+    for i in range(len(A)):
+        definite = definite and A[i, i] * A[i, i] > DEFICIENT * scale[i]
+    return definite
 
 
 @inner

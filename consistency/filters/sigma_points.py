@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from consistency.filters.blas import add_gram, product_of_transposed, solve_upper, upper_cholesky
+from consistency.filters.blas import add_gram, product_of_transposed, solve_upper
+from consistency.filters.covariance import definite_root
 from consistency.filters.jit import inner
-from consistency.filters.linalg import DEFICIENT, semidefinite_cholesky
+from consistency.filters.linalg import semidefinite_cholesky
 from consistency.filters.observation import predict_observation
 from consistency.models.motion import unicycle
 
@@ -118,27 +119,20 @@ def innovate_unscented(model: int, x: Any, n: int, m: int, rig: Any, points: Any
 
 
 @inner
-def _variable(a: int, at: Any) -> int:
+def _variable(a: int, at: Any) -> Any:
     """State index of the a-th of the variables involved."""
     return a if a < 3 else at[a // 3 - 1] + a % 3
 
 
 @inner
-def _root(L: int, work: Any) -> bool:
+def _root(L: int, work: Any) -> Any:
     """Upper root U = C' of the prior over the variables involved; False if it is indefinite."""
     rows, at, U = work.rows, work.at, work.U[:L, :L]
     for b in range(L):
         j = _variable(b, at)
         for a in range(b + 1):
             U[a, b] = rows[a, j]
-    if upper_cholesky(U):
-        definite = True
-        for a in range(L):
-            if not U[a, a] * U[a, a] > DEFICIENT * rows[a, _variable(a, at)]:
-                definite = False
-        if definite:
-            return True
-    return _singular_root(L, work)
+    return definite_root(U, work.scale) or _singular_root(L, work)
 
 
 @inner

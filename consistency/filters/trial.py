@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from consistency.filters.blas import add_transposed_times, solve_transposed, upper_cholesky
-from consistency.filters.covariance import append_landmark, subtract_gram
+from consistency.filters.blas import add_transposed_times, solve_transposed
+from consistency.filters.covariance import append_landmark, definite_root, subtract_gram
 from consistency.filters.jit import inner, kernel
-from consistency.filters.linalg import DEFICIENT, definiteness_with
+from consistency.filters.linalg import definiteness_with
 from consistency.filters.observation import place
 from consistency.filters.rules import UNSCENTED, innovate, predict
 from consistency.filters.work import make_work
@@ -23,7 +23,10 @@ REASONS = {
 
 @inner
 def _correct(x: Any, P: Any, n: int, m: int, z: Any, R: Any, work: Any) -> Any:
-    """Eq. 11, 12 with W = S^-1/2 A: x += W' S^-1/2 innovation, P -= W' W. Returns a code of REASONS or 0, and the NIS."""
+    """Eq. 11, 12 with W = S^-1/2 A: x += W' S^-1/2 innovation, P -= W' W.
+
+    Returns a code of REASONS or 0, and the NIS.
+    """
     S, zhat = work.S[: 3 * m, : 3 * m], work.zhat
     A, joined = work.A[: 3 * m, :n], work.A[: 3 * m, : n + 1]
     y = joined[:, n]
@@ -34,9 +37,8 @@ def _correct(x: Any, P: Any, n: int, m: int, z: Any, R: Any, work: Any) -> Any:
             y[r] = z[work.known[i], a] - zhat[r]
             for b in range(3):
                 S[r, 3 * i + b] += R[work.known[i], a, b]
-            work.scale[r] = S[r, r]
             total += y[r] + S[r, r:].sum()
-    if not _is_definite(S, work.scale):
+    if not definite_root(S, work.scale):
         return 2 if np.isfinite(total) else 1, np.nan
     solve_transposed(S, joined)
     nis = 0.0
@@ -47,17 +49,6 @@ def _correct(x: Any, P: Any, n: int, m: int, z: Any, R: Any, work: Any) -> Any:
     if np.isfinite(nis):
         return 0, nis
     return 2 if np.isfinite(total) else 1, np.nan
-
-
-@inner
-def _is_definite(S: Any, scale: Any) -> bool:
-    """S <- its upper root; False if it has none or if a pivot is lost to rounding."""
-    if not upper_cholesky(S):
-        return False
-    for i in range(len(S)):
-        if not S[i, i] * S[i, i] > DEFICIENT * scale[i]:
-            return False
-    return True
 
 
 @inner

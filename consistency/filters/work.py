@@ -19,7 +19,7 @@ class Work(NamedTuple):
     at: Any  # (m,) and its offset there
     label: Any  # (m,) and its label
     zhat: Any  # (3 m,) expected observations
-    scale: Any  # (3 m,) diagonal of S
+    scale: Any  # (L,) diagonal of what is factored
     S: Any  # (3 m, 3 m) innovation covariance, upper half
     A: Any  # (3 m, n + 1) Cov(z, x); in the column after the state the innovation
     rows: Any  # (L, n) rows of P of the robot and the seen landmarks
@@ -45,7 +45,7 @@ def make_work(n: int, m: int, sigma_points: bool) -> Any:
         np.empty(m, np.int64),
         np.empty(m, np.int64),
         np.empty(3 * m),
-        np.empty(3 * m),
+        np.empty(3 + 3 * m),
         np.empty((3 * m, 3 * m)),
         np.empty((3 * m, n + 1)),
         np.empty((3 + 3 * m, n)),

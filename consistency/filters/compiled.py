@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from consistency.errors import InputError
 from consistency.filters.jit import is_compiled
@@ -14,6 +19,28 @@ from consistency.models.motion import dead_reckoning
 from consistency.protocols import Problem
 from consistency.scenario import Belief
 from consistency.types import Control, Estimates, Failure, Gaussian, Info, Observation, Trial
+
+_lock = threading.Lock()
+_inside: list[Any] = []  # the limit in force, once for every trial that is running
+
+
+@cache
+def _libraries() -> Any:
+    return ThreadpoolController()  # looking for them takes longer than a short trial
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """The last bits depend on the number of BLAS threads, and matrices of this size are slower with two."""
+    with _lock:
+        _inside.append(_inside[-1] if _inside else _libraries().limit(limits=1))
+    try:
+        yield
+    finally:
+        with _lock:
+            limit = _inside.pop()
+            if not _inside:
+                limit.restore_original_limits()
 
 
 class Compiled:
@@ -57,7 +84,8 @@ class Compiled:
         # copies: writable and C-contiguous, so that one compiled signature serves every caller
         copies = [np.array(a, dtype=kind, order="C") for a, kind in arrays]
         try:
-            out = run_trial(self.rule, self.model, trial.n_landmarks, *copies)
+            with one_blas_thread():
+                out = run_trial(self.rule, self.model, trial.n_landmarks, *copies)
         except SystemError as error:  # Ctrl-C in the main thread comes out of a kernel like this
             raise KeyboardInterrupt from error
         pose, covariance, nis, nis_dof, step, code = out

@@ -40,24 +40,16 @@ def semidefinite_cholesky(A: Any, C: Any) -> bool:
 
 
 @jitable
-def forward_substitute(C: Any, B: Any) -> None:
-    """B <- C^-1 B by rows, for lower C; the rows of zero pivots become zero."""
-    for i in range(C.shape[0]):
-        if C[i, i] == 0.0:
-            B[i] = 0.0
-            continue
-        for k in range(i):
-            if C[i, k] != 0.0:
-                B[i] -= C[i, k] * B[k]
-        B[i] /= C[i, i]
+def definiteness(P: Any) -> int:
+    """1 positive definite, 0 rank-deficient, -1 indefinite or not finite, judged on correlations."""
+    return definiteness_with(P, np.empty(P.shape))
 
 
 @jitable
-def definiteness(P: Any) -> int:
-    """1 positive definite, 0 rank-deficient, -1 indefinite or not finite, judged on correlations."""
+def definiteness_with(P: Any, C: Any) -> int:
+    """:func:`definiteness` with ``C``, of the shape of P, for its work."""
     n = P.shape[0]
     deficient = False
-    C = np.zeros((n, n))
     for j in range(n):
         if not (P[j, j] >= 0.0 and P[j, j] < np.inf):
             return -1
@@ -68,6 +60,8 @@ def definiteness(P: Any) -> int:
             return -1
         if pivot <= DEFICIENT * P[j, j] or P[j, j] <= ROUNDING:
             deficient = True
+            for i in range(j, n):
+                C[i, j] = 0.0
             continue
         C[j, j] = np.sqrt(pivot)
         for i in range(j + 1, n):

@@ -49,25 +49,20 @@ def _locate_jacobian(model: int, z0: Any, z1: Any, z2: Any, rig: Any) -> Any:
 
 
 @inner
-def _sensor_point(pose: Any, landmark: Any, rig: Any) -> Any:
-    bx, by, bz = point.to_robot(pose[0], pose[1], pose[2], landmark[0], landmark[1], landmark[2])
-    return point.to_sensor(bx, by, bz, rig[2:])
-
-
-@inner
-def predict_observation(model: int, pose: Any, landmark: Any, rig: Any, z: Any) -> None:
-    """z <- h(pose, landmark)."""
-    cx, cy, cz = _sensor_point(pose, landmark, rig)
+def predict_observation(model: int, px: Any, py: Any, c: Any, s: Any, landmark: Any, rig: Any, z: Any) -> None:
+    """z <- h at a pose (px, py, heading) with c, s the cosine and sine of the heading."""
+    bx, by, bz = point.turned_to_robot(px, py, c, s, landmark[0], landmark[1], landmark[2])
+    cx, cy, cz = point.to_sensor(bx, by, bz, rig[2:])
     z[0], z[1], z[2] = _measure(model, cx, cy, cz, rig)
 
 
 @inner
 def _linearise_at(model: int, pose: Any, landmark: Any, rig: Any, z: Any, Hp: Any, Hl: Any) -> None:
-    cx, cy, cz = _sensor_point(pose, landmark, rig)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    bx, by, bz = point.turned_to_robot(pose[0], pose[1], c, s, landmark[0], landmark[1], landmark[2])
+    cx, cy, cz = point.to_sensor(bx, by, bz, rig[2:])
     z[0], z[1], z[2] = _measure(model, cx, cy, cz, rig)
     J = _measure_jacobian(model, cx, cy, cz, rig)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    bx, by, _ = point.to_robot(pose[0], pose[1], pose[2], landmark[0], landmark[1], landmark[2])
     for i in range(3):
         # d: the row of dh / d(robot-frame point), through the mount's rotation
         j0, j1, j2 = J[3 * i], J[3 * i + 1], J[3 * i + 2]

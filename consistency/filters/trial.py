@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from consistency.filters.blas import add_transposed_times, solve_transposed
+from consistency.filters.covariance import append_landmark, definite_root, subtract_gram
 from consistency.filters.jit import inner, kernel
-from consistency.filters.linalg import definiteness, forward_substitute, semidefinite_cholesky
+from consistency.filters.linalg import definiteness_with
 from consistency.filters.observation import place
-from consistency.filters.rules import innovate, predict
+from consistency.filters.rules import UNSCENTED, innovate, predict
+from consistency.filters.work import make_work
 
 REASONS = {
     1: "the estimate is not finite",
@@ -19,34 +22,44 @@ REASONS = {
 
 
 @inner
-def _correct(x: Any, P: Any, n: int, innovation: Any, S: Any, A: Any) -> Any:
-    """Eq. 11, 12 with W = S^-1/2 A: x += W' S^-1/2 innovation, P -= W' W. Returns the NIS or NaN."""
-    C = np.zeros_like(S)
-    if not semidefinite_cholesky(S, C):
-        return np.nan
-    for i in range(len(C)):
-        if C[i, i] == 0.0:
-            return np.nan
-    y = innovation.copy()
-    forward_substitute(C, y)
-    forward_substitute(C, A)
-    P[:n, :n] -= np.dot(A.T, A)
-    x[:n] += np.dot(A.T, y)
-    return np.dot(y, y)
+def _correct(x: Any, P: Any, n: int, m: int, z: Any, R: Any, work: Any) -> Any:
+    """Eq. 11, 12 with W = S^-1/2 A: x += W' S^-1/2 innovation, P -= W' W.
+
+    Returns a code of REASONS or 0, and the NIS.
+    """
+    S, zhat = work.S[: 3 * m, : 3 * m], work.zhat
+    A, joined = work.A[: 3 * m, :n], work.A[: 3 * m, : n + 1]
+    y = joined[:, n]
+    total = 0.0
+    for i in range(m):
+        for a in range(3):
+            r = 3 * i + a
+            y[r] = z[work.known[i], a] - zhat[r]
+            for b in range(3):
+                S[r, 3 * i + b] += R[work.known[i], a, b]
+            total += y[r] + S[r, r:].sum()
+    if not definite_root(S, work.scale):
+        return 2 if np.isfinite(total) else 1, np.nan
+    solve_transposed(S, joined)
+    nis = 0.0
+    for r in range(3 * m):
+        nis += y[r] * y[r]
+    add_transposed_times(A, y, x[:n])
+    subtract_gram(P, n, A)
+    if np.isfinite(nis):
+        return 0, nis
+    return 2 if np.isfinite(total) else 1, np.nan
 
 
 @inner
-def _augment(x: Any, P: Any, n: int, Jp: Any, Jz: Any, R: Any) -> None:
-    """Covariance of a landmark put at n: its own and the one with everything before it."""
-    for a in range(3):
-        for j in range(n):
-            P[n + a, j] = Jp[a, 0] * P[0, j] + Jp[a, 1] * P[1, j] + Jp[a, 2] * P[2, j]
-            P[j, n + a] = P[n + a, j]
-    own = np.dot(np.dot(Jz, R), Jz.T)
-    for a in range(3):
-        for b in range(3):
-            own[a, b] += P[n + a, 0] * Jp[b, 0] + P[n + a, 1] * Jp[b, 1] + P[n + a, 2] * Jp[b, 2]
-    P[n : n + 3, n : n + 3] = 0.5 * (own + own.T)
+def _find_known(first: int, last: int, landmark: Any, offset: Any, work: Any) -> int:
+    """Observations first..last-1 whose landmark is in the state, their offsets, and how many they are."""
+    m = 0
+    for r in range(first, last):
+        if offset[landmark[r]] >= 0:
+            work.known[m], work.label[m], work.at[m] = r, landmark[r], offset[landmark[r]]
+            m += 1
+    return m
 
 
 @kernel
@@ -87,35 +100,27 @@ def run_trial(
     offset = np.full(n_landmarks, -1)
     size = 3 + 3 * len(np.unique(landmark))
     x, P, n = np.zeros(size), np.zeros((size, size)), 3
+    work = make_work(size, np.max(first[1:] - first[:-1]), rule == UNSCENTED)
     x[:3] = start
     full_rank = False
-    Jp, Jz = np.empty((3, 3)), np.empty((3, 3))
     for k in range(T):
-        predict(rule, x, P, n, controls[k], path0[k], q, points)
-        rows = np.arange(first[k], first[k + 1])
-        known = np.array([r for r in rows if offset[landmark[r]] >= 0], np.int64)
-        m = len(known)
+        predict(rule, x, P, n, controls[k], path0[k], q, points, work)
+        m = _find_known(first[k], first[k + 1], landmark, offset, work)
         if m > 0:
-            at = offset[landmark[known]]
-            zhat, S, A = np.empty(3 * m), np.empty((3 * m, 3 * m)), np.empty((3 * m, n))
-            if not innovate(
-                rule, model, x, P, n, at, path0[k + 1], landmarks0[landmark[known]], rig, points, zhat, S, A
-            ):
+            if not innovate(rule, model, x, P, n, m, path0[k + 1], landmarks0, rig, points, work):
                 return pose, covariance, nis, nis_dof, k + 1, 3
-            for i in range(m):
-                S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += R[known[i]]
-            value = _correct(x, P, n, z[known].ravel() - zhat, S, A)
-            if not np.isfinite(value):
-                finite = np.isfinite(S.sum() + zhat.sum() + z[known].sum())
-                return pose, covariance, nis, nis_dof, k + 1, 2 if finite else 1
+            code, value = _correct(x, P, n, m, z, R, work)
+            if code > 0:
+                return pose, covariance, nis, nis_dof, k + 1, code
             nis[k], nis_dof[k] = value, 3 * m
-        for r in rows:
+        for r in range(first[k], first[k + 1]):
             if offset[landmark[r]] < 0:
                 offset[landmark[r]] = n
-                place(model, x[:3], z[r], path0[k + 1], landmarks0[landmark[r]], rig, x[n : n + 3], Jp, Jz)
-                _augment(x, P, n, Jp, Jz, R[r])
+                at0 = landmarks0[landmark[r]]
+                place(model, x[:3], z[r], path0[k + 1], at0, rig, x[n : n + 3], work.Jp, work.Jz)
+                append_landmark(P, n, work.Jp, work.Jz, R[r])
                 n += 3
-        rank = definiteness(P[:3, :3])
+        rank = definiteness_with(P[:3, :3], work.small)
         if not np.isfinite(x[:n].sum()):
             return pose, covariance, nis, nis_dof, k + 1, 1
         if rank < 0 or (full_rank and rank == 0):

@@ -12,7 +12,12 @@ from consistency.models.jitable import jitable
 @jitable
 def to_robot(px: Any, py: Any, heading: Any, lx: Any, ly: Any, lz: Any) -> tuple[Any, Any, Any]:
     """Landmark in the robot frame (x forward, y left, z up), all in m."""
-    c, s = np.cos(heading), np.sin(heading)
+    return turned_to_robot(px, py, np.cos(heading), np.sin(heading), lx, ly, lz)
+
+
+@jitable
+def turned_to_robot(px: Any, py: Any, c: Any, s: Any, lx: Any, ly: Any, lz: Any) -> tuple[Any, Any, Any]:
+    """:func:`to_robot` for many landmarks: cosine and sine of the heading are given."""
     dx, dy = lx - px, ly - py
     return c * dx + s * dy, -s * dx + c * dy, lz
 

@@ -1,19 +1,60 @@
-"""Compiled functions stand at module level: closures cached by two processes can be linked to each other."""
+"""What kernels must keep to: module level, no allocation in a step, one BLAS thread."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
 
+import numpy as np
+import pytest
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import _nrt_python, rtsys
+from threadpoolctl import threadpool_info
 
+import consistency as cs
 import consistency.filters
+from consistency.filters.compiled import one_blas_thread
 
 
 def test_no_kernel_is_a_closure() -> None:
+    """Closures that two processes have cached can be linked to each other."""
     found = []
     for module in pkgutil.iter_modules(consistency.filters.__path__):
         names = vars(importlib.import_module(f"consistency.filters.{module.name}"))
         found += [value.py_func.__qualname__ for value in names.values() if isinstance(value, Dispatcher)]
     assert "run_trial" in found
     assert not [name for name in found if "<locals>" in name]
+
+
+def allocations(steps: int, scenario: cs.Scenario, name: str) -> int:
+    """Arrays that a compiled trial of so many steps makes."""
+    trial = cs.simulate(scenario.variant("shorter", truth__steps=steps))
+    cs.get_filter(name).run(trial, scenario.belief)  # compiled before counting
+    before = rtsys.get_allocation_stats().alloc
+    cs.get_filter(name).run(trial, scenario.belief)
+    return int(rtsys.get_allocation_stats().alloc - before)
+
+
+@pytest.mark.parametrize("name", ["ekf-uvd", "ekf-xyz", "ukf-uvd"])
+def test_no_step_allocates(uvd: cs.Scenario, name: str) -> None:
+    _nrt_python.memsys_enable_stats()
+    assert 0 < allocations(20, uvd, name) == allocations(60, uvd, name)
+
+
+def test_a_direct_run_is_that_of_run_trials(uvd: cs.Scenario) -> None:
+    """One BLAS thread in both: with two the last bits could differ."""
+    direct = cs.get_filter("ekf-uvd").run(cs.simulate(uvd), uvd.belief)
+    among = cs.run_trials(uvd, ["ekf-uvd"], runs=1, jobs=1).estimates
+    assert np.array_equal(direct.pose, among[["x", "y", "heading"]].to_numpy())
+
+
+def test_the_limit_on_blas_threads_ends_with_the_last_trial() -> None:
+    def threads() -> list[int]:
+        return [entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"]
+
+    before = threads()
+    with one_blas_thread():
+        with one_blas_thread():
+            assert set(threads()) == {1}
+        assert set(threads()) == {1}
+    assert threads() == before

@@ -175,7 +175,7 @@ def test_kernels_equal_the_textbook_sensor(
     sensor, model, rig = PointSensor(belief, uvd), UVD if uvd else XYZ, belief.packed()
     expected = sensor.measure(pose, landmark)
     z, Hp, Hl, zero = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
-    predict_observation(model, pose, landmark, rig, z)
+    predict_observation(model, pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), landmark, rig, z)
     assert close(z, expected)
     linearise(model, pose, landmark, zero, zero, rig, z, Hp, Hl)
     assert close(z, expected)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from consistency.atomic import write_whole
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.errors import InputError
 from consistency.judge import curves
@@ -106,9 +107,7 @@ def write_baseline(results: Results, path: Path, overwrite: bool = False) -> Non
         },
     )
     try:
-        partial = path.with_name(f".{path.name}.partial")
-        partial.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        partial.replace(path)
+        write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"))
     except OSError as error:
         raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
 

@@ -178,8 +178,13 @@ def plan(dof: int, detect: float, false_alarm: float, power: float, allow: str |
             "looks": list(sequential_design(dof, detect, false_alarm, power).looks),
         }  # fmt: skip
     except ValueError as error:
-        name, rest = str(error).split(" ", 1)
-        raise InputError(f"--{OPTION.get(name, name)} {rest}") from None
+        raise refused(error) from None
+
+
+def refused(error: ValueError) -> InputError:
+    """What a plan refuses, with the option of the command in place of the argument."""
+    name, rest = str(error).split(" ", 1)
+    return InputError(f"--{OPTION.get(name, name)} {rest}")
 
 
 def _false_alarm(confidence: float | None) -> float:

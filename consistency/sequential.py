@@ -9,7 +9,7 @@ from typing import Any
 
 from consistency.diagnostics import Design, sequential_design
 from consistency.errors import InputError
-from consistency.judge import OPTION, curves, verdict_of
+from consistency.judge import curves, refused, verdict_of
 from consistency.montecarlo import Interrupted, run_trials
 from consistency.protocols import Filter
 from consistency.results import POSE, Results
@@ -78,8 +78,7 @@ def plan_of(plan: dict[str, Any]) -> Design:
     try:
         return sequential_design(**plan)
     except ValueError as error:
-        name, rest = str(error).split(" ", 1)
-        raise InputError(f"--{OPTION.get(name, name)} {rest}") from None
+        raise refused(error) from None
 
 
 def settled(verdict: Verdict) -> bool:

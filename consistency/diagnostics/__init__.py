@@ -8,7 +8,7 @@ from consistency.diagnostics.comparison import Comparison, Difference, RunSummar
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
 from consistency.diagnostics.distribution import Pit, pit
-from consistency.diagnostics.innovations import NisTest, Whiteness, nis_test, nis_whiteness, whiteness
+from consistency.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
 from consistency.diagnostics.nees import anees, nees
 from consistency.diagnostics.normality import Normality, normality
@@ -50,6 +50,7 @@ __all__ = [
     "mean_shape",
     "mean_test",
     "nees",
+    "nis_of",
     "nis_test",
     "nis_whiteness",
     "noncredibility",

@@ -28,6 +28,15 @@ class NisTest:
         return float(np.minimum(1.0, 2.0 * np.minimum(self.above, self.below)))
 
 
+def nis_of(innovations: Array, covariances: Array) -> tuple[Array, Array]:
+    """NIS and its degrees of freedom, (runs, steps, m), (runs, steps, m, m) -> (runs, steps), (runs, steps).
+
+    NaN and 0 where there is no innovation.
+    """
+    u = whiten(innovations, covariances)
+    return np.square(u).sum(axis=-1), np.where(np.isfinite(u[..., 0]), u.shape[-1], 0)
+
+
 def nis_test(nis: Array, dof: Array) -> NisTest:
     """Chi-square test of the total NIS, Bar-Shalom, Li & Kirubarajan (2001) sec. 5.4.
 

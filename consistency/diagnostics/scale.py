@@ -65,10 +65,11 @@ def mean_test(nees: Array, dof: int, whitened: Array | None = None) -> MeanTest:
     ratio = float(means.mean())
     nu, spread = float(dof), float("inf")
     present = np.isfinite(nees)
-    present = present[present.any(axis=1)]
+    some = present.any(axis=1)
+    present = present[some]
     if runs >= FEW and counts[0] > 1 and ratio > 0 and (present == present[0]).all():
         if whitened is not None:
-            w = np.where(np.isfinite(nees)[..., None], whitened, 0.0)[np.isfinite(nees).any(axis=1)]
+            w = np.where(present[..., None], whitened[some], 0.0)
             log_nu, left_out = _log_nu_of_errors(w, counts * dof, means)
             floor, caution = 0.0, 1.0
         else:

@@ -20,11 +20,7 @@ class Design:
     power: float
     looks: tuple[int, ...]  # runs at each look
     needed: int  # runs at which no fault found means consistent
-
-    @property
-    def look_false_alarm(self) -> float:
-        """False-alarm rate of one look: an equal part for each planned look."""
-        return self.false_alarm / planned_looks(self.dof, self.detect, self.false_alarm, self.power)[0]
+    look_false_alarm: float  # of one look: an equal part for each planned look
 
     def settle(self, verdict: Verdict) -> Verdict:
         """The verdict at a look: where no fault is found before ``needed`` runs it is undecided."""
@@ -60,7 +56,7 @@ def sequential_design(
     looks = [-(-needed // 2**k) for k in reversed(range(count))]
     if max_runs is not None and max_runs < needed:
         looks = [*(n for n in looks if n < max_runs), max_runs]
-    return Design(dof, detect, false_alarm, power, tuple(looks), needed)
+    return Design(dof, detect, false_alarm, power, tuple(looks), needed, false_alarm / count)
 
 
 def planned_looks(dof: int, detect: float, false_alarm: float, power: float) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from consistency.diagnostics.bias import hotelling, t_squared
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
 from consistency.diagnostics.distribution import pit
-from consistency.diagnostics.innovations import nis_test, nis_whiteness, whiteness
+from consistency.diagnostics.innovations import nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
 from consistency.diagnostics.location import INTERVAL, locate, locate_axes, subset
 from consistency.diagnostics.nees import anees
@@ -86,8 +86,7 @@ def judge(
     if not 0.0 < false_alarm < 1.0:
         raise ValueError(f"false_alarm must lie between 0 and 1, got {false_alarm}")
     if nis is None and innovations is not None and innovation_covariances is not None:
-        u = whiten(innovations, innovation_covariances)
-        nis, nis_dof = np.square(u).sum(axis=-1), np.where(np.isfinite(u[..., 0]), u.shape[-1], 0)
+        nis, nis_dof = nis_of(innovations, innovation_covariances)
     runs, steps = _shape_of(error, covariance, nees, nis, nis_dof)
     s: dict[str, Any] = {
         "runs": runs, "steps": steps, "false_alarm": false_alarm, "confidence": 1.0 - false_alarm,
@@ -188,7 +187,7 @@ def _errors(
     counted = np.isfinite(nees)
     error = np.where(counted[..., None], error, np.nan)
     groups = _groups(names, subsets)
-    tests = {key: _subset_test(error, covariance, nees, whitened, index) for key, index in groups.items()}
+    tests = {key: _subset_test(error, covariance, nees, index) for key, index in groups.items()}
     worst = float(np.min([t.above if allow else t.p_value for t in tests.values()], initial=1.0))
     mean, total = np.nanmean, counted.any(axis=1)
     of_runs = mean(whitened[total], axis=1) if total.any() else np.empty((0, n))
@@ -229,7 +228,7 @@ def _errors(
         "nci": float(mean(index)) if np.isfinite(index).any() else float("nan"),
         "inclination": float(mean(inclination)) if np.isfinite(inclination).any() else float("nan"),
         "outlier": {"run": odd.run, "step": odd.step + 1, "distance": odd.distance},
-        "left_out_steps": [int(k) + 1 for k in np.flatnonzero(_finite_any(covariance, error, counted))],
+        "left_out_steps": [int(k) + 1 for k in np.flatnonzero(_unusable(covariance, counted))],
     }
     return p
 
@@ -243,7 +242,7 @@ def _impossible(error: Array, covariance: Array, counted: Array) -> list[list[in
     return [[int(row), int(step) + 1] for row, step in np.argwhere(odd)]
 
 
-def _finite_any(covariance: Array, error: Array, counted: Array) -> Array:
+def _unusable(covariance: Array, counted: Array) -> Array:
     """Steps in which a run has an estimate whose covariance could not be used."""
     there = np.isfinite(covariance).all(axis=(-2, -1))
     return np.asarray((there & ~counted).any(axis=0))
@@ -263,7 +262,7 @@ def _groups(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None)
     return groups
 
 
-def _subset_test(error: Array, covariance: Array, nees: Array, whitened: Array, index: list[int]) -> MeanTest:
+def _subset_test(error: Array, covariance: Array, nees: Array, index: list[int]) -> MeanTest:
     w = subset(error, covariance, index)
     return mean_test(np.where(np.isfinite(nees), np.square(w).sum(axis=-1), np.nan), len(index), w)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from consistency.diagnostics.coverage import TWO_SIGMA
-from consistency.diagnostics.questions import ABOUT, BIAS, MAIN, SCALE, SHAPE
+from consistency.diagnostics.questions import BIAS, MAIN, SCALE, SHAPE
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 NOTABLE = 0.3  # difference of correlations that stands out in one step
@@ -201,6 +201,3 @@ def _asked(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
 
 def _runs(s: Mapping[str, Any]) -> str:
     return f"{s['runs']} run{'s' * (s['runs'] != 1)}"
-
-
-__all__ = ["ABOUT", "factor", "p_text", "reasons", "short"]

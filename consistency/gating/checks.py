@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.diagnostics import judge, whiten
+from consistency.diagnostics import judge, nis_of
 from consistency.types import Array, Failure, Indices, Verdict
 
 if TYPE_CHECKING:
@@ -201,8 +201,7 @@ def _innovations(
         covariance(S, "innovation_covariances", there)
         given |= {"innovations": v, "innovation_covariances": S}
         if nis is None:
-            u = np.where(there[..., None], whiten(v, np.where(there[..., None, None], S, np.eye(v.shape[-1]))), np.nan)
-            given |= {"nis": np.square(u).sum(axis=-1), "nis_dof": np.where(there, v.shape[-1], 0).astype(np.int64)}
+            given["nis"], given["nis_dof"] = nis_of(v, S)
     if nis is not None and nis_dof is not None:
         dof = array("nis_dof", nis_dof)
         shape = np.shape(nis)

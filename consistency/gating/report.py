@@ -8,6 +8,7 @@ import tempfile
 from html import escape
 from pathlib import Path
 
+from consistency.atomic import write_whole
 from consistency.gating.session import Ledger, ending, interval, named, number, outcome
 from consistency.gating.watch import Entry
 
@@ -125,18 +126,4 @@ def refusal(path: Path) -> str:
 def write(ledger: Ledger, path: Path) -> None:
     """The whole file or none: written beside its place and renamed."""
     text = as_json(ledger) if path.suffix.lower() == ".json" else as_html(ledger)
-    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        Path(partial).chmod(0o666 & ~_umask())
-        Path(partial).replace(path)
-    except BaseException:
-        Path(partial).unlink(missing_ok=True)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    write_whole(path, text.encode("utf-8"))

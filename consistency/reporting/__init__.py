@@ -6,10 +6,10 @@ statistic is computed here that the diagnostics do not already have.
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 
+from consistency.atomic import write_whole
 from consistency.errors import InputError
 
 __all__ = ["write_reports"]
@@ -71,14 +71,7 @@ def _require_writable(path: Path, overwrite: bool) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException as error:
-        Path(name).unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
-        raise
+        write_whole(path, content, 0o644)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from command import consistency
 from scipy import stats
 
 import consistency as cs
@@ -20,16 +21,6 @@ from consistency.scenario import data_folder
 
 ROOT = Path(__file__).parents[2]
 RUNS = 6
-
-
-def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run the command line; the exit status must be ``status``."""
-    done = subprocess.run(
-        [sys.executable, "-m", "consistency", *arguments], cwd=cwd, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == status, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    return done
 
 
 @pytest.fixture(scope="module")

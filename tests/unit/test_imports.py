@@ -17,7 +17,7 @@ EXPERIMENTS = PACKAGE.parent / "experiments"
 
 # a room may import rooms of lower rank and itself; rooms of equal rank do not know each other
 RANK = {
-    "types": 0, "errors": 0, "progress": 0,
+    "types": 0, "errors": 0, "progress": 0, "atomic": 0,
     "geometry": 1,
     "models": 2,
     "scenario": 3,

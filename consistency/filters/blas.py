@@ -24,8 +24,7 @@ from scipy.linalg import cython_blas, cython_lapack
 
 from consistency.filters.jit import inner
 
-ROUTINES = {"dgemm": cython_blas, "dgemv": cython_blas, "dsyrk": cython_blas, "dtrsm": cython_blas}
-ROUTINES |= {"dpotrf": cython_lapack}
+ROUTINES = dict.fromkeys(("dgemm", "dgemv", "dsymm", "dsyrk", "dtrsm"), cython_blas) | {"dpotrf": cython_lapack}
 _intrinsic: Callable[[Any], Any] = numba.extending.intrinsic
 _llvm: Any = cgutils  # untyped
 
@@ -98,6 +97,34 @@ def _dgemm_nt(
 
 
 @_intrinsic
+def _dgemm_nn(
+    _: Any, m: Any, n: Any, k: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
+) -> Any:
+    return _call("dgemm", b"NN", (m, n, k, alpha, A, lda, B, ldb, beta, C, ldc))
+
+
+@_intrinsic
+def _dgemm_tn(
+    _: Any, m: Any, n: Any, k: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
+) -> Any:
+    return _call("dgemm", b"TN", (m, n, k, alpha, A, lda, B, ldb, beta, C, ldc))
+
+
+@_intrinsic
+def _dsymm_ll(
+    _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
+) -> Any:
+    return _call("dsymm", b"LL", (m, n, alpha, A, lda, B, ldb, beta, C, ldc))
+
+
+@_intrinsic
+def _dsymm_rl(
+    _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
+) -> Any:
+    return _call("dsymm", b"RL", (m, n, alpha, A, lda, B, ldb, beta, C, ldc))
+
+
+@_intrinsic
 def _dgemv_n(
     _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, x: Any, incx: Any, beta: Any, y: Any, incy: Any
 ) -> Any:
@@ -138,6 +165,36 @@ def add_gram(weight: float, A: Any, C: Any) -> None:
 def product_of_transposed(A: Any, B: Any, C: Any) -> None:
     """C <- A' B."""
     _dgemm_nt(B.shape[1], A.shape[1], len(A), 1.0, B, _row(B), A, _row(A), 0.0, C, _row(C))
+
+
+@inner
+def add_product_of_transposed(weight: float, A: Any, B: Any, C: Any) -> None:
+    """C <- C + weight A' B."""
+    _dgemm_nt(B.shape[1], A.shape[1], len(A), weight, B, _row(B), A, _row(A), 1.0, C, _row(C))
+
+
+@inner
+def add_times_transposed(weight: float, A: Any, B: Any, C: Any) -> None:
+    """C <- C + weight A B'."""
+    _dgemm_tn(len(B), len(A), A.shape[1], weight, B, _row(B), A, _row(A), 1.0, C, _row(C))
+
+
+@inner
+def times_symmetric(A: Any, S: Any, C: Any) -> None:
+    """C <- A S, S read from its upper half."""
+    _dsymm_ll(len(S), len(A), 1.0, S, _row(S), A, _row(A), 0.0, C, _row(C))
+
+
+@inner
+def symmetric_times(S: Any, A: Any, C: Any) -> None:
+    """C <- S A, S read from its upper half."""
+    _dsymm_rl(A.shape[1], len(S), 1.0, S, _row(S), A, _row(A), 0.0, C, _row(C))
+
+
+@inner
+def product(A: Any, B: Any, C: Any) -> None:
+    """C <- A B."""
+    _dgemm_nn(B.shape[1], len(A), A.shape[1], 1.0, B, _row(B), A, _row(A), 0.0, C, _row(C))
 
 
 @inner

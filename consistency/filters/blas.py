@@ -24,6 +24,7 @@ from scipy.linalg import cython_blas, cython_lapack
 
 from consistency.filters.jit import inner
 
+SMALL = 512  # size up to which strips of dgemm are faster than dsyrk; measured with OpenBLAS
 ROUTINES = dict.fromkeys(("dgemm", "dgemv", "dsymm", "dsyrk", "dtrsm"), cython_blas) | {"dpotrf": cython_lapack}
 _intrinsic: Callable[[Any], Any] = numba.extending.intrinsic
 _llvm: Any = cgutils  # untyped
@@ -144,21 +145,9 @@ def upper_cholesky(A: Any) -> Any:
 
 
 @inner
-def solve_transposed(U: Any, B: Any) -> None:
-    """B <- U'^-1 B for the upper half U."""
-    _dtrsm_rltn(B.shape[1], len(U), 1.0, U, _row(U), B, _row(B))
-
-
-@inner
 def solve_upper(U: Any, B: Any) -> None:
     """B <- U^-1 B for the upper half U."""
     _dtrsm_rlnn(B.shape[1], len(U), 1.0, U, _row(U), B, _row(B))
-
-
-@inner
-def add_gram(weight: float, A: Any, C: Any) -> None:
-    """Upper half of C <- C + weight A' A."""
-    _dsyrk_ln(len(C), len(A), weight, A, _row(A), 1.0, C, _row(C))
 
 
 @inner
@@ -171,6 +160,35 @@ def product_of_transposed(A: Any, B: Any, C: Any) -> None:
 def add_product_of_transposed(weight: float, A: Any, B: Any, C: Any) -> None:
     """C <- C + weight A' B."""
     _dgemm_nt(B.shape[1], A.shape[1], len(A), weight, B, _row(B), A, _row(A), 1.0, C, _row(C))
+
+
+@inner
+def add_symmetric_product(weight: float, A: Any, B: Any, C: Any) -> None:
+    """Upper half of C <- C + weight A' B, which is symmetric; of the lower half, anything."""
+    n, width = len(C), 32 if len(C) <= SMALL else 256
+    for first in range(0, n, width):
+        last = min(first + width, n)
+        add_product_of_transposed(weight, A[:, :last], B[:, first:last], C[:last, first:last])
+
+
+@inner
+def add_gram(weight: float, A: Any, C: Any) -> None:
+    """Upper half of C <- C + weight A' A; of the lower half, anything."""
+    if len(C) <= SMALL:
+        add_symmetric_product(weight, A, A, C)
+    else:
+        _dsyrk_ln(len(C), len(A), weight, A, _row(A), 1.0, C, _row(C))
+
+
+@inner
+def solve_transposed(U: Any, B: Any) -> None:
+    """B <- U'^-1 B for the upper half U; in strips of rows, which is faster than one dtrsm."""
+    for first in range(0, len(U), 12):
+        last = min(first + 12, len(U))
+        if first > 0:
+            add_product_of_transposed(-1.0, U[:first, first:last], B[:first], B[first:last])
+        strip = U[first:last, first:last]
+        _dtrsm_rltn(B.shape[1], last - first, 1.0, strip, _row(strip), B[first:last], _row(B))
 
 
 @inner

@@ -12,6 +12,10 @@ carried behind those of P_a, and with W = S^-1/2 Cov(z, .) over both (W_a, W_b) 
 
     Phi <- Phi - W_a' W_b,    Psi <- Psi + W_b' W_b,    theta <- theta + W_b' y.
 
+The landmarks of the base are taken relative to the robot of the base: l - r and less its turn with the heading.
+Else P0 Psi P0 would be a small difference of large numbers wherever the pose is uncertain and what is around it is
+not, and nine digits would be left of it instead of thirteen.
+
 A new landmark is a row of Phi. A passive landmark l that is seen again needs no pass over the map: it joins
 the base, with P0_l,base Phi' as its covariance with a and -P0_l,base Psi as its row of Phi. Only when the base has
 grown too large is everything written back; a rule for when keeps the sum of both costs low. It works for
@@ -25,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.filters.blas import (
-    add_product_of_transposed,
+    add_symmetric_product,
     add_times_transposed,
     add_transposed_times,
     product,
@@ -38,10 +42,9 @@ from consistency.filters.jit import inner
 LOCAL_FROM = (
     100  # variables in the state from which local updating is tried; measured, as the next three (docs/bench.md)
 )
-TRAFFIC = 40.0  # writing P back, in variables of the base: what going through memory costs beside the arithmetic
+TRAFFIC = 60.0  # writing P back, in variables of the base: what going through memory costs beside the arithmetic
 OVERHEAD = 1e5  # multiplications (twice over) that the calls of a local step are worth
 PAUSE = 16  # steps of dense updating after a local stretch that did not pay; four times as many after the next
-BLOCK = 128
 
 
 class Local(NamedTuple):
@@ -93,6 +96,27 @@ def _place(i: int, at: Any) -> Any:
 
 
 @inner
+def _raw(x: Any, p: int, i: int, j: int, Phi: Any) -> None:
+    """Adds to rows i..i+2 of Phi the robot, or the landmark at ``p`` of the whole state, in columns of the base."""
+    for a in range(3):
+        Phi[i + a, j + a] += 1.0
+    if p > 0:
+        Phi[i, 0] += 1.0
+        Phi[i, 2] -= x[p + 1] - x[1]
+        Phi[i + 1, 1] += 1.0
+        Phi[i + 1, 2] += x[p] - x[0]
+
+
+@inner
+def _relative(x: Any, p: int, robot: Any, landmark: Any) -> None:
+    """Columns of the landmark at ``p``, x and y, become those of the base, relative to the columns of the ``robot``."""
+    dx, dy = x[p] - x[0], x[p + 1] - x[1]
+    for i in range(len(landmark)):
+        landmark[i, 0] -= robot[i, 0] - dy * robot[i, 2]
+        landmark[i, 1] -= robot[i, 1] + dx * robot[i, 2]
+
+
+@inner
 def split(x: Any, P: Any, home: Any, labels: Any, offset: Any, local: Any) -> int:
     """The robot and the known ones of ``labels`` become active and the base; returns their number of variables.
 
@@ -112,8 +136,9 @@ def split(x: Any, P: Any, home: Any, labels: Any, offset: Any, local: Any) -> in
             local.P[i, j] = _entry(P, p, _place(j, local.base))
             local.Psi[i, j] = 0.0
         local.Phi[i, :n] = 0.0
-        local.Phi[i, i] = 1.0
         local.theta[i] = 0.0
+    for i in range(0, n, 3):
+        _raw(x, _place(i, local.base), i, i, local.Phi)
     for i in range(3):
         for j in range(i):
             local.P[i, j] = local.P[j, i]
@@ -146,6 +171,8 @@ def _activate(x0: Any, P0: Any, n: int, b: int, more: int, local: Any) -> None:
             D[i, j] = _entry(P0, p, _place(j, local.base))
         for j in range(i, more):
             P[n + i, n + j] = _entry(P0, p, _place(b + j, local.base))
+    for j in range(3, b, 3):
+        _relative(x0, local.base[j // 3 - 1], D[:, :3], D[:, j : j + 2])
     times_symmetric(D, Psi[:b, :b], G)
     P[:n, n : n + more] = 0.0
     add_times_transposed(1.0, Phi[:n, :b], D, P[:n, n : n + more])
@@ -157,8 +184,8 @@ def _activate(x0: Any, P0: Any, n: int, b: int, more: int, local: Any) -> None:
     Phi[: n + more, b : b + more] = 0.0
     Psi[: b + more, b : b + more] = 0.0
     local.theta[b : b + more] = 0.0
-    for i in range(more):
-        Phi[n + i, b + i] = 1.0
+    for i in range(0, more, 3):
+        _raw(x0, local.base[(b + i) // 3 - 1], n + i, b + i, Phi)
 
 
 @inner
@@ -177,10 +204,10 @@ def join(x: Any, P: Any, whole: int, home: Any, n: int, b: int, local: Any) -> N
     x0 = local.rows[:b, :whole]
     gather_rows(P, whole, local.base, b // 3 - 1, x0)
     owed = local.owed[:b, :whole]
+    for j in range(3, b, 3):
+        _relative(x, local.base[j // 3 - 1], x0[:3].T, x0[j : j + 2].T)
     symmetric_times(local.Psi[:b, :b], x0, owed)
-    for first in range(0, whole, BLOCK):
-        last = min(first + BLOCK, whole)
-        add_product_of_transposed(-1.0, x0[:, :last], owed[:, first:last], P[:last, first:last])
+    add_symmetric_product(-1.0, x0, owed, P[:whole, :whole])
     add_transposed_times(x0, local.theta[:b], x[:whole])
     _settle_active(x, P, whole, home, n, b, local)
 

@@ -24,8 +24,8 @@ from scipy.linalg import cython_blas, cython_lapack
 
 from consistency.filters.jit import inner
 
-ROUTINES = {"dgemm": cython_blas, "dgemv": cython_blas, "dsyrk": cython_blas, "dtrsm": cython_blas}
-ROUTINES |= {"dpotrf": cython_lapack}
+SMALL = 512  # size up to which strips of dgemm are faster than dsyrk; measured with OpenBLAS
+ROUTINES = dict.fromkeys(("dgemm", "dgemv", "dsymm", "dsyrk", "dtrsm"), cython_blas) | {"dpotrf": cython_lapack}
 _intrinsic: Callable[[Any], Any] = numba.extending.intrinsic
 _llvm: Any = cgutils  # untyped
 
@@ -98,6 +98,34 @@ def _dgemm_nt(
 
 
 @_intrinsic
+def _dgemm_nn(
+    _: Any, m: Any, n: Any, k: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
+) -> Any:
+    return _call("dgemm", b"NN", (m, n, k, alpha, A, lda, B, ldb, beta, C, ldc))
+
+
+@_intrinsic
+def _dgemm_tn(
+    _: Any, m: Any, n: Any, k: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
+) -> Any:
+    return _call("dgemm", b"TN", (m, n, k, alpha, A, lda, B, ldb, beta, C, ldc))
+
+
+@_intrinsic
+def _dsymm_ll(
+    _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
+) -> Any:
+    return _call("dsymm", b"LL", (m, n, alpha, A, lda, B, ldb, beta, C, ldc))
+
+
+@_intrinsic
+def _dsymm_rl(
+    _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, B: Any, ldb: Any, beta: Any, C: Any, ldc: Any
+) -> Any:
+    return _call("dsymm", b"RL", (m, n, alpha, A, lda, B, ldb, beta, C, ldc))
+
+
+@_intrinsic
 def _dgemv_n(
     _: Any, m: Any, n: Any, alpha: Any, A: Any, lda: Any, x: Any, incx: Any, beta: Any, y: Any, incy: Any
 ) -> Any:
@@ -117,27 +145,74 @@ def upper_cholesky(A: Any) -> Any:
 
 
 @inner
-def solve_transposed(U: Any, B: Any) -> None:
-    """B <- U'^-1 B for the upper half U."""
-    _dtrsm_rltn(B.shape[1], len(U), 1.0, U, _row(U), B, _row(B))
-
-
-@inner
 def solve_upper(U: Any, B: Any) -> None:
     """B <- U^-1 B for the upper half U."""
     _dtrsm_rlnn(B.shape[1], len(U), 1.0, U, _row(U), B, _row(B))
 
 
 @inner
-def add_gram(weight: float, A: Any, C: Any) -> None:
-    """Upper half of C <- C + weight A' A."""
-    _dsyrk_ln(len(C), len(A), weight, A, _row(A), 1.0, C, _row(C))
-
-
-@inner
 def product_of_transposed(A: Any, B: Any, C: Any) -> None:
     """C <- A' B."""
     _dgemm_nt(B.shape[1], A.shape[1], len(A), 1.0, B, _row(B), A, _row(A), 0.0, C, _row(C))
+
+
+@inner
+def add_product_of_transposed(weight: float, A: Any, B: Any, C: Any) -> None:
+    """C <- C + weight A' B."""
+    _dgemm_nt(B.shape[1], A.shape[1], len(A), weight, B, _row(B), A, _row(A), 1.0, C, _row(C))
+
+
+@inner
+def add_symmetric_product(weight: float, A: Any, B: Any, C: Any) -> None:
+    """Upper half of C <- C + weight A' B, which is symmetric; of the lower half, anything."""
+    n, width = len(C), 32 if len(C) <= SMALL else 256
+    for first in range(0, n, width):
+        last = min(first + width, n)
+        add_product_of_transposed(weight, A[:, :last], B[:, first:last], C[:last, first:last])
+
+
+@inner
+def add_gram(weight: float, A: Any, C: Any) -> None:
+    """Upper half of C <- C + weight A' A; of the lower half, anything."""
+    if len(C) <= SMALL:
+        add_symmetric_product(weight, A, A, C)
+    else:
+        _dsyrk_ln(len(C), len(A), weight, A, _row(A), 1.0, C, _row(C))
+
+
+@inner
+def solve_transposed(U: Any, B: Any) -> None:
+    """B <- U'^-1 B for the upper half U; in strips of rows, which is faster than one dtrsm."""
+    for first in range(0, len(U), 12):
+        last = min(first + 12, len(U))
+        if first > 0:
+            add_product_of_transposed(-1.0, U[:first, first:last], B[:first], B[first:last])
+        strip = U[first:last, first:last]
+        _dtrsm_rltn(B.shape[1], last - first, 1.0, strip, _row(strip), B[first:last], _row(B))
+
+
+@inner
+def add_times_transposed(weight: float, A: Any, B: Any, C: Any) -> None:
+    """C <- C + weight A B'."""
+    _dgemm_tn(len(B), len(A), A.shape[1], weight, B, _row(B), A, _row(A), 1.0, C, _row(C))
+
+
+@inner
+def times_symmetric(A: Any, S: Any, C: Any) -> None:
+    """C <- A S, S read from its upper half."""
+    _dsymm_ll(len(S), len(A), 1.0, S, _row(S), A, _row(A), 0.0, C, _row(C))
+
+
+@inner
+def symmetric_times(S: Any, A: Any, C: Any) -> None:
+    """C <- S A, S read from its upper half."""
+    _dsymm_rl(A.shape[1], len(S), 1.0, S, _row(S), A, _row(A), 0.0, C, _row(C))
+
+
+@inner
+def product(A: Any, B: Any, C: Any) -> None:
+    """C <- A B."""
+    _dgemm_nn(B.shape[1], len(A), A.shape[1], 1.0, B, _row(B), A, _row(A), 0.0, C, _row(C))
 
 
 @inner

@@ -13,6 +13,7 @@ from threadpoolctl import ThreadpoolController
 
 from consistency.errors import InputError
 from consistency.filters.jit import is_compiled
+from consistency.filters.local import LOCAL_FROM
 from consistency.filters.textbook import ExtendedKalman, sensor_noise
 from consistency.filters.trial import REASONS, run_trial
 from consistency.models.motion import dead_reckoning
@@ -44,7 +45,12 @@ def one_blas_thread() -> Iterator[None]:
 
 
 class Compiled:
-    """``init``, ``predict``, ``update``, ``pose`` of the twin, and ``run`` of the kernel."""
+    """``init``, ``predict``, ``update``, ``pose`` of the twin, and ``run`` of the kernel.
+
+    ``local_from``: variables in the state from which the kernel updates locally; the numbers are the same.
+    """
+
+    local_from = LOCAL_FROM
 
     def __init__(self, twin: ExtendedKalman, rule: int, model: int, sensors: tuple[str, ...]) -> None:
         self.twin, self.rule, self.model, self.sensors = twin, rule, model, sensors
@@ -85,7 +91,7 @@ class Compiled:
         copies = [np.array(a, dtype=kind, order="C") for a, kind in arrays]
         try:
             with one_blas_thread():
-                out = run_trial(self.rule, self.model, trial.n_landmarks, *copies)
+                out = run_trial(self.rule, self.model, trial.n_landmarks, *copies, self.local_from)
         except SystemError as error:  # Ctrl-C in the main thread comes out of a kernel like this
             raise KeyboardInterrupt from error
         pose, covariance, nis, nis_dof, step, code = out

@@ -15,7 +15,7 @@ from consistency.filters.linalg import DEFICIENT
 
 @inner
 def gather_rows(P: Any, n: int, at: Any, m: int, rows: Any) -> None:
-    """Whole rows of P: of the robot in rows 0-2, then of the ``m`` landmarks at state offsets ``at``."""
+    """Whole rows of P: of the robot in rows 0-2, then of the ``m`` landmarks at offsets ``at``."""
     rows[:3, :n] = P[:3, :n]
     for i in range(m):
         o = at[i]
@@ -50,12 +50,18 @@ def subtract_gram(P: Any, n: int, W: Any) -> None:
 
 
 @inner
-def move_pose(P: Any, n: int, fx: Any, fy: Any) -> None:
-    """P <- F P F' where F is the identity but for F[0, 2] = fx and F[1, 2] = fy."""
+def move_rows(P: Any, n: int, fx: Any, fy: Any) -> None:
+    """P <- F P where F is the identity but for F[0, 2] = fx and F[1, 2] = fy."""
     p0, p1, p2 = P[0], P[1], P[2]
     for j in range(n):
         p0[j] += fx * p2[j]
         p1[j] += fy * p2[j]
+
+
+@inner
+def move_pose(P: Any, n: int, fx: Any, fy: Any) -> None:
+    """P <- F P F'."""
+    move_rows(P, n, fx, fy)
     for i in range(3):
         P[i, 0] += fx * P[i, 2]
         P[i, 1] += fy * P[i, 2]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from consistency.filters.covariance import gather_rows, move_pose
+from consistency.filters.covariance import gather_rows, move_pose, move_rows
 from consistency.filters.jit import inner
 from consistency.filters.observation import linearise
 from consistency.filters.sigma_points import innovate_unscented, predict_unscented
@@ -22,14 +22,20 @@ LINEARISED, FIXED, UNSCENTED = 0, 1, 2
 
 
 @inner
-def predict(rule: int, x: Any, P: Any, n: int, u: Any, pose0: Any, q: Any, points: Any, work: Any) -> None:
-    """x, P <- one step of motion, in place; ``u`` is (dt, v, omega) and ``q`` (sigma_v, sigma_omega)."""
+def predict(
+    rule: int, x: Any, P: Any, n: int, Phi: Any, b: int, u: Any, pose0: Any, q: Any, points: Any, work: Any
+) -> None:
+    """x, P, Phi <- one step of motion, in place; ``u`` is (dt, v, omega) and ``q`` (sigma_v, sigma_omega).
+
+    Phi has ``b`` columns, none unless the updating is local.
+    """
     heading = pose0[2] if rule == FIXED else x[2]
     if rule == UNSCENTED:
-        predict_unscented(x, P, n, u, points, work)
+        predict_unscented(x, P, n, Phi, b, u, points, work)
     else:
         fx, fy = unicycle_jacobian(heading, u[0], u[1])
         move_pose(P, n, fx, fy)
+        move_rows(Phi, b, fx, fy)
         if rule == FIXED:
             _move_fixed(x, u, pose0, fx, fy)
         else:
@@ -39,14 +45,39 @@ def predict(rule: int, x: Any, P: Any, n: int, u: Any, pose0: Any, q: Any, point
 
 @inner
 def innovate(
-    rule: int, model: int, x: Any, P: Any, n: int, m: int, pose0: Any, landmarks0: Any, rig: Any, points: Any, work: Any
+    rule: int,
+    model: int,
+    x: Any,
+    P: Any,
+    n: int,
+    Phi: Any,
+    b: int,
+    m: int,
+    pose0: Any,
+    landmarks0: Any,
+    rig: Any,
+    points: Any,
+    work: Any,
 ) -> Any:
-    """zhat, S (without R) and A = Cov(z, x) of the ``m`` landmarks in ``work.at``; False if P is indefinite."""
+    """zhat, S (without R) and A = Cov(z, x) of the ``m`` landmarks in ``work.at``; False if P is indefinite.
+
+    Behind the ``n`` columns of A, and treated alike, come the ``b`` that belong to Phi.
+    """
     gather_rows(P, n, work.at, m, work.rows)
+    if b > 0:
+        _gather_phi(Phi, n, b, m, work)
     if rule == UNSCENTED:
-        return innovate_unscented(model, x, n, m, rig, points, work)
-    _innovate_jacobian(model, x, n, m, pose0, landmarks0, rig, work)
+        return innovate_unscented(model, x, n + b, m, rig, points, work)
+    _innovate_jacobian(model, x, n + b, m, pose0, landmarks0, rig, work)
     return True
+
+
+@inner
+def _gather_phi(Phi: Any, n: int, b: int, m: int, work: Any) -> None:
+    work.rows[:3, n : n + b] = Phi[:3, :b]
+    for i in range(m):
+        o = work.at[i]
+        work.rows[3 * i + 3 : 3 * i + 6, n : n + b] = Phi[o : o + 3, :b]
 
 
 @inner
@@ -69,7 +100,9 @@ def _move_fixed(x: Any, u: Any, pose0: Any, fx: Any, fy: Any) -> None:
 
 
 @inner
-def _innovate_jacobian(model: int, x: Any, n: int, m: int, pose0: Any, landmarks0: Any, rig: Any, work: Any) -> None:
+def _innovate_jacobian(
+    model: int, x: Any, width: int, m: int, pose0: Any, landmarks0: Any, rig: Any, work: Any
+) -> None:
     """zhat, S and A = H P: a row of H has six numbers."""
     zhat, A, S, Hp, Hl = work.zhat, work.A, work.S, work.Hp, work.Hl
     p0, p1, p2 = work.rows[0], work.rows[1], work.rows[2]
@@ -81,7 +114,7 @@ def _innovate_jacobian(model: int, x: Any, n: int, m: int, pose0: Any, landmarks
         for a in range(3):
             row = A[3 * i + a]
             g0, g1, g2, h0, h1, h2 = Hp[i, a, 0], Hp[i, a, 1], Hp[i, a, 2], Hl[i, a, 0], Hl[i, a, 1], Hl[i, a, 2]
-            for j in range(n):
+            for j in range(width):
                 row[j] = g0 * p0[j] + g1 * p1[j] + g2 * p2[j] + h0 * l0[j] + h1 * l1[j] + h2 * l2[j]
     for i in range(m):
         o = work.at[i]

@@ -35,8 +35,8 @@ def _weights(L: int, points: Any) -> Any:
 
 
 @inner
-def predict_unscented(x: Any, P: Any, n: int, u: Any, points: Any, work: Any) -> None:
-    """x, P <- the unscented transform of the robot; without process noise."""
+def predict_unscented(x: Any, P: Any, n: int, Phi: Any, b: int, u: Any, points: Any, work: Any) -> None:
+    """x, P, Phi <- the unscented transform of the robot; without process noise."""
     spread, w0m, w0c, w = _weights(3, points)
     C, F, Y = work.small, work.F, work.moved
     if not semidefinite_cholesky(P[:3, :3], C):
@@ -55,7 +55,8 @@ def predict_unscented(x: Any, P: Any, n: int, u: Any, points: Any, work: Any) ->
             x[a] += w * Y[k, a]
         for j in range(3):
             F[a, j] = w * spread * (Y[2 * j, a] - Y[2 * j + 1, a])  # Cov(f, C-coordinates)
-    _move_cross(P, n, C, F)
+    _move_cross(P, 3, n, C, F)
+    _move_cross(Phi, 0, b, C, F)
     for a in range(3):
         for b in range(3):
             P[a, b] = w0c * (Y[6, a] - x[a]) * (Y[6, b] - x[b])
@@ -64,15 +65,15 @@ def predict_unscented(x: Any, P: Any, n: int, u: Any, points: Any, work: Any) ->
 
 
 @inner
-def _move_cross(P: Any, n: int, C: Any, F: Any) -> None:
-    """P_robot,rest <- F C^-1 P_robot,rest; a zero pivot of C carries nothing."""
+def _move_cross(P: Any, first: int, last: int, C: Any, F: Any) -> None:
+    """Columns first..last-1 of the robot's rows: P <- F C^-1 P; a zero pivot of C carries nothing."""
     i0, i1, i2 = _reciprocal(C[0, 0]), _reciprocal(C[1, 1]), _reciprocal(C[2, 2])
     c10, c20, c21 = C[1, 0], C[2, 0], C[2, 1]
     f00, f01, f02 = F[0, 0], F[0, 1], F[0, 2]
     f10, f11, f12 = F[1, 0], F[1, 1], F[1, 2]
     f20, f21, f22 = F[2, 0], F[2, 1], F[2, 2]
     p0, p1, p2 = P[0], P[1], P[2]
-    for j in range(3, n):
+    for j in range(first, last):
         g0 = p0[j] * i0
         g1 = (p1[j] - c10 * g0) * i1
         g2 = (p2[j] - c20 * g0 - c21 * g1) * i2
@@ -87,7 +88,7 @@ def _reciprocal(pivot: Any) -> Any:
 
 
 @inner
-def innovate_unscented(model: int, x: Any, n: int, m: int, rig: Any, points: Any, work: Any) -> bool:
+def innovate_unscented(model: int, x: Any, width: int, m: int, rig: Any, points: Any, work: Any) -> bool:
     """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite."""
     L = 3 + 3 * m
     spread, w0m, w0c, w = _weights(L, points)
@@ -114,7 +115,7 @@ def innovate_unscented(model: int, x: Any, n: int, m: int, rig: Any, points: Any
         if work.U[j, j] == 0.0:  # row j of Mt and the rest of row j of U are zero, and stay so
             work.U[j, j] = 1.0
     solve_upper(work.U[:L, :L], Mt)
-    product_of_transposed(Mt, work.rows[:L, :n], work.A[: 3 * m, :n])
+    product_of_transposed(Mt, work.rows[:L, :width], work.A[: 3 * m, :width])
     return True
 
 

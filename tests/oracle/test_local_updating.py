@@ -1,0 +1,109 @@
+"""Local updating is the dense filter: the same numbers whatever is active, when it is settled and how often."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import consistency as cs
+from consistency.filters.stepping import step_through
+from consistency.scenario import Belief
+from consistency.types import Estimates, Trial
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+from bench_trials import growing, grown
+
+NEVER = 10**9
+ALL = [
+    ("kf", "linear-gaussian"),
+    ("ekf-xyz", "herath2007-xyz"),
+    ("ekf-xyz", "herath2007-stereo"),
+    ("ekf-uvd", "herath2007-stereo"),
+    ("ukf-xyz", "herath2007-xyz"),
+    ("ukf-uvd", "herath2007-stereo"),
+]
+
+
+def run(name: str, trial: Trial, belief: Belief, local_from: int, monkeypatch: pytest.MonkeyPatch) -> Estimates:
+    filter_ = cs.get_filter(name)
+    monkeypatch.setattr(filter_, "local_from", local_from)
+    said: Estimates = filter_.run(trial, belief)
+    return said
+
+
+def gap(a: Estimates, b: Estimates) -> float:
+    """Largest difference of poses, of covariances in correlation units, and of NIS relative to it."""
+    assert a.failure is None
+    assert b.failure is None
+    assert np.array_equal(a.nis_dof, b.nis_dof)
+    sigma = np.sqrt(np.einsum("kii->ki", b.covariance))
+    scale = np.maximum(sigma[:, :, None] * sigma[:, None, :], 1e-30)
+    nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
+    return float(max(np.abs(a.pose - b.pose).max(), (np.abs(a.covariance - b.covariance) / scale).max(), nis))
+
+
+@pytest.mark.parametrize(("name", "world"), ALL)
+def test_every_filter_equals_its_dense_self(monkeypatch: pytest.MonkeyPatch, name: str, world: str) -> None:
+    scenario = cs.load_scenario(world)
+    trial = cs.simulate(scenario, run=2)
+    local, dense = (run(name, trial, scenario.belief, each, monkeypatch) for each in (10, NEVER))
+    assert gap(local, dense) < 1e-9
+    assert not np.array_equal(local.covariance, dense.covariance), "nothing was updated locally"
+
+
+def test_the_textbook_twin_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = growing(80, 3)
+    local = run("ekf-xyz", case.trial, case.belief, 10, monkeypatch)
+    assert gap(local, step_through(cs.get_filter("ekf-xyz").twin, case.trial, case.belief)) < 1e-9
+
+
+@pytest.mark.parametrize("local_from", [4, 60, 150])
+def test_places_seen_again(monkeypatch: pytest.MonkeyPatch, local_from: int) -> None:
+    """A loop of which every landmark is left and met again."""
+    scenario = cs.load_scenario("long-loop")
+    trial = cs.simulate(scenario)
+    local, dense = (run("ekf-xyz", trial, scenario.belief, each, monkeypatch) for each in (local_from, NEVER))
+    assert gap(local, dense) < 1e-9
+    assert not np.array_equal(local.covariance, dense.covariance)
+
+
+@pytest.mark.parametrize("name", ["ekf-xyz", "ukf-xyz"])
+@pytest.mark.parametrize("make", [lambda: growing(300, 2), lambda: grown(200, 150)], ids=["new ones", "known ones"])
+def test_one_landmark_more_in_each_step(monkeypatch: pytest.MonkeyPatch, name: str, make: Callable[[], Any]) -> None:
+    case = make()
+    local, dense = (run(name, case.trial, case.belief, each, monkeypatch) for each in (40, NEVER))
+    assert gap(local, dense) < 1e-9
+    assert not np.array_equal(local.covariance, dense.covariance)
+
+
+def test_steps_without_a_landmark(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot alone stays active; then it sees again what it saw at first."""
+    case = grown(30, 60)
+    trial = case.trial
+    step = np.repeat(np.arange(trial.steps), np.diff(trial.first))
+    kept = (step < 8) | (step > 40)
+    first = np.searchsorted(step[kept], np.arange(trial.steps + 1))
+    assert (np.diff(first) == 0).sum() > 30
+    sparse = cs.Trial(
+        0, trial.start, trial.controls, first, trial.landmark[kept], trial.z[kept], trial.n_landmarks, trial.truth
+    )
+    local, dense = (run("ekf-xyz", sparse, case.belief, each, monkeypatch) for each in (10, NEVER))
+    assert gap(local, dense) < 1e-9
+
+
+@pytest.mark.parametrize("steps", [3, 30, 80])
+def test_a_failure_is_in_the_same_step(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    case = growing(100, 1)
+    z = case.trial.z.copy()
+    z[case.trial.first[steps - 1]] = np.nan
+    t = case.trial
+    broken = cs.Trial(0, t.start, t.controls, t.first, t.landmark, z, t.n_landmarks, t.truth)
+    local, dense = (run("ekf-xyz", broken, case.belief, each, monkeypatch) for each in (10, NEVER))
+    assert local.failure == dense.failure
+    assert local.failure is not None
+    assert local.failure.step >= steps

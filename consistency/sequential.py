@@ -60,9 +60,9 @@ def run_until_decided(
         try:
             results = run_trials(scenario, filters, look, seed, jobs, timeout, results or previous)
         except Interrupted as stop:
-            assert isinstance(stop.results, Results)
-            raise Interrupted(_marked(stop.results, plan)) from None
-        results = _marked(results, plan)
+            manifest = stop.results.manifest | {"until_decided": plan}
+            raise Interrupted(replace(stop.results, manifest=manifest)) from None
+        results = replace(results, manifest=results.manifest | {"until_decided": plan})
         verdicts = {n: design.settle(verdict_of(curves(results, n), design.look_false_alarm)) for n in results.filters}
         final = look == looks[-1]
         decided |= {n: v for n, v in verdicts.items() if n not in decided and (final or settled(v))}
@@ -91,7 +91,3 @@ def said(decided: dict[str, Verdict], open_: list[str]) -> str:
     """One line of progress."""
     parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
     return ", ".join(parts + [f"{name} open" for name in open_])
-
-
-def _marked(results: Results, plan: dict[str, Any]) -> Results:
-    return replace(results, manifest=results.manifest | {"until_decided": plan})

@@ -63,18 +63,16 @@ def _versions() -> tuple[tuple[str, str], ...]:
 def _git_commit() -> str | None:
     """Commit of the checkout that the package runs from, with ``-dirty`` where it was changed; None elsewhere."""
     root = Path(__file__).parents[1]
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
-
+    if not (root / ".git").exists():  # installed, perhaps inside somebody else's repository
+        return None
+    command = ["git", "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]
     try:
-        if Path(git("rev-parse", "--show-toplevel")) != root:  # installed inside somebody else's repository
-            return None
-        dirty = git("status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "HEAD") + ("-dirty" if dirty else "")
+        lines = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
         return None
+    commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid ")), "(initial)")
+    dirty = any(not line.startswith("#") for line in lines)
+    return None if commit == "(initial)" else commit + ("-dirty" if dirty else "")
 
 
 def plain(value: Any) -> Any:

@@ -117,14 +117,18 @@ def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[int, 
     if not counted.any():
         return 0, 1, float("nan"), float("nan")
     n, count = error.shape[-1], int(counted.sum())
-    stated, total, second = np.zeros((n, n)), np.zeros(n), np.zeros((n, n))
-    for here in blocks(*counted.shape):
-        P, e = covariance[here][counted[here]], standardise(error[here], covariance[here])[counted[here]]
+    parts = list(blocks(*counted.shape))
+
+    def standard(here: slice) -> Array:
+        return standardise(error[here], covariance[here])[counted[here]]
+
+    mean = sum(e.sum(axis=0) for e in map(standard, parts)) / count
+    stated, second = np.zeros((n, n)), np.zeros((n, n))
+    for here in parts:
+        P, e = covariance[here][counted[here]], standard(here) - mean
         sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
         stated += (P / (sigma[:, :, None] * sigma[:, None, :])).sum(axis=0) / count
-        total += e.sum(axis=0) / count
         second += e.T @ e / count
-    second -= np.outer(total, total)
     scale = np.sqrt(np.diag(second))
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.nan_to_num(second / np.outer(scale, scale) - stated)

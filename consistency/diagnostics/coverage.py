@@ -6,7 +6,7 @@ import numpy as np
 from scipy import special
 
 from consistency.diagnostics.blocks import blocks, by_runs
-from consistency.diagnostics.whitening import spread_steps
+from consistency.diagnostics.whitening import spread_steps, squared_length
 from consistency.types import Array
 
 TWO_SIGMA = 0.9544997361036416  # P(|N(0, 1)| <= 2)
@@ -36,7 +36,7 @@ def _sigma(variance: Array) -> Array:
 
 def rmse(error: Array) -> float:
     """Root of the mean squared length of errors (..., n) over all runs and steps; NaN rows do not count."""
-    squared = np.sum(np.square(np.asarray(error, float)), axis=-1)
+    squared = squared_length(np.asarray(error, float))
     squared = squared[np.isfinite(squared)]
     return float(np.sqrt(squared.mean())) if squared.size else float("nan")
 

@@ -53,9 +53,8 @@ def locate_axes(
     counted = np.isfinite(nees[:, late])
     s["of_axes"] = {}
     for key, index in groups.items():
-        w = subset(error[:, late], covariance[:, late], index)
-        of_runs, count = run_means(np.where(counted, squared_length(w), np.nan))
-        s["of_axes"][key] = ratio_interval(of_runs[count > 0] / len(index), confidence)
+        of_runs = _run_means_of(error[:, late], covariance[:, late], counted, index)
+        s["of_axes"][key] = ratio_interval(of_runs[~np.isnan(of_runs)] / len(index), confidence)
     standard = standardise(error[:, late], covariance[:, late])
     standard[~counted] = np.nan
     rows, n = counted.any(axis=1), error.shape[-1]
@@ -85,6 +84,15 @@ def subset(error: Array, covariance: Array, index: list[int]) -> Array:
         return standardise(e, P) if len(index) == 1 else whiten(e, P)
 
     return by_runs(of_block, error, covariance)
+
+
+def _run_means_of(error: Array, covariance: Array, counted: Array, index: list[int]) -> Array:
+    """Mean NEES of each run by a group of components alone, (runs,); NaN where it has none."""
+
+    def of_block(e: Array, P: Array, counted: Array) -> Array:
+        return run_means(np.where(counted, squared_length(subset(e, P, index)), np.nan))[0]
+
+    return by_runs(of_block, error, covariance, counted)
 
 
 def _found(found: Mapping[str, Answer], questions: tuple[str, ...]) -> bool:

@@ -185,7 +185,6 @@ def _errors(
     if len(names) != n:
         raise ValueError(f"{len(names)} names of axes for {n} components")
     counted = np.isfinite(nees)
-    error = np.where(counted[..., None], error, np.nan)
     groups = _groups(names, subsets)
     tests = {key: _subset_test(error, covariance, nees, index) for key, index in groups.items()}
     worst = float(np.min([t.above if allow else t.p_value for t in tests.values()], initial=1.0))
@@ -212,6 +211,7 @@ def _errors(
         s["shape_step"] = int(np.nanargmin(shape_steps)) + 1 if asked else None
         p |= {"shape": shape, "shape in some step": at_step} if several else {"shape": at_step}
     index, inclination = noncredibility(error, nees)
+    error = np.where(counted[..., None], error, np.nan)
     inside, interval = coverage_interval(error, covariance)
     position = [i for i, axis in enumerate(names) if axis in POSITION]
     attitude = [i for i, axis in enumerate(names) if axis in ATTITUDE]

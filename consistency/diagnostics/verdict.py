@@ -263,7 +263,8 @@ def _groups(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None)
 
 def _subset_test(error: Array, covariance: Array, nees: Array, index: list[int]) -> MeanTest:
     w = subset(error, covariance, index)
-    return mean_test(np.where(np.isfinite(nees), squared_length(w), np.nan), len(index), w)
+    w[~np.isfinite(nees)] = np.nan
+    return mean_test(squared_length(w), len(index), w)
 
 
 def _nees(s: dict[str, Any], nees: Array, dof: int, whitened: Array | None, allow: str | None) -> dict[str, float]:

@@ -67,6 +67,18 @@ def test_blocks_do_not_change_the_verdict(
     assert all(np.array_equal(before[name], array, equal_nan=True) for name, array in arrays.items())
 
 
+def test_what_is_left_out_by_name_counts_nowhere(rng: np.random.Generator) -> None:
+    """Errors of a step without NEES: any other value there gives the same verdict."""
+    arrays = sample(rng, RUNS, STEPS)
+    nees = np.full((RUNS, STEPS), np.nan)
+    nees[:, 1:] = 1.0  # which steps count; the values are worked out from the errors
+    a = judge("f", **arrays, nees=nees)
+    arrays["error"][:, 0] *= 1e3
+    equal(a.statistics, judge("f", **arrays, nees=nees).statistics)
+    arrays["error"][:, 1] *= 1e3
+    assert judge("f", **arrays, nees=nees).statistic > 10 * a.statistic, "negative control"
+
+
 def test_a_verdict_needs_less_memory_than_its_arrays_hold(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,8 +60,12 @@ def _versions() -> tuple[tuple[str, str], ...]:
     return tuple(found)
 
 
+@functools.cache
 def _git_commit() -> str | None:
-    """Commit of the checkout that the package runs from, with ``-dirty`` where it was changed; None elsewhere."""
+    """Commit of the checkout that the package runs from, with ``-dirty`` where it was changed; None elsewhere.
+
+    Asked once a process, as its modules are read once.
+    """
     root = Path(__file__).parents[1]
     if not (root / ".git").exists():  # installed, perhaps inside somebody else's repository
         return None

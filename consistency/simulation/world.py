@@ -13,6 +13,8 @@ from consistency.types import Array, Indices, Trial
 MOTION_NOISE, OBSERVATION_NOISE = 0, 1  # purposes in the spawn key of the seed
 BLOCK = 8192  # numbers in each array of a search for what is in view: they stay in the processor's cache
 
+SOME = 50  # steps of the planned path that are searched at a time for a landmark
+
 
 class World:
     """What all trials of a scenario share, worked out once; any number of threads may ask it for trials."""
@@ -85,18 +87,20 @@ def require_landmarks_in_view(scenario: Scenario) -> World:
     """The scenario's world; raises :class:`InputError` if no landmark comes into view on the planned path."""
     truth = scenario.truth
     world = World(truth)
-    step, landmark = _in_view(truth, world.reference, world.landmarks)
-    if isinstance(truth.sensor, UvdSensor):
-        d = _measure(truth, world.reference[step + 1], world.landmarks[landmark])[:, 2]
-        low, high = truth.sensor.disparity
-        slack = 6.0 * truth.sensor.sigma[2]
-        step = step[(d > low - slack) & (d < high + slack)]
-    if not len(step):
-        raise InputError(
-            f"scenario '{scenario.name}': no landmark comes into view in {truth.steps} steps; "
-            "check truth.sensor (range, image, f, disparity, mount), truth.landmarks and truth.path"
-        )
-    return world
+    for k in range(0, truth.steps, SOME):
+        path = world.reference[k : k + SOME + 1]
+        step, landmark = _in_view(truth, path, world.landmarks)
+        if isinstance(truth.sensor, UvdSensor):
+            d = _measure(truth, path[step + 1], world.landmarks[landmark])[:, 2]
+            low, high = truth.sensor.disparity
+            slack = 6.0 * truth.sensor.sigma[2]
+            step = step[(d > low - slack) & (d < high + slack)]
+        if len(step):
+            return world
+    raise InputError(
+        f"scenario '{scenario.name}': no landmark comes into view in {truth.steps} steps; "
+        "check truth.sensor (range, image, f, disparity, mount), truth.landmarks and truth.path"
+    )
 
 
 def _drive_linear(reference: Array, planned: Array, noise: Array) -> Array:

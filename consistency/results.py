@@ -246,6 +246,8 @@ def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
 
 def failures_table(failures: Sequence[Failure]) -> pd.DataFrame:
     """``failures.parquet``."""
+    if not failures:
+        return _empty("failures")
     rows = [(f.filter, f.run, f.step, f.reason) for f in failures]
     return pd.DataFrame(rows, columns=list(COLUMNS["failures"])).astype(COLUMNS["failures"])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
+from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
@@ -148,8 +149,7 @@ class Gathered:
         """The kept runs of the previous results, one by one."""
         last = -1
         for batch in [] if self.previous is None else self.previous.batches(table, columns, filter_name):
-            starts = np.flatnonzero(np.diff(batch["run"], prepend=-1))
-            for start, end in zip(starts, [*starts[1:], len(batch["run"])], strict=True):
+            for start, end in pairwise(np.flatnonzero(np.diff(batch["run"], prepend=-1, append=-1))):
                 run = int(batch["run"][start])
                 if run < last:
                     raise InputError(f"the {table} to resume must be in order of the runs, as they were written")

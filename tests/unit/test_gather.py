@@ -236,6 +236,21 @@ def test_resuming_keeps_failures_and_fills_gaps(uvd: cs.Scenario, tmp_path: Path
     assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
+def test_a_filter_without_any_row_is_resumed(uvd: cs.Scenario, tmp_path: Path) -> None:
+    class Stillborn(Halts):
+        name = "stillborn"
+
+        def init(self, problem: Any) -> dict[str, Any]:
+            raise KeyError("no such map")
+
+    filters = [Stillborn(), "ekf-uvd"]
+    cs.run_trials(uvd, filters, runs=2, jobs=1, out=tmp_path / "out")
+    for previous in (open_results(tmp_path / "out"), cs.read_results(tmp_path / "out")):
+        cs.run_trials(uvd, filters, runs=4, jobs=1, previous=previous, out=tmp_path / "out", overwrite=True)
+        cs.run_trials(uvd, filters, runs=4, jobs=1, out=tmp_path / "whole", overwrite=True)
+        assert content(tmp_path / "out") == content(tmp_path / "whole")
+
+
 def test_rows_out_of_order_are_not_resumed(uvd: cs.Scenario, written: Path) -> None:
     memory = cs.read_results(written)
     upside_down = cs.Results(memory.estimates[::-1], memory.failures, memory.truth, memory.landmarks, memory.manifest)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import consistency as cs
-from consistency import gather, parquet
+from consistency import gather, montecarlo, parquet
 from consistency.montecarlo import Interrupted
-from consistency.results import StoredResults, open_results
+from consistency.results import Outcome, StoredResults, open_results, outcome_of
 from consistency.simulation import World
 from consistency.table import verdicts_json
 from consistency.types import Trial
@@ -127,21 +128,37 @@ def peak(work: Callable[[], object]) -> float:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_memory_does_not_grow_with_the_runs(
-    uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int
-) -> None:
+def test_memory_does_not_grow_with_the_runs(uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parquet, "ROWS", 256)
-    monkeypatch.setattr("consistency.montecarlo.AHEAD", 2)
     few, many = 10, 60
     row = 8 * (len(parquet.COLUMNS["estimates"]) - 1 + len(parquet.COLUMNS["truth"]))
     all_rows = (many - few) * 60 * row
     streamed = [
-        peak(lambda n=n: cs.run_trials(uvd, ["ekf-uvd"], n, jobs=jobs, out=tmp_path / str(n))) for n in (few, many)
+        peak(lambda n=n: cs.run_trials(uvd, ["ekf-uvd"], n, jobs=1, out=tmp_path / str(n))) for n in (few, many)
     ]
-    held = [peak(lambda n=n: cs.run_trials(uvd, ["ekf-uvd"], n, jobs=jobs)) for n in (few, many)]
+    held = [peak(lambda n=n: cs.run_trials(uvd, ["ekf-uvd"], n, jobs=1)) for n in (few, many)]
     assert streamed[1] - streamed[0] < 0.25 * all_rows
     assert held[1] - held[0] > all_rows, "negative control"
+
+
+def test_few_outcomes_wait_for_their_turn(uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alive: weakref.WeakSet[Outcome] = weakref.WeakSet()
+    most: list[int] = []
+
+    class Counted(Outcome):
+        __hash__ = object.__hash__
+
+    def counted(*arguments: Any) -> Outcome:
+        outcome = Counted(**vars(outcome_of(*arguments)))
+        alive.add(outcome)
+        most.append(len(alive))
+        return outcome
+
+    monkeypatch.setattr(montecarlo, "outcome_of", counted)
+    monkeypatch.setattr(montecarlo, "AHEAD", 2)
+    cs.run_trials(uvd, ["ekf-uvd"], 60, jobs=2, out=tmp_path / "out")
+    assert len(most) == 60
+    assert max(most) <= 2 * 2 + 2, "those ahead, the one that is written, and the next"
 
 
 def test_a_filter_is_read_without_the_others(uvd: cs.Scenario, written: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -110,7 +110,7 @@ def run(
     from consistency.judge import analyse
     from consistency.log import read_log
     from consistency.montecarlo import Interrupted, resolve_filters, run_log, run_trials
-    from consistency.results import read_results
+    from consistency.results import Results, StoredResults, open_results
     from consistency.scenario import load_scenario
     from consistency.sequential import run_until_decided
     from consistency.storage import require_free
@@ -124,6 +124,7 @@ def run(
         raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
     if until_decided and runs is not None:
         raise InputError("--until-decided finds the number of runs; give --max-runs instead of --runs")
+    results: Results | StoredResults
     verdicts = None
     if resume and overwrite:
         raise InputError("--resume goes on with what --overwrite would replace; give one of them")
@@ -144,23 +145,25 @@ def run(
             runs, seed = 50 if runs is None else runs, 0 if seed is None else seed
             resolve_filters(filters, world.belief)
             require_free(out, overwrite or resume)
-            previous = read_results(out) if resume else None
+            previous = open_results(out) if resume else None
             if until_decided:
                 results, verdicts = run_until_decided(
                     world, filters, seed=seed, jobs=jobs, timeout=timeout, previous=previous, **planned
                 )
             else:
-                results = run_trials(world, filters, runs, seed, jobs, timeout, previous)
+                results = run_trials(world, filters, runs, seed, jobs, timeout, previous, out=out, overwrite=overwrite)
     except Interrupted as stop:
         done = stop.results.manifest["finished_runs"]
         if not done:
             print("stopped before a run was finished; nothing written", file=sys.stderr)
         else:
-            stop.results.write(out, overwrite or resume, keep_others=resume)
+            if isinstance(stop.results, Results):
+                stop.results.write(out, overwrite or resume, keep_others=resume)
             how = "add --resume to the same command to go on" if log is None else "run it again for the rest"
             print(f"stopped: {done} finished runs are in {out}; {how}", file=sys.stderr)
         raise typer.Exit(130) from None
-    results.write(out, overwrite or resume, keep_others=resume)
+    if isinstance(results, Results):
+        results.write(out, overwrite or resume, keep_others=resume)
     print_verdicts(verdicts or analyse(results))
     print(f"results in {out}; next: consistency report {out}")
 
@@ -200,7 +203,7 @@ def analyse(
     from consistency.judge import analyse as judge_results
     from consistency.judge import analyse_recordings
     from consistency.recording import is_recording, read_recordings
-    from consistency.results import read_results
+    from consistency.results import open_results
     from consistency.table import print_verdicts, verdicts_json
 
     if fail_on not in (None, "inconsistent"):
@@ -216,7 +219,7 @@ def analyse(
         for note in dict.fromkeys(note for recording in recordings for note in recording.notes):
             print(f"consistency: {note}", file=sys.stderr)
     else:
-        results = read_results(path)
+        results = open_results(path)
         verdicts = judge_results(results, filters, confidence)
         if not results.manifest["complete"]:
             done, asked = results.manifest["finished_runs"], results.manifest["runs"]

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy import stats
 
 from consistency.diagnostics import Design, gate_runs, judge, required_runs, sequential_design
 from consistency.errors import InputError
 from consistency.geometry import pose_error
+from consistency.parquet import COLUMNS, COVARIANCE
 from consistency.recording import Recording
-from consistency.results import POSE, Results, covariances
+from consistency.results import NUMBERS, POSE, Tables
 from consistency.types import Array, Failure, Indices, Verdict
 
 CONFIDENCE = 0.95
@@ -32,7 +32,6 @@ class Curves:
     filter: str
     runs: Indices  # (R,), run numbers
     t: Array  # (T,)
-    pose: Array  # (R, T, 3)
     covariance: Array  # (R, T, 3, 3)
     error: Array | None  # (R, T, 3), truth minus estimate, heading wrapped
     nees: Array | None  # (R, T)
@@ -41,8 +40,8 @@ class Curves:
     failures: tuple[Failure, ...]
 
 
-def curves(results: Results, filter_name: str) -> Curves:
-    """Arrays of one filter.
+def curves(results: Tables, filter_name: str) -> Curves:
+    """Arrays of one filter; of results in a folder nothing else is read.
 
     Raises
     ------
@@ -51,33 +50,39 @@ def curves(results: Results, filter_name: str) -> Curves:
     """
     if filter_name not in results.filters:
         raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
-    table = results.estimates[results.estimates["filter"] == filter_name]
     broken = results.failures[results.failures["filter"] == filter_name]
-    runs = np.unique(np.concatenate([table["run"], broken["run"]])).astype(np.int64)
+    runs = results.runs_of(filter_name)
     steps = _steps(results)
-    row, column = np.searchsorted(runs, table["run"]), table["step"].to_numpy() - 1
-
-    def grid(values: Array) -> Array:
-        out = np.full((len(runs), steps, *values.shape[1:]), np.nan)
-        out[row, column] = values
-        return out
-
-    pose = grid(table[POSE].to_numpy())
+    pose, covariance = np.full((len(runs), steps, 3), np.nan), np.full((len(runs), steps, 3, 3), np.nan)
+    nis, nis_dof = np.full(pose.shape[:2], np.nan), np.zeros(pose.shape[:2], np.int64)
+    nees = np.full(pose.shape[:2], np.nan) if results.has_truth else None
     t = np.full(steps, np.nan)
-    for timed in (results.truth, table):  # where every run of this filter has failed only the truth goes on
-        if timed is not None:
-            after_start = timed[timed["step"] > 0]
-            t[after_start["step"] - 1] = after_start["t"]
-    dof = grid(table["nis_dof"].to_numpy(float))
-    error = nees = None
-    if results.truth is not None:
-        error = pose_error(_true_pose(results.truth, runs, steps), pose)
-        nees = grid(table["nees"].to_numpy())
+    for batch in results.batches("estimates", NUMBERS, filter_name):
+        at = np.searchsorted(runs, batch["run"]), batch["step"] - 1
+        for i, axis in enumerate(POSE):
+            pose[*at, i] = batch[axis]
+        for name, (i, j) in COVARIANCE.items():
+            covariance[*at, i, j] = covariance[*at, j, i] = batch[name]
+        nis[at], nis_dof[at], t[at[1]] = batch["nis"], batch["nis_dof"], batch["t"]
+        if nees is not None:
+            nees[at] = batch["nees"]
     failures = tuple(Failure(filter_name, int(r), int(s), str(why)) for _, r, s, why in broken.itertuples(index=False))
-    return Curves(
-        filter_name, runs, t, pose, grid(covariances(table)), error, nees,
-        grid(table["nis"].to_numpy()), np.nan_to_num(dof).astype(np.int64), failures,
-    )  # fmt: skip
+    error = _errors(results, runs, pose, t) if results.has_truth else None
+    return Curves(filter_name, runs, t, covariance, error, nees, nis, nis_dof, failures)
+
+
+def _errors(results: Tables, runs: Indices, pose: Array, t: Array) -> Array:
+    """Truth minus estimate in the place of ``pose``; NaN without truth. Fills ``t`` where every run had failed."""
+    known = np.zeros(pose.shape[:2], bool)
+    for batch in results.batches("truth", list(COLUMNS["truth"])):
+        chosen = (batch["step"] > 0) & np.isin(batch["run"], runs)
+        row, column = np.searchsorted(runs, batch["run"][chosen]), batch["step"][chosen] - 1
+        t[column] = np.where(np.isnan(t[column]), batch["t"][chosen], t[column])
+        true = np.stack([batch[axis][chosen] for axis in POSE], axis=-1)
+        pose[row, column] = pose_error(true, pose[row, column])
+        known[row, column] = True
+    pose[~known] = np.nan
+    return pose
 
 
 def run_means(c: Curves) -> Array:
@@ -97,7 +102,7 @@ def wins(a: Curves, b: Curves) -> tuple[int, float]:
 
 
 def analyse(
-    results: Results, filters: Sequence[str] | None = None, confidence: float | None = None
+    results: Tables, filters: Sequence[str] | None = None, confidence: float | None = None
 ) -> dict[str, Verdict]:
     """A verdict for every filter of the results, or for those named.
 
@@ -120,7 +125,7 @@ def analyse(
     return verdicts
 
 
-def design_of(results: Results) -> Design | None:
+def design_of(results: Tables) -> Design | None:
     """The group-sequential plan that the results were run by, if they were."""
     plan = results.manifest.get("until_decided")
     try:
@@ -194,16 +199,10 @@ def _false_alarm(confidence: float | None) -> float:
     return 1.0 - confidence
 
 
-def _steps(results: Results) -> int:
+def _steps(results: Tables) -> int:
     """Steps of the longest run, failed steps counted."""
-    tables = [results.estimates["step"], results.failures["step"]]
-    if results.truth is not None:
-        tables.append(results.truth["step"])
-    return int(max((column.max() for column in tables if len(column)), default=0))
-
-
-def _true_pose(truth: pd.DataFrame, runs: Indices, steps: int) -> Array:
-    out = np.full((len(runs), steps, 3), np.nan)
-    table = truth[(truth["step"] > 0) & truth["run"].isin(runs)]
-    out[np.searchsorted(runs, table["run"]), table["step"].to_numpy() - 1] = table[POSE].to_numpy()
-    return out
+    last = int(results.failures["step"].max()) if len(results.failures) else 0
+    for table in ("estimates", "truth"):
+        for batch in results.batches(table, ["step"]):
+            last = max(last, int(batch["step"].max(initial=0)))
+    return last

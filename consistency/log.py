@@ -13,7 +13,8 @@ import tomli_w
 from pydantic import ValidationError
 
 from consistency.errors import InputError
-from consistency.results import POSE, controls_table, observations_table, truth_table
+from consistency.parquet import read_parquet
+from consistency.results import POSE, controls_table, observations_table, truth_of
 from consistency.scenario import (
     Belief,
     BelievedMotion,
@@ -27,7 +28,7 @@ from consistency.scenario import (
     explain,
     read_table,
 )
-from consistency.storage import read_parquet, write_folder
+from consistency.storage import write_folder
 from consistency.types import Array, Trial
 
 View = tuple[tuple[int, int], tuple[float, float]]  # image (width, height) and principal point (column, row), px
@@ -124,7 +125,7 @@ def write_log(
     """Write trials as a log folder, whole or not at all; ``view`` is image size and principal point in px."""
     tables = {"controls": controls_table(trials), "observations": observations_table(trials)}
     if trials[0].truth is not None:
-        tables["truth"] = truth_table(trials)
+        tables["truth"] = truth_of(trials)
     if landmarks is not None:
         tables["landmarks"] = landmarks
     text = tomli_w.dumps(_sensor_file(belief, trials[0].start, view))

@@ -3,40 +3,55 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import joblib
-import numpy as np
 import pandas as pd
-from threadpoolctl import threadpool_limits
 
 from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter
-from consistency.filters.compiled import Compiled
+from consistency.filters.compiled import Compiled, one_blas_thread
 from consistency.filters.stepping import name_of, run_filter
+from consistency.gather import Gathered
 from consistency.log import Log, write_log
 from consistency.progress import progress
 from consistency.protocols import Filter
-from consistency.results import Results, estimates_table, failures_table, truth_table
+from consistency.results import Outcome, Results, StoredResults, Tables, outcome_of
 from consistency.scenario import Belief, Scenario
-from consistency.simulation import draw_landmarks, require_landmarks_in_view, simulate
-from consistency.storage import manifest_of, require_free
-from consistency.types import Estimates, Trial
+from consistency.simulation import draw_landmarks, require_landmarks_in_view
+from consistency.storage import NewFolder, manifest_of, require_free
+from consistency.types import Trial
 
-Outcome = tuple[Trial, list[Estimates]]
+Outcomes = Generator[Outcome, None, None]
+AHEAD = 8  # runs a worker that may be finished before an earlier one is
 
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C in :func:`run_trials`; ``results`` holds the runs that were finished."""
 
-    def __init__(self, results: Results) -> None:
+    def __init__(self, results: Results | StoredResults) -> None:
         super().__init__("interrupted")
         self.results = results
 
 
+# fmt: off
+@overload
+def run_trials(
+    scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
+    timeout: float | None = ..., previous: Tables | None = ..., out: None = ..., overwrite: bool = ...,
+) -> Results: ...
+@overload
+def run_trials(
+    scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
+    timeout: float | None = ..., previous: Tables | None = ..., *, out: Path, overwrite: bool = ...,
+) -> StoredResults: ...
+# fmt: on
 def run_trials(
     scenario: Scenario,
     filters: Sequence[str | Filter],
@@ -44,8 +59,10 @@ def run_trials(
     seed: int = 0,
     jobs: int = -1,
     timeout: float | None = None,
-    previous: Results | None = None,
-) -> Results:
+    previous: Tables | None = None,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> Results | StoredResults:
     """Simulate ``runs`` trials of ``scenario`` and put each through every filter.
 
     Parameters
@@ -55,41 +72,46 @@ def run_trials(
     jobs : workers; -1 for one a core. Compiled filters share threads, others get processes.
     timeout : seconds a trial, for filters that are not compiled
     previous : results of the same scenario, filters and seed to go on from; its runs are not done again
+    out : folder that the results are written to as they come, so that memory does not grow with the runs; it
+        appears as a whole at the end
+    overwrite : replace ``out``, where it is an output folder of this bench; that of ``previous`` is replaced anyway
+
+    Returns
+    -------
+    Results in memory; with ``out`` those in the folder, which are read when they are asked for
 
     Raises
     ------
     InputError
-        An unknown filter, one that does not fit the sensor, a number out of range, or nothing in view.
+        An unknown filter, one that does not fit the sensor, a number out of range, nothing in view, or a folder that
+        cannot be written.
     Interrupted
-        Ctrl-C; carries what is finished.
+        Ctrl-C; carries what is finished, and the folder, if any, is written.
     """
     chosen = resolve_filters(filters, scenario.belief)
     _require_counts(runs, seed)
-    require_landmarks_in_view(scenario)
+    world = require_landmarks_in_view(scenario)
     names = [name_of(f) for f in chosen]
     done = set() if previous is None else _same_study(previous, scenario, names, seed).finished_runs(names)
     if done and max(done) >= runs:
         raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
     todo = [run for run in range(runs) if run not in done]
-    outcomes, wall, complete = _map(
-        lambda run: simulate(scenario, run, seed), todo, chosen, scenario.belief, jobs, timeout
-    )
-    results = _gather(outcomes, chosen, previous)
-    manifest = manifest_of(seed=seed, runs=runs, filters=names, wall=wall, complete=complete)
-    return _finish(results, manifest | _scenario_entry(scenario), _landmarks_table(scenario))
+    work = _Work(lambda run: world.trial(run, seed), chosen, scenario.belief, jobs, timeout)
+    said = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
+    with _place(out, overwrite, previous) as new:
+        return _finish(work, todo, Gathered(names, new, previous, done), said, _landmarks_table(scenario))
 
 
 def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None) -> Results:
     """Put every run of a recorded log through every filter; raises as :func:`run_trials`."""
     chosen = resolve_filters(filters, log.belief)
     trials = {trial.run: trial for trial in log.trials}
-    outcomes, wall, complete = _map(trials.__getitem__, list(trials), chosen, log.belief, jobs, timeout)
-    results = _gather(outcomes, chosen, None)
-    manifest = manifest_of(
-        seed=None, runs=len(trials), filters=[name_of(f) for f in chosen], wall=wall, complete=complete
-    )
-    manifest |= {"log": log.name, "log_sha256": log.sha256, "belief": log.belief.model_dump(mode="json")}
-    return _finish(results, manifest, log.landmarks)
+    work = _Work(trials.__getitem__, chosen, log.belief, jobs, timeout)
+    said = {"seed": None, "runs": len(trials), "log": log.name, "log_sha256": log.sha256}
+    said |= {"belief": log.belief.model_dump(mode="json")}
+    results = _finish(work, list(trials), Gathered([name_of(f) for f in chosen]), said, log.landmarks)
+    assert isinstance(results, Results)
+    return results
 
 
 def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Filter]:
@@ -118,52 +140,96 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
     return chosen
 
 
+# --- the work --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What is done for each run."""
+
+    make_trial: Callable[[int], Trial]
+    filters: list[Filter]
+    belief: Belief
+    jobs: int
+    timeout: float | None
+
+    def __post_init__(self) -> None:
+        if self.jobs == 0 or self.jobs < -1:
+            raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {self.jobs}")
+        if self.timeout is not None and not self.timeout > 0:
+            raise InputError(f"timeout must be positive, got {self.timeout}")
+
+    def __call__(self, run: int) -> Outcome:
+        return _one(self.make_trial(run), self.filters, self.belief, self.timeout)
+
+    def compile(self, run: int) -> None:
+        """Compile what is not yet compiled, on the first steps of a run, and say so."""
+        for filter_ in self.filters:
+            if isinstance(filter_, Compiled) and not filter_.is_compiled:
+                with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
+                    filter_.run(_head(self.make_trial(run)), self.belief)
+                    advance(1)
+
+    def outcomes(self, runs: list[int]) -> Outcomes:
+        """In order of the runs, whoever does them; BLAS has one thread in each worker, for the bits depend on it."""
+        workers = min(self.jobs if self.jobs > 0 else joblib.cpu_count(), len(runs))
+        if workers <= 1:
+            return (self(run) for run in runs)
+        if all(isinstance(f, Compiled) for f in self.filters):  # kernels release the GIL; Python needs processes
+            return self._in_threads(runs, workers)
+        return self._in_processes(runs, workers)
+
+    def _in_threads(self, runs: list[int], workers: int) -> Outcomes:
+        pool, waiting = ThreadPoolExecutor(workers), deque[Future[Outcome]]()
+        try:
+            for run in runs:
+                waiting.append(pool.submit(self, run))
+                if len(waiting) > AHEAD * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _in_processes(self, runs: list[int], workers: int) -> Outcomes:
+        tasks = (joblib.delayed(_one)(self.make_trial(run), self.filters, self.belief, self.timeout) for run in runs)
+        with joblib.parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
+            yield from joblib.Parallel(return_as="generator")(tasks)
+
+
 def _one(trial: Trial, filters: list[Filter], belief: Belief, timeout: float | None) -> Outcome:
-    estimates = [run_filter(f, trial, belief, timeout) for f in filters]
-    # the observations are most of a trial, and no table of results needs them
-    none = np.zeros(0, np.int64)
-    return replace(trial, first=np.zeros_like(trial.first), landmark=none, z=np.zeros((0, 3))), estimates
+    return outcome_of(trial, [run_filter(f, trial, belief, timeout) for f in filters])
 
 
-def _map(
-    make_trial: Callable[[int], Trial],
-    runs: list[int],
-    filters: list[Filter],
-    belief: Belief,
-    jobs: int,
-    timeout: float | None,
-) -> tuple[list[Outcome], float, bool]:
-    """Outcomes in order of the runs, wall time in s, and whether all were finished."""
-    if jobs == 0 or jobs < -1:
-        raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
-    if timeout is not None and not timeout > 0:
-        raise InputError(f"timeout must be positive, got {timeout}")
-    for filter_ in filters if runs else []:
-        if isinstance(filter_, Compiled) and not filter_.is_compiled:
-            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
-                filter_.run(_head(make_trial(runs[0])), belief)
-                advance(1)
-    # kernels release the GIL; filters in Python need processes. One BLAS thread each: bits depend on it
-    threads = all(isinstance(f, Compiled) for f in filters)
-    workers = {"backend": "threading"} if threads else {"backend": "loky", "inner_max_num_threads": 1}
-    n_jobs = min(jobs, max(len(runs), 1)) if jobs > 0 else jobs
-    started = time.monotonic()
-    outcomes: list[Outcome] = []
-    complete = True
+def _finish(
+    work: _Work, runs: list[int], gathered: Gathered, said: dict[str, Any], landmarks: pd.DataFrame | None
+) -> Results | StoredResults:
+    """Do the runs and hand over the results, or, after Ctrl-C, what there is of them."""
+    if runs:
+        work.compile(runs[0])
+    started, complete = time.monotonic(), True
     try:
-        with (
-            threadpool_limits(1),
-            joblib.parallel_config(**workers, n_jobs=n_jobs),
-            progress("runs", len(runs)) as advance,
-        ):
-            parallel = joblib.Parallel(return_as="generator_unordered")
-            tasks: Iterable[Any] = (joblib.delayed(_one)(make_trial(run), filters, belief, timeout) for run in runs)
-            for outcome in parallel(tasks):
-                outcomes.append(outcome)
+        with one_blas_thread(), closing(work.outcomes(runs)) as outcomes, progress("runs", len(runs)) as advance:
+            for outcome in outcomes:
+                gathered.add(outcome)
                 advance(1)
     except KeyboardInterrupt:
         complete = False
-    return sorted(outcomes, key=lambda outcome: outcome[0].run), time.monotonic() - started, complete
+    manifest = manifest_of(filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **said)
+    if complete:
+        return gathered.results(manifest, landmarks)
+    raise Interrupted(gathered.results(manifest | {"finished_runs": gathered.finished}, landmarks))
+
+
+@contextmanager
+def _place(out: Path | None, overwrite: bool, previous: Tables | None) -> Iterator[NewFolder | None]:
+    """The folder for the results, if one is asked for; that of ``previous`` is taken over, with what else is in it."""
+    if out is None:
+        yield None
+        return
+    same = isinstance(previous, StoredResults) and previous.folder.absolute() == out.absolute()
+    with NewFolder(out, "results", overwrite or same, keep_others=same) as new:
+        yield new
 
 
 def _head(trial: Trial) -> Trial:
@@ -175,38 +241,7 @@ def _head(trial: Trial) -> Trial:
     )  # fmt: skip
 
 
-def _gather(outcomes: list[Outcome], filters: list[Filter], previous: Results | None) -> dict[str, pd.DataFrame]:
-    """Tables in order of the filters, then of the runs, as ``outcomes`` are."""
-    tables = {
-        "estimates": estimates_table(outcomes),
-        "truth": truth_table([trial for trial, _ in outcomes]),
-        "failures": failures_table(
-            [each.failure for said in zip(*(e for _, e in outcomes), strict=True) for each in said if each.failure]
-        ),
-    }
-    if previous is None:
-        return tables
-    rank = {name_of(f): i for i, f in enumerate(filters)}
-    for name, before in (("estimates", previous.estimates), ("truth", previous.truth), ("failures", previous.failures)):
-        both = pd.concat([t for t in (before, tables[name]) if t is not None and len(t)] or [tables[name]])
-        if name != "truth":
-            both = both.assign(_rank=both["filter"].map(rank)).sort_values(["_rank", "run", "step"])
-        tables[name] = both.drop(columns="_rank", errors="ignore").reset_index(drop=True)
-    tables["truth"] = tables["truth"].sort_values(["run", "step"], ignore_index=True)
-    return tables
-
-
-def _finish(tables: dict[str, pd.DataFrame], manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results:
-    manifest["failures"] = len(tables["failures"])
-    truth = tables["truth"] if len(tables["truth"]) else None
-    results = Results(tables["estimates"], tables["failures"], truth, landmarks, manifest)
-    if not manifest["complete"]:
-        manifest["finished_runs"] = len(results.finished_runs(manifest["filters"]))
-        raise Interrupted(results)
-    return results
-
-
-def _same_study(previous: Results, scenario: Scenario, names: list[str], seed: int) -> Results:
+def _same_study(previous: Tables, scenario: Scenario, names: list[str], seed: int) -> Tables:
     """The results to go on from, refused unless scenario, filters and seed are the same."""
     for key, now, before in (
         ("scenario", scenario.hash, previous.manifest.get("scenario_hash")),
@@ -221,10 +256,10 @@ def _same_study(previous: Results, scenario: Scenario, names: list[str], seed: i
 def simulate_log(scenario: Scenario, runs: int, seed: int, out: Path, overwrite: bool = False) -> None:
     """Write ``runs`` simulated trials as a log folder; raises as :func:`run_trials`."""
     _require_counts(runs, seed)
-    require_landmarks_in_view(scenario)
+    world = require_landmarks_in_view(scenario)
     require_free(out, overwrite, "log")
     started = time.monotonic()
-    trials = [simulate(scenario, run, seed) for run in range(runs)]
+    trials = [world.trial(run, seed) for run in range(runs)]
     manifest = manifest_of(kind="log", seed=seed, runs=runs, wall=time.monotonic() - started, complete=True)
     manifest |= _scenario_entry(scenario) | {"failures": 0}
     sensor = scenario.truth.sensor

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,26 +12,43 @@ import numpy as np
 import pandas as pd
 from pydantic import ValidationError
 
-from consistency.diagnostics import nees
+from consistency.diagnostics.whitening import whiten
 from consistency.errors import InputError
 from consistency.filters.linalg import definiteness
 from consistency.geometry import pose_error
+from consistency.parquet import COLUMNS, COVARIANCE, Columns, read_batches, read_parquet, require_table
 from consistency.scenario import Scenario, explain
-from consistency.storage import COLUMNS, COVARIANCE, read_manifest, read_parquet, write_folder
-from consistency.types import Array, Estimates, Failure, Trial
+from consistency.storage import read_manifest, write_folder
+from consistency.types import Array, Estimates, Failure, Indices, Trial
 
 POSE = ["x", "y", "heading"]
+NUMBERS = [column for column in COLUMNS["estimates"] if column != "filter"]
 
 
 @dataclass(frozen=True)
-class Results:
-    """What filters said in a number of runs; tables as in the files."""
+class Outcome:
+    """What one run leaves: rows of the tables, by filter, and failures."""
 
-    estimates: pd.DataFrame
-    failures: pd.DataFrame
-    truth: pd.DataFrame | None
-    landmarks: pd.DataFrame | None
+    run: int
+    estimates: dict[str, Columns]
+    truth: Columns | None
+    failures: tuple[Failure, ...]
+
+
+class Tables(ABC):
+    """What filters said in a number of runs, wherever it is kept."""
+
     manifest: dict[str, Any]
+    failures: pd.DataFrame
+    landmarks: pd.DataFrame | None
+
+    @abstractmethod
+    def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
+        """Columns of ``estimates`` (of one filter) or ``truth``, some rows at a time; nothing without the table."""
+
+    @property
+    @abstractmethod
+    def has_truth(self) -> bool: ...
 
     @property
     def filters(self) -> list[str]:
@@ -47,18 +65,67 @@ class Results:
 
     def finished_runs(self, filters: Sequence[str]) -> set[int]:
         """Runs that every one of ``filters`` has finished, well or not."""
-        per_filter = [
-            set(self.estimates.loc[self.estimates["filter"] == name, "run"])
-            | set(self.failures.loc[self.failures["filter"] == name, "run"])
-            for name in filters
-        ]
-        return {int(run) for run in set.intersection(*per_filter)} if per_filter else set()
+        per_filter = [{int(run) for run in self.runs_of(name)} for name in filters]
+        return set.intersection(*per_filter) if per_filter else set()
+
+    def runs_of(self, filter_name: str) -> Indices:
+        """Numbers of the runs of one filter, failed ones too, sorted."""
+        parts = [np.unique(batch["run"]) for batch in self.batches("estimates", ["run"], filter_name)]
+        parts.append(self.failures.loc[self.failures["filter"] == filter_name, "run"].to_numpy())
+        return np.unique(np.concatenate(parts)).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Results(Tables):
+    """What filters said in a number of runs; tables in memory, as in the files."""
+
+    estimates: pd.DataFrame
+    failures: pd.DataFrame
+    truth: pd.DataFrame | None
+    landmarks: pd.DataFrame | None
+    manifest: dict[str, Any]
+
+    @property
+    def has_truth(self) -> bool:
+        return self.truth is not None
+
+    def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
+        rows = self.truth if table == "truth" else self.estimates
+        if rows is not None:
+            chosen = slice(None) if filter_name is None else (rows["filter"] == filter_name).to_numpy()
+            yield {column: rows[column].to_numpy()[chosen] for column in columns}
 
     def write(self, folder: Path, overwrite: bool = False, keep_others: bool = False) -> None:
         """Write the folder at once, as :func:`write_folder`: it appears complete or not at all."""
         tables = {"estimates": self.estimates, "failures": self.failures}
         tables |= {n: t for n, t in (("truth", self.truth), ("landmarks", self.landmarks)) if t is not None}
         write_folder(folder, tables, self.manifest, overwrite=overwrite, keep_others=keep_others)
+
+
+@dataclass(frozen=True)
+class StoredResults(Tables):
+    """The same in a folder: ``estimates`` and ``truth`` are read each time they are asked for."""
+
+    folder: Path
+    failures: pd.DataFrame
+    landmarks: pd.DataFrame | None
+    manifest: dict[str, Any]
+
+    @property
+    def has_truth(self) -> bool:
+        return "truth" in self.manifest.get("tables", [])
+
+    @property
+    def estimates(self) -> pd.DataFrame:
+        return read_parquet(self.folder, "estimates")
+
+    @property
+    def truth(self) -> pd.DataFrame | None:
+        return read_parquet(self.folder, "truth") if self.has_truth else None
+
+    def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
+        if table != "truth" or self.has_truth:
+            yield from read_batches(self.folder, table, columns, filter_name)
 
 
 def joined(parts: Sequence[Results]) -> Results:
@@ -73,28 +140,25 @@ def joined(parts: Sequence[Results]) -> Results:
     return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest)
 
 
-def estimates_table(outcomes: Sequence[tuple[Trial, list[Estimates]]]) -> pd.DataFrame:
-    """``estimates.parquet`` of all outcomes, by filter, then as they come.
-
-    A failed run has no rows from the failed step on.
-    """
-    by_filter = zip(*(said for _, said in outcomes), strict=True)
-    pairs = [pair for said in by_filter for pair in zip((trial for trial, _ in outcomes), said, strict=True)]
-    if not pairs:
-        return _empty("estimates")
-    parts = [_columns(trial, said) for trial, said in pairs]
-    names = np.array([said.filter for _, said in pairs], dtype=object)
-    rows = [len(part["step"]) for part in parts]
-    return _table({"filter": pd.Series(np.repeat(names, rows), dtype="str")} | _stacked(parts))
+def outcome_of(trial: Trial, said: Sequence[Estimates]) -> Outcome:
+    """Rows of the tables for one trial; a failed run has none from the failed step on."""
+    return Outcome(
+        trial.run,
+        {estimates.filter: _columns(trial, estimates) for estimates in said},
+        None if trial.truth is None else _truth_columns(trial, trial.truth),
+        tuple(estimates.failure for estimates in said if estimates.failure),
+    )
 
 
-def _columns(trial: Trial, estimates: Estimates) -> dict[str, Array]:
+def _columns(trial: Trial, estimates: Estimates) -> Columns:
     last = estimates.failure.step - 1 if estimates.failure else trial.steps
     pose, P = estimates.pose[:last], estimates.covariance[:last]
     value = np.full(last, np.nan)
     if trial.truth is not None:
         first = next((k for k in range(last) if definiteness(P[k]) == 1), last)
-        value[first:] = nees(pose_error(trial.truth[1 + first : last + 1], pose[first:]), P[first:])
+        # the filter has answered for P: what nees() checks need not be checked again
+        w = whiten(pose_error(trial.truth[1 + first : last + 1], pose[first:]), P[first:])
+        value[first:] = np.einsum("ki,ki->k", w, w)
     return {
         "run": np.full(last, estimates.run),
         "step": np.arange(1, last + 1),
@@ -107,7 +171,25 @@ def _columns(trial: Trial, estimates: Estimates) -> dict[str, Array]:
     }
 
 
-def _stacked(parts: Sequence[dict[str, Array]]) -> dict[str, Array]:
+def _truth_columns(trial: Trial, path: Array) -> Columns:
+    return {
+        "run": np.full(len(path), trial.run),
+        "step": np.arange(len(path)),
+        "t": trial.t,
+        **dict(zip(POSE, path.T, strict=True)),
+    }
+
+
+def estimates_table(parts: Sequence[tuple[str, Columns]]) -> pd.DataFrame:
+    """``estimates.parquet`` of (filter, columns), one below the other."""
+    if not parts:
+        return _empty("estimates")
+    rows = [len(columns["step"]) for _, columns in parts]
+    names = pd.Series([name for name, _ in parts], dtype="str").repeat(rows).reset_index(drop=True)
+    return _table({"filter": names} | _stacked([columns for _, columns in parts]))
+
+
+def _stacked(parts: Sequence[Columns]) -> Columns:
     """The same columns of all parts, one below the other."""
     return {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
 
@@ -117,19 +199,14 @@ def _table(columns: dict[str, Any]) -> pd.DataFrame:
     return pd.DataFrame(columns, copy=False)
 
 
-def truth_table(trials: Sequence[Trial]) -> pd.DataFrame:
-    """``truth.parquet`` of the trials that have truth."""
-    parts = [
-        {
-            "run": np.full(t.steps + 1, t.run),
-            "step": np.arange(t.steps + 1),
-            "t": t.t,
-            **dict(zip(POSE, t.truth.T, strict=True)),
-        }
-        for t in trials
-        if t.truth is not None
-    ]
+def truth_table(parts: Sequence[Columns]) -> pd.DataFrame:
+    """``truth.parquet`` of the columns of several runs."""
     return _table(_stacked(parts)) if parts else _empty("truth")
+
+
+def truth_of(trials: Sequence[Trial]) -> pd.DataFrame:
+    """``truth.parquet`` of the trials that have truth."""
+    return truth_table([_truth_columns(trial, trial.truth) for trial in trials if trial.truth is not None])
 
 
 def controls_table(trials: Sequence[Trial]) -> pd.DataFrame:
@@ -169,6 +246,8 @@ def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
 
 def failures_table(failures: Sequence[Failure]) -> pd.DataFrame:
     """``failures.parquet``."""
+    if not failures:
+        return _empty("failures")
     rows = [(f.filter, f.run, f.step, f.reason) for f in failures]
     return pd.DataFrame(rows, columns=list(COLUMNS["failures"])).astype(COLUMNS["failures"])
 
@@ -177,32 +256,32 @@ def _empty(name: str) -> pd.DataFrame:
     return pd.DataFrame({column: pd.Series(dtype=kind) for column, kind in COLUMNS[name].items()})
 
 
-def covariances(table: pd.DataFrame) -> Array:
-    """Pose covariances (N, 3, 3) from the columns P_xx ... P_hh."""
-    P = np.empty((len(table), 3, 3))
-    for name, (i, j) in COVARIANCE.items():
-        P[:, i, j] = P[:, j, i] = table[name]
-    return P
+def open_results(folder: str | Path) -> StoredResults:
+    """A folder written by ``consistency run``, whose large tables stay on disk.
+
+    Raises
+    ------
+    InputError
+        A file is missing, cut short, or lacks a column; what is in its rows is checked when they are read.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    if "filters" not in manifest:
+        raise InputError(f"{folder}: holds no estimates; it was not written by 'consistency run'")
+    written = manifest.get("tables", [])
+    for name in ("estimates", *(["truth"] if "truth" in written else [])):
+        require_table(folder, name)
+    landmarks = read_parquet(folder, "landmarks") if "landmarks" in written else None
+    return StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest)
 
 
 def read_results(folder: str | Path) -> Results:
-    """Read a folder written by ``consistency run``.
+    """Read a folder written by ``consistency run`` into memory.
 
     Raises
     ------
     InputError
         A file is missing, cut short, or lacks a column.
     """
-    folder = Path(folder)
-    manifest = read_manifest(folder)
-    if "filters" not in manifest:
-        raise InputError(f"{folder}: holds no estimates; it was not written by 'consistency run'")
-    wanted = manifest.get("tables", [])
-    tables = {name: read_parquet(folder, name) if name in wanted else None for name in ("truth", "landmarks")}
-    return Results(
-        read_parquet(folder, "estimates"),
-        read_parquet(folder, "failures"),
-        tables["truth"],
-        tables["landmarks"],
-        manifest,
-    )
+    stored = open_results(folder)
+    return Results(stored.estimates, stored.failures, stored.truth, stored.landmarks, stored.manifest)

@@ -12,7 +12,7 @@ from consistency.errors import InputError
 from consistency.judge import curves, refused, verdict_of
 from consistency.montecarlo import Interrupted, run_trials
 from consistency.protocols import Filter
-from consistency.results import POSE, Results
+from consistency.results import POSE, Results, Tables
 from consistency.scenario import Scenario
 from consistency.types import Verdict
 
@@ -28,7 +28,7 @@ def run_until_decided(
     seed: int = 0,
     jobs: int = -1,
     timeout: float | None = None,
-    previous: Results | None = None,
+    previous: Tables | None = None,
 ) -> tuple[Results, dict[str, Verdict]]:
     """Simulate and judge at the looks of :func:`sequential_design` until every filter is decided.
 
@@ -55,13 +55,14 @@ def run_until_decided(
             f"the results to resume have {done} runs; the plan looks for the last time at {design.looks[-1]}"
         )
     decided: dict[str, Verdict] = {}
-    results = previous
+    results: Results | None = None
     for look in looks:
         try:
-            results = run_trials(scenario, filters, look, seed, jobs, timeout, results)
+            results = run_trials(scenario, filters, look, seed, jobs, timeout, results or previous)
         except Interrupted as stop:
-            raise Interrupted(_marked(stop.results, plan)) from None
-        results = _marked(results, plan)
+            manifest = stop.results.manifest | {"until_decided": plan}
+            raise Interrupted(replace(stop.results, manifest=manifest)) from None
+        results = replace(results, manifest=results.manifest | {"until_decided": plan})
         verdicts = {n: design.settle(verdict_of(curves(results, n), design.look_false_alarm)) for n in results.filters}
         final = look == looks[-1]
         decided |= {n: v for n, v in verdicts.items() if n not in decided and (final or settled(v))}
@@ -90,7 +91,3 @@ def said(decided: dict[str, Verdict], open_: list[str]) -> str:
     """One line of progress."""
     parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
     return ", ".join(parts + [f"{name} open" for name in open_])
-
-
-def _marked(results: Results, plan: dict[str, Any]) -> Results:
-    return replace(results, manifest=results.manifest | {"until_decided": plan})

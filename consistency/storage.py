@@ -1,4 +1,4 @@
-"""Output folders: tables and a manifest, written whole or not at all, and read back with checks."""
+"""Output folders: tables and a manifest, written whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,35 +11,19 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from consistency.errors import InputError
+from consistency.parquet import COLUMNS, write_table
 
 SCHEMA_VERSION = 1
-COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
-COLUMNS: dict[str, dict[str, str]] = {
-    "landmarks": {"landmark": "int64", "x": "float64", "y": "float64", "z": "float64"},
-    "truth": {"run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64", "heading": "float64"},
-    "controls": {"run": "int64", "step": "int64", "dt": "float64", "v": "float64", "omega": "float64"},
-    "observations": {
-        "run": "int64", "step": "int64", "landmark": "int64", "z0": "float64", "z1": "float64", "z2": "float64",
-    },
-    "estimates": {
-        "filter": "str", "run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64",
-        "heading": "float64", **dict.fromkeys(COVARIANCE, "float64"), "nees": "float64", "nis": "float64",
-        "nis_dof": "int64",
-    },
-    "failures": {"filter": "str", "run": "int64", "step": "int64", "reason": "str"},
-}  # fmt: skip
-NULLABLE = {"nees", "nis"}
 PACKAGES = (
     "filter-consistency", "numpy", "scipy", "numba", "filterpy", "pandas", "pyarrow", "joblib", "bokeh", "matplotlib",
     "typst",
@@ -76,21 +60,23 @@ def _versions() -> tuple[tuple[str, str], ...]:
     return tuple(found)
 
 
+@functools.cache
 def _git_commit() -> str | None:
-    """Commit of the checkout that the package runs from, with ``-dirty`` where it was changed; None elsewhere."""
+    """Commit of the checkout that the package runs from, with ``-dirty`` where it was changed; None elsewhere.
+
+    Asked once a process, as its modules are read once.
+    """
     root = Path(__file__).parents[1]
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
-
+    if not (root / ".git").exists():  # installed, perhaps inside somebody else's repository
+        return None
+    command = ["git", "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]
     try:
-        if Path(git("rev-parse", "--show-toplevel")) != root:  # installed inside somebody else's repository
-            return None
-        dirty = git("status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "HEAD") + ("-dirty" if dirty else "")
+        lines = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
         return None
+    commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid ")), "(initial)")
+    dirty = any(not line.startswith("#") for line in lines)
+    return None if commit == "(initial)" else commit + ("-dirty" if dirty else "")
 
 
 def plain(value: Any) -> Any:
@@ -126,12 +112,57 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results") -> None:
             raise InputError(
                 f"--out {folder}: is not an output folder of this bench; not overwritten ({error})"
             ) from None
-    there = next(parent for parent in folder.absolute().parents if parent.exists())
     try:
-        with tempfile.TemporaryDirectory(dir=there, prefix=f".{folder.name}."):
+        with tempfile.TemporaryDirectory(dir=_above(folder), prefix=f".{folder.name}."):
             pass
     except OSError as error:
         raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from None
+
+
+def _above(folder: Path) -> Path:
+    """The nearest folder above that is there."""
+    return next(parent for parent in folder.absolute().parents if parent.exists())
+
+
+class NewFolder:
+    """An output folder in the making, beside its place; as a context it is gone at the end unless it was put there.
+
+    ``path`` is where its files are written. Whatever is refused is refused at the beginning, see
+    :func:`require_free`. With ``overwrite`` an output folder of this bench is replaced; with ``keep_others`` the files
+    in it that are not written again stay.
+    """
+
+    def __init__(self, folder: Path, kind: str, overwrite: bool = False, keep_others: bool = False) -> None:
+        require_free(folder, overwrite, kind)
+        self.folder, self.kind, self.overwrite, self.keep_others = folder, kind, overwrite, keep_others
+        with self.writing():
+            self.path = Path(tempfile.mkdtemp(dir=_above(folder), prefix=f".{folder.name}."))
+
+    def __enter__(self) -> NewFolder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Where the system refuses, say it of the option ``--out``."""
+        try:
+            yield
+        except OSError as error:
+            raise InputError(f"--out {self.folder}: cannot be written ({error.strerror or error})") from error
+
+    def put_in_place(self, manifest: dict[str, Any]) -> dict[str, Any]:
+        """Write the manifest, with the names of the tables, and move the folder to its place as a whole."""
+        require_free(self.folder, self.overwrite, self.kind)  # the work may have taken hours
+        tables = sorted(path.stem for path in self.path.glob("*.parquet") if path.stem in COLUMNS)
+        with self.writing():
+            manifest = manifest | {"tables": tables}
+            (self.path / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+            self.path.chmod(0o755)
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            _put_in_place(self.path, self.folder, self.keep_others)
+        return manifest
 
 
 def write_folder(
@@ -142,30 +173,17 @@ def write_folder(
     overwrite: bool = False,
     keep_others: bool = False,
 ) -> None:
-    """Tables as Parquet, the manifest, and whatever ``extra`` writes, moved into place as a whole.
+    """Tables as Parquet, the manifest, and whatever ``extra`` writes, as a :class:`NewFolder`.
 
-    The manifest says what ``kind`` of folder it is, and gets the names of the tables. With ``overwrite``
-    an output folder of this bench is replaced; with ``keep_others`` the files in it that are not written
-    again stay.
+    The manifest says what ``kind`` of folder it is.
     """
-    require_free(folder, overwrite, manifest["kind"])
-    manifest = manifest | {"tables": sorted(tables)}
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-        try:
+    with NewFolder(folder, manifest["kind"], overwrite, keep_others) as new:
+        with new.writing():
             for name, table in tables.items():
-                frame = table[list(COLUMNS[name])].astype(COLUMNS[name])
-                frame.to_parquet(partial / f"{name}.parquet", compression="zstd", index=False)
+                write_table(new.path / f"{name}.parquet", name, table)
             if extra is not None:
-                extra(partial)
-            (partial / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
-            partial.chmod(0o755)
-            _put_in_place(partial, folder, keep_others)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written ({error.strerror or error})") from error
+                extra(new.path)
+        new.put_in_place(manifest)
 
 
 def _put_in_place(partial: Path, folder: Path, keep_others: bool) -> None:
@@ -200,36 +218,3 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: key 'schema_version' must be {SCHEMA_VERSION}; write the folder again")
     return manifest
-
-
-def read_parquet(folder: Path, name: str) -> pd.DataFrame:
-    """One table of a folder, checked: columns, types, no NaN where none is allowed."""
-    path = folder / f"{name}.parquet"
-    try:
-        table = pq.read_table(path).to_pandas()
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; write the folder again") from None
-    except (OSError, pa.ArrowException) as error:
-        first = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot be read, damaged or cut short ({first})") from None
-    wanted = COLUMNS[name]
-    if missing := [column for column in wanted if column not in table.columns]:
-        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(wanted)}")
-    for column, kind in wanted.items():
-        _check_column(path, table, column, kind)
-    checked: pd.DataFrame = table[list(wanted)].astype(wanted)
-    return checked
-
-
-def _check_column(path: Path, table: pd.DataFrame, column: str, kind: str) -> None:
-    if kind == "str":
-        return
-    values = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
-    if column in NULLABLE:
-        values = np.where(table[column].isna(), 0.0, values)
-    if not np.isfinite(values).all():
-        row = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise InputError(f"{path}: column '{column}', row {row}: not a finite number ({table[column].iloc[row]})")
-    if kind == "int64" and (values != np.round(values)).any():
-        row = int(np.flatnonzero(values != np.round(values))[0])
-        raise InputError(f"{path}: column '{column}', row {row}: not a whole number ({values[row]})")

@@ -209,7 +209,7 @@ def _dense(case: Case) -> Estimates:
 
 def program(effort: Effort) -> Iterator[Row]:
     """Workers, and time outside simulation and filters."""
-    s = whole.workers(effort.runs // 2, effort.repeats // 2 + 2, effort.run_steps)
+    s = whole.workers(effort.runs, effort.repeats // 2 + 2, effort.run_steps)
     free = s["one thread"] / s["two threads"]
     note = f"{s['1']:.2f} s / {s['2']:.2f} s; meanwhile 2 threads of bare dgemm were {free:.2f} x faster than 1"
     yield Row("program", "1 worker / 2 workers", s["1"] / s["2"], "x", 1.85, note=note)
@@ -220,7 +220,7 @@ def program(effort: Effort) -> Iterator[Row]:
 
 
 def memory(effort: Effort, full: bool = False) -> Iterator[Row]:
-    """Peak of a process that runs, gathers and writes; extrapolated unless ``full``."""
+    """Peak of a process that runs, writes and judges; extrapolated unless ``full``."""
     points = whole.memory((effort.full_runs,) if full else effort.memory_runs)
     mib = whole.extrapolated(points, effort.full_runs)
     peak = None if mib is None else mib / 1024

@@ -1,6 +1,6 @@
 """What ``bench.py`` measures of the whole program: workers, time outside the kernels, memory, start.
 
-``bench_whole.py RUNS`` is the child whose peak memory is measured: RUNS runs of two filters, written to disk.
+``bench_whole.py RUNS STEPS`` is the child whose peak memory is measured: runs of two filters, streamed and judged.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import numpy as np
 from bench_trials import Work, interleaved
 
 import consistency as cs
-from consistency import montecarlo
 from consistency.filters.compiled import Compiled
+from consistency.simulation import World
 
 WORLD, FILTERS = "herath2007-stereo", ["ekf-uvd", "ukf-uvd"]
 MIB = 2.0**20
@@ -87,7 +87,7 @@ def share_outside(runs: int, steps: int, filters: list[str], repeats: int) -> fl
     shares = []
     for _ in range(repeats + 1):  # the first warms up
         clock = Clock()
-        with _silent(), clock.on(montecarlo, "simulate"), clock.on(Compiled, "run"):
+        with _silent(), clock.on(World, "trial"), clock.on(Compiled, "run"):
             started = time.perf_counter()
             cs.run_trials(world, filters, runs, jobs=1)
             wall = time.perf_counter() - started
@@ -99,13 +99,14 @@ def share_outside(runs: int, steps: int, filters: list[str], repeats: int) -> fl
 
 
 def child(runs: int, steps: int) -> dict[str, float]:
-    """Peak memory in MiB and bytes a row of estimates on disk, of this process after ``runs`` runs."""
+    """Peak memory in MiB and bytes a row of estimates on disk, of this process after ``runs`` runs and verdicts."""
     world = cs.load_scenario(WORLD).variant("bench", truth__steps=steps)
     with tempfile.TemporaryDirectory() as scratch:
-        results = cs.run_trials(world, FILTERS, runs)
-        results.write(Path(scratch) / "out")
-        size = (Path(scratch) / "out" / "estimates.parquet").stat().st_size
-    return {"runs": runs, "peak_mib": peak_mib(), "rows": len(results.estimates), "bytes": size}
+        results = cs.run_trials(world, FILTERS, runs, out=Path(scratch) / "out")
+        cs.analyse(results)
+        rows = sum(len(batch["step"]) for batch in results.batches("estimates", ["step"]))
+        size = (results.folder / "estimates.parquet").stat().st_size
+    return {"runs": runs, "peak_mib": peak_mib(), "rows": rows, "bytes": size}
 
 
 def peak_mib() -> float:

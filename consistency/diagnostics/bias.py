@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from consistency.diagnostics.blocks import blocks
 from consistency.types import Array
 
 
@@ -60,6 +61,12 @@ def t_squared(whitened: Array) -> tuple[Array, Array]:
 
 def moments(whitened: Array) -> tuple[Array, Array, Array]:
     """Runs, mean and sample covariance of every step: (runs, steps, n) -> (steps,), (steps, n), (steps, n, n)."""
+    runs, steps = whitened.shape[:2]
+    N, mean, S = zip(*(_moments(whitened[:, here]) for here in blocks(steps, runs)), strict=True)
+    return np.concatenate(N), np.concatenate(mean), np.concatenate(S)
+
+
+def _moments(whitened: Array) -> tuple[Array, Array, Array]:
     present = np.asarray(np.isfinite(whitened).all(axis=-1))
     N = present.sum(axis=0)
     w = np.where(present[..., None], whitened, 0.0)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from consistency.diagnostics.whitening import spread_steps
+from consistency.diagnostics.blocks import blocks, by_runs
+from consistency.diagnostics.whitening import spread_steps, squared_length
 from consistency.types import Array
 
 TWO_SIGMA = 0.9544997361036416  # P(|N(0, 1)| <= 2)
@@ -17,18 +18,25 @@ def coverage(error: Array, covariance: Array, bound: float = 2.0) -> Array:
     Shapes (..., n) and (..., n, n) -> (n,); rows with NaN do not count.
     """
     error = np.asarray(error, float)
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
-    valid = np.isfinite(error) & np.isfinite(sigma)
-    inside = valid & (np.abs(np.where(valid, error, 0.0)) <= bound * np.where(valid, sigma, 0.0))
-    axes = tuple(range(error.ndim - 1))
-    count = valid.sum(axis=axes)
-    return np.where(count > 0, inside.sum(axis=axes) / np.maximum(count, 1), np.nan)
+    n = error.shape[-1]
+    inside, count = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    rows, variance = error.reshape(-1, n), np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, n)
+    for here in blocks(len(rows), 1):
+        sigma = _sigma(variance[here])
+        valid = np.isfinite(rows[here]) & np.isfinite(sigma)
+        within = np.abs(np.where(valid, rows[here], 0.0)) <= bound * np.where(valid, sigma, 0.0)
+        inside += (valid & within).sum(axis=0)
+        count += valid.sum(axis=0)
+    return np.where(count > 0, inside / np.maximum(count, 1), np.nan)
+
+
+def _sigma(variance: Array) -> Array:
+    return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
 def rmse(error: Array) -> float:
     """Root of the mean squared length of errors (..., n) over all runs and steps; NaN rows do not count."""
-    squared = np.sum(np.square(np.asarray(error, float)), axis=-1)
+    squared = squared_length(np.asarray(error, float))
     squared = squared[np.isfinite(squared)]
     return float(np.sqrt(squared.mean())) if squared.size else float("nan")
 
@@ -43,10 +51,10 @@ def coverage_interval(
     """
     error = np.asarray(error, float)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
-    chosen = spread_steps(np.asarray((np.isfinite(error) & np.isfinite(sigma)).all(axis=-1)))
+    there = by_runs(lambda e, v: (np.isfinite(e) & np.isfinite(v) & (v >= 0)).all(axis=-1), error, variance)
+    chosen = spread_steps(there)
     rows = np.flatnonzero(chosen >= 0)
-    inside = (np.abs(error[rows, chosen[rows]]) <= bound * sigma[rows, chosen[rows]]).sum(axis=0)
+    inside = (np.abs(error[rows, chosen[rows]]) <= bound * _sigma(variance[rows, chosen[rows]])).sum(axis=0)
     if not len(rows):
         n = error.shape[-1]
         return np.full(n, np.nan), np.tile([0.0, 1.0], (n, 1))

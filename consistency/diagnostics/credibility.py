@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.diagnostics.blocks import blocks
 from consistency.diagnostics.whitening import whiten
 from consistency.types import Array
 
@@ -25,6 +26,12 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
     -------
     (steps,) and (steps,) in dB; NaN where fewer than 2 n runs have a value
     """
+    runs, steps = nees.shape
+    index, inclination = zip(*(_of_steps(error[:, s], nees[:, s]) for s in blocks(steps, runs)), strict=True)
+    return np.concatenate(index), np.concatenate(inclination)
+
+
+def _of_steps(error: Array, nees: Array) -> tuple[Array, Array]:
     n = error.shape[-1]
     present = np.isfinite(nees) & np.isfinite(error).all(axis=-1) & (nees > 0)
     index, inclination = np.full(nees.shape[1], np.nan), np.full(nees.shape[1], np.nan)

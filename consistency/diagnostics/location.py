@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from consistency.diagnostics.bias import hotelling
+from consistency.diagnostics.bias import hotelling, moments
+from consistency.diagnostics.blocks import blocks, by_runs
 from consistency.diagnostics.questions import BIAS, SCALE, Answer
 from consistency.diagnostics.scale import Band, ratio_interval, run_means
-from consistency.diagnostics.whitening import standardise, whiten
+from consistency.diagnostics.whitening import mean_of_runs, squared_length, standardise, whiten
 from consistency.types import Array
 
 INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
@@ -50,16 +51,15 @@ def locate_axes(
     groups = s["groups"]
     confidence = 1.0 - (1.0 - INTERVAL) / len(groups)
     counted = np.isfinite(nees[:, late])
-    standard = standardise(error[:, late], covariance[:, late])
     s["of_axes"] = {}
     for key, index in groups.items():
-        w = standard[..., index] if len(index) == 1 else subset(error[:, late], covariance[:, late], index)
-        of_runs, count = run_means(np.where(counted, np.square(w).sum(axis=-1), np.nan))
-        s["of_axes"][key] = ratio_interval(of_runs[count > 0] / len(index), confidence)
-    standard = np.where(counted[..., None], standard, np.nan)
+        of_runs = _run_means_of(error[:, late], covariance[:, late], counted, index)
+        s["of_axes"][key] = ratio_interval(of_runs[~np.isnan(of_runs)] / len(index), confidence)
+    standard = standardise(error[:, late], covariance[:, late])
+    standard[~counted] = np.nan
     rows, n = counted.any(axis=1), error.shape[-1]
     if rows.sum() > n:
-        test = hotelling(np.nanmean(standard[rows], axis=1))
+        test = hotelling(mean_of_runs(standard)[rows])
         s["bias"] = {axis: (test.mean[i], *test.interval[i]) for i, axis in enumerate(s["axes"])}
     if _found(found, SCALE):
         s["subset"] = _main_axes(s)
@@ -78,9 +78,21 @@ def locate_axes(
 
 def subset(error: Array, covariance: Array, index: list[int]) -> Array:
     """Whitened errors of a group of components, (runs, steps, len(index))."""
-    if len(index) == 1:
-        return np.asarray(standardise(error, covariance)[..., index])
-    return whiten(error[..., index], covariance[..., index, :][..., index])
+
+    def of_block(e: Array, P: Array) -> Array:
+        e, P = e[..., index], P[..., index, :][..., index]
+        return standardise(e, P) if len(index) == 1 else whiten(e, P)
+
+    return by_runs(of_block, error, covariance)
+
+
+def _run_means_of(error: Array, covariance: Array, counted: Array, index: list[int]) -> Array:
+    """Mean NEES of each run by a group of components alone, (runs,); NaN where it has none."""
+
+    def of_block(e: Array, P: Array, counted: Array) -> Array:
+        return run_means(np.where(counted, squared_length(subset(e, P, index)), np.nan))[0]
+
+    return by_runs(of_block, error, covariance, counted)
 
 
 def _found(found: Mapping[str, Answer], questions: tuple[str, ...]) -> bool:
@@ -99,24 +111,32 @@ def _main_axes(s: dict[str, Any]) -> str | None:
 
 def _without_bias(whitened: Array) -> tuple[float, float, float]:
     """Covariance ratio of the errors less their mean over the runs in each step."""
-    present = np.asarray(np.isfinite(whitened).all(axis=-1))
-    N = present.sum(axis=0)
-    w = np.where(present[..., None], whitened, 0.0)
-    centred = w - w.sum(axis=0) / np.maximum(N, 1)[:, None]
-    squares = np.square(centred).sum(axis=-1) * (N / np.maximum(N - 1, 1))
-    means, counts = run_means(np.where(present & (N > 1), squares, np.nan))
+    N, mean, _ = moments(whitened)
+
+    def squares(w: Array) -> Array:
+        return np.where(N > 1, np.square(w - mean).sum(axis=-1) * (N / np.maximum(N - 1, 1)), np.nan)
+
+    means, counts = run_means(by_runs(squares, whitened))
     return ratio_interval(means[counts > 0] / whitened.shape[-1], INTERVAL)
 
 
 def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[int, int, float, float]:
     """The two axes whose errors are correlated least as stated, with both correlations, averaged over steps."""
-    e = np.where(counted[..., None], standardise(error, covariance), np.nan)
-    sigma = np.sqrt(np.where(counted[..., None], np.diagonal(covariance, axis1=-2, axis2=-1), np.nan))
     if not counted.any():
         return 0, 1, float("nan"), float("nan")
-    stated = np.nanmean(covariance[counted] / (sigma[counted][:, :, None] * sigma[counted][:, None, :]), axis=0)
-    flat = e[counted] - np.nanmean(e[counted], axis=0)
-    second = flat.T @ flat / max(len(flat), 1)
+    n, count = error.shape[-1], int(counted.sum())
+    parts = list(blocks(*counted.shape))
+
+    def standard(here: slice) -> Array:
+        return standardise(error[here], covariance[here])[counted[here]]
+
+    mean = sum(e.sum(axis=0) for e in map(standard, parts)) / count
+    stated, second = np.zeros((n, n)), np.zeros((n, n))
+    for here in parts:
+        P, e = covariance[here][counted[here]], standard(here) - mean
+        sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+        stated += (P / (sigma[:, :, None] * sigma[:, None, :])).sum(axis=0) / count
+        second += e.T @ e / count
     scale = np.sqrt(np.diag(second))
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.nan_to_num(second / np.outer(scale, scale) - stated)

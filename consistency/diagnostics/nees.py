@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.diagnostics.whitening import whiten
 from consistency.types import Array
 
 
@@ -34,17 +35,16 @@ def nees(error: Array, covariance: Array) -> Array:
         e, P = np.broadcast_to(e, (*batch, n)), np.broadcast_to(P, (*batch, n, n))
     except ValueError:
         raise ValueError(f"error {e.shape} and covariance {P.shape} must be (..., n) and (..., n, n)") from None
-    _require(np.isfinite(e).all(axis=-1), "the error is not finite")
-    _require(np.isfinite(P).all(axis=(-2, -1)), "the covariance is not finite")
-    scale = np.abs(P).max(axis=(-2, -1))
-    _require(np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1)) <= 1e-8 * scale, "the covariance is not symmetric")
-    try:
-        root = np.linalg.cholesky(P)
-    except np.linalg.LinAlgError:
-        smallest = np.linalg.eigvalsh(P)[..., 0]
-        _require(smallest > 0, "the covariance is not positive definite")
-        raise ValueError("a covariance is not positive definite") from None
-    whitened = np.linalg.solve(root, e[..., None])[..., 0]
+    _require(np.isfinite(e), "the error is not finite", 1)
+    _require(np.isfinite(P), "the covariance is not finite", 2)
+    mirrored = np.swapaxes(P, -1, -2)
+    if not (mirrored == P).all():
+        scale = np.abs(P).max(axis=(-2, -1), keepdims=True)
+        _require(np.abs(P - mirrored) <= 1e-8 * scale, "the covariance is not symmetric", 2)
+    whitened = whiten(e, P)
+    if not np.isfinite(whitened).all():
+        _require(np.linalg.eigvalsh(P) > 0, "the covariance is not positive definite", 1)
+        raise ValueError("a covariance is not positive definite")
     return np.asarray(np.einsum("...i,...i->...", whitened, whitened))
 
 
@@ -60,7 +60,9 @@ def anees(values: Array) -> Array:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _require(good: Array, what: str) -> None:
-    if not np.all(good):
-        index = tuple(int(i) for i in np.argwhere(~np.atleast_1d(good))[0])
-        raise ValueError(f"{what} at index {index if np.ndim(good) else ()}")
+def _require(good: Array, what: str, last: int) -> None:
+    """Refuse, with the first index of the batch, what is not all true over the ``last`` axes."""
+    if not good.all():
+        bad = ~good.all(axis=tuple(range(-last, 0)))
+        index = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0])
+        raise ValueError(f"{what} at index {index if np.ndim(bad) else ()}")

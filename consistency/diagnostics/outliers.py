@@ -8,6 +8,7 @@ import numpy as np
 from scipy import stats
 
 from consistency.diagnostics.bias import moments
+from consistency.diagnostics.blocks import blocks
 from consistency.types import Array
 
 
@@ -39,14 +40,11 @@ def outliers(whitened: Array) -> Outlier:
     usable = usable[np.linalg.det(S[usable]) > 0]
     if not len(usable):
         return Outlier(float("nan"), -1, -1, float("nan"))
-    gap = whitened[:, usable] - mean[usable]
     precision = np.linalg.inv(S[usable])
-    d2 = np.zeros(gap.shape[:2])
-    for i in range(n):
-        for j in range(n):
-            d2 += gap[..., i] * precision[:, i, j] * gap[..., j]
-    d2 = np.where(np.isfinite(d2), d2, 0.0)
-    rows, of_step = d2.argmax(axis=0), d2.max(axis=0)
+    rows, of_step = np.empty(len(usable), np.int64), np.empty(len(usable))
+    for here in blocks(len(usable), len(whitened)):
+        d2 = _distances(whitened[:, usable[here]] - mean[usable[here]], precision[here])
+        rows[here], of_step[here] = d2.argmax(axis=0), d2.max(axis=0)
     count = N[usable]
     with np.errstate(invalid="ignore"):
         p = stats.beta.sf(np.minimum(of_step * count / (count - 1.0) ** 2, 1.0), n / 2, (count - n - 1) / 2)
@@ -56,3 +54,12 @@ def outliers(whitened: Array) -> Outlier:
     share = min(float(of_step[worst]) * n_runs / (n_runs - 1.0) ** 2, 1.0 - 1e-12)
     left_out = share / (1.0 - share) * n_runs * (n_runs - 2.0) / (n_runs - 1.0)  # without the run itself
     return Outlier(p_value, int(rows[worst]), int(usable[worst]), float(np.sqrt(left_out)))
+
+
+def _distances(gap: Array, precision: Array) -> Array:
+    """gap' precision gap, (runs, steps, n) and (steps, n, n) -> (runs, steps); 0 where there is no value."""
+    d2 = np.zeros(gap.shape[:2])
+    for i in range(gap.shape[-1]):
+        for j in range(gap.shape[-1]):
+            d2 += gap[..., i] * precision[:, i, j] * gap[..., j]
+    return np.where(np.isfinite(d2), d2, 0.0)

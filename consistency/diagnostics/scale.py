@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special, stats
 
+from consistency.diagnostics.blocks import blocks
 from consistency.diagnostics.nees import anees
 from consistency.types import Array
 
@@ -69,8 +70,7 @@ def mean_test(nees: Array, dof: int, whitened: Array | None = None) -> MeanTest:
     present = present[some]
     if runs >= FEW and counts[0] > 1 and ratio > 0 and (present == present[0]).all():
         if whitened is not None:
-            w = np.where(present[..., None], whitened[some], 0.0)
-            log_nu, left_out = _log_nu_of_errors(w, counts * dof, means)
+            log_nu, left_out = _log_nu_of_errors(whitened if some.all() else whitened[some], counts * dof, means)
             floor, caution = 0.0, 1.0
         else:
             log_nu, left_out = _log_nu_of_means(means)
@@ -124,13 +124,21 @@ def _log_nu_of_errors(w: Array, size: Array, means: Array) -> tuple[float, Array
 
     ``size`` (runs,) counts the values in each run, ``means`` (runs,) their mean squares.
     """
-    flat = w.reshape(len(w), -1) / np.sqrt(size)[:, None]
-    runs = len(flat)
-    if runs > flat.shape[1]:
-        with_others = np.einsum("ij,ij->i", flat @ (flat.T @ flat), flat)
+    runs = len(w)
+    scale = np.sqrt(size)[:, None]
+
+    def flat(here: slice) -> Array:
+        block = w[here].reshape(len(w[here]), -1) / scale[here]
+        block[~np.isfinite(block)] = 0.0
+        return block
+
+    parts = [slice(k, k + BLOCK) for k in range(0, runs, BLOCK)]
+    if runs > w[0].size:
+        products = sum(block.T @ block for block in map(flat, parts))
+        with_others = np.concatenate([np.einsum("ij,ij->i", block @ products, block) for block in map(flat, parts)])
     else:
-        blocks = (flat[k : k + BLOCK] @ flat.T for k in range(0, runs, BLOCK))
-        with_others = np.concatenate([np.square(block).sum(axis=1) for block in blocks])
+        everything = flat(slice(None))
+        with_others = np.concatenate([np.square(everything[here] @ everything.T).sum(axis=1) for here in parts])
     with_others = with_others - np.square(means)
     total = with_others.sum()
     t2 = np.maximum(total / (runs * (runs - 1)), 1e-300)
@@ -249,6 +257,11 @@ def simultaneous_band(
 
 def _slopes(nees: Array) -> Array:
     """sqrt((1 - rho) / (1 + rho)) of neighbouring steps, (runs, steps) -> (steps - 1,); rho from 0 to 1."""
+    parts = [_slopes_of(nees[:, here.start : here.stop + 1]) for here in blocks(nees.shape[1] - 1, len(nees))]
+    return np.concatenate(parts)
+
+
+def _slopes_of(nees: Array) -> Array:
     both = np.isfinite(nees[:, 1:]) & np.isfinite(nees[:, :-1])
     count = np.maximum(both.sum(axis=0), 1)
     a, b = (np.where(both, part, 0.0) for part in (nees[:, :-1], nees[:, 1:]))

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import stats
 
 from consistency.diagnostics.bias import hotelling, moments
+from consistency.diagnostics.blocks import by_runs
 from consistency.types import Array
 
 
@@ -64,9 +65,8 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
     """
     present = np.asarray(np.isfinite(whitened).all(axis=-1))
     n = whitened.shape[-1]
-    w = np.where(present[..., None], whitened, 0.0)[present.any(axis=1)]
-    count = present.sum(axis=1)[present.any(axis=1)]
-    M = np.swapaxes(w, -1, -2) @ w / np.maximum(count, 1)[:, None, None]
+    count = present.sum(axis=1)
+    M = by_runs(_second_moments, whitened, present)[count > 0] / count[count > 0, None, None]
     mean = M.mean(axis=0) if len(M) else np.full((n, n), np.nan)
     trace = float(np.trace(mean))
     scaled = mean * n / trace if trace > 0 else mean
@@ -75,3 +75,9 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
         return scaled, float("nan")
     i, j = np.triu_indices(n, 1)
     return scaled, hotelling(M[:, i, j]).p_value
+
+
+def _second_moments(whitened: Array, present: Array) -> Array:
+    """Sum of w w' over the steps of each run, (runs, steps, n) -> (runs, n, n)."""
+    w = np.where(present[..., None], whitened, 0.0)
+    return np.asarray(np.swapaxes(w, -1, -2) @ w)

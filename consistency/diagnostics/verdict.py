@@ -29,7 +29,7 @@ from consistency.diagnostics.scale import (
     simultaneous_band,
 )  # fmt: skip
 from consistency.diagnostics.shape import mean_shape, sphericity
-from consistency.diagnostics.whitening import whiten
+from consistency.diagnostics.whitening import mean_of_runs, squared_length, whiten
 from consistency.types import Array, Failure, Indices, Verdict
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
@@ -99,9 +99,9 @@ def judge(
     if error is not None and covariance is not None:
         whitened = whiten(error, covariance)
         counted = np.asarray(np.isfinite(nees) if nees is not None else np.isfinite(whitened).all(axis=-1))
-        nees = np.where(counted, np.square(whitened).sum(axis=-1), np.nan)
+        nees = np.where(counted, squared_length(whitened), np.nan)
         s["impossible"] = _impossible(error, covariance, counted)
-        whitened = np.where(counted[..., None], whitened, np.nan)
+        whitened[~counted] = np.nan
         dof = error.shape[-1]
         p_values |= _errors(s, error, covariance, nees, whitened, allow, axes, subsets)
     if "outlier" in s and run_numbers is not None and s["outlier"]["run"] >= 0:
@@ -185,12 +185,10 @@ def _errors(
     if len(names) != n:
         raise ValueError(f"{len(names)} names of axes for {n} components")
     counted = np.isfinite(nees)
-    error = np.where(counted[..., None], error, np.nan)
     groups = _groups(names, subsets)
     tests = {key: _subset_test(error, covariance, nees, index) for key, index in groups.items()}
     worst = float(np.min([t.above if allow else t.p_value for t in tests.values()], initial=1.0))
-    mean, total = np.nanmean, counted.any(axis=1)
-    of_runs = mean(whitened[total], axis=1) if total.any() else np.empty((0, n))
+    of_runs = mean_of_runs(whitened)[counted.any(axis=1)]
     enough = len(of_runs) > n
     _, bias_steps = t_squared(whitened)
     asked_steps = np.isfinite(bias_steps)
@@ -213,6 +211,7 @@ def _errors(
         s["shape_step"] = int(np.nanargmin(shape_steps)) + 1 if asked else None
         p |= {"shape": shape, "shape in some step": at_step} if several else {"shape": at_step}
     index, inclination = noncredibility(error, nees)
+    error = np.where(counted[..., None], error, np.nan)
     inside, interval = coverage_interval(error, covariance)
     position = [i for i, axis in enumerate(names) if axis in POSITION]
     attitude = [i for i, axis in enumerate(names) if axis in ATTITUDE]
@@ -225,8 +224,8 @@ def _errors(
         "rmse": [rmse(error[..., [i]]) for i in range(n)],
         "rmse_position": rmse(error[..., position]) if position else float("nan"),
         "rmse_heading": rmse(error[..., attitude]) if attitude else float("nan"),
-        "nci": float(mean(index)) if np.isfinite(index).any() else float("nan"),
-        "inclination": float(mean(inclination)) if np.isfinite(inclination).any() else float("nan"),
+        "nci": float(np.nanmean(index)) if np.isfinite(index).any() else float("nan"),
+        "inclination": float(np.nanmean(inclination)) if np.isfinite(inclination).any() else float("nan"),
         "outlier": {"run": odd.run, "step": odd.step + 1, "distance": odd.distance},
         "left_out_steps": [int(k) + 1 for k in np.flatnonzero(_unusable(covariance, counted))],
     }
@@ -264,7 +263,8 @@ def _groups(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None)
 
 def _subset_test(error: Array, covariance: Array, nees: Array, index: list[int]) -> MeanTest:
     w = subset(error, covariance, index)
-    return mean_test(np.where(np.isfinite(nees), np.square(w).sum(axis=-1), np.nan), len(index), w)
+    w[~np.isfinite(nees)] = np.nan
+    return mean_test(squared_length(w), len(index), w)
 
 
 def _nees(s: dict[str, Any], nees: Array, dof: int, whitened: Array | None, allow: str | None) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.diagnostics.blocks import by_runs
 from consistency.types import Array
 
 
@@ -13,7 +14,12 @@ def whiten(error: Array, covariance: Array) -> Array:
     Shapes (..., n) and (..., n, n) -> (..., n). Rows that hold a NaN, or whose covariance is not positive
     definite, come back as NaN.
     """
-    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    e = np.asarray(error, float)
+    P = np.broadcast_to(np.asarray(covariance, float), (*e.shape, e.shape[-1]))
+    return by_runs(_whiten, e, P) if e.ndim > 1 else _whiten(e, P)
+
+
+def _whiten(e: Array, P: Array) -> Array:
     n = e.shape[-1]
     out = np.empty(e.shape)
     L = np.zeros((n, n), object)  # of arrays over the batch: n is small, the batch is not
@@ -30,7 +36,23 @@ def whiten(error: Array, covariance: Array) -> Array:
 def standardise(error: Array, covariance: Array) -> Array:
     """Each component over its own standard deviation, (..., n) and (..., n, n) -> (..., n); NaN where that is 0."""
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    return np.asarray(np.asarray(error, float) / np.sqrt(np.where(variance > 0, variance, np.nan)))
+    return by_runs(lambda e, v: e / np.sqrt(np.where(v > 0, v, np.nan)), np.asarray(error, float), variance)
+
+
+def squared_length(whitened: Array) -> Array:
+    """(runs, steps, n) -> (runs, steps): the NEES, if nothing is missing."""
+    return by_runs(lambda w: np.square(w).sum(axis=-1), whitened)
+
+
+def mean_of_runs(values: Array) -> Array:
+    """Mean over the steps that a run has, (runs, steps, n) -> (runs, n); NaN where it has none."""
+
+    def mean(block: Array) -> Array:
+        present = ~np.isnan(block)
+        total, count = np.where(present, block, 0.0).sum(axis=1), present.sum(axis=1)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    return by_runs(mean, values)
 
 
 def spread_steps(present: Array) -> Array:

@@ -65,7 +65,8 @@ def _study(folder: Path, styles: dict[str, int], said: tuple[tuple[str, str], ..
     for name in results.filters:
         styles.setdefault(name, len(styles))
     common = _common_band(verdicts)
-    tracks = tuple(_track(all_curves[n], verdicts[n], shown, styles[n], common) for n in results.filters)
+    paths = {name: _path(results.estimates, name, shown, steps) for name in results.filters}
+    tracks = tuple(_track(all_curves[n], verdicts[n], shown, styles[n], common, paths[n]) for n in results.filters)
     resolved = results.manifest.get("scenario") or results.manifest.get("belief") or {}
     return Study(
         name=scenario.name if scenario else Path(str(results.manifest.get("log", folder.name))).name,
@@ -85,7 +86,7 @@ def _study(folder: Path, styles: dict[str, int], said: tuple[tuple[str, str], ..
     )
 
 
-def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | None) -> Track:
+def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | None, path: Array) -> Track:
     steps = len(c.t)
     row = int(np.searchsorted(c.runs, shown))
     has_run = row < len(c.runs) and c.runs[row] == shown
@@ -101,7 +102,7 @@ def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | 
         name=c.filter,
         style=style,
         verdict=verdict,
-        path=(c.pose[row] if has_run else empty)[:, :2],
+        path=path,
         error=None if c.error is None else DEGREES * (c.error[row] if has_run else empty),
         sigma=DEGREES * np.sqrt(np.maximum(variance[row], 0.0)) if has_run else empty,
         anees=s.get("anees"),
@@ -137,6 +138,14 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [_rounded(item) for item in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def _path(estimates: pd.DataFrame, filter_name: str, run: int, steps: int) -> Array:
+    """Estimated x and y of one run, (steps, 2); NaN where there is no estimate."""
+    path = np.full((steps, 2), np.nan)
+    rows = estimates[(estimates["filter"] == filter_name) & (estimates["run"] == run)]
+    path[rows["step"].to_numpy() - 1] = rows[["x", "y"]].to_numpy(float)
+    return path
 
 
 def _true_path(truth: pd.DataFrame | None, run: int) -> Array | None:

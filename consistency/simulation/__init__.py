@@ -4,6 +4,6 @@ Nothing here knows a filter.
 """
 
 from consistency.simulation.path import planned_controls, planned_path
-from consistency.simulation.world import draw_landmarks, require_landmarks_in_view, simulate
+from consistency.simulation.world import World, draw_landmarks, require_landmarks_in_view, simulate
 
-__all__ = ["draw_landmarks", "planned_controls", "planned_path", "require_landmarks_in_view", "simulate"]
+__all__ = ["World", "draw_landmarks", "planned_controls", "planned_path", "require_landmarks_in_view", "simulate"]

@@ -216,6 +216,7 @@ import signal, sys
 import consistency.montecarlo as mc
 from consistency.cli import main
 one, count = mc._one, []
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell runs in the background
 def interrupt(trial, *rest):
     count.append(trial.run)
     if len(count) == 4:

@@ -13,7 +13,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import consistency as cs
-from consistency import montecarlo
+from consistency.simulation import World
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 import bench
@@ -157,10 +157,10 @@ def test_medians_of_interleaved_measurements(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_clock_takes_time_and_goes_away() -> None:
-    original = montecarlo.simulate
-    with whole.Clock().on(montecarlo, "simulate"):
-        assert montecarlo.simulate is not original
-    assert montecarlo.simulate is original
+    original = World.trial
+    with whole.Clock().on(World, "trial"):
+        assert World.trial is not original
+    assert World.trial is original
     assert 0.0 < whole.share_outside(2, 20, ["ekf-uvd"], 1) < 1.0
 
 

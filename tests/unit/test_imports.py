@@ -23,7 +23,7 @@ RANK = {
     "scenario": 3,
     "protocols": 4,
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
-    "storage": 5, "results": 6,
+    "parquet": 4, "storage": 5, "results": 6, "gather": 7,
     "log": 7, "recording": 7,
     "montecarlo": 8, "judge": 8,
     "sequential": 9, "comparison": 9,

@@ -12,10 +12,10 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency import montecarlo
 from consistency.filters.stepping import run_filter
 from consistency.montecarlo import Interrupted
 from consistency.results import joined
+from consistency.simulation import World
 from consistency.types import Control, Gaussian, Observation, Trial
 
 Small = Callable[..., cs.Scenario]
@@ -304,14 +304,14 @@ def stop_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Ctrl-C when the run of that number is begun."""
 
     def arm(runs: int) -> None:
-        simulate = montecarlo.simulate
+        trial = World.trial
 
-        def interrupted(scenario: cs.Scenario, run: int, seed: int) -> Trial:
+        def interrupted(self: World, run: int, seed: int) -> Trial:
             if run == runs:
                 raise KeyboardInterrupt
-            return simulate(scenario, run, seed)
+            return trial(self, run, seed)
 
-        monkeypatch.setattr(montecarlo, "simulate", interrupted)
+        monkeypatch.setattr(World, "trial", interrupted)
 
     return arm
 

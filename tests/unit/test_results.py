@@ -17,8 +17,8 @@ import pytest
 import consistency as cs
 from consistency.judge import curves
 from consistency.montecarlo import simulate_log
-from consistency.results import covariances
-from consistency.storage import COLUMNS, require_free
+from consistency.parquet import COLUMNS
+from consistency.storage import require_free
 from consistency.types import Control, Gaussian, Observation
 
 TABLES = ("estimates", "failures", "truth", "landmarks")
@@ -135,7 +135,7 @@ def test_nees_is_null_only_while_the_pose_is_not_of_full_rank(results: cs.Result
         truth = results.truth.query("run == @row.run and step == @row.step")[["x", "y", "heading"]].to_numpy()[0]
         e = truth - [row.x, row.y, row.heading]
         e[2] = (e[2] + np.pi) % (2 * np.pi) - np.pi
-        P = covariances(pd.DataFrame([row._asdict()]))[0]
+        P = np.array([[row.P_xx, row.P_xy, row.P_xh], [row.P_xy, row.P_yy, row.P_yh], [row.P_xh, row.P_yh, row.P_hh]])
         assert row.nees == pytest.approx(e @ np.linalg.inv(P) @ e, rel=1e-6)
 
 
@@ -145,7 +145,9 @@ def test_curves_put_every_row_in_its_place(results: cs.Results) -> None:
     assert np.array_equal(np.isfinite(c.nees), np.broadcast_to(np.arange(60) < 4, (4, 60)))
     assert [(failure.run, failure.step) for failure in c.failures] == [(0, 5), (1, 5), (2, 5), (3, 5)]
     row = results.estimates.query("filter == 'sleepy' and run == 2 and step == 3").iloc[0]
-    assert c.pose[2, 2, 0] == row["x"]
+    true = results.truth.query("run == 2 and step == 3").iloc[0]
+    assert c.error[2, 2, 0] == true["x"] - row["x"]
+    assert c.covariance[2, 2, 0, 2] == c.covariance[2, 2, 2, 0] == row["P_xh"]
     assert c.nees[2, 2] == row["nees"]
     assert np.allclose(curves(results, "ekf-xyz").t, 0.1 * np.arange(1, 61))
     with pytest.raises(cs.InputError, match="filter 'kf' is not in these results; there are: ekf-xyz, sleepy"):
@@ -267,15 +269,15 @@ class DiskFull(OSError):
 @pytest.fixture
 def full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second table does not fit any more."""
-    write, calls = pd.DataFrame.to_parquet, []
+    write, calls = pq.ParquetWriter.write_table, []
 
-    def to_parquet(self: pd.DataFrame, *args: Any, **kwargs: Any) -> Any:
+    def write_table(self: pq.ParquetWriter, *args: Any, **kwargs: Any) -> Any:
         calls.append(1)
         if len(calls) > 1:
             raise DiskFull(28, "No space left on device")
         return write(self, *args, **kwargs)
 
-    monkeypatch.setattr(pd.DataFrame, "to_parquet", to_parquet)
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", write_table)
 
 
 @pytest.mark.usefixtures("full_disk")

@@ -1,0 +1,166 @@
+"""From the outcomes of runs, as they come, to results: in memory, or in a folder without holding them."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
+from itertools import pairwise
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from consistency.errors import InputError
+from consistency.parquet import COLUMNS, Columns, Writer, write_table
+from consistency.results import (
+    NUMBERS,
+    Outcome,
+    Results,
+    StoredResults,
+    Tables,
+    estimates_table,
+    failures_table,
+    truth_table,
+)
+from consistency.storage import NewFolder
+from consistency.types import Failure
+
+
+class Pieces(Protocol):
+    """Rows of a table, a run at a time, in the order in which they came."""
+
+    def append(self, columns: Columns, /) -> None: ...
+    def __iter__(self) -> Iterator[Columns]: ...
+
+
+class Spool:
+    """Pieces in a file: numbers as they are, neither encoded nor compressed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file: Any = None
+
+    def append(self, columns: Columns, /) -> None:
+        batch = pa.RecordBatch.from_pydict(columns)
+        if self._file is None:
+            self._file = pa.ipc.new_stream(str(self.path), batch.schema)
+        self._file.write_batch(batch)
+
+    def __iter__(self) -> Iterator[Columns]:
+        if self._file is not None:
+            self._file.close()
+            with pa.OSFile(str(self.path)) as file, pa.ipc.open_stream(file) as stream:
+                for batch in stream:
+                    yield {name: batch.column(name).to_numpy() for name in batch.schema.names}
+
+
+class Gathered:
+    """Outcomes of runs of some filters, kept in memory, or where ``new`` is given on disk.
+
+    Outcomes come in order of their runs. ``previous`` are results to which they are added, of which the runs ``kept``
+    count.
+    """
+
+    def __init__(
+        self,
+        filters: Sequence[str],
+        new: NewFolder | None = None,
+        previous: Tables | None = None,
+        kept: Iterable[int] = (),
+    ) -> None:
+        self.filters, self.new, self.previous, self.kept = list(filters), new, previous, frozenset(kept)
+        self.runs: set[int] = set()
+        self._failures: list[Failure] = []
+        self._spools: list[Spool] = []
+        self._estimates = {name: self._pieces() for name in self.filters}
+        self._truth = self._pieces()
+
+    def _pieces(self) -> Pieces:
+        if self.new is None:
+            return []
+        self._spools.append(Spool(self.new.path / f"{len(self._spools)}.spool"))
+        return self._spools[-1]
+
+    def add(self, outcome: Outcome) -> None:
+        """Keep what a run left."""
+        with nullcontext() if self.new is None else self.new.writing():
+            for name, columns in outcome.estimates.items():
+                self._estimates[name].append(columns)
+            if outcome.truth is not None:
+                self._truth.append(outcome.truth)
+        self._failures += outcome.failures
+        self.runs.add(outcome.run)
+
+    @property
+    def finished(self) -> int:
+        """Runs that are there, those of before too."""
+        return len(self.runs | self.kept)
+
+    def results(self, manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results | StoredResults:
+        """The results; a folder is written and put in its place, unless no run is finished."""
+        failures = self._all_failures()
+        manifest = manifest | {"failures": len(failures)}
+        if self.new is not None and self.finished:
+            return self._stored(self.new, manifest, failures, landmarks)
+        estimates = estimates_table([(name, columns) for name in self.filters for columns in self._of(name)])
+        truth = truth_table(list(self._true()))
+        return Results(estimates, failures, truth if len(truth) else None, landmarks, manifest)
+
+    def _stored(
+        self, new: NewFolder, manifest: dict[str, Any], failures: pd.DataFrame, landmarks: pd.DataFrame | None
+    ) -> StoredResults:
+        with new.writing():
+            with Writer(new.path / "estimates.parquet", "estimates") as writer:
+                for name in self.filters:
+                    for columns in self._of(name):
+                        writer.add(columns, filter=name)
+                    writer.end_group()
+            true = self._true()
+            if (first := next(true, None)) is not None:
+                with Writer(new.path / "truth.parquet", "truth") as writer:
+                    writer.add(first)
+                    for columns in true:
+                        writer.add(columns)
+                    writer.end_group()
+            write_table(new.path / "failures.parquet", "failures", failures)
+            if landmarks is not None:
+                write_table(new.path / "landmarks.parquet", "landmarks", landmarks)
+            for spool in self._spools:
+                spool.path.unlink(missing_ok=True)
+        return StoredResults(new.folder, failures, landmarks, new.put_in_place(manifest))
+
+    def _of(self, filter_name: str) -> Iterator[Columns]:
+        return self._merged(self._before("estimates", NUMBERS, filter_name), self._estimates[filter_name])
+
+    def _true(self) -> Iterator[Columns]:
+        return self._merged(self._before("truth", list(COLUMNS["truth"])), self._truth)
+
+    def _merged(self, before: Iterator[tuple[int, Columns]], now: Pieces) -> Iterator[Columns]:
+        """Pieces of both in order of their runs; those of a run that was cut off are left out."""
+        numbered = ((int(columns["run"][0]), columns) for columns in now if len(columns["run"]))
+        finished = (piece for piece in numbered if piece[0] in self.runs)
+        return (columns for _, columns in heapq.merge(before, finished, key=itemgetter(0)))
+
+    def _before(self, table: str, columns: list[str], filter_name: str | None = None) -> Iterator[tuple[int, Columns]]:
+        """The kept runs of the previous results, one by one."""
+        last = -1
+        for batch in [] if self.previous is None else self.previous.batches(table, columns, filter_name):
+            for start, end in pairwise(np.flatnonzero(np.diff(batch["run"], prepend=-1, append=-1))):
+                run = int(batch["run"][start])
+                if run < last:
+                    raise InputError(f"the {table} to resume must be in order of the runs, as they were written")
+                last = run
+                if run in self.kept:
+                    yield run, {name: values[start:end] for name, values in batch.items()}
+
+    def _all_failures(self) -> pd.DataFrame:
+        """By filter, run and step."""
+        rank = {name: i for i, name in enumerate(self.filters)}
+        before = [] if self.previous is None else self.previous.failures.itertuples(index=False)
+        failures = [f for f in (Failure(*row) for row in before) if f.run in self.kept and f.filter in rank]
+        failures += [failure for failure in self._failures if failure.run in self.runs]
+        return failures_table(sorted(failures, key=lambda f: (rank[f.filter], f.run, f.step)))

@@ -1,0 +1,191 @@
+"""Tables as Parquet: written piece by piece, in row groups that do not depend on the pieces; read back with checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from consistency.errors import InputError
+from consistency.types import Array
+
+COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
+COLUMNS: dict[str, dict[str, str]] = {
+    "landmarks": {"landmark": "int64", "x": "float64", "y": "float64", "z": "float64"},
+    "truth": {"run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64", "heading": "float64"},
+    "controls": {"run": "int64", "step": "int64", "dt": "float64", "v": "float64", "omega": "float64"},
+    "observations": {
+        "run": "int64", "step": "int64", "landmark": "int64", "z0": "float64", "z1": "float64", "z2": "float64",
+    },
+    "estimates": {
+        "filter": "str", "run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64",
+        "heading": "float64", **dict.fromkeys(COVARIANCE, "float64"), "nees": "float64", "nis": "float64",
+        "nis_dof": "int64",
+    },
+    "failures": {"filter": "str", "run": "int64", "step": "int64", "reason": "str"},
+}  # fmt: skip
+NULLABLE = {"nees", "nis"}
+REPEATED = {"t", "dt"}  # floating-point columns of few different values
+ROWS = 65_536  # of a row group, and of a batch that is read
+TYPES = {"str": pa.string(), "int64": pa.int64(), "float64": pa.float64()}
+
+Columns = dict[str, Array]  # columns of a table by name, equally long
+
+
+# --- writing -------------------------------------------------------------------------------------
+
+
+class Writer:
+    """A Parquet file of the table ``name``, in row groups of ``ROWS`` rows however many are added at a time."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        kinds = COLUMNS[name]
+        self.schema = pa.schema([(column, TYPES[kind]) for column, kind in kinds.items()])
+        # the bytes of similar numbers are alike: apart from each other they take less room, and nothing is lost
+        split = [column for column, kind in kinds.items() if kind == "float64" and column not in REPEATED]
+        repeated = [column for column in kinds if column not in split]
+        self._file = pq.ParquetWriter(
+            path, self.schema, compression="zstd", use_dictionary=repeated, use_byte_stream_split=split
+        )
+        self._pieces: list[Any] = []
+        self._rows = 0
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def add(self, columns: Columns, **constant: str) -> None:
+        """Rows of arrays; ``constant`` is the text of a column that is the same in all of them."""
+        rows = len(next(iter(columns.values())))
+        arrays = [
+            pa.repeat(pa.scalar(constant[field.name], field.type), rows)
+            if field.name in constant
+            else pa.array(columns[field.name], field.type, from_pandas=True)
+            for field in self.schema
+        ]
+        self._pieces.append(pa.RecordBatch.from_arrays(arrays, schema=self.schema))
+        self._rows += rows
+        if self._rows >= ROWS:
+            self._write(self._rows - self._rows % ROWS)
+
+    def end_group(self) -> None:
+        """The rows that come next begin a row group of their own."""
+        if self._rows:
+            self._write(self._rows)
+
+    def _write(self, rows: int) -> None:
+        table = pa.Table.from_batches(self._pieces)
+        self._file.write_table(table.slice(0, rows), row_group_size=ROWS)
+        self._pieces = table.slice(rows).to_batches()
+        self._rows -= rows
+
+
+def write_table(path: Path, name: str, table: pd.DataFrame) -> None:
+    """A whole table; estimates in row groups of one filter each."""
+    table = table[list(COLUMNS[name])].astype(COLUMNS[name])
+    with Writer(path, name) as writer:
+        if name != "estimates":
+            writer.add({str(column): table[column].to_numpy() for column in table})
+        else:
+            for filter_name in table["filter"].unique():
+                part = table[table["filter"] == filter_name].drop(columns="filter")
+                writer.add({str(column): part[column].to_numpy() for column in part}, filter=filter_name)
+                writer.end_group()
+        writer.end_group()
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+def read_parquet(folder: Path, name: str) -> pd.DataFrame:
+    """One table of a folder, checked: columns, types, no NaN where none is allowed.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged, lacks a column or holds what the column may not.
+    """
+    path, wanted = folder / f"{name}.parquet", COLUMNS[name]
+    with _refusals(path):
+        table = require_table(folder, name).read(list(wanted)).to_pandas()
+    for column, kind in wanted.items():
+        _check_column(path, table[column], kind)
+    checked: pd.DataFrame = table.astype(wanted)
+    return checked
+
+
+def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
+    """Columns of numbers, some rows at a time and checked likewise; of one filter where it is named."""
+    path, wanted = folder / f"{name}.parquet", COLUMNS[name]
+    file = require_table(folder, name)
+    needed = [*columns, "filter"] if filter_name is not None else list(columns)
+    first = 0
+    for group in range(file.num_row_groups):
+        about = file.metadata.row_group(group)
+        if filter_name is not None and not _may_hold(about, filter_name):
+            first += about.num_rows
+            continue
+        with _refusals(path):
+            for batch in file.iter_batches(ROWS, [group], needed):
+                table = {column: batch.column(column).to_pandas() for column in columns}
+                for column, values in table.items():
+                    values.name = column
+                    _check_column(path, values, wanted[column], first)
+                first += batch.num_rows
+                chosen: Any = slice(None)
+                if filter_name is not None:
+                    chosen = pc.equal(batch.column("filter"), filter_name).to_numpy(zero_copy_only=False)
+                yield {column: values.to_numpy(wanted[column])[chosen] for column, values in table.items()}
+
+
+def require_table(folder: Path, name: str) -> Any:
+    """The opened file of a table, refused where it is missing, damaged or lacks a column."""
+    path = folder / f"{name}.parquet"
+    with _refusals(path):
+        file = pq.ParquetFile(path)
+    wanted = COLUMNS[name]
+    if missing := [column for column in wanted if column not in file.schema_arrow.names]:
+        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(wanted)}")
+    return file
+
+
+@contextmanager
+def _refusals(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(f"{path}: missing; write the folder again") from None
+    except (OSError, pa.ArrowException) as error:
+        first = str(error).splitlines()[0]
+        raise InputError(f"{path}: cannot be read, damaged or cut short ({first})") from None
+
+
+def _may_hold(group: Any, filter_name: str) -> bool:
+    """Whether rows of the filter are in a row group, by its statistics; True where there are none."""
+    columns = (group.column(k) for k in range(group.num_columns))
+    known = next(column.statistics for column in columns if column.path_in_schema == "filter")
+    return known is None or not known.has_min_max or bool(known.min <= filter_name <= known.max)
+
+
+def _check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
+    """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
+    if kind == "str":
+        return
+    values = pd.to_numeric(column, errors="coerce").to_numpy(float)
+    if column.name in NULLABLE:
+        values = np.where(column.isna(), 0.0, values)
+    if not np.isfinite(values).all():
+        row = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise InputError(f"{path}: column '{column.name}', row {first + row}: not a finite number ({column.iloc[row]})")
+    if kind == "int64" and (values != np.round(values)).any():
+        row = int(np.flatnonzero(values != np.round(values))[0])
+        raise InputError(f"{path}: column '{column.name}', row {first + row}: not a whole number ({values[row]})")

@@ -13,6 +13,7 @@ from consistency.vision.consensus import register_ransac
 from consistency.vision.errors import ConsensusError, ConvergenceError, DegenerateError, GimbalLockError, PointError
 from consistency.vision.pose import RelativePose, compose, invert
 from consistency.vision.propagation import implicit_covariance, registration_covariance, triangulation_covariance
+from consistency.vision.refinement import Refined, refine_reprojection, register_weighted
 from consistency.vision.registration import register_horn, register_svd
 from consistency.vision.rig import StereoRig, triangulable, triangulate
 
@@ -22,14 +23,17 @@ __all__ = [
     "DegenerateError",
     "GimbalLockError",
     "PointError",
+    "Refined",
     "RelativePose",
     "StereoRig",
     "compose",
     "implicit_covariance",
     "invert",
+    "refine_reprojection",
     "register_horn",
     "register_ransac",
     "register_svd",
+    "register_weighted",
     "registration_covariance",
     "triangulable",
     "triangulate",

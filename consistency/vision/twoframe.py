@@ -1,0 +1,118 @@
+"""What two frames measured of N unknown points, as a cost of the relative pose.
+
+Frame 1 measured z1 of R q + t, frame 2 measured z2 of q. With e the measured minus the predicted value and W the
+inverse of its covariance, a point's cost is f = (e1' W1 e1 + e2' W2 e2) / 2. Points are independent given the pose, so
+that each q is eliminated from the second derivatives by itself (Schur complement).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.types import Array
+from consistency.vision.pose import RelativePose, rotation_derivatives
+from consistency.vision.rig import StereoRig
+
+# points (N, 3) to values (N, k), first (N, k, 3) and second derivatives (N, k, 3, 3)
+Measure = Callable[[Array], tuple[Array, Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class TwoFrames:
+    """Measurements of the same points in two frames."""
+
+    measure: Measure
+    z1: Array  # (N, k)
+    z2: Array  # (N, k)
+    W1: Array  # (N, k, k), inverse covariance
+    W2: Array  # (N, k, k)
+
+    def residuals(self, pose: RelativePose, q: Array) -> tuple[Array, Array]:
+        """e1 and e2, (N, k) each."""
+        return self.z1 - self.measure(pose.apply(q))[0], self.z2 - self.measure(q)[0]
+
+    def squared(self, pose: RelativePose, q: Array) -> Array:
+        """2 f of each point, (N,), infinite where a point is not in front of the cameras."""
+        with np.errstate(invalid="ignore"):
+            s = sum(
+                np.einsum("ni,nij,nj->n", e, W, e)
+                for e, W in zip(self.residuals(pose, q), (self.W1, self.W2), strict=True)
+            )
+        return np.where(np.isnan(s), np.inf, s)
+
+
+@dataclass(frozen=True, eq=False)
+class Derivatives:
+    """Of f of each point by the pose d = (x, y, z, roll, pitch, yaw), by q and by z1 and z2."""
+
+    d: Array  # (N, 6)
+    q: Array  # (N, 3)
+    z1: Array  # (N, k)
+    z2: Array  # (N, k)
+    dd: Array  # (N, 6, 6)
+    dq: Array  # (N, 6, 3)
+    qq: Array  # (N, 3, 3)
+    dz1: Array  # (N, 6, k); by d and z2 it is zero
+    qz1: Array  # (N, 3, k)
+    qz2: Array  # (N, 3, k)
+
+
+def derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) -> Derivatives:
+    """First and second derivatives of f in closed form; not ``exact``: Gauss-Newton's, without second derivatives.
+
+    With a = R q + t and A = d a / d d = [I, R_k q], f_d = A' f_a and f_q = R' f_a + (the term of frame 2).
+    """
+    R, (R_k, R_kl) = pose.R, rotation_derivatives(pose.rpy)
+    f_a, f_aa, f_az, f_z1 = _frame(frames.measure, frames.z1, frames.W1, pose.apply(q), exact)
+    f_b, f_bb, f_bz, f_z2 = _frame(frames.measure, frames.z2, frames.W2, q, exact)
+    At = np.zeros((len(q), 6, 3))
+    At[:, :3] = np.eye(3)
+    At[:, 3:] = np.swapaxes(R_k @ q.T, 0, 2).swapaxes(1, 2)
+    AtH = At @ f_aa
+    dd, dq = AtH @ np.swapaxes(At, 1, 2), AtH @ R
+    if exact:
+        dd[:, 3:, 3:] += np.einsum("ni,klij,nj->nkl", f_a, R_kl, q, optimize=True)
+        dq[:, 3:] += np.swapaxes(np.swapaxes(R_k, 1, 2) @ f_a.T, 0, 2).swapaxes(1, 2)
+    return Derivatives(
+        d=(At @ f_a[:, :, None])[:, :, 0], q=f_a @ R + f_b, z1=f_z1, z2=f_z2,
+        dd=dd, dq=dq, qq=R.T @ f_aa @ R + f_bb, dz1=At @ f_az, qz1=R.T @ f_az, qz2=f_bz,
+    )  # fmt: skip
+
+
+def _frame(measure: Measure, z: Array, W: Array, p: Array, exact: bool) -> tuple[Array, Array, Array, Array]:
+    """f_p, f_pp, f_pz and f_z of e' W e / 2 in one frame."""
+    value, J, second = measure(p)
+    We = (W @ (z - value)[:, :, None])[:, :, 0]
+    JtW = np.swapaxes(J, 1, 2) @ W
+    f_pp = JtW @ J
+    if exact:
+        f_pp = f_pp - np.einsum("nk,nkij->nij", We, second)
+    return -(We[:, None] @ J)[:, 0], f_pp, -JtW, We
+
+
+def itself(p: Array) -> tuple[Array, Array, Array]:
+    """The measurement of a point is the point."""
+    n = len(p)
+    return p, np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3, 3, 3))
+
+
+def pixels(rig: StereoRig) -> Measure:
+    """The measurement of a point is u, v, u', v' of eq. 2.1 and 2.2; NaN at or behind a camera.
+
+    With u = a / w, a and w linear in p: u_p = (a_p - u w_p) / w and u_pp = -(u_p w_p' + w_p u_p') / w.
+    """
+    P = rig.cameras
+    top, last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
+
+    def measure(p: Array) -> tuple[Array, Array, Array]:
+        w = p @ last[:, :3].T + last[:, 3]
+        w = np.where(w > 0.0, w, np.nan)
+        value = (p @ top[:, :3].T + top[:, 3]) / w
+        J = (top[:, :3] - value[:, :, None] * last[:, :3]) / w[:, :, None]
+        outer = J[:, :, :, None] * (last[:, None, :3] / w[:, :, None, None])
+        return value, J, -(outer + np.swapaxes(outer, 2, 3))
+
+    return measure

@@ -13,6 +13,7 @@ from consistency.vision.rig import StereoRig
 RATIO = 0.8  # distance of the best match over that of the second best, Lowe (2004) sec. 7.1
 EPIPOLAR_PX = 2.0  # distance from the epipolar line; rectified images of a good calibration keep below 1
 
+BAND = 32  # rows of rectified images that are matched at once; time only
 NEVER = -2.0  # below every cosine
 
 
@@ -89,9 +90,27 @@ def homogeneous(uv: Array) -> Array:
 def stereo_matches(
     rig: StereoRig, left: Features, right: Features, ratio: float = RATIO, tolerance: float = EPIPOLAR_PX
 ) -> StereoFeatures:
-    """Features of both images matched within the epipolar gate."""
-    allowed = epipolar_gate(rig, left.uv, right.uv, tolerance)
-    return StereoFeatures(left, right, mutual_matches(left.descriptors, right.descriptors, allowed, ratio))
+    """Features of both images matched within the epipolar gate.
+
+    Rectified images are matched in bands of rows. Around a band, the right features reach ``tolerance`` further and
+    the left ones twice that, so that each left feature of the band and each right one it may match has all its rivals.
+    """
+    height, step = (rig.image_size[1], BAND) if is_rectified(rig) else (1, 1)
+    found = [np.empty((0, 2), np.int64)]
+    for top in range(0, height, step):
+        ends = (-np.inf if top == 0 else top, np.inf if top + step >= height else top + step)
+        i, j = (_within(f.uv[:, 1], ends, margin * tolerance) for f, margin in ((left, 2), (right, 1)))
+        allowed = epipolar_gate(rig, left.uv[i], right.uv[j], tolerance)
+        matches = mutual_matches(left.descriptors[i], right.descriptors[j], allowed, ratio)
+        pairs = np.column_stack([i[matches[:, 0]], j[matches[:, 1]]])
+        row = left.uv[pairs[:, 0], 1]
+        found.append(pairs[(row >= ends[0]) & (row < ends[1])])
+    pairs = np.concatenate(found)
+    return StereoFeatures(left, right, pairs[np.argsort(pairs[:, 0])])
+
+
+def _within(values: Array, ends: tuple[float, float], margin: float) -> Indices:
+    return np.flatnonzero((values >= ends[0] - margin) & (values < ends[1] + margin))
 
 
 def circular_matches(before: StereoFeatures, after: StereoFeatures, ratio: float = RATIO) -> Indices:
@@ -100,10 +119,10 @@ def circular_matches(before: StereoFeatures, after: StereoFeatures, ratio: float
     Left is matched with left and right with right over time, among features that have a stereo match; both must
     say the same. The two stereo matches of the circle are those of the pairs.
     """
-    over_time = []
+    codes = []
     for side, (was, now) in enumerate(((before.left, after.left), (before.right, after.right))):
         old, new = before.pairs[:, side], after.pairs[:, side]
-        over_time.append(mutual_matches(was.descriptors[old], now.descriptors[new], None, ratio))
-    by_left, by_right = ({(int(i), int(j)) for i, j in matches} for matches in over_time)
-    closed = sorted(by_left & by_right)
-    return np.array(closed, np.int64).reshape(-1, 2)
+        i, j = mutual_matches(was.descriptors[old], now.descriptors[new], None, ratio).T
+        codes.append(i * len(new) + j)
+    closed = np.intersect1d(*codes, assume_unique=True)
+    return np.column_stack(np.divmod(closed, max(len(after.pairs), 1))).astype(np.int64)

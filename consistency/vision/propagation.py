@@ -13,7 +13,7 @@ from consistency.vision import checks
 from consistency.vision.errors import ConvergenceError, DegenerateError
 from consistency.vision.pose import RelativePose, rotation_derivatives
 from consistency.vision.registration import matched
-from consistency.vision.rig import StereoRig, system, triangulate
+from consistency.vision.rig import StereoRig, solved
 
 AT_MINIMUM = 1e-3  # standard deviations that a pose may be away from the minimum that the theorem speaks of
 
@@ -84,17 +84,16 @@ def triangulation_covariance(rig: StereoRig, uv: Array, S_uv: Array) -> Array:
     """
     uv = checks.rows("uv", uv, 4)
     S_uv = checks.covariances("S_uv", S_uv, len(uv), 4)
-    C_pp, C_pu = triangulation_derivatives(rig, uv, triangulate(rig, uv))
+    C_pp, C_pu = triangulation_derivatives(rig, *solved(rig, uv))
     return implicit_covariance(C_pp, C_pu[:, None], S_uv[:, None])
 
 
-def triangulation_derivatives(rig: StereoRig, uv: Array, points: Array) -> tuple[Array, Array]:
+def triangulation_derivatives(rig: StereoRig, A: Array, b: Array, points: Array) -> tuple[Array, Array]:
     """C_pp (N, 3, 3) and C_pu (N, 3, 4) of half of eq. 2.25.
 
     Row j of A p - b is (u_j P_3 - P_j) (p, 1), with P the rows of its camera: u_j stands in row j only, and its factor
     there is the depth P_3 (p, 1).
     """
-    A, b = system(rig, uv)
     last = rig.cameras[:, 2].repeat(2, axis=0)  # (4, 4), P_3 of each row
     residual = np.einsum("nij,nj->ni", A, points) - b
     depth = points @ last[:, :3].T + last[:, 3]

@@ -19,7 +19,7 @@ from consistency.vision.propagation import implicit_covariance
 from consistency.vision.registration import matched, register_svd
 from consistency.vision.rig import StereoRig, triangulate
 from consistency.vision.robust import Robust, loss, threshold
-from consistency.vision.twoframe import Derivatives, TwoFrames, derivatives, itself, pixels
+from consistency.vision.twoframe import Derivatives, Pixels, Points, TwoFrames, derivatives
 
 STEPS = 100  # of Levenberg and Marquardt, at most; ten do for honest matches
 DECREMENT = 1e-14  # predicted decrease of the cost at the minimum: 1e-7 standard deviations
@@ -73,7 +73,7 @@ def register_weighted(
     """
     p1, p2 = matched(p1, p2)
     S1, S2 = checks.covariances("S1", S1, len(p1), 3), checks.covariances("S2", S2, len(p1), 3)
-    frames = TwoFrames(itself, p1, p2, _weights("S1", S1), _weights("S2", S2))
+    frames = TwoFrames(Points(), p1, p2, _weights("S1", S1), _weights("S2", S2))
     return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2, robust)
 
 
@@ -113,7 +113,7 @@ def refine_reprojection(
     S2 = S1 if S_uv2 is None else checks.covariances("S_uv2", S_uv2, len(uv1), 4)
     _, q = matched(triangulate(rig, uv1), triangulate(rig, uv2))
     rig.project(pose.apply(q))
-    frames = TwoFrames(pixels(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
+    frames = TwoFrames(Pixels(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
     return _refined(frames, S1, S2, pose, q, robust)
 
 
@@ -178,13 +178,12 @@ def _cost(frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None
 
 def _step(f: Derivatives, weight: Array, damping: float) -> tuple[Array, Array, float]:
     """Step of the pose (6,) and of the points (N, 3), and twice the decrease that it predicts."""
-    more = 1.0 + damping
     inverse = np.linalg.inv(f.qq * (1.0 + damping * np.eye(3)))
     gain = f.dq @ inverse
     g = weight @ (f.d - (gain @ f.q[:, :, None])[:, :, 0])
-    H = np.tensordot(weight, f.dd * (1.0 + (more - 1.0) * np.eye(6)) - gain @ np.swapaxes(f.dq, 1, 2), 1)
+    H = np.tensordot(weight, f.dd * (1.0 + damping * np.eye(6)) - gain @ np.swapaxes(f.dq, 1, 2), 1)
     step = -np.linalg.solve(H, g)
-    down = f.q + (step @ f.dq)
+    down = f.q + step @ f.dq
     step_q = -(inverse @ down[:, :, None])[:, :, 0]
     slope = step @ (weight @ f.d) + float(np.einsum("n,ni,ni->", weight, step_q, f.q))
     return step, step_q, -float(slope)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -66,7 +67,7 @@ class StereoRig:
         """Distance of the two cameras, m."""
         return float(np.linalg.norm(self.t))
 
-    @property
+    @cached_property
     def cameras(self) -> Array:
         """(2, 3, 4): K [I 0] of eq. 2.1 and K' [R' -R't], which eq. 2.2 calls [R t]."""
         left = np.column_stack([self.K_left, np.zeros(3)])
@@ -116,30 +117,33 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
     PointError
         Rays that meet at infinity, at a camera or behind one: zero or negative disparity. See :func:`triangulable`.
     """
-    matches = checks.rows("uv", uv, 4)
-    points, good = _solved(rig, matches)
+    return solved(rig, checks.rows("uv", uv, 4))[2]
+
+
+def triangulable(rig: StereoRig, uv: Array) -> Array:
+    """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
+    return _in_front(rig, *_system(rig, checks.rows("uv", uv, 4)))[1]
+
+
+def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
+    """A (N, 4, 3) and b (N, 4) of eq. 2.3, rows in the order u, v, u', v', and the points (N, 3); or PointError."""
+    A, b = _system(rig, uv)
+    points, good = _in_front(rig, A, b)
     if not good.all():
         raise PointError(
             f"uv: match {int(np.argmin(good))} has zero or negative disparity, its point is at infinity or behind a "
             "camera; leave such matches out (triangulable tells them)"
         )
-    return points
+    return A, b, points
 
 
-def triangulable(rig: StereoRig, uv: Array) -> Array:
-    """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
-    return _solved(rig, checks.rows("uv", uv, 4))[1]
-
-
-def system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
-    """A (N, 4, 3) and b (N, 4) of eq. 2.3, the rows in the order u, v, u', v'."""
+def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
     P = rig.cameras
     A = uv[:, :, None] * P[:, 2].repeat(2, axis=0) - P[:, :2].reshape(4, 4)
     return A[:, :, :3], -A[:, :, 3]
 
 
-def _solved(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
-    A, b = system(rig, uv)
+def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
     At = np.swapaxes(A, 1, 2)
     N = At @ A
     finite = np.linalg.det(N) > FARTHEST * (np.trace(N, axis1=1, axis2=2) / 3.0) ** 3

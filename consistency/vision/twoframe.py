@@ -7,8 +7,8 @@ that each q is eliminated from the second derivatives by itself (Schur complemen
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -16,8 +16,21 @@ from consistency.types import Array
 from consistency.vision.pose import RelativePose, rotation_derivatives
 from consistency.vision.rig import StereoRig
 
-# points (N, 3) to values (N, k), first (N, k, 3) and second derivatives (N, k, 3, 3)
-Measure = Callable[[Array], tuple[Array, Array, Array]]
+
+class Measure(Protocol):
+    """What a frame measures of points (N, 3) in it: k numbers each."""
+
+    def value(self, p: Array) -> Array:
+        """(N, k)."""
+        ...
+
+    def jacobian(self, p: Array) -> Array:
+        """(N, k, 3)."""
+        ...
+
+    def second(self, p: Array, J: Array, w: Array) -> Array:
+        """Sum over the k numbers of w (N, k) times the second derivative, (N, 3, 3); J is the Jacobian at p."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +45,7 @@ class TwoFrames:
 
     def residuals(self, pose: RelativePose, q: Array) -> tuple[Array, Array]:
         """e1 and e2, (N, k) each."""
-        return self.z1 - self.measure(pose.apply(q))[0], self.z2 - self.measure(q)[0]
+        return self.z1 - self.measure.value(pose.apply(q)), self.z2 - self.measure.value(q)
 
     def squared(self, pose: RelativePose, q: Array) -> Array:
         """2 f of each point, (N,), infinite where a point is not in front of the cameras."""
@@ -84,35 +97,49 @@ def derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) ->
 
 def _frame(measure: Measure, z: Array, W: Array, p: Array, exact: bool) -> tuple[Array, Array, Array, Array]:
     """f_p, f_pp, f_pz and f_z of e' W e / 2 in one frame."""
-    value, J, second = measure(p)
-    We = (W @ (z - value)[:, :, None])[:, :, 0]
+    J = measure.jacobian(p)
+    We = (W @ (z - measure.value(p))[:, :, None])[:, :, 0]
     JtW = np.swapaxes(J, 1, 2) @ W
     f_pp = JtW @ J
     if exact:
-        f_pp = f_pp - np.einsum("nk,nkij->nij", We, second)
+        f_pp = f_pp - measure.second(p, J, We)
     return -(We[:, None] @ J)[:, 0], f_pp, -JtW, We
 
 
-def itself(p: Array) -> tuple[Array, Array, Array]:
+class Points:
     """The measurement of a point is the point."""
-    n = len(p)
-    return p, np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3, 3, 3))
+
+    def value(self, p: Array) -> Array:
+        return p
+
+    def jacobian(self, p: Array) -> Array:
+        return np.broadcast_to(np.eye(3), (len(p), 3, 3))
+
+    def second(self, p: Array, J: Array, w: Array) -> Array:
+        return np.zeros((len(p), 3, 3))
 
 
-def pixels(rig: StereoRig) -> Measure:
+class Pixels:
     """The measurement of a point is u, v, u', v' of eq. 2.1 and 2.2; NaN at or behind a camera.
 
     With u = a / w, a and w linear in p: u_p = (a_p - u w_p) / w and u_pp = -(u_p w_p' + w_p u_p') / w.
     """
-    P = rig.cameras
-    top, last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
 
-    def measure(p: Array) -> tuple[Array, Array, Array]:
-        w = p @ last[:, :3].T + last[:, 3]
-        w = np.where(w > 0.0, w, np.nan)
-        value = (p @ top[:, :3].T + top[:, 3]) / w
-        J = (top[:, :3] - value[:, :, None] * last[:, :3]) / w[:, :, None]
-        outer = J[:, :, :, None] * (last[:, None, :3] / w[:, :, None, None])
-        return value, J, -(outer + np.swapaxes(outer, 2, 3))
+    def __init__(self, rig: StereoRig) -> None:
+        P = rig.cameras
+        self.top, self.last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
 
-    return measure
+    def value(self, p: Array) -> Array:
+        return np.asarray((p @ self.top[:, :3].T + self.top[:, 3]) / self._depth(p))
+
+    def jacobian(self, p: Array) -> Array:
+        w_p = self.last[:, :3]
+        return np.asarray((self.top[:, :3] - self.value(p)[:, :, None] * w_p) / self._depth(p)[:, :, None])
+
+    def second(self, p: Array, J: Array, w: Array) -> Array:
+        half = np.swapaxes(J * (w / self._depth(p))[:, :, None], 1, 2) @ self.last[:, :3]
+        return -(half + np.swapaxes(half, 1, 2))
+
+    def _depth(self, p: Array) -> Array:
+        w = p @ self.last[:, :3].T + self.last[:, 3]
+        return np.where(w > 0.0, w, np.nan)

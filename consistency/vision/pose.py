@@ -87,19 +87,18 @@ class RelativePose:
         return RelativePose(self.R.T, -self.R.T @ self.t)
 
 
-def rotation_derivatives(rpy: Array) -> tuple[Array, Array]:
-    """d R / d rpy_k (3, 3, 3) and d2 R / d rpy_k d rpy_l (3, 3, 3, 3) of rot(roll, pitch, yaw)."""
-    zeros = np.zeros((3, 3))
-    rx, ry, rz = (geometry.rotation(*row) for row in np.where(np.eye(3, dtype=bool), rpy, zeros))
-    # a factor's derivative is generator times factor; the second one is that twice
-    factors = [[np.linalg.matrix_power(G, n) @ r for n in range(3)] for G, r in zip(AXES, (rx, ry, rz), strict=True)]
-    orders = np.eye(3, dtype=int)
+def rotation_derivatives(pose: RelativePose) -> tuple[Array, Array]:
+    """d R / d rpy_k (3, 3, 3) and d2 R / d rpy_k d rpy_l (3, 3, 3, 3) of R = Rz(yaw) Ry(pitch) Rx(roll).
 
-    def product(order: Array) -> Array:
-        return np.asarray(factors[2][order[2]] @ factors[1][order[1]] @ factors[0][order[0]])
-
-    first = np.array([product(k) for k in orders])
-    return first, np.array([[product(k + m) for m in orders] for k in orders])
+    Each angle turns about one axis e: the derivative is [e]x on the side of R where that axis does not turn, which is
+    the frame 2 for roll, and frame 1 for yaw and, with e = Rz(yaw) e_y, for pitch.
+    """
+    R, (X, _, Z), yaw = pose.R, AXES, pose.rpy[2]
+    Y = _cross(np.array([-np.sin(yaw), np.cos(yaw), 0.0]))
+    R_r, R_p, R_y = R @ X, Y @ R, Z @ R
+    R_rp, R_ry, R_py = Y @ R_r, Z @ R_r, Z @ R_p
+    second = [[R_r @ X, R_rp, R_ry], [R_rp, Y @ R_p, R_py], [R_ry, R_py, Z @ R_y]]
+    return np.array([R_r, R_p, R_y]), np.array(second)
 
 
 def angular(pose: RelativePose) -> Array:

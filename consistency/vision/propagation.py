@@ -36,10 +36,12 @@ def implicit_covariance(C_yy: Array, C_yx: Array, S_x: Array) -> Array:
     DegenerateError
         C_yy is not positive definite: x does not fix y.
     """
-    inverse = _inverse(C_yy)
-    root = C_yx @ S_x
-    middle = np.swapaxes(_wide(root), -1, -2)
-    S = inverse @ (_wide(C_yx) @ middle) @ inverse
+    try:
+        np.linalg.cholesky(C_yy)
+    except np.linalg.LinAlgError:
+        raise DegenerateError("the cost has no minimum here: its second derivative is not positive definite") from None
+    inverse = np.linalg.inv(C_yy)
+    S = inverse @ (_wide(C_yx @ S_x) @ np.swapaxes(_wide(C_yx), -1, -2)) @ inverse
     return np.asarray(0.5 * (S + np.swapaxes(S, -1, -2)))
 
 
@@ -47,20 +49,6 @@ def _wide(blocks: Array) -> Array:
     """(..., B, m, k) -> (..., m, B k)."""
     swapped = np.swapaxes(blocks, -3, -2)
     return swapped.reshape(*swapped.shape[:-2], -1)
-
-
-def _inverse(C_yy: Array) -> Array:
-    """Scaled to a unit diagonal first: metres and radians, near and far points differ by orders of magnitude."""
-    scale = np.diagonal(C_yy, axis1=-2, axis2=-1)
-    if not (scale > 0.0).all():
-        raise DegenerateError("the cost has no minimum here: its second derivative is not positive")
-    scale = 1.0 / np.sqrt(scale)
-    outer = scale[..., :, None] * scale[..., None, :]
-    try:
-        root = np.linalg.inv(np.linalg.cholesky(C_yy * outer))
-    except np.linalg.LinAlgError:
-        raise DegenerateError("the cost has no minimum here: its second derivative is not positive definite") from None
-    return np.asarray(outer * (np.swapaxes(root, -1, -2) @ root))
 
 
 def triangulation_covariance(rig: StereoRig, uv: Array, S_uv: Array) -> Array:
@@ -138,7 +126,7 @@ def registration_covariance(p1: Array, p2: Array, S1: Array, S2: Array, pose: Re
 
 def registration_derivatives(p1: Array, p2: Array, pose: RelativePose) -> tuple[Array, Array, Array]:
     """C_d (6,), C_dd (6, 6) and C_dp (2N, 6, 3), first of p1 then of p2, of half of eq. 2.28."""
-    first, second = rotation_derivatives(pose.rpy)
+    first, second = rotation_derivatives(pose)
     residual = p1 - pose.apply(p2)
     turned = np.einsum("kij,nj->nki", first, p2)  # R_k p2
     n = len(p1)

@@ -22,7 +22,7 @@ from consistency.vision.robust import Robust, loss, threshold
 from consistency.vision.twoframe import Derivatives, Pixels, Points, TwoFrames, derivatives
 
 STEPS = 100  # of Levenberg and Marquardt, at most; ten do for honest matches
-DECREMENT = 1e-14  # predicted decrease of the cost at the minimum: 1e-7 standard deviations
+DECREMENT = 1e-12  # twice the predicted decrease of the cost in the last step: 1e-6 standard deviations
 SLACK = 1e-12  # relative rounding of the cost
 
 
@@ -159,9 +159,9 @@ def _minimum(
         f = derivatives(frames, pose, q, exact=False)
         while True:
             step, step_q, decrement = _step(f, weight, damping)
-            if decrement < DECREMENT:
-                return pose, q
             there, q_there = RelativePose.from_vector(pose.vector + step), q + step_q
+            if decrement < DECREMENT and damping < 1.0:
+                return there, q_there
             reached = _cost(frames, there, q_there, robust, c)
             if reached <= cost * (1.0 + SLACK):
                 break
@@ -182,7 +182,10 @@ def _step(f: Derivatives, weight: Array, damping: float) -> tuple[Array, Array, 
     gain = f.dq @ inverse
     g = weight @ (f.d - (gain @ f.q[:, :, None])[:, :, 0])
     H = np.tensordot(weight, f.dd * (1.0 + damping * np.eye(6)) - gain @ np.swapaxes(f.dq, 1, 2), 1)
-    step = -np.linalg.solve(H, g)
+    try:
+        step = -np.linalg.solve(H, g)
+    except np.linalg.LinAlgError:
+        raise ConvergenceError("pose: the points left by the robust weights do not fix a motion") from None
     down = f.q + step @ f.dq
     step_q = -(inverse @ down[:, :, None])[:, :, 0]
     slope = step @ (weight @ f.d) + float(np.einsum("n,ni,ni->", weight, step_q, f.q))

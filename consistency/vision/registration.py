@@ -14,6 +14,7 @@ from consistency.vision.errors import DegenerateError
 from consistency.vision.pose import RelativePose
 
 ON_A_LINE = 1e-8  # second singular value of a cloud, over its largest coordinate, up to which it is a line
+AMBIGUOUS = 1e-14  # gap to the second-best rotation, relative, that is rounding
 
 
 def register_svd(p1: Array, p2: Array) -> RelativePose:
@@ -35,7 +36,8 @@ def register_svd(p1: Array, p2: Array) -> RelativePose:
         Fewer than three points, identical points, or points on one line.
     """
     p1, p2 = matched(p1, p2)
-    R, t, _ = rigid_motions(p1, p2)
+    R, t, fixed = rigid_motions(p1, p2)
+    _require_unique(float(fixed))
     return RelativePose(R, t)
 
 
@@ -75,7 +77,9 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
     B_i[:, 1, 2], B_i[:, 1, 3], B_i[:, 2, 3] = b[:, 2], -b[:, 1], b[:, 0]
     B_i[:, 2, 1], B_i[:, 3, 1], B_i[:, 3, 2] = -b[:, 2], b[:, 1], -b[:, 0]
     B = np.einsum("nij,nkj->ik", B_i, B_i)
-    scalar, *vector = np.linalg.eigh(B)[1][:, 0]
+    values, vectors = np.linalg.eigh(B)
+    _require_unique(float((values[1] - values[0]) / values[3]))
+    scalar, *vector = vectors[:, 0]
     R = Rotation.from_quat([*vector, scalar]).as_matrix()
     return RelativePose(R, p1.mean(axis=0) - R @ p2.mean(axis=0))
 
@@ -91,6 +95,11 @@ def matched(p1: Array, p2: Array) -> tuple[Array, Array]:
         if spread[1] <= ON_A_LINE * np.abs(p).max():
             raise DegenerateError(f"{name}: the points are identical or lie on one line and do not fix a rotation")
     return p1, p2
+
+
+def _require_unique(fixed: float) -> None:
+    if not fixed > AMBIGUOUS:
+        raise DegenerateError("p1, p2: more than one rotation fits the points best; one cloud mirrors the other")
 
 
 def rigid_motions(p1: Array, p2: Array) -> tuple[Array, Array, Array]:

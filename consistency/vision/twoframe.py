@@ -78,7 +78,7 @@ def derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) ->
 
     With a = R q + t and A = d a / d d = [I, R_k q], f_d = A' f_a and f_q = R' f_a + (the term of frame 2).
     """
-    R, (R_k, R_kl) = pose.R, rotation_derivatives(pose.rpy)
+    R, (R_k, R_kl) = pose.R, rotation_derivatives(pose)
     f_a, f_aa, f_az, f_z1 = _frame(frames.measure, frames.z1, frames.W1, pose.apply(q), exact)
     f_b, f_bb, f_bz, f_z2 = _frame(frames.measure, frames.z2, frames.W2, q, exact)
     At = np.zeros((len(q), 6, 3))

@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.types import Array, Indices
-from consistency.vision.consensus import register_ransac
+from consistency.vision.consensus import register_ransac, squared_distances
 from consistency.vision.errors import ConsensusError
 from consistency.vision.features import COUNT, grey, sift
 from consistency.vision.matching import EPIPOLAR_PX, RATIO, StereoFeatures, circular_matches, stereo_matches
@@ -21,6 +21,7 @@ from consistency.vision.rig import StereoRig, triangulable, triangulate
 
 ESTIMATORS = ("reprojection", "svd", "horn")
 FEWEST = 8  # closed circles; below, RANSAC would agree with anything
+REFITS = 4  # of the pose to its inliers, at most; two or three do
 Pair = tuple[Array, Array]
 
 
@@ -46,13 +47,21 @@ class Settings:
             raise InputError(f"features: {self.features}, must be at least {FEWEST}")
 
 
-@dataclass(frozen=True)
-class RelativeMotion:
-    """The pose of the left camera at time 1 in that of time 0, p0 = R p1 + t, and what it was found from."""
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The pose of the left camera at time 1 in that of time 0, p0 = R p1 + t, of M matches."""
 
     pose: RelativePose
     covariance: Array  # (6, 6), of x, y, z (m), roll, pitch, yaw (rad)
-    inliers: Array  # (M,) bool, of the closed circles
+    inliers: Array  # (M,) bool
+    chi2: float  # of the inliers' residuals; over dof it is 1 where the noise of the features is as stated
+    dof: int
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeMotion(Estimate):
+    """An estimate and what it was found from: M circles of matches through all four images."""
+
     uv0: Array  # (M, 4), u, v left and right at time 0, px
     uv1: Array  # (M, 4), at time 1, px
     sigma0: Array  # (M, 4), of uv0, px
@@ -145,10 +154,10 @@ def motion_between(
         )
     sigma0, sigma1 = (noise(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
     try:
-        pose, covariance, inliers = _estimated(rig, uv0, uv1, sigma0, sigma1, estimator, settings.gate, rng)
+        found = _estimated(rig, uv0, uv1, sigma0, sigma1, estimator, settings.gate, rng)
     except InputError as error:
         raise type(error)(f"{names[0]} to {names[1]}: {error}") from None
-    return RelativeMotion(pose, covariance, inliers, uv0, uv1, sigma0, sigma1, rows)
+    return RelativeMotion(**vars(found), uv0=uv0, uv1=uv1, sigma0=sigma0, sigma1=sigma1, rows=rows)
 
 
 def _estimated(
@@ -160,18 +169,29 @@ def _estimated(
     estimator: str,
     gate: float,
     rng: np.random.Generator,
-) -> tuple[RelativePose, Array, Array]:
-    """Pose, covariance and inliers of matched pixels."""
+) -> Estimate:
+    """Pose and covariance of matched pixels.
+
+    RANSAC ends with an unweighted fit, which far points spoil: what is an inlier is asked again of the refined pose.
+    """
     p0, p1 = triangulate(rig, uv0), triangulate(rig, uv1)
     S0, S1 = diagonal(sigma0), diagonal(sigma1)
     C0, C1 = triangulation_covariance(rig, uv0, S0), triangulation_covariance(rig, uv1, S1)
     pose, inliers = register_ransac(p0, p1, threshold=gate, rng=rng, S1=C0, S2=C1)
-    if estimator == "reprojection":
-        refined = refine_reprojection(rig, uv0[inliers], uv1[inliers], pose, S0[inliers], S1[inliers])
-        return refined.pose, refined.covariance, inliers
-    p0, p1, C0, C1 = (values[inliers] for values in (p0, p1, C0, C1))
-    pose = (register_horn if estimator == "horn" else register_svd)(p0, p1)
-    return pose, registration_covariance(p0, p1, C0, C1, pose), inliers
+    if estimator != "reprojection":
+        near, far, C_near, C_far = (values[inliers] for values in (p0, p1, C0, C1))
+        pose = (register_horn if estimator == "horn" else register_svd)(near, far)
+        S = registration_covariance(near, far, C_near, C_far, pose)
+        chi2 = float(squared_distances(near, far, pose.R, pose.t, C_near, C_far).sum())
+        return Estimate(pose, S, inliers, chi2, 3 * len(near) - 6)
+    for _ in range(REFITS):
+        i = inliers
+        refined = refine_reprojection(rig, uv0[i], uv1[i], pose, S0[i], S1[i], robust="cauchy")
+        pose = refined.pose
+        inliers = squared_distances(p0, p1, pose.R, pose.t, C0, C1) <= gate**2
+        if (inliers == i).all():
+            break
+    return Estimate(pose, refined.covariance, i, refined.chi2, refined.dof)
 
 
 def pixels(features: StereoFeatures) -> Array:

@@ -137,9 +137,13 @@ def write_log(
 
     def contents(at: Path) -> None:
         for name, text in texts.items():
-            (at / name).write_text(text, encoding="utf-8")
+            _write_text(at / name, text)
 
     write_folder(folder, tables, manifest, contents, overwrite)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
 
 
 def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, object]:

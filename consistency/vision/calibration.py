@@ -110,13 +110,9 @@ def read_opencv(path: Path) -> Calibration:
                 raise InputError(f"{path}: key '{key}': has {found[key].size} numbers, not {np.prod(shape)}")
             found[key] = found[key].reshape(shape)
     size = tuple(int(_number(path, data, key)) for key in ("image_width", "image_height") if key in data)
-    return _checked(
-        Calibration(
-            str(path), found["K1"], found["K2"],
-            *(_distortion(path, key, found.get(key, np.zeros(4))) for key in ("D1", "D2")),
-            found.get("R", np.eye(3)), found["T"], (size[0], size[1]) if len(size) == 2 else None,
-        )
-    )  # fmt: skip
+    D_left, D_right = (_distortion(path, key, found.get(key, np.zeros(4))) for key in ("D1", "D2"))
+    R, image_size = found.get("R", np.eye(3)), (size[0], size[1]) if len(size) == 2 else None
+    return _checked(Calibration(str(path), found["K1"], found["K2"], D_left, D_right, R, found["T"], image_size))
 
 
 def read_euroc(folder: Path) -> Calibration:
@@ -155,7 +151,9 @@ def _checked(calibration: Calibration) -> Calibration:
     for name, K in (("left", calibration.K_left), ("right", calibration.K_right)):
         upper = np.allclose(K[1:, 0], 0) and np.isclose(K[2, 1], 0) and np.isclose(K[2, 2], 1)
         if not upper or K[0, 0] <= 0 or K[1, 1] <= 0:
-            raise InputError(f"{where}: the matrix of the {name} camera must be fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0")
+            raise InputError(
+                f"{where}: the matrix of the {name} camera must be fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0"
+            )
     calibration = replace(calibration, R=_rotation(where, calibration.R))
     centre = -calibration.R.T @ calibration.T
     if centre[0] <= 0 or abs(centre[1]) > centre[0]:

@@ -48,7 +48,7 @@ def mutual_matches(first: Array, second: Array, allowed: Array | None = None, ra
     near, far = (np.sqrt(np.maximum(2.0 - 2.0 * value, 0.0)) for value in (nearest, further))
     good = (nearest > NEVER) & mutual & (near < ratio * far)
     good &= np.bincount(best[good], minlength=len(second))[best] == 1  # equal descriptors tell nothing
-    return np.column_stack([rows, best])[good].astype(np.int64)
+    return np.asarray(np.column_stack([rows, best])[good], np.int64)
 
 
 def epipolar_gate(rig: StereoRig, left: Array, right: Array, tolerance: float = EPIPOLAR_PX) -> Array:
@@ -119,10 +119,10 @@ def circular_matches(before: StereoFeatures, after: StereoFeatures, ratio: float
     Left is matched with left and right with right over time, among features that have a stereo match; both must
     say the same. The two stereo matches of the circle are those of the pairs.
     """
-    codes = []
+    codes = list[Indices]()
     for side, (was, now) in enumerate(((before.left, after.left), (before.right, after.right))):
         old, new = before.pairs[:, side], after.pairs[:, side]
         i, j = mutual_matches(was.descriptors[old], now.descriptors[new], None, ratio).T
         codes.append(i * len(new) + j)
-    closed = np.intersect1d(*codes, assume_unique=True)
-    return np.column_stack(np.divmod(closed, max(len(after.pairs), 1))).astype(np.int64)
+    closed = np.intersect1d(codes[0], codes[1], assume_unique=True)
+    return np.asarray(np.column_stack(np.divmod(closed, max(len(after.pairs), 1))), np.int64)

@@ -56,8 +56,16 @@ def rectify(calibration: Calibration, image_size: tuple[int, int]) -> Rectificat
         return Rectification(raw, np.eye(3), None)
     cv2 = opencv()
     turn_left, turn_right, P_left, P_right, *_ = cv2.stereoRectify(
-        c.K_left, c.D_left, c.K_right, c.D_right, image_size, c.R, c.T.reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0
-    )
+        c.K_left,
+        c.D_left,
+        c.K_right,
+        c.D_right,
+        image_size,
+        c.R,
+        c.T.reshape(3, 1),
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        alpha=0.0,
+    )  # fmt: skip
     maps = [
         cv2.initUndistortRectifyMap(K, D, turn, P, image_size, cv2.CV_16SC2)
         for K, D, turn, P in (

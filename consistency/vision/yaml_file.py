@@ -1,4 +1,4 @@
-"""YAML files of cameras: plain ones (EuRoC) and those of OpenCV's FileStorage, which no YAML reader takes as they are."""
+"""YAML files of cameras: plain ones (EuRoC), and those of OpenCV's FileStorage, which are not quite YAML."""
 
 from __future__ import annotations
 

@@ -47,8 +47,8 @@ def implicit_covariance(C_yy: Array, C_yx: Array, S_x: Array) -> Array:
 
 def _wide(blocks: Array) -> Array:
     """(..., B, m, k) -> (..., m, B k)."""
-    swapped = np.swapaxes(blocks, -3, -2)
-    return swapped.reshape(*swapped.shape[:-2], -1)
+    *batch, B, m, k = blocks.shape
+    return np.swapaxes(blocks, -3, -2).reshape(*batch, m, B * k)
 
 
 def triangulation_covariance(rig: StereoRig, uv: Array, S_uv: Array) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.types import Array
-from consistency.vision import checks
+from consistency.vision import checks, small
 from consistency.vision.errors import ConvergenceError, DegenerateError
 from consistency.vision.pose import RelativePose, rotation_derivatives
 from consistency.vision.registration import matched
@@ -36,11 +36,9 @@ def implicit_covariance(C_yy: Array, C_yx: Array, S_x: Array) -> Array:
     DegenerateError
         C_yy is not positive definite: x does not fix y.
     """
-    try:
-        np.linalg.cholesky(C_yy)
-    except np.linalg.LinAlgError:
-        raise DegenerateError("the cost has no minimum here: its second derivative is not positive definite") from None
-    inverse = np.linalg.inv(C_yy)
+    inverse, definite = small.inverse(C_yy)
+    if not definite.all():
+        raise DegenerateError("the cost has no minimum here: its second derivative is not positive definite")
     S = inverse @ (_wide(C_yx @ S_x) @ np.swapaxes(_wide(C_yx), -1, -2)) @ inverse
     return np.asarray(0.5 * (S + np.swapaxes(S, -1, -2)))
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.types import Array
-from consistency.vision import checks
-from consistency.vision.errors import ConvergenceError
+from consistency.vision import checks, small
+from consistency.vision.errors import ConvergenceError, DegenerateError
 from consistency.vision.pose import RelativePose
 from consistency.vision.propagation import implicit_covariance
 from consistency.vision.registration import matched, register_svd
@@ -140,7 +140,10 @@ def _refined(frames: TwoFrames, S1: Array, S2: Array, pose: RelativePose, q: Arr
 
 def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
     """C_dd (6, 6) and C_dz (2N, 6, k) of the cost of the pose alone, each point at its best position."""
-    gain = f.dq @ np.linalg.inv(f.qq)  # (N, 6, 3)
+    inverse, definite = small.inverse(f.qq)
+    if not definite.all():
+        raise DegenerateError(f"match {int(np.argmin(definite))}: its point is not fixed by the images; leave it out")
+    gain = f.dq @ inverse  # (N, 6, 3)
     dd = f.dd - gain @ np.swapaxes(f.dq, 1, 2)
     dz1, dz2 = f.dz1 - gain @ f.qz1, -gain @ f.qz2
     w, b = weight[:, None, None], 2.0 * bend[:, None, None]
@@ -178,7 +181,7 @@ def _cost(frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None
 
 def _step(f: Derivatives, weight: Array, damping: float) -> tuple[Array, Array, float]:
     """Step of the pose (6,) and of the points (N, 3), and twice the decrease that it predicts."""
-    inverse = np.linalg.inv(f.qq * (1.0 + damping * np.eye(3)))
+    inverse, _ = small.inverse(f.qq * (1.0 + damping * np.eye(3)))
     gain = f.dq @ inverse
     g = weight @ (f.d - (gain @ f.q[:, :, None])[:, :, 0])
     H = np.tensordot(weight, f.dd * (1.0 + damping * np.eye(6)) - gain @ np.swapaxes(f.dq, 1, 2), 1)

@@ -32,6 +32,7 @@ from consistency.vision import (
     triangulate,
     triangulation_covariance,
 )
+from consistency.vision.pose import euler_angles
 from consistency.vision.registration import rigid_motions
 
 ROUTES = ("svd", "horn", "weighted", "reprojection")
@@ -182,8 +183,7 @@ def poses_nees(rng: np.random.Generator, far: float, repetitions: int) -> Array:
             noisy = (uv + rng.normal(0.0, NOISE, (chunk, POINTS_23, 4)) for uv in (uv1, uv2))
             clouds = [triangulate(rig, uv.reshape(-1, 4)).reshape(chunk, POINTS_23, 3) for uv in noisy]
             R, t, _ = rigid_motions(*clouds)
-            vectors = np.array([RelativePose(*motion).vector for motion in zip(R, t, strict=True)])
-            totals[k] += cs.nees(MOTION.vector - vectors, S).sum()
+            totals[k] += cs.nees(MOTION.vector - np.concatenate([t, euler_angles(R)], axis=1), S).sum()
     return totals
 
 

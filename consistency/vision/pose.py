@@ -58,11 +58,7 @@ class RelativePose:
     @property
     def rpy(self) -> Array:
         """Roll, pitch, yaw, rad; GimbalLockError at a pitch of +-90 degrees."""
-        R = self.R
-        cosine = np.hypot(R[0, 0], R[1, 0])
-        if cosine < LOCKED:
-            raise GimbalLockError("pose: a pitch of 90 degrees, roll and yaw are not defined; turn the frames' axes")
-        return np.array([np.arctan2(R[2, 1], R[2, 2]), np.arctan2(-R[2, 0], cosine), np.arctan2(R[1, 0], R[0, 0])])
+        return euler_angles(self.R)
 
     @property
     def vector(self) -> Array:
@@ -85,6 +81,15 @@ class RelativePose:
     def inverse(self) -> RelativePose:
         """p2 = R'(p1 - t)."""
         return RelativePose(self.R.T, -self.R.T @ self.t)
+
+
+def euler_angles(R: Array) -> Array:
+    """Roll, pitch, yaw (..., 3) of rotations (..., 3, 3), rad; GimbalLockError at a pitch of +-90 degrees."""
+    cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
+    if (cosine < LOCKED).any():
+        raise GimbalLockError("pose: a pitch of 90 degrees, roll and yaw are not defined; turn the frames' axes")
+    roll, yaw = np.arctan2(R[..., 2, 1], R[..., 2, 2]), np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
 
 
 def rotation_derivatives(pose: RelativePose) -> tuple[Array, Array]:

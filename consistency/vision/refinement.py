@@ -23,6 +23,7 @@ from consistency.vision.twoframe import Derivatives, Pixels, Points, TwoFrames, 
 
 STEPS = 100  # of Levenberg and Marquardt, at most; ten do for honest matches
 DECREMENT = 1e-12  # twice the predicted decrease of the cost in the last step: 1e-6 standard deviations
+NEAR = 1.0  # the same from which on second derivatives are taken in: one standard deviation
 SLACK = 1e-12  # relative rounding of the cost
 
 
@@ -155,41 +156,50 @@ def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
 def _minimum(
     frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float
 ) -> tuple[RelativePose, Array]:
-    """Levenberg and Marquardt on pose and points; a loss enters by its weights."""
-    damping, cost = 0.0, _cost(frames, pose, q, robust, c)
+    """Levenberg and Marquardt on pose and points, and Newton's steps near the minimum."""
+    damping, newton = 0.0, False
+    cost, weight, bend = _cost(frames, pose, q, robust, c)
     for _ in range(STEPS):
-        _, weight, _ = loss(robust, frames.squared(pose, q), c)
-        f = derivatives(frames, pose, q, exact=False)
+        f = derivatives(frames, pose, q, exact=newton)
         while True:
-            step, step_q, decrement = _step(f, weight, damping)
+            step, step_q, decrement = _step(f, weight, bend if newton else 0.0 * bend, damping)
+            if newton and not decrement >= 0.0:
+                newton, f = False, derivatives(frames, pose, q, exact=False)
+                continue
             there, q_there = RelativePose.from_vector(pose.vector + step), q + step_q
             if decrement < DECREMENT and damping < 1.0:
                 return there, q_there
-            reached = _cost(frames, there, q_there, robust, c)
+            reached, *losses = _cost(frames, there, q_there, robust, c)
             if reached <= cost * (1.0 + SLACK):
                 break
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e12:
                 raise ConvergenceError("pose: no step lowers the cost; start nearer, or take the outliers out first")
-        pose, q, cost, damping = there, q_there, reached, 0.1 * damping if damping > 1e-8 else 0.0
+        pose, q, cost, (weight, bend) = there, q_there, reached, losses
+        damping, newton = 0.1 * damping if damping > 1e-8 else 0.0, decrement < NEAR
     raise ConvergenceError(f"pose: no minimum in {STEPS} steps; start nearer, or take the outliers out first")
 
 
-def _cost(frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float) -> float:
-    return 0.5 * float(loss(robust, frames.squared(pose, q), c)[0].sum())
+def _cost(
+    frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float
+) -> tuple[float, Array, Array]:
+    """The cost, and rho' and rho'' of each point."""
+    rho, weight, bend = loss(robust, frames.squared(pose, q), c)
+    return 0.5 * float(rho.sum()), weight, bend
 
 
-def _step(f: Derivatives, weight: Array, damping: float) -> tuple[Array, Array, float]:
-    """Step of the pose (6,) and of the points (N, 3), and twice the decrease that it predicts."""
-    inverse, _ = small.inverse(f.qq * (1.0 + damping * np.eye(3)))
+def _step(f: Derivatives, weight: Array, bend: Array, damping: float) -> tuple[Array, Array, float]:
+    """Step of the pose (6,) and of the points (N, 3), and twice the decrease that it predicts; NaN: not downhill."""
+    inverse, definite = small.inverse(f.qq * (1.0 + damping * np.eye(3)))
     gain = f.dq @ inverse
-    g = weight @ (f.d - (gain @ f.q[:, :, None])[:, :, 0])
+    g = f.d - (gain @ f.q[:, :, None])[:, :, 0]
     H = np.tensordot(weight, f.dd * (1.0 + damping * np.eye(6)) - gain @ np.swapaxes(f.dq, 1, 2), 1)
+    H += 2.0 * (g.T * bend) @ g
     try:
-        step = -np.linalg.solve(H, g)
+        np.linalg.cholesky(H)
+        step = -np.linalg.solve(H, weight @ g)
     except np.linalg.LinAlgError:
-        raise ConvergenceError("pose: the points left by the robust weights do not fix a motion") from None
-    down = f.q + step @ f.dq
-    step_q = -(inverse @ down[:, :, None])[:, :, 0]
-    slope = step @ (weight @ f.d) + float(np.einsum("n,ni,ni->", weight, step_q, f.q))
-    return step, step_q, -float(slope)
+        return np.zeros(6), np.zeros(f.q.shape), np.nan
+    step_q = -(inverse @ (f.q + step @ f.dq)[:, :, None])[:, :, 0]
+    slope = float(step @ (weight @ f.d) + weight @ (step_q * f.q).sum(axis=1))
+    return step, step_q, -slope if definite.all() else np.nan

@@ -87,7 +87,8 @@ def derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) ->
     AtH = At @ f_aa
     dd, dq = AtH @ np.swapaxes(At, 1, 2), AtH @ R
     if exact:
-        dd[:, 3:, 3:] += np.einsum("ni,klij,nj->nkl", f_a, R_kl, q, optimize=True)
+        outer = (f_a[:, :, None] * q[:, None]).reshape(-1, 9)
+        dd[:, 3:, 3:] += (outer @ R_kl.reshape(9, 9).T).reshape(-1, 3, 3)
         dq[:, 3:] += np.swapaxes(np.swapaxes(R_k, 1, 2) @ f_a.T, 0, 2).swapaxes(1, 2)
     return Derivatives(
         d=(At @ f_a[:, :, None])[:, :, 0], q=f_a @ R + f_b, z1=f_z1, z2=f_z2,

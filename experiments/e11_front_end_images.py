@@ -69,10 +69,10 @@ ACCEPT = {
     f"rest {LIMIT['euroc t'] * 1e3:.0f} mm, rover {LIMIT['minnie t'] * 1e3:.0f} mm from the onboard pose",
     "nees": "the referee calls the errors consistent with the propagated covariance, of all 50 motions or of those "
     "whose truth is not interpolated",
-    "halves": "noise fitted to disjoint halves of the matches in the first half of the drive: in the other the mean NEES "
-    f"between halves is right within a factor of {FACTOR:g}",
-    "noise": "bias and a floor fitted to the errors in the first half of the motions: in the other the mean NEES is right "
-    f"within a factor of {FACTOR:g} (12 numbers fitted to 20 serially correlated motions allow no less)",
+    "halves": "noise fitted to disjoint halves of the matches in the first half of the drive: in the other the mean "
+    f"NEES between halves is right within a factor of {FACTOR:g}",
+    "noise": "bias and a floor fitted to the errors in the first half of the motions: in the other the mean NEES is "
+    f"right within a factor of {FACTOR:g} (12 numbers fitted to 20 serially correlated motions allow no less)",
 }
 
 

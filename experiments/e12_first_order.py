@@ -6,6 +6,7 @@ covariance that its own noisy matches give, as in use.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,7 +134,9 @@ def described(study: cs.Study, name: str, cells: pd.DataFrame) -> cs.Finding:
     near = cells["ratio"] <= HOLDS
     wrong = cells[~accepted].sort_values("ratio")
     first = f"from {wrong['ratio'].iloc[0]:.1%} on" if len(wrong) else "nowhere"
-    worst = wrong.sort_values("mean_nees").iloc[-1] if len(wrong) else cells.iloc[0]
+    worst = cells.sort_values("mean_nees").iloc[-1]
+    kinds = Counter(fault for faults in wrong["faults"] for fault in str(faults).split(", ") if fault)
+    faults = ", ".join(f"{fault} {count}" for fault, count in kinds.most_common(3)) or "none"
     return study.finding(
         bool(accepted[near].all()),
         scenario="none",
@@ -144,7 +147,7 @@ def described(study: cs.Study, name: str, cells: pd.DataFrame) -> cs.Finding:
         f"baseline {BASELINES} m, noise {NOISES} px",
         published="not tried",
         measured=f"accepted in {int(accepted[near].sum())} of {int(near.sum())} cells up to {HOLDS:.0%} and in "
-        f"{int(accepted[~near].sum())} of {int((~near).sum())} beyond; at fault {first}; worst mean NEES "
+        f"{int(accepted[~near].sum())} of {int((~near).sum())} beyond; at fault {first}, by {faults}; worst mean NEES "
         f"{worst['mean_nees']:.3g} at {worst['depth']:g} m, {worst['baseline']:g} m, {worst['noise']:g} px; "
         f"{int(cells['failed'].sum())} of {RUNS * len(cells)} runs failed",
         accept=f"accepted in every cell up to {HOLDS:.0%}",

@@ -56,6 +56,9 @@ def register_weighted(
     That is the likelihood of points in both frames whose true positions are unknown, and the weighting of eq. 2.4 that
     Valencia & Andrade-Cetto (2018) sec. 2.2 leave out as too complicated; Matthies & Shafer (1987) have it.
 
+    Covariances of triangulated points are worked out at the noisy points: those that err towards the camera seem surer,
+    and the pose is biased where the disparity's noise is some per cent of it. :func:`refine_reprojection` is not.
+
     Parameters
     ----------
     p1, p2 : (N, 3), m

@@ -23,7 +23,7 @@ class StereoRig:
 
     ``R, t`` are the pose of the right camera in the left camera's frame, p_left = R p_right + t, which is how the
     chapter's text and its experiments state them. Its eq. 2.2 and 2.3 apply [R t] to a point in the left frame and so
-    mean the inverse: R' and -R' t. The two agree in nothing but the identity.
+    mean the inverse, R' and -R' t: R and t put there literally are another rig.
 
     Parameters
     ----------

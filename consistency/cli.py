@@ -83,6 +83,50 @@ def simulate(
 
 
 @app.command()
+def frontend(
+    images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of stereo pairs: KITTI, EuRoC, or plain.")],
+    out: Out,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("--calibration", help="KITTI calib.txt, OpenCV .yaml, or EuRoC folder; not needed if in IMAGES."),
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", help="True poses: KITTI, EuRoC .csv or TUM; found if in IMAGES.")
+    ] = None,
+    format: Annotated[str | None, typer.Option("--format", help="kitti, euroc or opencv [by the folders].")] = None,
+    left: Annotated[str | None, typer.Option("--left", help="Pattern of plain left images, as 'left/*.png'.")] = None,
+    right: Annotated[str | None, typer.Option("--right", help="Pattern of plain right images.")] = None,
+    rate: Annotated[float | None, typer.Option("--rate", help="Hz, of images without times [10].")] = None,
+    estimator: Annotated[str, typer.Option("--estimator", help="reprojection, svd or horn.")] = "reprojection",
+    sigma_per_scale: Annotated[
+        float | None, typer.Option("--sigma-per-scale", help="Feature noise over SIFT scale [0.15].")
+    ] = None,
+    max_landmarks: Annotated[
+        int | None, typer.Option("--max-landmarks", help="In the log, which filters are quadratic in [200].")
+    ] = None,
+    lever: Annotated[float, typer.Option("--lever", help="Metres from the robot's point forward to the camera.")] = 0.0,
+    seed: Seed = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Stereo images to a log for filters, and to a trajectory with covariance."""
+    from consistency.frontend import Options, write_frontend_log
+    from consistency.vision.motion import Settings
+
+    settings = Settings(estimator=estimator, **_given(sigma_per_scale=sigma_per_scale))
+    options = Options(
+        calibration, truth, format, left, right, rate, lever=lever, seed=seed, settings=settings,
+        **_given(max_landmarks=max_landmarks),
+    )  # fmt: skip
+    for line in write_frontend_log(images, out, options, overwrite).lines(out):
+        print(line)
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    """Options that were given; the others keep the defaults of what they are handed to."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+@app.command()
 def run(
     out: Out,
     filters: Annotated[list[str], typer.Option("--filter", help="Filter name; give it again for more.")],
@@ -118,8 +162,7 @@ def run(
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
-    planned: dict[str, Any] = {"max_runs": max_runs, "detect": detect, "false_alarm": false_alarm}
-    planned = {key: value for key, value in planned.items() if value is not None}
+    planned = _given(max_runs=max_runs, detect=detect, false_alarm=false_alarm)
     if planned and not until_decided:
         raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
     if until_decided and runs is not None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -121,15 +123,24 @@ def write_log(
     manifest: dict[str, object],
     overwrite: bool = False,
     view: View | None = None,
+    files: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Write trials as a log folder, whole or not at all; ``view`` is image size and principal point in px."""
+    """Write trials as a log folder, whole or not at all.
+
+    ``view`` is image size and principal point in px, ``files`` are other texts by name.
+    """
     tables = {"controls": controls_table(trials), "observations": observations_table(trials)}
     if trials[0].truth is not None:
         tables["truth"] = truth_of(trials)
     if landmarks is not None:
         tables["landmarks"] = landmarks
-    text = tomli_w.dumps(_sensor_file(belief, trials[0].start, view))
-    write_folder(folder, tables, manifest, lambda at: _write_text(at / "sensor.toml", text), overwrite)
+    texts = {"sensor.toml": tomli_w.dumps(_sensor_file(belief, trials[0].start, view)), **files}
+
+    def contents(at: Path) -> None:
+        for name, text in texts.items():
+            _write_text(at / name, text)
+
+    write_folder(folder, tables, manifest, contents, overwrite)
 
 
 def _write_text(path: Path, text: str) -> None:

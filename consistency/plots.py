@@ -1,4 +1,4 @@
-"""Figures of a filter's honesty: records and arrays onto Matplotlib Axes. Nothing is computed here.
+"""Figures of a filter's honesty: records and arrays onto Matplotlib Axes. Nothing is computed here but outlines.
 
 Every function draws on the Axes it is given and returns nothing; text is shown literally, so a name
 may hold any character. Colours are those of Okabe & Ito (2008); each style has its own dash pattern
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -225,6 +226,32 @@ def samples(axes: Axes, points: Array, linear: Array, fitted: Array) -> None:
     axes.plot(*fitted.T, color=COLOURS[1], linewidth=1.4, dashes=DASHES[1])
     axes.set(xlabel="x (m)", ylabel="y (m)")
     _frame(axes)
+
+
+def ellipse(axes: Axes, centre: Array, covariance: Array, scale: float, look: Style) -> None:
+    """Iso-uncertainty curve of a covariance (2, 2) about ``centre`` (2,), ``scale`` standard deviations wide.
+
+    Valencia & Andrade-Cetto (2018) fig. 2.4 and 2.5.
+    """
+    width, axis = np.linalg.eigh(covariance)
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    half = scale * np.sqrt(np.maximum(width, 0.0))
+    curve = axis @ (half[:, None] * np.stack([np.cos(turn), np.sin(turn)])) + np.asarray(centre)[:, None]
+    axes.plot(*curve, color=look.colour, linestyle=look.linestyle, linewidth=1.1, zorder=4)
+
+
+def cloud(axes: Axes, points: Array, labels: tuple[str, str]) -> None:
+    """Samples (n, 2) and their mean, as Valencia & Andrade-Cetto (2018) fig. 2.5."""
+    axes.plot(*points.T, ".", color="#8c8c8c", markersize=2.0, markeredgewidth=0, alpha=0.6, zorder=1)
+    axes.plot(*points.mean(axis=0), "o", color="#D55E00", markersize=3.5, markeredgewidth=0, zorder=5)
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    _frame(axes)
+
+
+def image(axes: Axes, pixels: Array) -> None:
+    """A grey image (h, w) as it is."""
+    axes.imshow(pixels, cmap="gray", vmin=0, vmax=255)
+    axes.set_axis_off()
 
 
 def marginal(axes: Axes, edges: Array, density: Array, grid: Array, linear: Array, fitted: Array) -> None:

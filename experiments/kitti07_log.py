@@ -17,7 +17,9 @@ import pandas as pd
 from consistency.errors import InputError
 from consistency.geometry import rotation
 from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
-from consistency.types import Array, Indices, Trial
+from consistency.types import Array, Trial
+from consistency.vision import tracks
+from consistency.vision.tracks import PIXELS
 
 SIGMA_V, SIGMA_OMEGA = 0.5, 0.05  # m/s, rad/s: white noise that the course added to the velocities
 SIGMA_PX = (1.0, 3.3, 0.7)  # rms of u, v, d against the planar truth; v carries pitch and roll
@@ -31,7 +33,6 @@ WIDTH, HEIGHT = 1226, 370  # px
 VIEW = ((WIDTH, HEIGHT), (601.8873, 183.1104))  # image and principal point of the rectified left camera, px
 KITTI_FROM_SENSOR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # right, down, forward <- forward, left, up
 FILES = ("0027.npz", "kitti07_gt.txt")
-PIXELS = ["z0", "z1", "z2"]
 
 
 @dataclass(frozen=True)
@@ -241,53 +242,5 @@ def _rodrigues(vector: Array) -> Array:
 
 
 def thinned(rows: pd.DataFrame, slots: int = SLOTS) -> pd.DataFrame:
-    """Rows (step, landmark, z0, z1, z2) of at most ``slots`` landmarks at once, none older than MAX_AGE.
-
-    A free slot goes to the emptiest column of the image, there to the piece with the longest life ahead,
-    then the nearer, then the first: nothing is drawn by chance. Step 0 has no observation.
-    """
-    rows = rows[rows["step"] >= 1].assign(band=lambda r: band_of(r["z0"].to_numpy()))
-    rows["left"] = rows.groupby("piece").cumcount(ascending=False) + 1  # observations to come, with this one
-    row_of = {key: i for i, key in enumerate(zip(rows["piece"], rows["step"], strict=True))}
-    alive: list[tuple[int, int, int]] = []  # piece, landmark, observations left
-    picked: list[tuple[int, int]] = []  # row, landmark
-    started = 0
-    for step, seen in rows.groupby("step"):
-        alive = [(piece, landmark, life - 1) for piece, landmark, life in alive if life > 1]
-        used = {piece for piece, _, _ in alive}
-        candidates = seen[(seen["left"] >= MIN_LIFE) & ~seen["piece"].isin(used)]
-        crowd = np.bincount(seen.loc[seen["piece"].isin(used), "band"], minlength=BANDS)
-        for piece, life in _chosen(candidates, crowd, slots - len(alive)):
-            alive.append((piece, started, life if life <= MAX_AGE else staggered(started)))
-            started += 1
-        picked += [(row_of[piece, step], landmark) for piece, landmark, _ in alive]
-    if not picked:
-        raise InputError("the recording holds no track that could be used")
-    index, landmark = np.array(picked).T
-    table: pd.DataFrame = rows.iloc[index].assign(landmark=landmark)
-    return table[["step", "landmark", *PIXELS]].reset_index(drop=True)
-
-
-def _chosen(candidates: pd.DataFrame, crowd: Indices, free: int) -> list[tuple[int, int]]:
-    """(piece, life) of the next landmarks, one column of the image after the other."""
-    order = candidates.assign(life=candidates["left"].clip(upper=MAX_AGE)).sort_values(
-        ["life", "z2", "piece"], ascending=[False, False, True]
-    )
-    bands = [order[order["band"] == b] for b in range(BANDS)]
-    queues = [list(zip(q["piece"], q["left"], strict=True)) for q in bands]
-    crowd, result = crowd.copy(), list[tuple[int, int]]()
-    while len(result) < free and any(queues):
-        band = min((b for b in range(BANDS) if queues[b]), key=lambda b: crowd[b])
-        result.append(queues[band].pop(0))
-        crowd[band] += 1
-    return result
-
-
-def staggered(landmark: int) -> int:
-    """Life of a piece that is too long, half for every other: cut all in one frame, nothing would link it on."""
-    return MAX_AGE if landmark % 2 else MAX_AGE // 2
-
-
-def band_of(u: Array) -> Indices:
-    """Column of the image, 0..BANDS-1 from the left, of pixels ``u``."""
-    return np.clip((u + WIDTH / 2) * BANDS // WIDTH, 0, BANDS - 1).astype(np.int64)
+    """Rows (step, landmark, z0, z1, z2) of at most ``slots`` landmarks at once, none older than MAX_AGE."""
+    return tracks.thinned(rows, tracks.Selection(slots, MAX_AGE, MIN_LIFE, BANDS, WIDTH))

@@ -1,0 +1,129 @@
+"""A sequence of stereo pairs as a log folder: controls, observations of few landmarks, truth, trajectory."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.frontend.planar_log import log_of
+from consistency.frontend.truth import find_truth, read_truth
+from consistency.frontend.tum import covariance_text, trajectory_text
+from consistency.log import write_log
+from consistency.storage import manifest_of, require_free
+from consistency.types import Array
+from consistency.vision.features import opencv
+from consistency.vision.matching import is_rectified
+from consistency.vision.motion import RelativeMotion, Settings
+from consistency.vision.odometry import trajectory, visual_odometry
+from consistency.vision.sequence import Sequence, read_sequence
+
+LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
+
+
+@dataclass(frozen=True)
+class Options:
+    """What of a sequence becomes a log."""
+
+    calibration: Path | None = None
+    truth: Path | None = None
+    format: str | None = None
+    left: str | None = None
+    right: str | None = None
+    rate: float | None = None  # Hz
+    max_landmarks: int = LANDMARKS
+    lever: float = 0.0  # m from the robot's point forward to the camera
+    seed: int = 0  # of RANSAC
+    settings: Settings = field(default_factory=Settings)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What came of it."""
+
+    frames: int
+    landmarks: int
+    observations: int
+    distance: float  # m along the path
+    inliers: float  # median of the motions
+    noise_ratio: float  # chi2/dof of all motions: measured variance of the pixels over the stated one
+    sigma_px: tuple[float, float, float]  # u, v, d
+    sigma_v: float  # m/s
+    sigma_omega: float  # rad/s
+    timed: bool  # whether images had timestamps
+    rate: float  # Hz
+    truth: Path | None
+
+    def lines(self, out: Path) -> list[str]:
+        """What a terminal shows, and what to do next."""
+        u, v, d = self.sigma_px
+        times = [] if self.timed else [f"the images have no times: {self.rate:g} Hz assumed, --rate says otherwise"]
+        judge = f"consistency analyse {out}/trajectory.tum --covariance {out}/covariance.txt --truth {out}/truth.tum"
+        return [
+            f"{self.frames} stereo pairs, {self.distance:.2f} m, {self.inliers:.0f} inliers in the median",
+            f"residuals: chi2/dof {self.noise_ratio:.2f} with the stated noise of the features (--sigma-per-scale)",
+            f"log: {self.landmarks} landmarks, {self.observations} observations; "
+            f"sigma u {u:.2f} v {v:.2f} d {d:.2f} px, v {self.sigma_v:.3g} m/s, omega {self.sigma_omega:.3g} rad/s",
+            "controls come from these images too: a filter that takes both uses the images twice",
+            *times,
+            f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
+            *([] if self.truth is None else [f"truth from {self.truth}; next: {judge}"]),
+        ]
+
+
+def write_frontend_log(images: Path, out: Path, options: Options, overwrite: bool = False) -> Summary:
+    """Run the front-end on ``images`` and write the log folder ``out``, whole or not at all.
+
+    Beside the files of a log: trajectory.tum and covariance.txt (error convention so3), truth.tum where known.
+
+    Raises
+    ------
+    InputError
+        As :func:`consistency.vision.sequence.read_sequence` and :func:`consistency.vision.relative_motion`; ``out``
+        exists; no landmark is left.
+    """
+    started = time.monotonic()
+    if options.max_landmarks < 1:
+        raise InputError(f"--max-landmarks {options.max_landmarks}: must be at least 1")
+    if not np.isfinite(options.lever):
+        raise InputError(f"--lever {options.lever}: must be a finite number of metres")
+    require_free(out, overwrite, "log")
+    sequence = read_sequence(
+        images, options.calibration, options.format, options.left, options.right, options.rate
+    )  # fmt: skip
+    if not is_rectified(sequence.rectification.rig):
+        raise InputError(f"{sequence.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
+    path = options.truth or find_truth(sequence)
+    truth = None if path is None else read_truth(path, sequence)
+    motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed), settings=options.settings)
+    trial, belief = log_of(sequence, motions, truth, options.max_landmarks, options.lever)
+    rig = sequence.rectification.rig
+    manifest = manifest_of(
+        kind="log", seed=options.seed, runs=1, complete=True, failures=0, wall=time.monotonic() - started,
+        opencv=opencv().__version__, images=str(images), calibration=sequence.calibration.source,
+        settings=asdict(options.settings), timestamps="read" if sequence.timed else "assumed",
+    )  # fmt: skip
+    view = (rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2])))
+    write_log(out, [trial], belief, None, manifest, overwrite, view, trajectory_files(sequence, motions, truth))
+    chi2, dof = (sum(values) for values in zip(*((m.chi2, m.dof) for m in motions), strict=True))
+    return Summary(
+        len(sequence), trial.n_landmarks, len(trial.z),
+        float(sum(np.linalg.norm(m.pose.t) for m in motions)), float(np.median([m.inliers.sum() for m in motions])),
+        chi2 / dof, belief.sensor.sigma, belief.motion.sigma_v, belief.motion.sigma_omega, sequence.timed,
+        (len(sequence) - 1) / float(sequence.t[-1] - sequence.t[0]), path,
+    )  # fmt: skip
+
+
+def trajectory_files(
+    sequence: Sequence, motions: list[RelativeMotion], truth: tuple[Array, Array] | None
+) -> dict[str, str]:
+    """Texts of trajectory.tum, covariance.txt and truth.tum, all in the first camera's frame."""
+    R, t, P = trajectory(motions)
+    files = {"trajectory.tum": trajectory_text(sequence.t, R, t), "covariance.txt": covariance_text(sequence.t, P)}
+    if truth is not None:
+        back = truth[0][0].T
+        files["truth.tum"] = trajectory_text(sequence.t, back @ truth[0], (truth[1] - truth[1][0]) @ back.T)
+    return files

@@ -1,0 +1,90 @@
+"""True poses of the left camera from the files of datasets: KITTI, EuRoC / ASL, TUM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.errors import InputError
+from consistency.recording.record import associate
+from consistency.recording.tum import read_trajectory
+from consistency.types import Array
+from consistency.vision.sequence import Sequence
+
+MAX_DT = 0.01  # s between an image and its truth, as in `consistency analyse`
+PLACES = ("poses.txt", "mav0/state_groundtruth_estimate0/data.csv")
+ROTATION = 1e-3  # largest entry of R'R - I; KITTI writes seven digits
+
+
+def find_truth(sequence: Sequence) -> Path | None:
+    """Where the layout keeps the truth, or None."""
+    return next((sequence.folder / place for place in PLACES if (sequence.folder / place).is_file()), None)
+
+
+def read_truth(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+    """Poses of the rectified left camera in the world at every frame, (n, 3, 3) and (n, 3) in m.
+
+    12 numbers a line are KITTI's (3 x 4 row by row, a line a frame); a .csv is EuRoC's (nanoseconds, position,
+    quaternion w x y z, of the body, which T_BS ties to the camera); else TUM lines (seconds, position, quaternion
+    x y z w) of the left camera.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged, of another length or form, or a frame has no truth within 10 ms.
+    """
+    if not path.is_file():
+        raise InputError(f"--truth {path}: no such file")
+    if path.suffix.lower() == ".csv":
+        R, t = _euroc(path, sequence)
+    elif _columns(path) == 12:
+        R, t = _kitti(path, len(sequence))
+    else:
+        lines = read_trajectory(path, true=True)
+        own = _matched(path, sequence.t, lines.t)
+        R, t = Rotation.from_quat(lines.values[own, 4:8]).as_matrix(), lines.values[own, 1:4]
+    return R @ sequence.rectification.turn.T, t
+
+
+def _columns(path: Path) -> int:
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return next((len(line.split()) for line in file if line.strip() and not line.startswith("#")), 0)
+
+
+def _numbers(path: Path, delimiter: str | None) -> Array:
+    try:
+        return np.loadtxt(path, delimiter=delimiter, ndmin=2)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a table of numbers ({error})") from None
+
+
+def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
+    rows = _numbers(path, None)
+    if len(rows) != frames or not np.isfinite(rows).all():
+        raise InputError(f"{path}: {len(rows)} poses for {frames} frames, or one that is not finite")
+    poses = rows.reshape(-1, 3, 4)
+    U, singular, Vt = np.linalg.svd(poses[:, :, :3])
+    if np.abs(singular - 1.0).max() > ROTATION or (np.linalg.det(U @ Vt) < 0).any():
+        raise InputError(f"{path}: holds a rotation that is none; a line must be the 3 x 4 matrix [R t] row by row")
+    return U @ Vt, poses[:, :, 3]
+
+
+def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+    rows = _numbers(path, ",")
+    if rows.shape[1] < 8 or not np.isfinite(rows[:, :8]).all() or (np.diff(rows[:, 0]) <= 0).any():
+        raise InputError(f"{path}: must hold increasing nanoseconds, position and quaternion w x y z, all finite")
+    body = sequence.calibration.body_from_left
+    if body is None:
+        raise InputError(f"{path}: is the truth of a body, but {sequence.calibration.source} has no T_BS to the camera")
+    rows = rows[_matched(path, sequence.t, rows[:, 0] / 1e9)]
+    turn = Rotation.from_quat(rows[:, [5, 6, 7, 4]]).as_matrix()
+    return turn @ body[:3, :3], rows[:, 1:4] + turn @ body[:3, 3]
+
+
+def _matched(path: Path, t: Array, reference: Array) -> Array:
+    own, match = associate(t, reference, MAX_DT)
+    if len(own) != len(t):
+        raise InputError(f"{path}: {len(t) - len(own)} of {len(t)} frames have no truth within {MAX_DT:g} s")
+    return match

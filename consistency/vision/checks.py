@@ -1,0 +1,68 @@
+"""Arrays that callers hand in: shape, finite values, covariances that are covariances."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.types import Array
+
+ROUNDING = 1e-9  # of a covariance's largest entry: asymmetry and negative eigenvalues below are rounding
+
+
+def rows(name: str, value: Any, width: int) -> Array:
+    """``value`` as floats of shape (N, width).
+
+    Raises
+    ------
+    InputError
+        Another shape, or a value that is not finite.
+    """
+    array = floats(name, value)
+    if array.ndim != 2 or array.shape[1] != width:
+        raise InputError(f"{name}: shape {array.shape}, allowed is (N, {width})")
+    return array
+
+
+def same_length(names: str, *arrays: Array) -> None:
+    """All arrays have the same number of rows, else InputError."""
+    if len({len(array) for array in arrays}) > 1:
+        counts = ", ".join(str(len(array)) for array in arrays)
+        raise InputError(f"{names}: {counts} rows, they must be matched row by row")
+
+
+def covariances(name: str, value: Any, count: int, size: int) -> Array:
+    """``value`` of shape (size, size), for all rows, or (count, size, size), as the latter.
+
+    Raises
+    ------
+    InputError
+        Another shape, a value that is not finite, or a matrix that is not symmetric positive semidefinite.
+    """
+    given = floats(name, value)
+    if given.shape not in {(size, size), (count, size, size)}:
+        raise InputError(f"{name}: shape {given.shape}, allowed are ({size}, {size}) and ({count}, {size}, {size})")
+    if given.size == 0:
+        return given
+    slack = ROUNDING * np.abs(given).max(axis=(-2, -1), keepdims=True)
+    if (np.abs(given - np.swapaxes(given, -1, -2)) > slack).any():
+        raise InputError(f"{name}: not symmetric; give covariances, for pixels in px^2")
+    try:
+        np.linalg.cholesky(given + (slack + np.finfo(float).tiny) * np.eye(size))
+    except np.linalg.LinAlgError:
+        raise InputError(f"{name}: not positive semidefinite; give covariances, for pixels in px^2") from None
+    return np.broadcast_to(given, (count, size, size))
+
+
+def floats(name: str, value: Any) -> Array:
+    """``value`` as an array of finite floats, else InputError."""
+    try:
+        array: Array = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: not an array of numbers") from None
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise InputError(f"{name}: not finite at index {index}; leave such rows out")
+    return array

@@ -1,0 +1,226 @@
+"""From two stereo pairs of images to a relative pose with its covariance, Valencia & Andrade-Cetto (2018) ch. 2."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.types import Array, Indices
+from consistency.vision.consensus import register_ransac, squared_distances
+from consistency.vision.errors import ConsensusError
+from consistency.vision.features import COUNT, grey, sift
+from consistency.vision.matching import EPIPOLAR_PX, RATIO, StereoFeatures, circular_matches, stereo_matches
+from consistency.vision.pose import RelativePose
+from consistency.vision.propagation import registration_covariance, triangulation_covariance
+from consistency.vision.refinement import refine_reprojection
+from consistency.vision.registration import register_horn, register_svd
+from consistency.vision.rig import StereoRig, triangulable, triangulate
+
+ESTIMATORS = ("reprojection", "svd", "horn")
+FEWEST = 8  # closed circles; below, RANSAC would agree with anything
+MISFIT = 5.0  # chi2/dof at most; 0.2 to 1.4 on good images, 8 on swapped ones
+REFITS = 2  # of the pose to its inliers, at most; more change nothing but 1 % of the inliers
+Pair = tuple[Array, Array]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the front-end does with images; the defaults are those of docs/front-end.md, with their origin."""
+
+    features: int = COUNT  # of an image, at most
+    ratio: float = RATIO
+    epipolar_px: float = EPIPOLAR_PX
+    min_disparity: float = 2.0  # px; nearer to zero, a point's depth is not Gaussian even to first order
+    sigma_per_scale: float = 0.15  # px of feature noise per px of SIFT scale
+    gate: float = 4.0  # sigma of an inlier of RANSAC, 3 degrees of freedom: 0.1 % of good matches are lost
+    estimator: str = "reprojection"
+
+    def __post_init__(self) -> None:
+        if self.estimator not in ESTIMATORS:
+            raise InputError(f"estimator '{self.estimator}': must be one of {', '.join(ESTIMATORS)}")
+        for name in ("ratio", "epipolar_px", "min_disparity", "sigma_per_scale", "gate"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}, must be a positive number")
+        if self.features < FEWEST:
+            raise InputError(f"features: {self.features}, must be at least {FEWEST}")
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The pose of the left camera at time 1 in that of time 0, p0 = R p1 + t, of M matches."""
+
+    pose: RelativePose
+    covariance: Array  # (6, 6), of x, y, z (m), roll, pitch, yaw (rad)
+    inliers: Array  # (M,) bool
+    chi2: float  # of the inliers' residuals; over dof it is 1 where the noise of the features is as stated
+    dof: int
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeMotion(Estimate):
+    """An estimate and what it was found from: M circles of matches through all four images."""
+
+    uv0: Array  # (M, 4), u, v left and right at time 0, px
+    uv1: Array  # (M, 4), at time 1, px
+    sigma0: Array  # (M, 4), of uv0, px
+    sigma1: Array  # (M, 4), of uv1, px
+    rows: Indices  # (M, 2), of the stereo matches at time 0 and 1
+
+
+def relative_motion(
+    rig: StereoRig,
+    before: Pair,
+    after: Pair,
+    *,
+    rng: np.random.Generator,
+    settings: Settings | None = None,
+    estimator: str | None = None,
+) -> RelativeMotion:
+    """Motion of a stereo rig between two pairs of images without distortion.
+
+    SIFT features, matched left0-right0-right1-left1-left0; triangulation (eq. 2.26); RANSAC over the Mahalanobis
+    distances of the points, so that far points may miss by more; then the estimator.
+
+    Parameters
+    ----------
+    before, after : (left, right), images (h, w) or (h, w, 3), 8-bit grey or colour
+    rng : the only source of chance, for RANSAC
+    estimator : ``reprojection``, maximum likelihood of the eight pixels of each point with robust weights; ``svd``
+        or ``horn``, the chapter's registrations of points (eq. 2.5-2.21) with the covariance of eq. 2.24-2.31
+
+    Returns
+    -------
+    pose of camera 1 in camera 0 (p0 = R p1 + t) and its covariance; see :class:`RelativeMotion`
+
+    Raises
+    ------
+    InputError
+        OpenCV is not installed; images of another size than the rig's; too few matches.
+    ConsensusError, DegenerateError, ConvergenceError
+        The matches do not agree on a motion, or do not fix one; all are InputErrors.
+    """
+    settings = settings or Settings()
+    frames = [
+        stereo_features(rig, *pair, settings=settings, name=name)
+        for pair, name in ((before, "before"), (after, "after"))
+    ]
+    return motion_between(rig, *frames, rng=rng, settings=settings, estimator=estimator)
+
+
+def stereo_features(
+    rig: StereoRig, left: Array, right: Array, settings: Settings | None = None, name: str = "pair"
+) -> StereoFeatures:
+    """Features and stereo matches of a pair of images: what a sequence keeps for the next motion.
+
+    Raises
+    ------
+    InputError
+        As :func:`relative_motion`.
+    """
+    settings = settings or Settings()
+    images = [grey(image, f"{name} {side}") for image, side in ((left, "left"), (right, "right"))]
+    for image, side in zip(images, ("left", "right"), strict=True):
+        if image.shape[::-1] != rig.image_size:
+            found, wanted = (f"{width} x {height} px" for width, height in (image.shape[::-1], rig.image_size))
+            raise InputError(f"{name} {side}: has {found}, but the rig is for {wanted}")
+    with ThreadPoolExecutor(2) as pool:  # OpenCV holds no lock, and uses a core and a half of its own accord
+        one, two = pool.map(lambda image: sift(image, settings.features, name), images)
+    return stereo_matches(rig, one, two, settings.ratio, settings.epipolar_px)
+
+
+def motion_between(
+    rig: StereoRig,
+    before: StereoFeatures,
+    after: StereoFeatures,
+    *,
+    rng: np.random.Generator,
+    settings: Settings | None = None,
+    estimator: str | None = None,
+    names: tuple[str, str] = ("before", "after"),
+) -> RelativeMotion:
+    """:func:`relative_motion` from features that are there already; errors call the pairs by ``names``."""
+    settings = settings or Settings()
+    estimator = Settings(estimator=estimator).estimator if estimator else settings.estimator
+    rows = circular_matches(before, after, settings.ratio)
+    uv0, uv1 = pixels(before)[rows[:, 0]], pixels(after)[rows[:, 1]]
+    near = usable(rig, uv0, settings.min_disparity) & usable(rig, uv1, settings.min_disparity)
+    rows, uv0, uv1 = rows[near], uv0[near], uv1[near]
+    if len(rows) < FEWEST:
+        raise ConsensusError(
+            f"{names[0]} to {names[1]}: {len(rows)} matches through all four images, at least {FEWEST} are needed; do "
+            "the pairs show the same scene, and is the left image the left one?"
+        )
+    sigma0, sigma1 = (noise(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
+    try:
+        found = _estimated(rig, uv0, uv1, sigma0, sigma1, estimator, settings.gate, rng)
+    except InputError as error:
+        raise type(error)(f"{names[0]} to {names[1]}: {error}") from None
+    if estimator == "reprojection" and found.chi2 > MISFIT * found.dof:
+        raise ConsensusError(
+            f"{names[0]} to {names[1]}: chi2/dof of the inliers is {found.chi2 / found.dof:.1f} where 1 is right; are "
+            "the cameras swapped or badly calibrated, or is sigma_per_scale too small?"
+        )
+    return RelativeMotion(**vars(found), uv0=uv0, uv1=uv1, sigma0=sigma0, sigma1=sigma1, rows=rows)
+
+
+def _estimated(
+    rig: StereoRig,
+    uv0: Array,
+    uv1: Array,
+    sigma0: Array,
+    sigma1: Array,
+    estimator: str,
+    gate: float,
+    rng: np.random.Generator,
+) -> Estimate:
+    """Pose and covariance of matched pixels.
+
+    RANSAC ends with an unweighted fit, which far points spoil: what is an inlier is asked again of the refined pose.
+    """
+    p0, p1 = triangulate(rig, uv0), triangulate(rig, uv1)
+    S0, S1 = diagonal(sigma0), diagonal(sigma1)
+    C0, C1 = triangulation_covariance(rig, uv0, S0), triangulation_covariance(rig, uv1, S1)
+    pose, inliers = register_ransac(p0, p1, threshold=gate, rng=rng, S1=C0, S2=C1)
+    if estimator != "reprojection":
+        near, far, C_near, C_far = (values[inliers] for values in (p0, p1, C0, C1))
+        pose = (register_horn if estimator == "horn" else register_svd)(near, far)
+        S = registration_covariance(near, far, C_near, C_far, pose)
+        chi2 = float(squared_distances(near, far, pose.R, pose.t, C_near, C_far).sum())
+        return Estimate(pose, S, inliers, chi2, 3 * len(near) - 6)
+    for _ in range(REFITS):
+        i = inliers
+        refined = refine_reprojection(rig, uv0[i], uv1[i], pose, S0[i], S1[i], robust="cauchy")
+        pose = refined.pose
+        inliers = squared_distances(p0, p1, pose.R, pose.t, C0, C1) <= gate**2
+        if (inliers == i).all():
+            break
+    return Estimate(pose, refined.covariance, i, refined.chi2, refined.dof)
+
+
+def pixels(features: StereoFeatures) -> Array:
+    """u, v left and right of the stereo matches, (M, 4), px."""
+    left, right = features.pairs.T
+    return np.column_stack([features.left.uv[left], features.right.uv[right]])
+
+
+def noise(features: StereoFeatures, sigma_per_scale: float) -> Array:
+    """Standard deviations (M, 4) of :func:`pixels`, px: the SIFT scale, sec. 2.3.1, times a calibrated factor."""
+    left, right = features.pairs.T
+    scale = np.column_stack([features.left.scale[left], features.right.scale[right]])
+    return np.asarray(sigma_per_scale * scale.repeat(2, axis=1))
+
+
+def usable(rig: StereoRig, uv: Array, min_disparity: float) -> Array:
+    """Matches (N, 4) in front of both cameras and nearer than the depth of ``min_disparity`` px, (N,) bool."""
+    good = triangulable(rig, uv)
+    depth = np.full(len(uv), np.inf)
+    depth[good] = triangulate(rig, uv[good])[:, 2]
+    return np.asarray(depth <= rig.K_left[0, 0] * rig.baseline / min_disparity)
+
+
+def diagonal(sigma: Array) -> Array:
+    """Covariances (N, k, k) of independent components with standard deviations (N, k)."""
+    return np.asarray(sigma[:, :, None] ** 2 * np.eye(sigma.shape[1]))

@@ -1,0 +1,71 @@
+"""Visual odometry: the relative motions of a sequence, and the trajectory that they make up, with covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Ordered
+
+import numpy as np
+
+from consistency.progress import progress
+from consistency.types import Array
+from consistency.vision.motion import RelativeMotion, Settings, motion_between, stereo_features
+from consistency.vision.pose import angular
+from consistency.vision.sequence import Sequence
+
+
+def visual_odometry(
+    sequence: Sequence, *, rng: np.random.Generator, settings: Settings | None = None
+) -> list[RelativeMotion]:
+    """The motion from each stereo pair to the next, one less than pairs; features are found once a pair.
+
+    Raises
+    ------
+    InputError
+        As :func:`consistency.vision.relative_motion`, with the files' names.
+    """
+    rig, motions = sequence.rectification.rig, list[RelativeMotion]()
+    with progress(sequence.folder.name, len(sequence), "stereo pairs") as advance:
+        before = None
+        for frame in range(len(sequence)):
+            name = sequence.left[frame].name
+            after = stereo_features(rig, *sequence.pair(frame), settings=settings, name=name)
+            if before is not None:
+                names = (sequence.left[frame - 1].name, name)
+                motions.append(motion_between(rig, before, after, rng=rng, settings=settings, names=names))
+            before = after
+            advance(1)
+    return motions
+
+
+def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
+    """Poses of the left camera in its first frame, and covariances to first order.
+
+    The errors of the motions are taken as independent. Two in a row share the pixels of a frame, with opposite signs:
+    for noise of the pixels that overstates the covariance; what is common to all motions, such as an error of the
+    calibration, is not in it at all.
+
+    Returns
+    -------
+    R : (T + 1, 3, 3)
+    t : (T + 1, 3), m
+    P : (T + 1, 6, 6), of the position and of the rotation vector of R_true R' about the first frame's axes (error
+        convention so3 of :mod:`consistency.recording.conventions`), m and rad; 0 for the first pose. Rotation vectors
+        have no gimbal lock, which Euler angles in camera axes have where a car turns by 90 degrees.
+    """
+    R, t, P = [np.eye(3)], [np.zeros(3)], [np.zeros((6, 6))]
+    for motion in motions:
+        # p + R dt and R dR, with errors dp + dtheta x (R dt) + R d(dt) and dtheta + R d(phi)
+        arm = R[-1] @ motion.pose.t
+        F, G = np.eye(6), np.zeros((6, 6))
+        F[:3, 3:] = [[0.0, arm[2], -arm[1]], [-arm[2], 0.0, arm[0]], [arm[1], -arm[0], 0.0]]
+        G[:3, :3], G[3:, 3:] = R[-1], R[-1] @ angular(motion.pose)
+        grown = F @ P[-1] @ F.T + G @ motion.covariance @ G.T
+        P.append(0.5 * (grown + grown.T))
+        t.append(t[-1] + arm)
+        R.append(_orthonormal(R[-1] @ motion.pose.R))
+    return np.array(R), np.array(t), np.array(P)
+
+
+def _orthonormal(R: Array) -> Array:
+    U, _, Vt = np.linalg.svd(R)
+    return np.asarray(U @ Vt)

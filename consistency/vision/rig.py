@@ -1,0 +1,152 @@
+"""A calibrated pair of pin-hole cameras, Valencia & Andrade-Cetto (2018) sec. 2.1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.types import Array
+from consistency.vision import checks, small
+from consistency.vision.errors import PointError
+
+ORTHONORMAL = 1e-6  # largest entry of R'R - I: a calibration file has about that many digits
+NEAREST = 1e-9  # depth in baselines up to which a point is at the camera
+FARTHEST = 1e6  # depth in baselines from which on a point is at infinity: eight of sixteen digits of A'A are left
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """Two cameras without distortion; x right, y down, z forward, pixels from the image's corner.
+
+    ``R, t`` are the pose of the right camera in the left camera's frame, p_left = R p_right + t, which is how the
+    chapter's text and its experiments state them. Its eq. 2.2 and 2.3 apply [R t] to a point in the left frame and so
+    mean the inverse, R' and -R' t: R and t put there literally are another rig.
+
+    Parameters
+    ----------
+    K_left, K_right : (3, 3), upper triangular with 1 at the end, px
+    R : (3, 3), rotation
+    t : (3,), m
+    image_size : (width, height), px
+
+    Raises
+    ------
+    InputError
+        A shape, a value that is not finite, a focal length that is not positive, R no rotation, no baseline.
+    """
+
+    K_left: Array  # (3, 3), px
+    K_right: Array  # (3, 3), px
+    R: Array  # (3, 3)
+    t: Array  # (3,), m
+    image_size: tuple[int, int]  # width, height, px
+
+    def __post_init__(self) -> None:
+        for name, shape in {"K_left": (3, 3), "K_right": (3, 3), "R": (3, 3), "t": (3,)}.items():
+            value = checks.floats(name, getattr(self, name)).copy()
+            if value.shape != shape:
+                raise InputError(f"{name}: shape {value.shape}, allowed is {shape}")
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        for name, K in (("K_left", self.K_left), ("K_right", self.K_right)):
+            if np.tril(K, -1).any() or K[2, 2] != 1.0 or min(K[0, 0], K[1, 1]) <= 0.0:
+                raise InputError(f"{name}: give [[fu, skew, u0], [0, fv, v0], [0, 0, 1]] with positive fu and fv")
+        if np.abs(self.R.T @ self.R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(self.R) < 0.0:
+            raise InputError("R: not a rotation; its columns must be orthonormal and its determinant +1")
+        if not self.t.any():
+            raise InputError("t: no baseline between the cameras; depth needs one")
+        if len(self.image_size) != 2 or min(self.image_size) < 1:
+            raise InputError(f"image_size: {self.image_size}, allowed is (width, height) in pixels")
+        object.__setattr__(self, "image_size", (int(self.image_size[0]), int(self.image_size[1])))
+
+    @property
+    def baseline(self) -> float:
+        """Distance of the two cameras, m."""
+        return float(np.linalg.norm(self.t))
+
+    @cached_property
+    def cameras(self) -> Array:
+        """(2, 3, 4): K [I 0] of eq. 2.1 and K' [R' -R't], which eq. 2.2 calls [R t]."""
+        left = np.column_stack([self.K_left, np.zeros(3)])
+        return np.stack([left, self.K_right @ np.column_stack([self.R.T, -self.R.T @ self.t])])
+
+    def project(self, points: Array) -> Array:
+        """Eq. 2.1 and 2.2: points in the left camera's frame to both images.
+
+        Parameters
+        ----------
+        points : (N, 3), m
+
+        Returns
+        -------
+        (N, 4): u, v, u', v', px; also outside ``image_size``
+
+        Raises
+        ------
+        PointError
+            A point at or behind a camera.
+        """
+        p = checks.rows("points", points, 3)
+        h = p @ np.swapaxes(self.cameras[:, :, :3], 1, 2) + self.cameras[:, None, :, 3]  # (2, N, 3)
+        depth = h[:, :, 2]
+        if (bad := (depth <= NEAREST * self.baseline).any(axis=0)).any():
+            raise PointError(f"points: number {int(np.argmax(bad))} is at or behind a camera; leave such points out")
+        return np.concatenate(list(h[:, :, :2] / depth[:, :, None]), axis=1)
+
+    def inside(self, uv: Array) -> Array:
+        """(N, 4) px to (N,) bool: seen in both images."""
+        return np.asarray(((uv >= 0.0) & (uv <= np.tile(self.image_size, 2) - 1.0)).all(axis=1))
+
+
+def triangulate(rig: StereoRig, uv: Array) -> Array:
+    """Least squares of eq. 2.3 by eq. 2.26.
+
+    Parameters
+    ----------
+    uv : (N, 4), u, v, u', v', px
+
+    Returns
+    -------
+    (N, 3), points in the left camera's frame, m
+
+    Raises
+    ------
+    PointError
+        Rays that meet at infinity, at a camera or behind one: zero or negative disparity. See :func:`triangulable`.
+    """
+    return solved(rig, checks.rows("uv", uv, 4))[2]
+
+
+def triangulable(rig: StereoRig, uv: Array) -> Array:
+    """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
+    return _in_front(rig, *_system(rig, checks.rows("uv", uv, 4)))[1]
+
+
+def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
+    """A (N, 4, 3) and b (N, 4) of eq. 2.3, rows in the order u, v, u', v', and the points (N, 3); or PointError."""
+    A, b = _system(rig, uv)
+    points, good = _in_front(rig, A, b)
+    if not good.all():
+        raise PointError(
+            f"uv: match {int(np.argmin(good))} has zero or negative disparity, its point is at infinity or behind a "
+            "camera; leave such matches out (triangulable tells them)"
+        )
+    return A, b, points
+
+
+def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
+    P = rig.cameras
+    A = uv[:, :, None] * P[:, 2].repeat(2, axis=0) - P[:, :2].reshape(4, 4)
+    return A[:, :, :3], -A[:, :, 3]
+
+
+def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
+    At = np.swapaxes(A, 1, 2)
+    inverse, definite = small.inverse(At @ A)
+    points = (inverse @ (At @ b[:, :, None]))[:, :, 0]
+    depth = points @ rig.cameras[:, 2, :3].T + rig.cameras[:, 2, 3]
+    near, far = NEAREST * rig.baseline, FARTHEST * rig.baseline
+    return points, definite & ((depth > near) & (depth < far)).all(axis=1)

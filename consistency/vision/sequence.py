@@ -1,0 +1,219 @@
+"""Sequences of stereo pairs on disk: KITTI odometry, EuRoC / ASL, or plain folders with an OpenCV calibration."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.types import Array
+from consistency.vision.calibration import Calibration, read_calibration
+from consistency.vision.features import opencv
+from consistency.vision.rectification import Rectification, rectify
+
+FORMATS = ("kitti", "euroc", "opencv")
+KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"))
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
+RATE = 10.0  # Hz, of images without timestamps: KITTI's, and a choice elsewhere
+FEWEST = 2  # stereo pairs
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Stereo pairs in the order of time; images are read when they are asked for."""
+
+    folder: Path
+    format: str  # one of FORMATS
+    left: list[Path]
+    right: list[Path]
+    t: Array  # (n,), s, increasing
+    timed: bool  # whether ``t`` was read, else it is a matter of the rate
+    calibration: Calibration
+    rectification: Rectification
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    def pair(self, frame: int) -> tuple[Array, Array]:
+        """Rectified grey images (h, w) of a frame.
+
+        Raises
+        ------
+        InputError
+            An image cannot be read or has another size than the first one.
+        """
+        size = self.rectification.rig.image_size
+        left, right = (read_image(path, size) for path in (self.left[frame], self.right[frame]))
+        return self.rectification.apply(left, right)
+
+    def __iter__(self) -> Iterator[tuple[Array, Array]]:
+        return (self.pair(frame) for frame in range(len(self)))
+
+
+def read_sequence(
+    folder: Path,
+    calibration: Path | None = None,
+    format: str | None = None,
+    left: str | None = None,
+    right: str | None = None,
+    rate: float | None = None,
+) -> Sequence:
+    """The stereo pairs of a folder and their calibration.
+
+    Parameters
+    ----------
+    folder : KITTI: image_0 and image_1 (or image_2 and image_3, image_l and image_r), times.txt, calib.txt;
+        EuRoC: mav0/cam0 and mav0/cam1 with data.csv and data, or cam0 and cam1 with images named by nanoseconds
+    calibration : file, or a folder for EuRoC; None where the layout holds it
+    format : one of FORMATS; None to find out by the folders that are there
+    left, right : for ``opencv``: patterns below ``folder``, such as ``left/*.png``; None for left and right as
+        folders, or as the beginning of the names
+    rate : Hz, for images without timestamps
+
+    Raises
+    ------
+    InputError
+        No such layout, fewer than two pairs, an image without its partner, an unreadable image or calibration.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of images")
+    if format not in (None, *FORMATS):
+        raise InputError(f"--format {format}: must be one of {', '.join(FORMATS)}")
+    if rate is not None and not (np.isfinite(rate) and rate > 0):
+        raise InputError(f"--rate {rate}: must be a positive number of Hz")
+    if (left is None) != (right is None):
+        raise InputError("--left and --right go together: patterns of the left and of the right images")
+    kind = format or ("opencv" if left is not None else _recognised(folder))
+    if kind == "kitti":
+        files, t, home = _kitti(folder), _kitti_times(folder), folder / "calib.txt"
+    elif kind == "euroc":
+        files, t = _euroc(folder)
+        home = folder
+    else:
+        files, t, home = _plain(folder, left, right), None, None
+    if calibration is None and home is None:
+        raise InputError(f"{folder}: plain images need --calibration FILE, an OpenCV YAML or a KITTI calib.txt")
+    _require_pairs(folder, files, t)
+    known = read_calibration(calibration or home or folder, *(side[0].parent.name for side in files))
+    rectification = rectify(known, _size_of(files[0][0]))
+    times = np.arange(len(files[0])) / (rate or RATE) if t is None else t
+    return Sequence(folder, kind, *files, times, t is not None, known, rectification)
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> Array:
+    """An image as 8-bit grey (h, w); with ``size`` (width, height) it must have it."""
+    cv2 = opencv()
+    if not path.is_file():
+        raise InputError(f"{path}: no such image")
+    try:
+        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except (OSError, cv2.error):
+        image = None
+    if image is None:
+        raise InputError(f"{path}: cannot be read as an image; damaged or of an unknown format")
+    if size is not None and image.shape[::-1] != tuple(size):
+        wanted, found = (f"{width} x {height} px" for width, height in (size, image.shape[::-1]))
+        raise InputError(f"{path}: has {found}, other images {wanted}; all must have one size")
+    return np.asarray(image)
+
+
+def _size_of(path: Path) -> tuple[int, int]:
+    height, width = read_image(path).shape
+    return width, height
+
+
+def _recognised(folder: Path) -> str:
+    if any((folder / one).is_dir() and (folder / two).is_dir() for one, two in KITTI_PAIRS):
+        return "kitti"
+    if (folder / "mav0").is_dir() or (folder / "cam0").is_dir():
+        return "euroc"
+    return "opencv"
+
+
+def _images(folder: Path, pattern: str = "*") -> list[Path]:
+    return sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+
+
+def _require_pairs(folder: Path, files: tuple[list[Path], list[Path]], t: Array | None) -> None:
+    pairs = min(map(len, files))
+    if pairs < FEWEST:
+        raise InputError(f"{folder}: holds {pairs} stereo pairs; a motion takes at least {FEWEST}")
+    if t is not None and (len(t) != pairs or (np.diff(t) <= 0).any()):
+        raise InputError(f"{folder}: {len(t)} timestamps for {pairs} stereo pairs, or not increasing")
+
+
+def _by_name(folder: Path, left: list[Path], right: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Both lists, if every image has a partner of the same name."""
+    names = [{path.stem for path in side} for side in (left, right)]
+    for side, lonely in ((left, names[0] - names[1]), (right, names[1] - names[0])):
+        if lonely:
+            path = next(path for path in side if path.stem in lonely)
+            raise InputError(f"{path}: has no partner of the other camera in {folder}; add it, or leave this one out")
+    return left, right
+
+
+def _kitti(folder: Path) -> tuple[list[Path], list[Path]]:
+    for one, two in KITTI_PAIRS:
+        if (folder / one).is_dir() and (folder / two).is_dir():
+            return _by_name(folder, _images(folder / one), _images(folder / two))
+    raise InputError(f"{folder}: holds no folders {' or '.join(' and '.join(pair) for pair in KITTI_PAIRS)}")
+
+
+def _kitti_times(folder: Path) -> Array | None:
+    path = folder / "times.txt"
+    if not path.is_file():
+        return None
+    try:
+        t = np.loadtxt(path, ndmin=1)
+    except (ValueError, UnicodeDecodeError, OSError):
+        t = np.empty((0, 0))
+    if t.ndim != 1 or not np.isfinite(t).all():
+        raise InputError(f"{path}: must hold one time in seconds a line")
+    return t
+
+
+def _euroc(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
+    """Images of both cameras and times in seconds; the names, or data.csv, are nanoseconds."""
+    root = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    left, right = (_camera(root / camera) for camera in ("cam0", "cam1"))
+    both = _by_name(root, list(left.values()), list(right.values()))
+    stamps = np.array(sorted(left), dtype=np.int64)
+    return both, stamps / 1e9
+
+
+def _camera(folder: Path) -> dict[int, Path]:
+    """Images of one camera by their time in nanoseconds, sorted."""
+    images = folder / "data" if (folder / "data").is_dir() else folder
+    if not images.is_dir():
+        raise InputError(f"{folder}: no such folder of images")
+    table = folder / "data.csv"
+    try:
+        if table.is_file():
+            with table.open(encoding="utf-8", newline="") as file:
+                rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+            found = {int(row[0]): images / row[1].strip() for row in rows}
+        else:
+            found = {int(path.stem): path for path in _images(images)}
+    except (ValueError, IndexError, OSError, UnicodeDecodeError):
+        raise InputError(f"{folder}: times must be whole nanoseconds, in data.csv or as the images' names") from None
+    for path in found.values():
+        if not path.is_file():
+            raise InputError(f"{table}: names {path.name}, which is not in {images}")
+    return dict(sorted(found.items()))
+
+
+def _plain(folder: Path, left: str | None, right: str | None) -> tuple[list[Path], list[Path]]:
+    """Images by pattern, paired in sorted order; names may differ between the cameras."""
+    if left is None or right is None:
+        folders = (folder / "left").is_dir() and (folder / "right").is_dir()
+        left, right = ("left/*", "right/*") if folders else ("[lL]eft*", "[rR]ight*")
+    sides = _images(folder, left), _images(folder, right)
+    if len(sides[0]) != len(sides[1]):
+        raise InputError(
+            f"{folder}: {len(sides[0])} images are like '{left}' but {len(sides[1])} like '{right}' (--left, --right)"
+        )
+    return sides

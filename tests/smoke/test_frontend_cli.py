@@ -1,0 +1,64 @@
+"""Images to a log to a verdict, as a newcomer types it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scene
+from command import consistency
+
+pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``images``, a KITTI sequence of a wall, and ``log``, what the front-end makes of it."""
+    at = tmp_path_factory.mktemp("frontend")
+    scene.write_kitti(at / "images", scene.drive(8), scene.texture(np.random.default_rng(0)))
+    done = consistency("frontend", "images", "--calibration", "images/calib.txt", "--out", "log", cwd=at)
+    assert "8 stereo pairs, 0.70 m" in done.stdout
+    assert "uses the images twice" in done.stdout
+    return at
+
+
+def test_filters_run_on_the_log_and_are_judged(folder: Path) -> None:
+    filters = ("--filter", "ekf-uvd", "--filter", "ukf-uvd")
+    consistency("run", "--log", "log", *filters, "--out", "results", cwd=folder)
+    verdicts = json.loads(consistency("analyse", "results", "--json", cwd=folder).stdout)
+    assert set(verdicts) == {"ekf-uvd", "ukf-uvd"}
+    assert "failed" not in {verdict["status"] for verdict in verdicts.values()}
+
+
+def test_the_trajectory_is_judged(folder: Path) -> None:
+    files = ("--truth", "log/truth.tum", "--covariance", "log/covariance.txt", "--error", "so3")
+    done = consistency("analyse", "log/trajectory.tum", *files, cwd=folder)
+    assert "trajectory" in done.stdout
+
+
+def test_a_log_is_not_overwritten_by_accident(folder: Path) -> None:
+    done = consistency("frontend", "images", "--out", "log", cwd=folder, status=2)
+    assert "exists already" in done.stderr
+    consistency("frontend", "images", "--out", "log", "--overwrite", "--max-landmarks", "20", cwd=folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nowhere",), "nowhere: no such folder of images"),
+        (("images", "--calibration", "none.yaml"), "--calibration none.yaml: no such file"),
+        (("images", "--format", "ros"), "--format ros: must be one of kitti, euroc, opencv"),
+        (("images", "--estimator", "icp"), "estimator 'icp': must be one of reprojection, svd, horn"),
+        (("images", "--sigma-per-scale", "0"), "sigma_per_scale: 0.0, must be a positive number"),
+        (("images", "--max-landmarks", "0"), "--max-landmarks 0: must be at least 1"),
+        (("images", "--truth", "none.txt"), "--truth none.txt: no such file"),
+        (("images", "--lever", "nan"), "--lever nan: must be a finite number"),
+    ],
+)
+def test_bad_input(folder: Path, arguments: tuple[str, ...], said: str) -> None:
+    done = consistency("frontend", *arguments, "--out", "other", cwd=folder, status=2)
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) <= 2
+    assert not (folder / "other").exists()

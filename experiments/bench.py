@@ -20,6 +20,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import bench_vision as front_end
 import bench_whole as whole
 import numpy as np
 from bench_peers import WARM, FilterpyEkf, FilterpyUkf, Peer, stone_soup
@@ -27,6 +28,7 @@ from bench_trials import LANDMARKS, SEEN, Case, Work, growing, grown, interleave
 from scipy.linalg import blas, lapack
 
 import consistency as cs
+from consistency.errors import InputError
 from consistency.filters.stepping import run_filter
 from consistency.types import Estimates
 
@@ -67,6 +69,7 @@ class Effort:
     growth_repeats: int = 3
     known_steps: int = 200
     size: tuple[int, int] = (LANDMARKS, SEEN)
+    cloud: tuple[int, int] = (300, 1000)  # points and samples
     runs: int = 50
     run_steps: int = 500
     memory_runs: tuple[int, ...] = (150, 300)
@@ -242,10 +245,31 @@ def start(effort: Effort) -> Iterator[Row]:
     yield Row("start", "second consistency run", second, "s", 3.0, True, "the same command; median of 3")
 
 
+def vision(effort: Effort) -> Iterator[Row]:
+    """The stereo front-end."""
+    points, samples = effort.cloud
+    s = front_end.covariance_and_simulation(points, samples, effort.growth_repeats)
+    note = f"{_us(s['simulate'])}, sample by sample / {_us(s['propagate'])}"
+    what = f"covariance of a motion, {points} points: Monte Carlo of {samples} samples / ours"
+    yield Row("vision", what, s["simulate"] / s["propagate"], "x", 200.0, note=note)
+    note = f"{_us(s['at once'])}; all samples triangulated and registered in one call"
+    yield Row("vision", "the same, vectorised over the samples", s["at once"] / s["propagate"], "x", note=note)
+    what = f"covariance of a motion from {points} stereo matches in both frames"
+    yield Row("vision", what, 1e3 * s["propagate"], "ms", 2.0, True)
+    what = "motions between stereo pairs, from files to covariances"
+    try:
+        rate, note = front_end.motions_per_second(effort.growth_repeats)
+    except InputError as error:
+        yield Row("vision", what, None, "1/s", note=str(error))
+    else:
+        yield Row("vision", what, rate, "1/s", 3.0, note=note)
+
+
 # --- the table -----------------------------------------------------------------------------------------
 
 GROUPS: dict[str, Callable[[Effort], Iterator[Row]]] = {
-    "peers": peers, "kernels": kernels, "growth": growth, "program": program, "memory": memory, "start": start,
+    "peers": peers, "kernels": kernels, "growth": growth, "vision": vision, "program": program, "memory": memory,
+    "start": start,
 }  # fmt: skip
 
 

@@ -6,8 +6,6 @@ are. Camera matrices and motion are not, and are those of ``consistency.vision.s
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -28,7 +26,7 @@ from consistency.vision.pose import euler_angles
 from consistency.vision.registration import rigid_motions
 from consistency.vision.synthetic import MOTION, common_points, disparity_noise, published_rig
 
-FINDINGS = ("frontend-interval", "frontend-fig2.2", "frontend-fig2.3", "frontend-rate", "frontend-speed")
+FINDINGS = ("frontend-interval", "frontend-fig2.2", "frontend-fig2.3", "frontend-rate")
 
 # --- printed ---------------------------------------------------------------------------------
 NOISE = 2.0  # px
@@ -42,7 +40,6 @@ OTHERS = ((4.0, 2.0), (6.0, 2.0), (10.0, 2.0), (3.0, 1.0), (3.0, 0.5))  # m, px:
 # --- rules -----------------------------------------------------------------------------------
 REPETITIONS, REGION, LEVEL = 200, 0.95, 0.01
 FEWER = 12  # repetitions of each of OTHERS, of which the mean is told
-FASTER = 200  # times, than a simulation of 1,000 samples
 
 
 def generator(study: cs.Study, *purpose: int) -> np.random.Generator:
@@ -50,8 +47,8 @@ def generator(study: cs.Study, *purpose: int) -> np.random.Generator:
 
 
 def main(study: cs.Study) -> list[cs.Finding]:
-    """The interval, fig. 2.2 and 2.3, and the time it takes."""
-    return [interval(study), figure_22(study), *figure_23(study), speed(study)]
+    """The interval, fig. 2.2 and 2.3."""
+    return [interval(study), figure_22(study), *figure_23(study)]
 
 
 # --- figures -----------------------------------------------------------------------------------
@@ -174,53 +171,6 @@ def shares(total: Array, dof: int) -> tuple[float, int, float]:
     low, high = region(dof, REGION)
     inside = int(((total >= low) & (total <= high)).sum())
     return float(total.mean()), inside, float(stats.binomtest(inside, len(total), REGION).pvalue)
-
-
-# --- time ----------------------------------------------------------------------------------------
-
-
-def speed(study: cs.Study, points: int = 300, samples: int = 1000, repeats: int = 5) -> cs.Finding:
-    """A covariance from the pixels on, and the Monte Carlo simulation it replaces, in turns."""
-    rig, rng = published_rig(), generator(study, 3)
-    p1 = common_points(rng, rig, MOTION, points, NEAR, FAR)
-    uv = [rig.project(p) for p in (p1, MOTION.inverse().apply(p1))]
-    clouds = [triangulate(rig, z) for z in uv]
-    pose, S_uv = register_svd(*clouds), NOISE**2 * np.eye(4)
-
-    def propagate() -> None:
-        for _ in range(20):
-            S1, S2 = (triangulation_covariance(rig, z, S_uv) for z in uv)
-            registration_covariance(clouds[0], clouds[1], S1, S2, pose)
-
-    def simulate() -> None:
-        for _ in range(samples):
-            register_svd(*(triangulate(rig, z + rng.normal(0.0, NOISE, z.shape)) for z in uv))
-
-    def at_once() -> None:
-        noisy = [z + rng.normal(0.0, NOISE, (samples, *z.shape)) for z in uv]
-        rigid_motions(*(triangulate(rig, z.reshape(-1, 4)).reshape(samples, points, 3) for z in noisy))
-
-    taken = np.array([[seconds(propagate) / 20, seconds(simulate), seconds(at_once)] for _ in range(repeats)])
-    ratio, batched = np.median(taken[:, 1:] / taken[:, :1], axis=0)
-    return study.finding(
-        bool(ratio >= FASTER),
-        scenario="none",
-        id="frontend-speed",
-        source="Valencia & Andrade-Cetto 2018, sec. 2.3.3.1",
-        claim="the closed form is less expensive than Monte Carlo simulation",
-        statistic=f"time of a simulation of {samples} samples over that of the covariance, both from {points} matches; "
-        f"median of {repeats} repeats in turns",
-        published="less expensive",
-        measured=f"x{ratio:.0f}; x{batched:.0f} where all samples are triangulated and registered at once; the "
-        f"covariance takes {1e3 * np.median(taken[:, 0]):.2f} ms",
-        accept=f"at least x{FASTER}, sample by sample as simulations are written",
-    )
-
-
-def seconds(work: Callable[[], None]) -> float:
-    started = time.perf_counter()
-    work()
-    return time.perf_counter() - started
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ TINY = bench.Effort(
     steps=12,
     peer_steps=(3, 2),
     landmarks=(14, 20),
+    cloud=(10, 5),
     growth_repeats=1,
     size=(20, 12),
     runs=4,
@@ -118,7 +119,7 @@ def test_a_difference_is_caught(case: Case, what: str) -> None:
         require_equal("peer", pose, covariance, ours, WARM)
 
 
-@pytest.mark.parametrize("group", ["peers", "kernels", "growth", "program", "memory"])
+@pytest.mark.parametrize("group", ["peers", "kernels", "growth", "vision", "program", "memory"])
 def test_a_group_of_rows(group: str) -> None:
     rows = list(bench.GROUPS[group](TINY))
     assert rows

@@ -63,12 +63,6 @@ def test_a_deep_scene_is_not_reproduced(figures: ModuleType, monkeypatch: pytest
     assert figures.figure_22(cs.Study(seed=3)).verdict == "not reproduced"
 
 
-def test_speed_is_measured(figures: ModuleType) -> None:
-    finding = figures.speed(cs.Study(), points=10, samples=5, repeats=1)
-    assert finding.id == "frontend-speed"
-    assert finding.verdict == "not reproduced"  # five samples are no match
-
-
 def test_map(first_order: ModuleType) -> None:
     study = cs.Study(seed=3)
     findings = first_order.main(study)

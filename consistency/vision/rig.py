@@ -15,8 +15,8 @@ from consistency.vision.errors import PointError
 ORTHONORMAL = 1e-6  # largest entry of R'R - I: a calibration file has about that many digits
 NEAREST = 1e-3  # depth in baselines up to which a point is at the camera: a disparity of a thousand focal lengths
 FARTHEST = 1e6  # depth in baselines from which on a point is at infinity
-# what A'A leaves of a coordinate's own entry when the others are eliminated: about (disparity / pixel)^2 / 4. At FARTHEST
-# it is some 3e-13, of rounding alone some 1e-16; parallel rays must not pass for a point that rounding made up
+# What A'A leaves of a coordinate's own entry when the others are eliminated: some 3e-13 at FARTHEST, up to 6e-16 by
+# rounding alone. Parallel rays must not pass for a point that rounding made up.
 FIXED = 2e-14
 
 

@@ -21,6 +21,10 @@ OPENCV_KEYS = {
     "R": ("R", "rotation_matrix", "R_stereo"),
     "T": ("T", "translation_coefficients", "translation_vector", "T_stereo"),
 }
+# matrices that the same tools write beside them and nobody needs here
+OTHERS = {"R1", "R2", "P1", "P2", "Q", "E", "F", "essential_matrix", "fundamental_matrix", "LEFT.R", "LEFT.P"}
+OTHERS |= {"RIGHT.R", "RIGHT.P", "projection_matrix_1", "projection_matrix_2", "rectification_matrix_1"}
+OTHERS |= {"rectification_matrix_2", "image_size", "imageSize"}
 COUNTS = (4, 5, 8, 12, 14)  # distortion coefficients that OpenCV knows
 EUROC_KEYS = ("T_BS", "intrinsics", "distortion_model", "distortion_coefficients", "resolution")
 NO_DISTORTION = ("none", "")
@@ -93,7 +97,8 @@ def read_opencv(path: Path) -> Calibration:
     """A YAML file as OpenCV's FileStorage writes it: K1, D1, K2, D2, R, T in Bouguet's convention.
 
     x_right = R x_left + T. D1 and D2 may be left out for images without distortion, R for rectified ones;
-    ``image_width`` and ``image_height`` are optional. Other usual names of the same keys are taken as well.
+    ``image_width`` and ``image_height`` are optional. Other usual names of the same keys are taken as well. Where one
+    of D1, D2 and R is left out, another list or matrix of an unknown name may be that one misspelt, and is refused.
     """
     data = read_yaml(path)
     found: dict[str, Array] = {}
@@ -104,6 +109,7 @@ def read_opencv(path: Path) -> Calibration:
         elif key in ("K1", "K2", "T"):
             known = "; ".join(" = ".join(names) for names in OPENCV_KEYS.values())
             raise InputError(f"{path}: key '{key}' is missing; known keys: {known}, image_width, image_height")
+    _require_known(path, data, [key for key in ("D1", "D2", "R") if key not in found])
     for key, shape in (("K1", (3, 3)), ("K2", (3, 3)), ("R", (3, 3)), ("T", (3,))):
         if key in found:
             if found[key].size != np.prod(shape):
@@ -162,6 +168,17 @@ def _checked(calibration: Calibration) -> Calibration:
             "T is that of x_right = R x_left + T, in metres; are the cameras swapped?"
         )
     return calibration
+
+
+def _require_known(path: Path, data: dict[str, Any], missing: list[str]) -> None:
+    known = OTHERS.union(*OPENCV_KEYS.values())
+    strange = [key for key, value in data.items() if isinstance(value, dict | list) and key not in known]
+    if missing and strange:
+        names = " = ".join(OPENCV_KEYS[missing[0]])
+        raise InputError(f"{path}: key '{strange[0]}' is unknown while '{missing[0]}' is missing; known: {names}")
+    lonely = [key for key in ("image_width", "image_height") if key in data]
+    if len(lonely) == 1:
+        raise InputError(f"{path}: key '{lonely[0]}': image_width and image_height go together")
 
 
 def _rotation(where: str, R: Array) -> Array:

@@ -10,6 +10,7 @@ from consistency.errors import InputError
 from consistency.types import Array
 
 ROUNDING = 1e-9  # of a covariance's largest entry: asymmetry and negative eigenvalues below are rounding
+LARGEST = 1e75  # of a number: fourth powers of coordinates are still finite
 
 
 def rows(name: str, value: Any, width: int) -> Array:
@@ -62,7 +63,8 @@ def floats(name: str, value: Any) -> Array:
         array: Array = np.asarray(value, float)
     except (TypeError, ValueError):
         raise InputError(f"{name}: not an array of numbers") from None
-    if not np.isfinite(array).all():
-        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise InputError(f"{name}: not finite at index {index}; leave such rows out")
+    if (bad := ~(np.abs(array) <= LARGEST)).any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        why = "too large" if np.isfinite(array[index]) else "not finite"
+        raise InputError(f"{name}: {why} at index {index}; leave such rows out")
     return array

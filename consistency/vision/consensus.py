@@ -105,7 +105,11 @@ def squared_distances(
         return np.asarray(np.einsum("...i,...i->...", residual, residual))
     R = R[..., None, :, :]
     S = S1 + R @ S2 @ np.swapaxes(R, -1, -2)
-    return np.asarray(np.einsum("...i,...i->...", residual, np.linalg.solve(S, residual[..., None])[..., 0]))
+    try:
+        scaled = np.linalg.solve(S, residual[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        raise InputError("S1, S2: singular together; a point needs noise in every direction to be judged by") from None
+    return np.asarray(np.einsum("...i,...i->...", residual, scaled))
 
 
 def _search(p1: Array, p2: Array, inliers_of: Callable[[Array, Array], Array], rng: np.random.Generator) -> Array:

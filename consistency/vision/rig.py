@@ -13,8 +13,11 @@ from consistency.vision import checks, small
 from consistency.vision.errors import PointError
 
 ORTHONORMAL = 1e-6  # largest entry of R'R - I: a calibration file has about that many digits
-NEAREST = 1e-9  # depth in baselines up to which a point is at the camera
-FARTHEST = 1e6  # depth in baselines from which on a point is at infinity: eight of sixteen digits of A'A are left
+NEAREST = 1e-3  # depth in baselines up to which a point is at the camera: a disparity of a thousand focal lengths
+FARTHEST = 1e6  # depth in baselines from which on a point is at infinity
+# What A'A leaves of a coordinate's own entry when the others are eliminated: some 3e-13 at FARTHEST, up to 6e-16 by
+# rounding alone. Parallel rays must not pass for a point that rounding made up.
+FIXED = 2e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +149,8 @@ def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
 def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
     At = np.swapaxes(A, 1, 2)
     inverse, definite = small.inverse(At @ A)
+    alone = np.einsum("nii,nij,nij->ni", inverse, At, At)
+    definite &= (alone < 1.0 / FIXED).all(axis=1)
     points = (inverse @ (At @ b[:, :, None]))[:, :, 0]
     depth = points @ rig.cameras[:, 2, :3].T + rig.cameras[:, 2, 3]
     near, far = NEAREST * rig.baseline, FARTHEST * rig.baseline

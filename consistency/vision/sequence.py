@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +78,8 @@ def read_sequence(
     Raises
     ------
     InputError
-        No such layout, fewer than two pairs, an image without its partner, an unreadable image or calibration.
+        No such layout, fewer than two pairs, an image without its partner, a gap in the numbers of images without
+        timestamps, an unreadable image or calibration.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of images")
@@ -95,9 +97,15 @@ def read_sequence(
         home = folder
     else:
         files, t, home = _plain(folder, left, right), None, None
+    if kind == "opencv" and not any(files):
+        raise InputError(
+            f"{folder}: holds no images of a KITTI, EuRoC or plain layout (left and right, or --left, --right)"
+        )
     if calibration is None and home is None:
         raise InputError(f"{folder}: plain images need --calibration FILE, an OpenCV YAML or a KITTI calib.txt")
     _require_pairs(folder, files, t)
+    if t is None:
+        _require_no_gap(files[0])
     known = read_calibration(calibration or home or folder, *(side[0].parent.name for side in files))
     rectification = rectify(known, _size_of(files[0][0]))
     times = np.arange(len(files[0])) / (rate or RATE) if t is None else t
@@ -144,6 +152,26 @@ def _require_pairs(folder: Path, files: tuple[list[Path], list[Path]], t: Array 
         raise InputError(f"{folder}: holds {pairs} stereo pairs; a motion takes at least {FEWEST}")
     if t is not None and (len(t) != pairs or (np.diff(t) <= 0).any()):
         raise InputError(f"{folder}: {len(t)} timestamps for {pairs} stereo pairs, or not increasing")
+
+
+def _number(path: Path) -> int | None:
+    """The last number in a file's name, or None."""
+    digits = re.findall(r"\d+", path.stem)
+    return int(digits[-1]) if digits else None
+
+
+def _require_no_gap(files: list[Path]) -> None:
+    """Without timestamps the frames are taken as equally far apart: their numbers must not skip one."""
+    numbers = [_number(path) for path in files]
+    steps = np.diff([n for n in numbers if n is not None])
+    if None in numbers or len(steps) == 0 or (least := steps.min()) <= 0 or (steps % least).any():
+        return  # names do not count frames
+    if (far := steps > least).any():
+        k = int(np.argmax(far))
+        raise InputError(
+            f"{files[k + 1]}: frames are missing between {files[k].name} and it, and no times are there; add the "
+            "frames, or times.txt"
+        )
 
 
 def _by_name(folder: Path, left: list[Path], right: list[Path]) -> tuple[list[Path], list[Path]]:
@@ -208,12 +236,21 @@ def _camera(folder: Path) -> dict[int, Path]:
 
 def _plain(folder: Path, left: str | None, right: str | None) -> tuple[list[Path], list[Path]]:
     """Images by pattern, paired in sorted order; names may differ between the cameras."""
+    named = False
     if left is None or right is None:
         folders = (folder / "left").is_dir() and (folder / "right").is_dir()
         left, right = ("left/*", "right/*") if folders else ("[lL]eft*", "[rR]ight*")
-    sides = _images(folder, left), _images(folder, right)
+        named = True
+    try:
+        sides = _images(folder, left), _images(folder, right)
+    except (NotImplementedError, ValueError) as error:  # of pathlib
+        raise InputError(f"--left {left}, --right {right}: must be patterns below {folder} ({error})") from None
     if len(sides[0]) != len(sides[1]):
         raise InputError(
             f"{folder}: {len(sides[0])} images are like '{left}' but {len(sides[1])} like '{right}' (--left, --right)"
         )
+    numbers = [[_number(path) for path in side] for side in sides]
+    if named and numbers[0] != numbers[1] and set(numbers[0]) & set(numbers[1]):
+        k = next(k for k, (a, b) in enumerate(zip(*numbers, strict=True)) if a != b)
+        raise InputError(f"{sides[0][k]} and {sides[1][k].name} would be a pair, but their numbers differ")
     return sides

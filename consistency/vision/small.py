@@ -14,8 +14,10 @@ def inverse(C: Array) -> tuple[Array, Array]:
     the time of LAPACK's calls for each matrix.
     """
     if C.shape[-1] != 3:
-        definite = np.linalg.eigvalsh(C)[..., 0] > 0.0
-        return np.linalg.inv(np.where(definite[..., None, None], C, np.eye(C.shape[-1]))), definite
+        one = np.eye(C.shape[-1])
+        finite = np.asarray(np.isfinite(C).all(axis=(-2, -1)))
+        definite = finite & (np.linalg.eigvalsh(np.where(finite[..., None, None], C, one))[..., 0] > 0.0)
+        return np.linalg.inv(np.where(definite[..., None, None], C, one)), definite
     a, b, c, d, e, f = (C[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     out = np.empty(C.shape)
     out[..., 0, 0] = d * f - e * e

@@ -55,6 +55,7 @@ def test_a_log_is_not_overwritten_by_accident(folder: Path) -> None:
         (("images", "--max-landmarks", "0"), "--max-landmarks 0: must be at least 1"),
         (("images", "--truth", "none.txt"), "--truth none.txt: no such file"),
         (("images", "--lever", "nan"), "--lever nan: must be a finite number"),
+        (("images", "--seed", "-1"), "--seed -1: must not be negative"),
     ],
 )
 def test_bad_input(folder: Path, arguments: tuple[str, ...], said: str) -> None:

@@ -145,6 +145,9 @@ def test_rectified_pixels_of_a_point_are_those_of_the_rectified_rig(tmp_path: Pa
         ({"T": np.array([[0.2], [0.0], [0.0]]), "R": np.eye(3)}, "are the cameras swapped"),
         ({"K1": -K}, "the matrix of the left camera must be"),
         ({"image_width": 100, "image_height": 50}, "is for images of 100 x 50 px"),
+        ({"image_width": 100}, "image_width and image_height go together"),
+        ({"D1": None, "distorsion": np.ones((1, 4))}, "key 'distorsion' is unknown while 'D1' is missing"),
+        ({"R": None, "Rot": np.eye(3)}, "'Rot' is unknown while 'R' is missing"),
     ],
 )
 def test_unusable_opencv_calibration(tmp_path: Path, changes: dict[str, object], said: str) -> None:
@@ -207,6 +210,8 @@ def test_plain_folders_and_patterns(tmp_path: Path, kitti: Path) -> None:
     (kitti / "image_0").rename(kitti / "left")
     (kitti / "image_1").rename(kitti / "right")
     assert read_sequence(kitti, calibration).format == "opencv"
+    with pytest.raises(cs.InputError, match="plain images need --calibration"):
+        read_sequence(kitti)
     found = read_sequence(kitti, calibration, left="left/*[12].png", right="right/*[01].png")
     assert [(a.name, b.name) for a, b in zip(found.left, found.right, strict=True)] == [
         ("000001.png", "000000.png"),
@@ -229,13 +234,33 @@ def damaged(change: Callable[[Path], object], said: str) -> tuple[Callable[[Path
         damaged(lambda f: (f / "times.txt").write_text("0\n0.2\n0.1\n"), "not increasing"),
         damaged(lambda f: (f / "times.txt").write_text("a b\n"), "one time in seconds a line"),
         damaged(lambda f: (f / "calib.txt").unlink(), "calib.txt: no such file"),
-        damaged(lambda f: (f / "image_0").rename(f / "imagex"), "plain images need --calibration"),
+        damaged(lambda f: (f / "image_0").rename(f / "imagex"), "holds no images of a KITTI, EuRoC or plain layout"),
     ],
 )  # fmt: skip
 def test_unusable_folder(kitti: Path, change: Callable[[Path], object], said: str) -> None:
     change(kitti)
     with pytest.raises(cs.InputError, match=said):
         read_sequence(kitti)
+
+
+def test_a_gap_in_frames_without_times(kitti: Path) -> None:
+    for side in ("image_0", "image_1"):
+        (kitti / side / "000002.png").rename(kitti / side / "000003.png")
+    assert len(read_sequence(kitti)) == 3  # times.txt tells when they were
+    (kitti / "times.txt").unlink()
+    with pytest.raises(cs.InputError, match=r"000003\.png: frames are missing between 000001\.png and it"):
+        read_sequence(kitti)
+
+
+def test_plain_pairs_of_different_numbers(kitti: Path) -> None:
+    (kitti / "image_0").rename(kitti / "left")
+    (kitti / "image_1").rename(kitti / "right")
+    (kitti / "left" / "000001.png").unlink()
+    with pytest.raises(cs.InputError, match="2 images are like 'left/\\*' but 3"):
+        read_sequence(kitti)
+    (kitti / "right" / "000002.png").unlink()
+    with pytest.raises(cs.InputError, match=r"000002\.png and 000001\.png would be a pair"):
+        read_sequence(kitti, kitti / "calib.txt")
 
 
 def test_images_of_different_sizes(kitti: Path) -> None:
@@ -252,6 +277,7 @@ def test_images_of_different_sizes(kitti: Path) -> None:
         ({"rate": -1.0}, "--rate -1.0"),
         ({"left": "a*"}, "--left and --right go together"),
         ({"left": "image_0/*", "right": "image_1/*1.png"}, "3 images are like"),
+        ({"left": "/image_0/*", "right": "image_1/*"}, "must be patterns below"),
     ],
 )
 def test_unusable_options(kitti: Path, options: dict[str, object], said: str) -> None:

@@ -85,6 +85,8 @@ def test_unusable_images(wall: Array, rng: np.random.Generator) -> None:
     blank = np.zeros(scene.SIZE[::-1], np.uint8)
     with pytest.raises(ConsensusError, match="0 matches through all four images"):
         relative_motion(rig, pair, (blank, blank), rng=rng)
+    with pytest.raises(ConsensusError, match="0 matches through all four images"):  # no disparity anywhere
+        relative_motion(rig, (pair[0], pair[0]), (pair[0], pair[0]), rng=rng)
     later = scene.pair(scene.drive(2)[1], wall)
     with pytest.raises(ConsensusError, match="cameras swapped"):
         relative_motion(rig, pair[::-1], later[::-1], rng=rng)

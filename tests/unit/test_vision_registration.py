@@ -173,6 +173,10 @@ def test_arguments_of_the_search(rng: np.random.Generator) -> None:
             register_ransac(p, p, threshold=threshold, rng=rng)
     with pytest.raises(InputError, match="S1, S2: give both"):
         register_ransac(p, p, threshold=1.0, rng=rng, S1=np.eye(3))
+    with pytest.raises(InputError, match="S1, S2: singular together"):
+        register_ransac(p, p, threshold=1.0, rng=rng, S1=np.zeros((3, 3)), S2=np.zeros((3, 3)))
+    with pytest.raises(InputError, match="p1: too large at index"):
+        register_ransac(1e200 * p, p, threshold=1.0, rng=rng)
 
 
 # --- covariance of the registration --------------------------------------------------------------

@@ -64,6 +64,24 @@ def test_points_that_are_not_in_front_are_named(uv: list[float], why: str) -> No
     assert triangulable(LEVEL, matches).tolist() == [True, False], why
 
 
+@pytest.mark.parametrize("disparity", [0.0, 1e-12, 1e-9, 1e-6])
+@pytest.mark.parametrize("rows", [0.0, 1.0])
+def test_parallel_rays_meet_nowhere_in_the_image(disparity: float, rows: float, rng: np.random.Generator) -> None:
+    """Rounding leaves A'A a small determinant of either sign."""
+    pixels = rng.uniform([0.0, 0.0], SIZE, (5000, 2))
+    uv = np.column_stack([pixels, pixels - [disparity, rows]])
+    assert not triangulable(LEVEL, uv).any()
+    turned = StereoRig(K, K, rotation(0.1, -0.1, 0.2), [0.4, 0.1, -0.05], SIZE)
+    rays = np.column_stack([rng.uniform(-0.5, 0.5, (5000, 2)), np.ones(5000)])
+    left, right = rays @ K.T, rays @ turned.R @ K.T
+    assert not triangulable(turned, np.column_stack([left[:, :2] / left[:, 2:], right[:, :2] / right[:, 2:]])).any()
+
+
+def test_far_points_are_still_points(rng: np.random.Generator) -> None:
+    p = np.column_stack([rng.uniform(-0.5, 0.5, (5000, 2)), np.ones(5000)]) * 3e5 * LEVEL.baseline
+    np.testing.assert_allclose(triangulate(LEVEL, LEVEL.project(p)), p, rtol=0.01)
+
+
 @pytest.mark.parametrize("z", [0.0, -4.0])
 def test_projection_refuses_points_behind(z: float) -> None:
     with pytest.raises(PointError, match="number 1 is at or behind a camera"):

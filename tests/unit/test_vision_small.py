@@ -32,6 +32,7 @@ def test_what_is_not_positive_definite_is_told(m: int, rng: np.random.Generator)
         assert definite.tolist() == [True, False]
         assert np.isfinite(inverse).all()
     assert small.inverse(-np.eye(m)[None])[1].tolist() == [False]
+    assert small.inverse(np.full((1, m, m), np.nan))[1].tolist() == [False]
 
 
 def test_the_mathematics_needs_no_opencv() -> None:

@@ -25,6 +25,7 @@ OPENCV_KEYS = {
 OTHERS = {"R1", "R2", "P1", "P2", "Q", "E", "F", "essential_matrix", "fundamental_matrix", "LEFT.R", "LEFT.P"}
 OTHERS |= {"RIGHT.R", "RIGHT.P", "projection_matrix_1", "projection_matrix_2", "rectification_matrix_1"}
 OTHERS |= {"rectification_matrix_2", "image_size", "imageSize"}
+WIDEST = 30.0  # m between two cameras on one rig; calibrations are often in millimetres by mistake
 COUNTS = (4, 5, 8, 12, 14)  # distortion coefficients that OpenCV knows
 EUROC_KEYS = ("T_BS", "intrinsics", "distortion_model", "distortion_coefficients", "resolution")
 NO_DISTORTION = ("none", "")
@@ -166,6 +167,10 @@ def _checked(calibration: Calibration) -> Calibration:
         raise InputError(
             f"{where}: the right camera stands at {np.round(centre, 3).tolist()} m of the left one, not to its right: "
             "T is that of x_right = R x_left + T, in metres; are the cameras swapped?"
+        )
+    if centre[0] > WIDEST:
+        raise InputError(
+            f"{where}: the right camera stands {centre[0]:g} m from the left one; T is in metres, is it in millimetres?"
         )
     return calibration
 

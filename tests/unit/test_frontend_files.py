@@ -143,6 +143,7 @@ def test_rectified_pixels_of_a_point_are_those_of_the_rectified_rig(tmp_path: Pa
         ({"R": 2 * np.eye(3)}, "the rotation between the cameras is not one"),
         ({"D1": np.zeros((1, 3))}, "key 'D1': has 3 coefficients"),
         ({"T": np.array([[0.2], [0.0], [0.0]]), "R": np.eye(3)}, "are the cameras swapped"),
+        ({"T": np.array([[-537.0], [0.0], [0.0]]), "R": np.eye(3)}, "stands 537 m from the left one"),
         ({"K1": -K}, "the matrix of the left camera must be"),
         ({"image_width": 100, "image_height": 50}, "is for images of 100 x 50 px"),
         ({"image_width": 100}, "image_width and image_height go together"),

@@ -144,9 +144,8 @@ def described(study: cs.Study, name: str, cells: pd.DataFrame) -> cs.Finding:
         id=f"first-order-{name}",
         source=f"{OURS}, beyond Valencia & Andrade-Cetto 2018, sec. 2.3.3",
         claim=f"{name}: first order holds while the disparity's noise is at most {HOLDS:.0%} of the disparity",
-        statistic=f"verdicts of the referee over depth {DEPTHS} m, baseline {BASELINES} m, noise {NOISES} px; {RUNS} runs "
-        f"a cell, false alarm {ALARM:g}, which find a covariance too small by x{seen:.2g} "
-        "and may miss a smaller fault",
+        statistic=f"verdicts of the referee over depth {DEPTHS} m, baseline {BASELINES} m, noise {NOISES} px; {RUNS} "
+        f"runs a cell, false alarm {ALARM:g}, which find a covariance too small by x{seen:.2g} and may miss less",
         published="not tried",
         measured=f"accepted in {int(accepted[near].sum())} of {int(near.sum())} cells up to {HOLDS:.0%} and in "
         f"{int(accepted[~near].sum())} of {int((~near).sum())} beyond; at fault {first}, by {faults}; worst mean NEES "

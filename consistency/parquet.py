@@ -51,9 +51,11 @@ class Writer:
         # the bytes of similar numbers are alike: apart from each other they take less room, and nothing is lost
         split = [column for column, kind in kinds.items() if kind == "float64" and column not in REPEATED]
         repeated = [column for column in kinds if column not in split]
+        # numbers hardly compress, so that damage to them goes unseen without a checksum
         self._file = pq.ParquetWriter(
-            path, self.schema, compression="zstd", use_dictionary=repeated, use_byte_stream_split=split
-        )
+            path, self.schema, compression="zstd", use_dictionary=repeated, use_byte_stream_split=split,
+            write_page_checksum=True,
+        )  # fmt: skip
         self._pieces: list[Any] = []
         self._rows = 0
 
@@ -151,7 +153,7 @@ def require_table(folder: Path, name: str) -> Any:
     """The opened file of a table, refused where it is missing, damaged or lacks a column."""
     path = folder / f"{name}.parquet"
     with _refusals(path):
-        file = pq.ParquetFile(path)
+        file = pq.ParquetFile(path, page_checksum_verification=True)
     wanted = COLUMNS[name]
     if missing := [column for column in wanted if column not in file.schema_arrow.names]:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(wanted)}")

@@ -241,6 +241,17 @@ def test_changed_bytes_are_refused(written: Path, tmp_path: Path, name: str) -> 
         cs.read_results(tmp_path / "out")
 
 
+def test_a_row_of_no_filter_is_refused(written: Path, tmp_path: Path) -> None:
+    memory = cs.read_results(written)
+    memory.write(tmp_path / "out")
+    estimates = memory.estimates.copy()
+    estimates.loc[7, "filter"] = None
+    estimates.to_parquet(tmp_path / "out" / "estimates.parquet", index=False)
+    for read in (open_results, cs.read_results):
+        with pytest.raises(cs.InputError, match=r"estimates\.parquet: a column of text, row 7: nothing there"):
+            cs.analyse(read(tmp_path / "out"))
+
+
 # --- stopped and resumed -----------------------------------------------------------------------------
 
 
@@ -275,6 +286,15 @@ def test_resuming_keeps_failures_and_fills_gaps(uvd: cs.Scenario, tmp_path: Path
     part.write(tmp_path / "out")
     cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1, previous=open_results(tmp_path / "out"), out=tmp_path / "out")
     assert content(tmp_path / "out") == content(tmp_path / "whole")
+
+
+def test_an_error_in_odd_letters_is_recorded(uvd: cs.Scenario, tmp_path: Path) -> None:
+    class Reads(Halts):
+        def init(self, problem: Any) -> dict[str, Any]:
+            raise OSError("no such map: caf\udce9.txt")  # as Python gives a file name that is not UTF-8
+
+    stored = cs.run_trials(uvd, [Reads()], runs=1, jobs=1, out=tmp_path / "out")
+    assert list(stored.failures["reason"]) == [r"OSError: no such map: caf\udce9.txt"]
 
 
 def test_a_filter_without_any_row_is_resumed(uvd: cs.Scenario, tmp_path: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
+import threading
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -394,7 +396,9 @@ def reproduce(
 
 
 def main(arguments: list[str] | None = None) -> Any:
-    """Entry point: unusable input ends in one line and exit status 2."""
+    """Entry point: unusable input ends in one line and exit status 2; SIGTERM is taken as Ctrl-C."""
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # else the folder in the making would stay
     try:
         sys.exit(app(arguments, standalone_mode=False))
     except MemoryError:

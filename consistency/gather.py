@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from itertools import pairwise
@@ -26,7 +27,7 @@ from consistency.results import (
     failures_table,
     truth_table,
 )
-from consistency.storage import NewFolder
+from consistency.storage import NewFolder, undisturbed
 from consistency.types import Failure
 
 
@@ -63,6 +64,11 @@ class Gathered:
 
     Outcomes come in order of their runs. ``previous`` are results to which they are added, of which the runs ``kept``
     count.
+
+    Raises
+    ------
+    InputError
+        The previous results are damaged, or not in order of the runs: said before the work, which may take hours.
     """
 
     def __init__(
@@ -73,6 +79,7 @@ class Gathered:
         kept: Iterable[int] = (),
     ) -> None:
         self.filters, self.new, self.previous, self.kept = list(filters), new, previous, frozenset(kept)
+        self._require_readable()
         self.runs: set[int] = set()
         self._failures: list[Failure] = []
         self._spools: list[Spool] = []
@@ -105,7 +112,8 @@ class Gathered:
         failures = self._all_failures()
         manifest = manifest | {"failures": len(failures)}
         if self.new is not None and self.finished:
-            return self._stored(self.new, manifest, failures, landmarks)
+            with undisturbed():
+                return self._stored(self.new, manifest, failures, landmarks)
         estimates = estimates_table([(name, columns) for name in self.filters for columns in self._of(name)])
         truth = truth_table(list(self._true()))
         return Results(estimates, failures, truth if len(truth) else None, landmarks, manifest)
@@ -137,13 +145,20 @@ class Gathered:
         return self._merged(self._before("estimates", NUMBERS, filter_name), self._estimates[filter_name])
 
     def _true(self) -> Iterator[Columns]:
-        return self._merged(self._before("truth", list(COLUMNS["truth"])), self._truth)
+        return self._merged(self._true_before(), self._truth)
 
     def _merged(self, before: Iterator[tuple[int, Columns]], now: Pieces) -> Iterator[Columns]:
         """Pieces of both in order of their runs; those of a run that was cut off are left out."""
         numbered = ((int(columns["run"][0]), columns) for columns in now if len(columns["run"]))
         finished = (piece for piece in numbered if piece[0] in self.runs)
         return (columns for _, columns in heapq.merge(before, finished, key=itemgetter(0)))
+
+    def _require_readable(self) -> None:
+        for before in (*(self._before("estimates", NUMBERS, name) for name in self.filters), self._true_before()):
+            deque(before, maxlen=0)
+
+    def _true_before(self) -> Iterator[tuple[int, Columns]]:
+        return self._before("truth", list(COLUMNS["truth"]))
 
     def _before(self, table: str, columns: list[str], filter_name: str | None = None) -> Iterator[tuple[int, Columns]]:
         """The kept runs of the previous results, one by one."""

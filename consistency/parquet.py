@@ -51,9 +51,11 @@ class Writer:
         # the bytes of similar numbers are alike: apart from each other they take less room, and nothing is lost
         split = [column for column, kind in kinds.items() if kind == "float64" and column not in REPEATED]
         repeated = [column for column in kinds if column not in split]
+        # numbers hardly compress, so that damage to them goes unseen without a checksum
         self._file = pq.ParquetWriter(
-            path, self.schema, compression="zstd", use_dictionary=repeated, use_byte_stream_split=split
-        )
+            path, self.schema, compression="zstd", use_dictionary=repeated, use_byte_stream_split=split,
+            write_page_checksum=True,
+        )  # fmt: skip
         self._pieces: list[Any] = []
         self._rows = 0
 
@@ -116,9 +118,13 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
     """
     path, wanted = folder / f"{name}.parquet", COLUMNS[name]
     with _refusals(path):
-        table = require_table(folder, name).read(list(wanted)).to_pandas()
+        read = require_table(folder, name).read(list(wanted))
+        table = read.to_pandas()
     for column, kind in wanted.items():
-        _check_column(path, table[column], kind)
+        if kind == "str":
+            _require_text(path, read.column(column))
+        else:
+            _check_column(path, table[column], kind)
     checked: pd.DataFrame = table.astype(wanted)
     return checked
 
@@ -140,10 +146,11 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
                 for column, values in table.items():
                     values.name = column
                     _check_column(path, values, wanted[column], first)
-                first += batch.num_rows
                 chosen: Any = slice(None)
                 if filter_name is not None:
+                    _require_text(path, batch.column("filter"), first)
                     chosen = pc.equal(batch.column("filter"), filter_name).to_numpy(zero_copy_only=False)
+                first += batch.num_rows
                 yield {column: values.to_numpy(wanted[column])[chosen] for column, values in table.items()}
 
 
@@ -151,7 +158,7 @@ def require_table(folder: Path, name: str) -> Any:
     """The opened file of a table, refused where it is missing, damaged or lacks a column."""
     path = folder / f"{name}.parquet"
     with _refusals(path):
-        file = pq.ParquetFile(path)
+        file = pq.ParquetFile(path, page_checksum_verification=True)
     wanted = COLUMNS[name]
     if missing := [column for column in wanted if column not in file.schema_arrow.names]:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(wanted)}")
@@ -176,10 +183,14 @@ def _may_hold(group: Any, filter_name: str) -> bool:
     return known is None or not known.has_min_max or bool(known.min <= filter_name <= known.max)
 
 
+def _require_text(path: Path, names: Any, first: int = 0) -> None:
+    if names.null_count:
+        row = first + pc.index(names.is_null(), True).as_py()
+        raise InputError(f"{path}: a column of text, row {row}: nothing there")
+
+
 def _check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
     """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
-    if kind == "str":
-        return
     values = pd.to_numeric(column, errors="coerce").to_numpy(float)
     if column.name in NULLABLE:
         values = np.where(column.isna(), 0.0, values)

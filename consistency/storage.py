@@ -8,9 +8,11 @@ import os
 import platform
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -165,6 +167,20 @@ class NewFolder:
         return manifest
 
 
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """No Ctrl-C, and no SIGTERM, before what is being written is whole: it would cost the work of hours."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+
+
 def write_folder(
     folder: Path,
     tables: dict[str, pd.DataFrame],
@@ -177,7 +193,7 @@ def write_folder(
 
     The manifest says what ``kind`` of folder it is.
     """
-    with NewFolder(folder, manifest["kind"], overwrite, keep_others) as new:
+    with undisturbed(), NewFolder(folder, manifest["kind"], overwrite, keep_others) as new:
         with new.writing():
             for name, table in tables.items():
                 write_table(new.path / f"{name}.parquet", name, table)

@@ -63,7 +63,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
             reason = "the innovation covariance is not positive definite"
             break
         except Exception as error:  # whatever a user's filter throws is a result
-            reason = f"{type(error).__name__}: {error}"
+            reason = f"{type(error).__name__}: {error}".encode(errors="backslashreplace").decode()
             break
         rank = definiteness(P)
         if not (np.isfinite(mean).all() and np.isfinite(P).all()):

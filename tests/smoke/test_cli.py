@@ -209,7 +209,8 @@ def test_a_failed_run_is_in_results_verdict_and_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
-def test_ctrl_c_keeps_what_is_finished(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, name: str) -> None:
     """Interrupted after the first runs, then resumed: the bytes of an uninterrupted run."""
     code = f"""
 import signal, sys
@@ -220,7 +221,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a sh
 def interrupt(trial, *rest):
     count.append(trial.run)
     if len(count) == 4:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.{name})
     return one(trial, *rest)
 mc._one = interrupt
 main({["run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--jobs", "1", "--out", "out"]!r})
@@ -228,6 +229,7 @@ main({["run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--jobs", "1", 
     stopped = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert stopped.returncode == 130, stopped.stderr
     assert "--resume" in stopped.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
     done = cs.read_results(tmp_path / "out").manifest["finished_runs"]
     assert 0 < done < 6
     command = ("run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--out")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import tracemalloc
 import weakref
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +50,15 @@ class Halts:
 
 def content(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
+
+
+def damage(path: Path) -> None:
+    """Flip a bit in the middle of the column y."""
+    group = pq.ParquetFile(path).metadata.row_group(0)
+    column = next(c for c in map(group.column, range(group.num_columns)) if c.path_in_schema == "y")
+    bytes_ = bytearray(path.read_bytes())
+    bytes_[column.data_page_offset + column.total_compressed_size // 2] ^= 1
+    path.write_bytes(bytes_)
 
 
 @pytest.fixture
@@ -217,6 +229,29 @@ def test_a_cut_file_is_refused_when_the_folder_is_opened(written: Path, tmp_path
         open_results(tmp_path / "out")
 
 
+@pytest.mark.parametrize("name", ["estimates", "truth"])
+def test_changed_bytes_are_refused(written: Path, tmp_path: Path, name: str) -> None:
+    """Numbers that hardly compress are stored as they are: a flipped bit would be another number."""
+    cs.read_results(written).write(tmp_path / "out")
+    path = tmp_path / "out" / f"{name}.parquet"
+    damage(path)
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
+        cs.analyse(open_results(tmp_path / "out"))
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
+        cs.read_results(tmp_path / "out")
+
+
+def test_a_row_of_no_filter_is_refused(written: Path, tmp_path: Path) -> None:
+    memory = cs.read_results(written)
+    memory.write(tmp_path / "out")
+    estimates = memory.estimates.copy()
+    estimates.loc[7, "filter"] = None
+    estimates.to_parquet(tmp_path / "out" / "estimates.parquet", index=False)
+    for read in (open_results, cs.read_results):
+        with pytest.raises(cs.InputError, match=r"estimates\.parquet: a column of text, row 7: nothing there"):
+            cs.analyse(read(tmp_path / "out"))
+
+
 # --- stopped and resumed -----------------------------------------------------------------------------
 
 
@@ -253,6 +288,15 @@ def test_resuming_keeps_failures_and_fills_gaps(uvd: cs.Scenario, tmp_path: Path
     assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
+def test_an_error_in_odd_letters_is_recorded(uvd: cs.Scenario, tmp_path: Path) -> None:
+    class Reads(Halts):
+        def init(self, problem: Any) -> dict[str, Any]:
+            raise OSError("no such map: caf\udce9.txt")  # as Python gives a file name that is not UTF-8
+
+    stored = cs.run_trials(uvd, [Reads()], runs=1, jobs=1, out=tmp_path / "out")
+    assert list(stored.failures["reason"]) == [r"OSError: no such map: caf\udce9.txt"]
+
+
 def test_a_filter_without_any_row_is_resumed(uvd: cs.Scenario, tmp_path: Path) -> None:
     class Stillborn(Halts):
         name = "stillborn"
@@ -273,6 +317,37 @@ def test_rows_out_of_order_are_not_resumed(uvd: cs.Scenario, written: Path) -> N
     upside_down = cs.Results(memory.estimates[::-1], memory.failures, memory.truth, memory.landmarks, memory.manifest)
     with pytest.raises(cs.InputError, match="estimates to resume must be in order of the runs"):
         cs.run_trials(uvd, FILTERS, runs=10, seed=3, jobs=1, previous=upside_down)
+
+
+@pytest.mark.parametrize("name", ["estimates", "truth"])
+def test_what_cannot_be_resumed_is_refused_before_any_work(
+    uvd: cs.Scenario, written: Path, tmp_path: Path, stop_at: Any, name: str
+) -> None:
+    out = tmp_path / "out"
+    cs.read_results(written).write(out)
+    damage(out / f"{name}.parquet")
+    stop_at(9, RuntimeError("work"))
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
+        cs.run_trials(uvd, FILTERS, runs=10, seed=3, jobs=1, previous=open_results(out), out=out)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize("how", ["complete", "stopped"])
+def test_ctrl_c_waits_while_the_folder_is_written(
+    uvd: cs.Scenario, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    class Pressed(gather.Writer):
+        def end_group(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+            super().end_group()
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(gather, "Writer", Pressed)
+    with pytest.raises(Interrupted) if how == "stopped" else nullcontext():
+        stop_at(2 if how == "stopped" else -1, KeyboardInterrupt())
+        cs.run_trials(uvd, FILTERS, runs=3, seed=3, jobs=1, out=tmp_path / "out")
+    assert open_results(tmp_path / "out").finished_runs(FILTERS) == set(range(2 if how == "stopped" else 3))
+    assert signal.getsignal(signal.SIGINT) == before
 
 
 # --- nothing half-written ----------------------------------------------------------------------------

@@ -208,10 +208,19 @@ def _camera(folder: Path) -> dict[int, Path]:
 
 def _plain(folder: Path, left: str | None, right: str | None) -> tuple[list[Path], list[Path]]:
     """Images by pattern, paired in sorted order; names may differ between the cameras."""
+    given = left is not None and right is not None
     if left is None or right is None:
         folders = (folder / "left").is_dir() and (folder / "right").is_dir()
         left, right = ("left/*", "right/*") if folders else ("[lL]eft*", "[rR]ight*")
     sides = _images(folder, left), _images(folder, right)
+    if not any(sides) and given:
+        raise InputError(f"{folder}: no image is like '{left}' (--left) or '{right}' (--right)")
+    if not any(sides):
+        raise InputError(
+            f"{folder}: holds no stereo images of a known layout: {' or '.join(' and '.join(p) for p in KITTI_PAIRS)} "
+            "(KITTI), mav0 or cam0 and cam1 (EuRoC), left and right (plain); give the folder that holds these, or "
+            "--left and --right"
+        )
     if len(sides[0]) != len(sides[1]):
         raise InputError(
             f"{folder}: {len(sides[0])} images are like '{left}' but {len(sides[1])} like '{right}' (--left, --right)"

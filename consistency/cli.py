@@ -90,12 +90,16 @@ def frontend(
     out: Out,
     calibration: Annotated[
         Path | None,
-        typer.Option("--calibration", help="KITTI calib.txt, OpenCV .yaml, or EuRoC folder; not needed if in IMAGES."),
+        typer.Option(
+            "--calibration", help="KITTI calib.txt, OpenCV .yaml, or folder of EuRoC's; not needed if in IMAGES."
+        ),
     ] = None,
     truth: Annotated[
         Path | None, typer.Option("--truth", help="True poses: KITTI, EuRoC .csv or TUM; found if in IMAGES.")
     ] = None,
-    format: Annotated[str | None, typer.Option("--format", help="kitti, euroc or opencv [by the folders].")] = None,
+    format: Annotated[
+        str | None, typer.Option("--format", help="kitti, euroc or opencv (plain) [by the folders].")
+    ] = None,
     left: Annotated[str | None, typer.Option("--left", help="Pattern of plain left images, as 'left/*.png'.")] = None,
     right: Annotated[str | None, typer.Option("--right", help="Pattern of plain right images.")] = None,
     rate: Annotated[float | None, typer.Option("--rate", help="Hz, of images without times [10].")] = None,
@@ -104,10 +108,11 @@ def frontend(
         float | None, typer.Option("--sigma-per-scale", help="Feature noise over SIFT scale [0.15].")
     ] = None,
     max_landmarks: Annotated[
-        int | None, typer.Option("--max-landmarks", help="In the log, which filters are quadratic in [200].")
+        int | None,
+        typer.Option("--max-landmarks", help="Most landmarks in the log; filters are quadratic in them [200]."),
     ] = None,
     lever: Annotated[float, typer.Option("--lever", help="Metres from the robot's point forward to the camera.")] = 0.0,
-    seed: Seed = 0,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of RANSAC.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Stereo images to a log for filters, and to a trajectory with covariance."""

@@ -91,6 +91,10 @@ def read_log(folder: str | Path) -> Log:
     if not folder.is_dir():
         raise InputError(f"--log {folder}: no such folder")
     path = folder / "sensor.toml"
+    if not path.is_file():
+        raise InputError(
+            f"{path}: missing; 'consistency frontend' makes a log of images, 'consistency simulate' one of a scenario"
+        )
     sensor = read_table(path, SensorFile)
     try:
         belief = sensor.belief()

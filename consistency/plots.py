@@ -32,6 +32,7 @@ DASHES: tuple[tuple[float, ...], ...] = (
     (3.0, 1.5, 1.0, 1.5, 1.0, 1.5),
 )
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+NARROWEST = 0.15  # span of one axis of a map over that of the other, at least: room for the tick labels
 BESIDE = 0.66  # of the figure's width is left of a legend that stands beside the axes
 AXES = (("x", "m"), ("y", "m"), ("heading", "deg"))
 Interval = tuple[float, float, float]  # value, low, high; the ends may be infinite
@@ -80,6 +81,7 @@ def scenario(
         axes.plot(*true_path[0], "o", color="white", markeredgecolor=TRUTH, markersize=7, zorder=6)
     for look, path in paths:
         axes.plot(*path.T, color=look.colour, linestyle=look.linestyle, linewidth=1.1, zorder=4)
+    _widen(axes)
     axes.set_aspect("equal", adjustable="box")
     axes.set(xlabel="x (m)", ylabel="y (m)")
     _frame(axes)
@@ -297,6 +299,14 @@ def _plain_numbers(axis: Axis, low: float, high: float) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0,) if high > 200 * low else (1.0, 2.0, 5.0)))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
+
+
+def _widen(axes: Axes) -> None:
+    """A straight path has height too: neither axis spans less than :data:`NARROWEST` of the other."""
+    limits = np.array([axes.get_xlim(), axes.get_ylim()])
+    spans = np.maximum(np.diff(limits)[:, 0], NARROWEST * np.diff(limits).max())
+    low, high = limits.mean(axis=1) - spans / 2, limits.mean(axis=1) + spans / 2
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
 
 
 def _frame(axes: Axes) -> None:

@@ -59,7 +59,12 @@ def _lines(label: str, total: int, unit: str, every: float = 5.0) -> Advance:
         if done == total or now - last >= every:
             last = now
             rate = done / max(now - started, 1e-9)
-            left = f", {(total - done) / rate:.0f} s left" if done < total else ""
-            print(f"{label}: {done} of {total} {unit}, {_speed(rate, unit)}{left}", file=sys.stderr, flush=True)
+            if done == total:
+                speed = f", {_speed(rate, unit)}"
+            elif done == count:  # the first: it may have waited for kernels to be compiled
+                speed = f", {now - started:.0f} s with the start"
+            else:
+                speed = f", {_speed(rate, unit)}, {(total - done) / rate:.0f} s left"
+            print(f"{label}: {done} of {total} {unit}{speed}", file=sys.stderr, flush=True)
 
     return advance

@@ -193,6 +193,8 @@ def _nis(s: Mapping[str, Any]) -> str:
 def _asked(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     asked = [a["question"] for a in s["answers"]]
     text = f"{len(asked)} questions at a false-alarm rate of {s['false_alarm']:.3g} together"
+    if len(asked) == 1:
+        text = f"1 question at a false-alarm rate of {s['false_alarm']:.3g}"
     if not found:
         least = min(s["answers"], key=lambda a: a["adjusted"])
         return f"{text}; nearest to a fault: {least['question']} (corrected p {p_text(least['adjusted'])})"

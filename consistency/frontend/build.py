@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.frontend.planar_log import log_of
+from consistency.frontend.planar_log import MIN_LIFE, log_of
 from consistency.frontend.truth import find_truth, read_truth
 from consistency.frontend.tum import covariance_text, trajectory_text
 from consistency.log import write_log
@@ -22,6 +22,7 @@ from consistency.vision.odometry import trajectory, visual_odometry
 from consistency.vision.sequence import Sequence, read_sequence
 
 LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
+FEWEST = MIN_LIFE + 1  # stereo pairs: the first is no observation of a log
 
 
 @dataclass(frozen=True)
@@ -61,16 +62,22 @@ class Summary:
         """What a terminal shows, and what to do next."""
         u, v, d = self.sigma_px
         times = [] if self.timed else [f"the images have no times: {self.rate:g} Hz assumed, --rate says otherwise"]
-        judge = f"consistency analyse {out}/trajectory.tum --covariance {out}/covariance.txt --truth {out}/truth.tum"
+        judge = f"consistency analyse {out}/trajectory.tum --truth {out}/truth.tum --covariance {out}/covariance.txt"
+        judged = (
+            "no truth found: --truth FILE takes one"
+            if self.truth is None
+            else f"truth from {self.truth}; next: {judge} --error so3"
+        )
         return [
             f"{self.frames} stereo pairs, {self.distance:.2f} m, {self.inliers:.0f} inliers in the median",
-            f"residuals: chi2/dof {self.noise_ratio:.2f} with the stated noise of the features (--sigma-per-scale)",
+            f"residuals: chi2/dof {self.noise_ratio:.2f}; 1 where the stated noise of the features "
+            "(--sigma-per-scale) is right",
             f"log: {self.landmarks} landmarks, {self.observations} observations; "
             f"sigma u {u:.2f} v {v:.2f} d {d:.2f} px, v {self.sigma_v:.3g} m/s, omega {self.sigma_omega:.3g} rad/s",
             "controls come from these images too: a filter that takes both uses the images twice",
             *times,
             f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
-            *([] if self.truth is None else [f"truth from {self.truth}; next: {judge}"]),
+            judged,
         ]
 
 
@@ -92,12 +99,19 @@ def write_frontend_log(images: Path, out: Path, options: Options, overwrite: boo
         raise InputError(f"--seed {options.seed}: must not be negative")
     if not np.isfinite(options.lever):
         raise InputError(f"--lever {options.lever}: must be a finite number of metres")
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: must not be negative")
     require_free(out, overwrite, "log")
     sequence = read_sequence(
         images, options.calibration, options.format, options.left, options.right, options.rate
     )  # fmt: skip
     if not is_rectified(sequence.rectification.rig):
         raise InputError(f"{sequence.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
+    if len(sequence) < FEWEST:
+        raise InputError(
+            f"{images}: holds {len(sequence)} stereo pairs; a log takes at least {FEWEST}, one motion by itself comes "
+            "from consistency.vision.relative_motion"
+        )
     path = options.truth or find_truth(sequence)
     truth = None if path is None else read_truth(path, sequence)
     motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed), settings=options.settings)

@@ -97,6 +97,8 @@ def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
         No track can be used, or even one landmark at once makes more than ``most`` in all.
     """
     rows = rows[rows["z2"] >= NEAR * rows["sigma"]]
+    if rows.empty:
+        raise InputError(f"no match has a disparity of at least {NEAR:g} of its sigmas; the scene is too far for a log")
     rows = rows.assign(piece=np.cumsum((rows["piece"].diff() != 0) | (rows["step"].diff() != 1)))
 
     def chosen(slots: int) -> pd.DataFrame:

@@ -62,8 +62,10 @@ def _numbers(path: Path, delimiter: str | None) -> Array:
 
 def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
     rows = _numbers(path, None)
-    if len(rows) != frames or not np.isfinite(rows).all():
-        raise InputError(f"{path}: {len(rows)} poses for {frames} frames, or one that is not finite")
+    if len(rows) != frames:
+        raise InputError(f"{path}: {len(rows)} poses for {frames} frames; must hold one a frame")
+    if not np.isfinite(rows).all():
+        raise InputError(f"{path}: holds a number that is not finite")
     poses = rows.reshape(-1, 3, 4)
     U, singular, Vt = np.linalg.svd(poses[:, :, :3])
     if np.abs(singular - 1.0).max() > ROTATION or (np.linalg.det(U @ Vt) < 0).any():

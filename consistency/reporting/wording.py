@@ -122,9 +122,10 @@ def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
     text = []
     if pairs:
         honest = sum(track.verdict.consistent for track, _ in pairs)
-        passed = ("is" if honest == 1 else "are") + " honest about the uncertainty of the pose"
+        one = honest == 1 or len(pairs) == 1
+        passed = ("is" if one else "are") + " honest about the uncertainty of the pose"
         if not any(study.has_truth for study in studies):
-            passed = ("passes" if honest == 1 else "pass") + " the test of the innovations, the only one without truth"
+            passed = ("passes" if one else "pass") + " the test of the innovations, the only one without truth"
         if len(studies) == 1:
             size = f"{_count(studies[0].runs, 'run')} of {_count(len(studies[0].steps), 'step')}"
             text.append(f"In {studies[0].name} ({size}), {honest} of {_count(len(pairs), 'filter')} {passed}.")

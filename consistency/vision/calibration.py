@@ -107,6 +107,8 @@ def read_opencv(path: Path) -> Calibration:
         name = next((name for name in names if name in data), None)
         if name is not None:
             found[key] = matrix(path, name, data[name])
+        elif "T_BS" in data:
+            raise InputError(f"{path}: is one of the two files of EuRoC; --calibration takes the folder with both")
         elif key in ("K1", "K2", "T"):
             known = "; ".join(" = ".join(names) for names in OPENCV_KEYS.values())
             raise InputError(f"{path}: key '{key}' is missing; known keys: {known}, image_width, image_height")
@@ -130,7 +132,10 @@ def read_euroc(folder: Path) -> Calibration:
         places.append(folder / f"{camera}_sensor.yaml")
         path = next((place for place in places if place.is_file()), None)
         if path is None:
-            raise InputError(f"{folder}: holds no calibration of {camera}; expected {' or '.join(map(str, places))}")
+            raise InputError(
+                f"{folder}: holds no calibration of {camera}; expected {' or '.join(map(str, places))}; a calibration "
+                "that is not EuRoC's is given as a file"
+            )
         data = read_yaml(path)
         for key in EUROC_KEYS:
             if key not in data:

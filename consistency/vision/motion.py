@@ -156,6 +156,11 @@ def motion_between(
     sigma0, sigma1 = (noise(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
     try:
         found = _estimated(rig, uv0, uv1, sigma0, sigma1, estimator, settings.gate, rng)
+    except ConsensusError:
+        raise ConsensusError(
+            f"{names[0]} to {names[1]}: too few of {len(rows)} matches through all four images agree on a motion; do "
+            "the pairs show the same scene, one soon after the other?"
+        ) from None
     except InputError as error:
         raise type(error)(f"{names[0]} to {names[1]}: {error}") from None
     if estimator == "reprojection" and found.chi2 > MISFIT * found.dof:

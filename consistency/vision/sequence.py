@@ -97,10 +97,6 @@ def read_sequence(
         home = folder
     else:
         files, t, home = _plain(folder, left, right), None, None
-    if kind == "opencv" and not any(files):
-        raise InputError(
-            f"{folder}: holds no images of a KITTI, EuRoC or plain layout (left and right, or --left, --right)"
-        )
     if calibration is None and home is None:
         raise InputError(f"{folder}: plain images need --calibration FILE, an OpenCV YAML or a KITTI calib.txt")
     _require_pairs(folder, files, t)
@@ -236,21 +232,28 @@ def _camera(folder: Path) -> dict[int, Path]:
 
 def _plain(folder: Path, left: str | None, right: str | None) -> tuple[list[Path], list[Path]]:
     """Images by pattern, paired in sorted order; names may differ between the cameras."""
-    named = False
+    given = left is not None and right is not None
     if left is None or right is None:
         folders = (folder / "left").is_dir() and (folder / "right").is_dir()
         left, right = ("left/*", "right/*") if folders else ("[lL]eft*", "[rR]ight*")
-        named = True
     try:
         sides = _images(folder, left), _images(folder, right)
     except (NotImplementedError, ValueError) as error:  # of pathlib
         raise InputError(f"--left {left}, --right {right}: must be patterns below {folder} ({error})") from None
+    if not any(sides) and given:
+        raise InputError(f"{folder}: no image is like '{left}' (--left) or '{right}' (--right)")
+    if not any(sides):
+        raise InputError(
+            f"{folder}: holds no stereo images of a known layout: {' or '.join(' and '.join(p) for p in KITTI_PAIRS)} "
+            "(KITTI), mav0 or cam0 and cam1 (EuRoC), left and right (plain); give the folder that holds these, or "
+            "--left and --right"
+        )
     if len(sides[0]) != len(sides[1]):
         raise InputError(
             f"{folder}: {len(sides[0])} images are like '{left}' but {len(sides[1])} like '{right}' (--left, --right)"
         )
     numbers = [[_number(path) for path in side] for side in sides]
-    if named and numbers[0] != numbers[1] and set(numbers[0]) & set(numbers[1]):
+    if not given and numbers[0] != numbers[1] and set(numbers[0]) & set(numbers[1]):
         k = next(k for k, (a, b) in enumerate(zip(*numbers, strict=True)) if a != b)
         raise InputError(f"{sides[0][k]} and {sides[1][k].name} would be a pair, but their numbers differ")
     return sides

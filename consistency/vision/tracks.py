@@ -81,7 +81,9 @@ def thinned(rows: pd.DataFrame, rule: Selection) -> pd.DataFrame:
             started += 1
         picked += [(row_of[piece, step], landmark) for piece, landmark, _ in alive]
     if not picked:
-        raise InputError("the recording holds no track that could be used")
+        raise InputError(
+            f"the recording holds no track that could be used: {rule.min_life} observations in a row after step 0"
+        )
     index, landmark = np.array(picked).T
     table: pd.DataFrame = rows.iloc[index].assign(landmark=landmark)
     return table[["step", "landmark", *PIXELS]].reset_index(drop=True)

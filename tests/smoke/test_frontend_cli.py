@@ -54,6 +54,9 @@ def test_a_log_is_not_overwritten_by_accident(folder: Path) -> None:
         (("images", "--sigma-per-scale", "0"), "sigma_per_scale: 0.0, must be a positive number"),
         (("images", "--max-landmarks", "0"), "--max-landmarks 0: must be at least 1"),
         (("images", "--truth", "none.txt"), "--truth none.txt: no such file"),
+        (("images", "--seed", "-1"), "--seed -1: must not be negative"),
+        ((".",), ".: holds no stereo images of a known layout"),
+        (("images", "--left", "a*", "--right", "b*"), "no image is like 'a*' (--left) or 'b*' (--right)"),
         (("images", "--lever", "nan"), "--lever nan: must be a finite number"),
         (("images", "--seed", "-1"), "--seed -1: must not be negative"),
     ],
@@ -63,3 +66,14 @@ def test_bad_input(folder: Path, arguments: tuple[str, ...], said: str) -> None:
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) <= 2
     assert not (folder / "other").exists()
+
+
+def test_two_pairs_make_no_log(folder: Path) -> None:
+    scene.write_kitti(folder / "short", scene.drive(2), scene.texture(np.random.default_rng(0)))
+    done = consistency("frontend", "short", "--out", "other", cwd=folder, status=2)
+    assert "short: holds 2 stereo pairs; a log takes at least 3" in done.stderr
+
+
+def test_images_are_no_log(folder: Path) -> None:
+    done = consistency("run", "--log", "images", "--filter", "ekf-uvd", "--out", "other", cwd=folder, status=2)
+    assert "images/sensor.toml: missing; 'consistency frontend' makes" in done.stderr

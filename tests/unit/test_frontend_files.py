@@ -157,6 +157,13 @@ def test_unusable_opencv_calibration(tmp_path: Path, changes: dict[str, object],
         rectify(read_calibration(path), SIZE)
 
 
+def test_one_file_of_euroc(tmp_path: Path) -> None:
+    path = tmp_path / "sensor.yaml"
+    path.write_text("T_BS: [1]\nintrinsics: [1, 1, 1, 1]\n")
+    with pytest.raises(cs.InputError, match="is one of the two files of EuRoC; --calibration takes the folder"):
+        read_calibration(path)
+
+
 @pytest.mark.parametrize(("text", "said"), [("a: [1", "cannot be read as YAML"), ("- 1", "no 'key: value'")])
 def test_a_file_that_is_no_yaml(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "stereo.yaml"
@@ -235,7 +242,9 @@ def damaged(change: Callable[[Path], object], said: str) -> tuple[Callable[[Path
         damaged(lambda f: (f / "times.txt").write_text("0\n0.2\n0.1\n"), "not increasing"),
         damaged(lambda f: (f / "times.txt").write_text("a b\n"), "one time in seconds a line"),
         damaged(lambda f: (f / "calib.txt").unlink(), "calib.txt: no such file"),
-        damaged(lambda f: (f / "image_0").rename(f / "imagex"), "holds no images of a KITTI, EuRoC or plain layout"),
+        damaged(lambda f: (f / "image_0").rename(f / "imagex"), "holds no stereo images of a known layout: image_0"),
+        damaged(lambda f: [p.rename(f / s) for p, s in zip(sorted(f.glob("image*")), ("left", "right"), strict=True)],
+                "need --calibration"),
     ],
 )  # fmt: skip
 def test_unusable_folder(kitti: Path, change: Callable[[Path], object], said: str) -> None:

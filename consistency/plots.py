@@ -35,6 +35,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 NARROWEST = 0.15  # span of one axis of a map over that of the other, at least: room for the tick labels
 BESIDE = 0.66  # of the figure's width is left of a legend that stands beside the axes
 AXES = (("x", "m"), ("y", "m"), ("heading", "deg"))
+PERCENT = 100.0
 Interval = tuple[float, float, float]  # value, low, high; the ends may be infinite
 
 
@@ -50,6 +51,9 @@ class Style:
     def linestyle(self) -> Any:
         """The dash pattern as Matplotlib takes it."""
         return (0.0, self.dash) if self.dash else "-"
+
+
+ACCEPTED, REJECTED = Style(COLOURS[0], (), "o"), Style(COLOURS[1], (), "X")
 
 
 def style(index: int) -> Style:
@@ -227,6 +231,36 @@ def samples(axes: Axes, points: Array, linear: Array, fitted: Array) -> None:
     axes.plot(*linear.T, color=COLOURS[0], linewidth=1.4)
     axes.plot(*fitted.T, color=COLOURS[1], linewidth=1.4, dashes=DASHES[1])
     axes.set(xlabel="x (m)", ylabel="y (m)")
+    _frame(axes)
+
+
+def shares(axes: Axes, x: Array, share: Array, expected: float, accepted: tuple[float, float]) -> None:
+    """Shares (n,) in % with the expected one and the range that a test accepts (shaded).
+
+    As Valencia & Andrade-Cetto (2018) fig. 2.2, which is one repetition.
+    """
+    axes.axhspan(PERCENT * accepted[0], PERCENT * accepted[1], color=BAND, linewidth=0, zorder=0)
+    axes.axhline(PERCENT * expected, color="#555555", linewidth=0.8, zorder=1)
+    axes.plot(x, PERCENT * share, "-o", color=COLOURS[0], linewidth=1.2, markersize=4.2, zorder=3)
+    axes.set(xlabel="depth (m)", ylabel="inside the 95 % region (%)")
+    _frame(axes)
+
+
+def cells(axes: Axes, ratio: Array, nees: Array, accepted: Array, holds: float) -> None:
+    """NEES over its degrees of freedom against the noise of the disparity, both (n,), on log axes; 1 is right.
+
+    ``accepted`` (n,) says of each cell whether its verdict is consistent; up to ``holds`` it should be.
+    """
+    axes.axhline(1.0, color="#555555", linewidth=0.8, zorder=1)
+    axes.axvline(PERCENT * holds, color="#333333", linewidth=0.9, dashes=(4, 3), zorder=1)
+    for look, chosen in ((ACCEPTED, accepted), (REJECTED, ~accepted)):
+        axes.plot(
+            PERCENT * ratio[chosen], nees[chosen], look.marker, color=look.colour, markersize=4.2, markeredgewidth=0,
+            alpha=0.8, zorder=3,
+        )  # fmt: skip
+    axes.set(xscale="log", xlabel="noise / disparity (%)", ylabel="mean NEES / dof")
+    _plain_numbers(axes.xaxis, *axes.get_xlim())
+    _log_scale(axes)
     _frame(axes)
 
 

@@ -83,7 +83,11 @@ def figure_22(study: cs.Study) -> cs.Finding:
         total = cs.nees(points - p, triangulation_covariance(rig, uv, S_uv)[0]).sum(axis=1)
         rows.append((depth, disparity_noise(rig, depth, NOISE), *shares(total, 3 * SAMPLES_22)))
     table = pd.DataFrame(rows, columns=["depth", "ratio", "mean", "inside", "p_value"])
-    study.tables["frontend_fig22"] = table
+    low, high = accepted_counts(REPETITIONS)
+    study.tables["frontend_fig22"] = table.assign(
+        noise=NOISE, samples=SAMPLES_22, repetitions=REPETITIONS, share=table["inside"] / REPETITIONS, expected=REGION,
+        low=low / REPETITIONS, high=high / REPETITIONS, false_alarm=LEVEL,
+    )  # fmt: skip
     ours = table[table["depth"] == POINT[2]].iloc[0]
     others = "; ".join(f"{z:g} m {n / REPETITIONS:.1%}" for z, n in zip(table["depth"], table["inside"], strict=True))
     return study.finding(
@@ -105,13 +109,13 @@ def figure_23(study: cs.Study) -> list[cs.Finding]:
     """100 points a scene, 1,000 samples a repetition; and other depths and noises."""
     total = poses_nees(generator(study, 23), FAR, NOISE, REPETITIONS)
     mean, inside, p_value = shares(total, 6 * SAMPLES_23)
-    rows = [(FAR, NOISE, REPETITIONS, mean, inside, p_value)]
+    low, high = middle(total)
+    rows = [(FAR, NOISE, REPETITIONS, mean, inside, p_value, low, high)]
     for number, (far, noise) in enumerate(OTHERS):
         other = poses_nees(generator(study, 23, number), far, noise, FEWER)
-        rows.append((far, noise, FEWER, *shares(other, 6 * SAMPLES_23)))
-    table = pd.DataFrame(rows, columns=["far", "noise", "repetitions", "mean", "inside", "p_value"])
-    study.tables["frontend_fig23"] = table
-    low, high = np.quantile(total, [0.025, 0.975])
+        rows.append((far, noise, FEWER, *shares(other, 6 * SAMPLES_23), *middle(other)))
+    columns = ["far", "noise", "repetitions", "mean", "inside", "p_value", "least", "most"]
+    study.tables["frontend_fig23"] = scenes_table(pd.DataFrame(rows, columns=columns))
     value = study.finding(
         bool(low <= VALUE_23 <= high and inside > REPETITIONS / 2),
         scenario="none",
@@ -161,6 +165,17 @@ def pose_nees(rng: np.random.Generator, far: float, noise: float, chunk: int = 1
     return total
 
 
+def scenes_table(table: pd.DataFrame) -> pd.DataFrame:
+    """The scenes with what a report says of them; ratios are over the degrees of freedom."""
+    dof = 6 * SAMPLES_23
+    low, high = region(dof, REGION)
+    return table.assign(
+        near=NEAR, points=POINTS_23, samples=SAMPLES_23, dof=dof, ratio=table["mean"] / dof,
+        ratio_least=table["least"] / dof, ratio_most=table["most"] / dof, region_low=low / dof, region_high=high / dof,
+        confidence=REGION,
+    )  # fmt: skip
+
+
 def region(dof: int, confidence: float) -> tuple[float, float]:
     low, high = chi2_mean_interval(dof, confidence)
     return dof * low, dof * high
@@ -171,6 +186,19 @@ def shares(total: Array, dof: int) -> tuple[float, int, float]:
     low, high = region(dof, REGION)
     inside = int(((total >= low) & (total <= high)).sum())
     return float(total.mean()), inside, float(stats.binomtest(inside, len(total), REGION).pvalue)
+
+
+def middle(total: Array) -> tuple[float, float]:
+    """Between which 95 % of the repetitions are."""
+    low, high = np.quantile(total, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def accepted_counts(repetitions: int) -> tuple[int, int]:
+    """Least and greatest number of repetitions inside the region that the rule accepts."""
+    counts = range(repetitions + 1)
+    accepted = [count for count in counts if stats.binomtest(count, repetitions, REGION).pvalue > LEVEL]
+    return accepted[0], accepted[-1]
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
         measured = [triangulated(rng, rig, depth, noise), *registered(rng, rig, place)]
         rows += [place | errors.row() for errors in measured]
     table = pd.DataFrame(rows)
-    study.tables["first_order"] = table
+    study.tables["first_order"] = table.assign(runs=RUNS, points=POINTS, false_alarm=ALARM, holds=HOLDS)
     return [described(study, name, table[table["estimator"] == name]) for name in ("triangulation", *ROUTES)]
 
 
@@ -70,8 +70,10 @@ class Errors:
         verdict = judge(
             self.name, self.error[:, None], self.covariance[:, None], failures=self.failures, false_alarm=ALARM
         )
+        dof = self.error.shape[1]
         return {
             "estimator": self.name, "status": verdict.status, "mean_nees": verdict.statistic,
+            "dof": dof, "nees_ratio": verdict.statistic / dof,
             "inflation": verdict.inflation, "faults": ", ".join(verdict.faults), "failed": len(self.failures),
         }  # fmt: skip
 

@@ -16,6 +16,7 @@ from consistency.models.motion import dead_reckoning
 from consistency.reporting.calibration import calibration
 from consistency.reporting.distributions import distributions
 from consistency.reporting.model import Report, Study, Track
+from consistency.reporting.stereo import front_end
 from consistency.reporting.wording import answer, number
 from consistency.results import read_results
 from consistency.scenario import Scenario
@@ -49,7 +50,7 @@ def build_report(folder: Path) -> Report:
     name = "reproduction" if "studies" in manifest else studies[0].name
     return Report(
         f"Filter consistency: {name}", answer(studies, findings), studies, findings,
-        distributions(folder / "fig12.parquet"), calibration(), provenance,
+        distributions(folder / "fig12.parquet"), front_end(folder), calibration(), provenance,
     )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from consistency.reporting.calibration import Calibration
 from consistency.reporting.diagnosis import forests, lags
-from consistency.reporting.model import Distribution, Report, Study, Track
+from consistency.reporting.model import Distribution, FirstOrder, Report, Scenes, Shares, Study, Track
 from consistency.reporting.wording import FOUND, NOT_ASKED, NOT_FOUND, listed
 
 
@@ -95,6 +95,45 @@ def distribution_caption(d: Distribution) -> str:
         f"Baseline {d.baseline:g} m: {d.samples} samples of eq. 21 within the search range, for a point at x = 10 m, "
         f"y = 1 m ({len(d.points)} drawn). Standard deviation of x: {linear:.2f} m linearised, {fitted:.2f} m from the "
         f"samples' moments; mean {d.fitted.mean[0]:.2f} m.{beyond} Ellipses at 2 sigma."
+    )
+
+
+def shares_caption(found: Shares) -> str:
+    """What the figure of shares by depth shows."""
+    return (
+        f"Share of {found.repetitions} repetitions whose N times mean NEES lies inside the 95 % region, by depth of "
+        f"the triangulated point: {found.samples} noisy matches ({found.noise:g} px) a repetition, as Valencia & "
+        "Andrade-Cetto (2018) fig. 2.2, which shows one repetition and no depth. A right covariance is at "
+        f"{100 * found.expected:g} % (line). Shaded: shares that the binomial test accepts; it rejects a right "
+        f"covariance at one depth with probability {100 * found.false_alarm:g} % at most."
+    )
+
+
+def scenes_caption(found: Scenes) -> str:
+    """What the figure of scenes shows."""
+    percent = f"{100 * found.confidence:g} %"
+    return (
+        f"N times the mean NEES of {found.samples} registrations (SVD) of {found.points} points over the {found.dof} "
+        "that is expected, by the scene's greatest depth and the noise, in brackets the number of repetitions; as "
+        f"Valencia & Andrade-Cetto (2018) fig. 2.3. Scenes begin at {found.near:g} m. Dot: mean of the repetitions; "
+        "bar: their middle 95 %. "
+        f"Shaded: the {percent} region of one repetition, which a right covariance leaves in "
+        f"{100 * (1 - found.confidence):.2g} % of them. Above 1 is overconfident."
+    )
+
+
+def first_order_caption(found: FirstOrder) -> str:
+    """What the map of cells shows."""
+    lost = sum(int(np.isnan(cells.nees).sum()) for cells in found.estimators)
+    note = f" Cells without a run that is left, not drawn: {lost}." if lost else ""
+    return (
+        "Where the first-order covariance breaks: mean NEES over its degrees of freedom against the standard deviation "
+        "of the disparity over the disparity, log axes; a cell is one depth, baseline and pixel noise, with "
+        f"{found.runs} runs ({found.points} points a registration, one a triangulation; {found.failed} runs failed in "
+        "all). Accepted: the referee calls the errors consistent. It rejects a right covariance in a cell with "
+        f"probability {100 * found.false_alarm:g} % at most, and a wrong one also for what the mean does not show, "
+        f"such as bias or outliers. First order is asked to hold up to {100 * found.holds:g} % (dashed). Source: this "
+        f"project, beyond Valencia & Andrade-Cetto (2018) sec. 2.3.3.{note}"
     )
 
 

@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 from scipy import stats
 
-from consistency.errors import InputError
 from consistency.models.stereo import project, triangulate_jacobian
 from consistency.reporting.model import Distribution
+from consistency.reporting.tables import extra_table
 from consistency.types import Array, Gaussian
 
 POINT, FOCAL = (10.0, 1.0), 150.0  # m, px: Herath et al. (2007) sec. 4.5
@@ -29,15 +27,11 @@ def distributions(path: Path) -> tuple[Distribution, ...]:
     InputError
         The file is damaged or lacks a column.
     """
-    if not path.exists():
+    table = extra_table(path, COLUMNS)
+    if table is None:
         return ()
-    try:
-        table = pq.read_table(path).to_pandas()
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}: cannot be read, damaged or cut short ({str(error).splitlines()[0]})") from None
-    if missing := [column for column in COLUMNS if column not in table.columns]:
-        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(COLUMNS)}")
-    return tuple(_distribution(float(baseline), part) for baseline, part in table.groupby("baseline", sort=True))
+    parts = (part for _, part in table.groupby("baseline", sort=True))
+    return tuple(_distribution(float(part["baseline"].iloc[0]), part) for part in parts)
 
 
 def _distribution(baseline: float, table: pd.DataFrame) -> Distribution:

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 
 from consistency import plots
 from consistency.reporting import diagnosis
-from consistency.reporting.model import Distribution, Study
+from consistency.reporting.model import Distribution, FirstOrder, Scenes, Shares, Study
 from consistency.reporting.thin import thin
 
 WIDTH = 6.7  # inches, the text width of the page
@@ -204,4 +204,64 @@ def distribution(d: Distribution) -> Figure:
             ),
         ],
     )
+    return figure
+
+
+def shares(found: Shares) -> Figure:
+    """Share of repetitions inside the 95 % region by depth."""
+    figure, axes = _figure(2.0)
+    plots.shares(axes[0, 0], found.depth, found.share, found.expected, found.accepted)
+    axes[0, 0].set_xlim(0, None)
+    _key(
+        figure,
+        [
+            ("measured", Line2D([], [], color=plots.COLOURS[0], marker="o", markersize=4.2, linewidth=1.2)),
+            ("95 %", Line2D([], [], color="#555555", linewidth=0.8)),
+            ("accepted by the test", Patch(color=plots.BAND)),
+        ],
+    )
+    return figure
+
+
+def scenes(found: Scenes) -> Figure:
+    """Mean NEES over what is expected, a row for each scene."""
+    figure, axes = _figure(0.55 + 0.22 * len(found.scenes))
+    panel, look = axes[0, 0], plots.style(0)
+    panel.axvspan(*found.region, color=plots.BAND, linewidth=0, zorder=0.5)
+    rows = [(scene.label, [(scene.ratio, *scene.spread)]) for scene in found.scenes]
+    plots.forest(panel, [look], rows, 1.0, found.window)
+    panel.set(xlabel=f"N times mean NEES / {found.dof}")
+    _key(
+        figure,
+        [
+            ("mean, middle 95 %", Line2D([], [], color=look.colour, marker="o", markersize=4.2, linewidth=1.3)),
+            ("expected", Line2D([], [], color="#555555", linewidth=0.8)),
+            ("95 % region of one", Patch(color=plots.BAND)),
+        ],
+    )
+    return figure
+
+
+def first_order(found: FirstOrder) -> Figure:
+    """Cells of every estimator on the same axes, a panel each."""
+    rows = -(-len(found.estimators) // 3)
+    figure, axes = _figure(0.3 + 1.6 * rows, rows, 3, sharex=True, sharey=True)
+    for panel, of in zip(axes.flat, found.estimators, strict=False):
+        plots.cells(panel, of.ratio, of.nees, of.accepted, found.holds)
+        plots.title(panel, of.title)
+        panel.label_outer()
+    for panel in axes.flat[len(found.estimators) :]:
+        panel.set_axis_off()
+    for panel in axes.flat[max(len(found.estimators) - 3, 0) : len(found.estimators)]:
+        panel.tick_params(labelbottom=True)
+    marks = {"accepted": plots.ACCEPTED, "rejected": plots.REJECTED}
+    entries: list[tuple[str, Any]] = [
+        (name, Line2D([], [], linestyle="", marker=look.marker, color=look.colour, markersize=5, markeredgewidth=0))
+        for name, look in marks.items()
+    ]
+    entries += [
+        ("expected", Line2D([], [], color="#555555", linewidth=0.8)),
+        ("rule: up to here", Line2D([], [], color="#333333", linewidth=0.9, dashes=(4, 3))),
+    ]
+    _key(figure, entries)
     return figure

@@ -98,6 +98,94 @@ class Distribution:
 
 
 @dataclass(frozen=True)
+class Shares:
+    """Repetitions inside the 95 % region against depth, as Valencia & Andrade-Cetto (2018) fig. 2.2; n depths."""
+
+    depth: Array  # (n,), m
+    share: Array  # (n,), of the repetitions
+    expected: float
+    accepted: tuple[float, float]  # least and greatest share that the binomial test accepts
+    false_alarm: float  # of that test at one depth
+    noise: float  # px
+    samples: int  # of a repetition
+    repetitions: int
+
+
+@dataclass(frozen=True)
+class Scene:
+    """N times the mean NEES of one scene over its degrees of freedom, as Valencia & Andrade-Cetto (2018) fig. 2.3."""
+
+    far: float  # m
+    noise: float  # px
+    repetitions: int
+    ratio: float  # mean of the repetitions; 1 is right
+    spread: tuple[float, float]  # of the middle 95 % of the repetitions
+
+    @property
+    def label(self) -> str:
+        """Depth, noise and number of repetitions."""
+        return f"{self.far:g} m, {self.noise:g} px ({self.repetitions}×)"
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """All scenes, and what is the same in them."""
+
+    scenes: tuple[Scene, ...]
+    region: tuple[float, float]  # where one repetition lies, of the degrees of freedom
+    confidence: float  # of the region
+    near: float  # m
+    points: int
+    samples: int  # of a repetition
+    dof: int
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """Drawn range: all values, the region and some room."""
+        ends = [end for scene in self.scenes for end in (scene.ratio, *scene.spread)]
+        return min(self.region[0], *ends) - 0.03, max(self.region[1], *ends) + 0.03
+
+
+@dataclass(frozen=True)
+class Cells:
+    """One estimator over n cells of depth, baseline and pixel noise."""
+
+    estimator: str
+    ratio: Array  # (n,), noise of the disparity over the disparity
+    nees: Array  # (n,), mean NEES over its degrees of freedom, NaN where no run was left
+    accepted: Array  # (n,), bool: the verdict is consistent
+
+    @property
+    def title(self) -> str:
+        """Name, and how many cells are accepted."""
+        return f"{self.estimator}: {int(self.accepted.sum())} of {len(self.accepted)} accepted"
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """Where first order breaks, estimator by estimator."""
+
+    estimators: tuple[Cells, ...]
+    runs: int  # of a cell
+    failed: int  # of all runs of all cells
+    points: int  # of a registration
+    false_alarm: float  # of a verdict
+    holds: float  # noise over disparity up to which first order is asked to hold
+
+
+@dataclass(frozen=True)
+class FrontEnd:
+    """What was measured of the stereo front-end on synthetic matches; None where a table is not there."""
+
+    shares: Shares | None
+    scenes: Scenes | None
+    first_order: FirstOrder | None
+
+    def __bool__(self) -> bool:
+        return any(part is not None for part in (self.shares, self.scenes, self.first_order))
+
+
+@dataclass(frozen=True)
 class Report:
     """All of it."""
 
@@ -106,6 +194,7 @@ class Report:
     studies: tuple[Study, ...]
     findings: tuple[dict[str, Any], ...]
     distributions: tuple[Distribution, ...]
+    front_end: FrontEnd
     calibration: Calibration | None
     provenance: tuple[tuple[str, str], ...]
 

@@ -17,13 +17,13 @@ import matplotlib as mpl
 import typst
 
 from consistency.reporting import captions, diagnosis, figures, wording
-from consistency.reporting.model import Report, Study
+from consistency.reporting.model import FrontEnd, Report, Study
 
 TEMPLATE = "report.typ"
 SHORT = 4000  # characters of settings that surely fit on one page
 FILES = ("image", "images")  # keys of file names
 Save = Callable[[str, Any], str]  # name, figure -> file name
-LONG_WORD = re.compile(r"[^\s\u200b]{14}")
+LONG_WORD = re.compile(r"[^\s\u200b]{1,13}-(?=[^\W\d])|[^\s\u200b]{14}")  # at a hyphen within reach, else anywhere
 
 
 def render_pdf(report: Report) -> bytes:
@@ -37,6 +37,7 @@ def render_pdf(report: Report) -> bytes:
             "studies": [_study(study, f"s{i}", folder) for i, study in enumerate(report.studies)],
             "findings": [{key: str(value) for key, value in finding.items()} for finding in report.findings],
             "distributions": [_distribution(d, f"d{i}", folder) for i, d in enumerate(report.distributions)],
+            "front_end": _front_end(report.front_end, folder),
             "calibration": _calibration(report),
             "provenance": [list(row) for row in report.provenance],
         }
@@ -111,6 +112,17 @@ def _distribution(distribution: Any, prefix: str, folder: Path) -> dict[str, str
     return {"image": image, "caption": captions.distribution_caption(distribution)}
 
 
+def _front_end(found: FrontEnd, folder: Path) -> list[dict[str, str]]:
+    shown = []
+    if found.shares is not None:
+        shown.append(("shares", figures.shares(found.shares), captions.shares_caption(found.shares)))
+    if found.scenes is not None:
+        shown.append(("scenes", figures.scenes(found.scenes), captions.scenes_caption(found.scenes)))
+    if (cells := found.first_order) is not None:
+        shown.append(("first-order", figures.first_order(cells), captions.first_order_caption(cells)))
+    return [{"image": _svg(figure, folder / f"{name}.svg"), "caption": caption} for name, figure, caption in shown]
+
+
 def _svg(figure: Any, path: Path) -> str:
     buffer = BytesIO()
     with warnings.catch_warnings():
@@ -122,12 +134,14 @@ def _svg(figure: Any, path: Path) -> str:
 
 
 def _soft(value: Any) -> Any:
-    """The same data with room to break inside long words, so that nothing runs over an edge."""
+    """The same data with room to break inside long words and none before %, so that nothing runs over an edge."""
     if isinstance(value, dict):
         return {key: item if key in FILES else _soft(item) for key, item in value.items()}
     if isinstance(value, list):
         return [_soft(item) for item in value]
-    return LONG_WORD.sub(lambda match: match.group() + "\u200b", value) if isinstance(value, str) else value
+    if not isinstance(value, str):
+        return value
+    return LONG_WORD.sub(lambda match: match.group() + "\u200b", value.replace(" %", "\u00a0%"))
 
 
 def _settings(resolved: dict[str, Any]) -> list[list[str]]:

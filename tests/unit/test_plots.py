@@ -156,3 +156,21 @@ def test_other_figures_draw_what_they_are_given(axes):
     plots.marginal(panels[1], np.arange(4.0), np.ones(3), STEPS, STEPS / 5, STEPS / 6)
     assert [len(panel.lines) for panel in panels] == [3, 2]
     assert all(isinstance(line, Line2D) for line in panels[0].lines)
+
+
+def test_cells_differ_by_marker_and_colour(axes):
+    ratio, nees, accepted = np.array([0.01, 0.1, 0.5]), np.array([1.0, 1.1, 9.0]), np.array([True, True, False])
+    plots.cells(axes, ratio, nees, accepted, holds=0.05)
+    found = {line.get_marker(): line for line in axes.lines if line.get_marker() != "None"}
+    np.testing.assert_array_equal(found[plots.ACCEPTED.marker].get_ydata(), [1.0, 1.1])
+    np.testing.assert_allclose(found[plots.REJECTED.marker].get_xdata(), [50.0])
+    assert len({line.get_color() for line in found.values()}) == 2
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+
+
+def test_shares_are_drawn_with_the_range_that_is_accepted(axes):
+    plots.shares(axes, STEPS, np.full(5, 0.9), 0.95, (0.91, 0.985))
+    band = axes.patches[0].get_extents().transformed(axes.transData.inverted())
+    np.testing.assert_allclose([band.y0, band.y1], [91.0, 98.5])
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), 95.0)
+    np.testing.assert_allclose(axes.lines[1].get_ydata(), 90.0)

@@ -455,6 +455,116 @@ def test_damaged_distributions_are_named(results, tmp_path):
         build_report(folder)
 
 
+def front_end_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Small tables as the experiments on the stereo front-end write them."""
+    tables = {
+        "frontend_fig22": pd.DataFrame({"depth": [4.0, 2.0], "share": [0.8, 0.95]}).assign(
+            expected=0.95, low=0.9, high=0.985, false_alarm=0.01, noise=2.0, samples=300, repetitions=200
+        ),
+        "frontend_fig23": pd.DataFrame(
+            {
+                "far": [3.0, 6.0], "noise": [2.0, 0.5], "repetitions": [200, 12], "ratio": [1.01, 1.2],
+                "ratio_least": [0.97, 1.1], "ratio_most": [1.05, 1.3],
+            }
+        ).assign(region_low=0.96, region_high=1.04, confidence=0.95, near=1.5, points=100, samples=1000, dof=6000),
+        "first_order": pd.DataFrame(
+            {
+                "estimator": ["svd", "$x$ <b>", "svd"], "status": ["consistent", "failed", "overconfident"],
+                "ratio": [0.01, 0.5, 0.3], "nees_ratio": [1.02, np.nan, 7.0], "failed": [0, 80, 3],
+            }
+        ).assign(runs=80, points=30, false_alarm=1e-3, holds=0.05),
+    }  # fmt: skip
+    for name, table in tables.items():
+        table.to_parquet(folder / f"{name}.parquet")
+    return tables
+
+
+def test_the_front_end_is_what_its_tables_hold(results, tmp_path):
+    folder = reproduction(results, tmp_path / "all")
+    front_end_tables(folder)
+    report = build_report(folder)
+    shares, scenes, cells = report.front_end.shares, report.front_end.scenes, report.front_end.first_order
+    np.testing.assert_array_equal(shares.depth, [2.0, 4.0])
+    np.testing.assert_array_equal(shares.share, [0.95, 0.8])
+    assert shares.accepted == (0.9, 0.985)
+    assert [(scene.far, scene.noise, scene.ratio) for scene in scenes.scenes] == [(3.0, 2.0, 1.01), (6.0, 0.5, 1.2)]
+    assert scenes.window[0] < 0.96 < 1.3 < scenes.window[1]
+    svd, odd = cells.estimators
+    assert (svd.title, odd.title) == ("svd: 1 of 2 accepted", "$x$ <b>: 0 of 1 accepted")
+    np.testing.assert_array_equal(svd.nees, [1.02, 7.0])
+    assert cells.failed == 83
+    text = "".join(Page(html.render_html(report)).text)
+    for caption in (
+        captions.shares_caption(shares), captions.scenes_caption(scenes), captions.first_order_caption(cells)
+    ):  # fmt: skip
+        assert caption in text
+    assert "Cells without a run that is left, not drawn: 1." in text
+    assert "probability 0.1 % at most" in text
+    assert "$x$ <b>: 0 of 1 accepted" in text
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("alone", ["frontend_fig22", "frontend_fig23", "first_order"])
+def test_a_table_of_the_front_end_alone(results, tmp_path, alone):
+    folder = reproduction(results, tmp_path / "all")
+    for name in set(front_end_tables(folder)) - {alone}:
+        (folder / f"{name}.parquet").unlink()
+    report = build_report(folder)
+    assert 'id="front-end"' in html.render_html(report)
+    assert len(pdf._front_end(report.front_end, tmp_path)) == 1
+
+
+def test_without_its_tables_there_is_no_front_end(results, tmp_path):
+    report = build_report(reproduction(results, tmp_path / "all"))
+    assert not report.front_end
+    assert "front-end" not in html.render_html(report)
+    assert pdf._front_end(report.front_end, tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["frontend_fig22", "frontend_fig23", "first_order"])
+def test_damaged_tables_of_the_front_end_are_named(results, tmp_path, name):
+    folder = reproduction(results, tmp_path / "all")
+    table, path = front_end_tables(folder)[name], folder / f"{name}.parquet"
+    damaged = {
+        "column 'noise' is missing" if name != "first_order" else "column 'status' is missing": table.drop(
+            columns="noise" if name != "first_order" else "status"
+        ),
+        "has no rows": table.iloc[:0],
+        rf"column '{table.columns[-1]}', row 0: not a finite number \(much\)": table.assign(
+            **{table.columns[-1]: "much"}
+        ),
+    }
+    for message, content in damaged.items():
+        content.to_parquet(path)
+        with pytest.raises(cs.InputError, match=rf"{name}\.parquet: {message}"):
+            build_report(folder)
+    path.write_bytes(b"PAR1")
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read"):
+        build_report(folder)
+
+
+@pytest.mark.parametrize(("value", "message"), [(0.0, "not above zero"), (np.inf, "not a finite number")])
+def test_cells_that_no_log_axis_shows_are_refused(results, tmp_path, value, message):
+    folder = reproduction(results, tmp_path / "all")
+    table = front_end_tables(folder)["first_order"]
+    table.assign(nees_ratio=[1.0, 1.0, value]).to_parquet(folder / "first_order.parquet")
+    with pytest.raises(cs.InputError, match=rf"first_order\.parquet: column 'nees_ratio', row 2: {message}"):
+        build_report(folder)
+
+
+@pytest.mark.parametrize(
+    ("word", "pieces"),
+    [
+        ("first-order-reprojection", ["first-order-", "reprojection"]),
+        ("frontend-fig2.2", ["frontend-", "fig2.2"]),
+        (30 * "x", [14 * "x", 14 * "x", "xx"]),
+        ("x = -0.5e-6 2-2", ["x = -0.5e-6 2-2"]),
+    ],
+)
+def test_long_words_break_at_hyphens(word, pieces):
+    assert pdf._soft([{"id": word}])[0]["id"].split("\u200b") == pieces
+
+
 def test_a_log_without_truth_says_so(uvd, tmp_path):
     simulate_log(uvd, 1, 0, tmp_path / "log")
     for name in ("truth", "landmarks"):

@@ -9,8 +9,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import consistency as cs
+from consistency.reporting.build import build_report
 from consistency.vision import RelativePose
 from consistency.vision.synthetic import MOTION, SIZE, common_points, disparity_noise, published_rig
 
@@ -48,6 +50,10 @@ def test_figures(figures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     found = {finding.id: finding for finding in (figures.figure_22(study), *figures.figure_23(study))}
     assert set(found) < set(figures.FINDINGS)
     assert {"frontend_fig22", "frontend_fig23"} <= set(study.tables)
+    scenes = study.tables["frontend_fig23"]
+    np.testing.assert_allclose(scenes["ratio"], scenes["mean"] / 600)
+    assert (scenes["ratio_least"] <= scenes["ratio"]).all()
+    assert (scenes["ratio"] <= scenes["ratio_most"]).all()
     again = cs.Study(seed=3)
     assert figures.figure_22(again).measured == found["frontend-fig2.2"].measured
     monkeypatch.setattr(figures, "INTERVAL_22", (818.8, 985.0))
@@ -69,6 +75,27 @@ def test_map(first_order: ModuleType) -> None:
     assert [finding.id for finding in findings] == list(first_order.FINDINGS)
     assert study.tables["first_order"]["estimator"].nunique() == 5
     assert study.tables["first_order"]["mean_nees"].between(0.5, 30).all()
+    assert study.tables["first_order"]["nees_ratio"].between(0.2, 5).all()
+    assert study.tables["first_order"].groupby("estimator")["dof"].first().to_dict() == {
+        "triangulation": 3, "svd": 6, "horn": 6, "weighted": 6, "reprojection": 6,
+    }  # fmt: skip
+
+
+def test_the_drawn_band_is_the_rule(figures: ModuleType) -> None:
+    """Counts at its ends are accepted by the binomial test, those beside them are not."""
+    low, high = figures.accepted_counts(200)
+    p = [stats.binomtest(count, 200, figures.REGION).pvalue for count in (low - 1, low, high, high + 1)]
+    assert [value > figures.LEVEL for value in p] == [False, True, True, False]
+
+
+@pytest.mark.parametrize("name", ["e10", "e12"])
+def test_the_report_shows_the_tables(name: str, figures: ModuleType, first_order: ModuleType, tmp_path: Path) -> None:
+    study = cs.Study(seed=3)
+    found = figures.main(study) if name == "e10" else first_order.main(study)
+    study.write(tmp_path / "out", found, 1.0)
+    report = build_report(tmp_path / "out")
+    assert (report.front_end.shares is not None) == (report.front_end.scenes is not None) == (name == "e10")
+    assert (report.front_end.first_order is not None) == (name == "e12")
 
 
 def test_points_that_all_images_see(rng: np.random.Generator) -> None:

@@ -58,6 +58,8 @@ def curves(results: Tables, filter_name: str) -> Curves:
     nees = np.full(pose.shape[:2], np.nan) if results.has_truth else None
     t = np.full(steps, np.nan)
     for batch in results.batches("estimates", NUMBERS, filter_name):
+        if (batch["step"] < 1).any():
+            raise InputError(f"estimates of '{filter_name}': column 'step' must be at least 1")
         at = np.searchsorted(runs, batch["run"]), batch["step"] - 1
         for i, axis in enumerate(POSE):
             pose[*at, i] = batch[axis]

@@ -49,7 +49,7 @@ def run_trials(
 @overload
 def run_trials(
     scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
-    timeout: float | None = ..., previous: Tables | None = ..., *, out: Path, overwrite: bool = ...,
+    timeout: float | None = ..., previous: Tables | None = ..., *, out: str | Path, overwrite: bool = ...,
 ) -> StoredResults: ...
 # fmt: on
 def run_trials(
@@ -60,7 +60,7 @@ def run_trials(
     jobs: int = -1,
     timeout: float | None = None,
     previous: Tables | None = None,
-    out: Path | None = None,
+    out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Results | StoredResults:
     """Simulate ``runs`` trials of ``scenario`` and put each through every filter.
@@ -98,7 +98,7 @@ def run_trials(
     todo = [run for run in range(runs) if run not in done]
     work = _Work(lambda run: world.trial(run, seed), chosen, scenario.belief, jobs, timeout)
     said = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
-    with _place(out, overwrite, previous) as new:
+    with _place(None if out is None else Path(out), overwrite, previous) as new:
         return _finish(work, todo, Gathered(names, new, previous, done), said, _landmarks_table(scenario))
 
 
@@ -227,7 +227,7 @@ def _place(out: Path | None, overwrite: bool, previous: Tables | None) -> Iterat
     if out is None:
         yield None
         return
-    same = isinstance(previous, StoredResults) and previous.folder.absolute() == out.absolute()
+    same = isinstance(previous, StoredResults) and previous.folder.resolve() == out.resolve()
     with NewFolder(out, "results", overwrite or same, keep_others=same) as new:
         yield new
 

@@ -95,8 +95,6 @@ def write_frontend_log(images: Path, out: Path, options: Options, overwrite: boo
     started = time.monotonic()
     if options.max_landmarks < 1:
         raise InputError(f"--max-landmarks {options.max_landmarks}: must be at least 1")
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: must not be negative")
     if not np.isfinite(options.lever):
         raise InputError(f"--lever {options.lever}: must be a finite number of metres")
     if options.seed < 0:

@@ -54,7 +54,6 @@ def test_a_log_is_not_overwritten_by_accident(folder: Path) -> None:
         (("images", "--sigma-per-scale", "0"), "sigma_per_scale: 0.0, must be a positive number"),
         (("images", "--max-landmarks", "0"), "--max-landmarks 0: must be at least 1"),
         (("images", "--truth", "none.txt"), "--truth none.txt: no such file"),
-        (("images", "--seed", "-1"), "--seed -1: must not be negative"),
         ((".",), ".: holds no stereo images of a known layout"),
         (("images", "--left", "a*", "--right", "b*"), "no image is like 'a*' (--left) or 'b*' (--right)"),
         (("images", "--lever", "nan"), "--lever nan: must be a finite number"),

@@ -8,6 +8,7 @@ import tracemalloc
 import weakref
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -402,3 +403,19 @@ def test_a_folder_that_came_meanwhile_is_not_replaced(uvd: cs.Scenario, tmp_path
     with pytest.raises(cs.InputError, match="exists already"):
         cs.run_trials(uvd, [Comes()], runs=2, jobs=1, out=tmp_path / "out")
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "thesis.txt"]
+
+
+def test_a_folder_may_be_named_by_text(uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And by another path when it is gone on with."""
+    monkeypatch.chdir(tmp_path)
+    before = cs.run_trials(uvd, ["ekf-uvd"], runs=1, jobs=1, out="here")
+    (tmp_path / "other").mkdir()
+    after = cs.run_trials(uvd, ["ekf-uvd"], runs=2, jobs=1, out="other/../here", previous=before)
+    assert after.finished_runs(["ekf-uvd"]) == {0, 1}
+
+
+def test_steps_begin_at_one(uvd: cs.Scenario) -> None:
+    results = cs.run_trials(uvd, ["ekf-uvd"], runs=2, jobs=1)
+    shifted = results.estimates.assign(step=results.estimates["step"] - 1)
+    with pytest.raises(cs.InputError, match="column 'step' must be at least 1"):
+        cs.analyse(replace(results, estimates=shifted))

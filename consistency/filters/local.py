@@ -13,8 +13,8 @@ carried behind those of P_a, and with W = S^-1/2 Cov(z, .) over both (W_a, W_b) 
     Phi <- Phi - W_a' W_b,    Psi <- Psi + W_b' W_b,    theta <- theta + W_b' y.
 
 The landmarks of the base are taken relative to the robot of the base: l - r and less its turn with the heading.
-Else P0 Psi P0 would be a small difference of large numbers wherever the pose is uncertain and what is around it is
-not, and nine digits would be left of it instead of thirteen.
+Else what is observed would be a small difference of large numbers wherever the pose is uncertain and what is around
+it is not: on a long loop rounding is then ten times as large.
 
 A new landmark is a row of Phi. A passive landmark l that is seen again needs no pass over the map: it joins
 the base, with P0_l,base Phi' as its covariance with a and -P0_l,base Psi as its row of Phi. Only when the base has
@@ -39,9 +39,7 @@ from consistency.filters.blas import (
 from consistency.filters.covariance import gather_rows
 from consistency.filters.jit import inner
 
-LOCAL_FROM = (
-    100  # variables in the state from which local updating is tried; measured, as the next three (docs/bench.md)
-)
+LOCAL_FROM = 100  # variables in the state from which local updating is tried; measured, as the next three
 TRAFFIC = 60.0  # writing P back, in variables of the base: what going through memory costs beside the arithmetic
 OVERHEAD = 1e5  # multiplications (twice over) that the calls of a local step are worth
 PAUSE = 16  # steps of dense updating after a local stretch that did not pay; four times as many after the next

@@ -72,7 +72,7 @@ class Effort:
     cloud: tuple[int, int] = (300, 1000)  # points and samples
     runs: int = 50
     run_steps: int = 500
-    memory_runs: tuple[int, ...] = (150, 300)
+    memory_runs: tuple[int, ...] = (1000, 3000)
     full_runs: int = 10_000
 
 

@@ -87,7 +87,7 @@ def share_outside(runs: int, steps: int, filters: list[str], repeats: int) -> fl
     shares = []
     for _ in range(repeats + 1):  # the first warms up
         clock = Clock()
-        with _silent(), clock.on(World, "trial"), clock.on(Compiled, "run"):
+        with _silent(), clock.on(World, "__init__"), clock.on(World, "trial"), clock.on(Compiled, "run"):
             started = time.perf_counter()
             cs.run_trials(world, filters, runs, jobs=1)
             wall = time.perf_counter() - started

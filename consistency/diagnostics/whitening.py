@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import operator
+
 import numpy as np
 
 from consistency.diagnostics.blocks import by_runs
@@ -20,17 +23,26 @@ def whiten(error: Array, covariance: Array) -> Array:
 
 
 def _whiten(e: Array, P: Array) -> Array:
-    n = e.shape[-1]
     out = np.empty(e.shape)
-    L = np.zeros((n, n), object)  # of arrays over the batch: n is small, the batch is not
+    L: list[list[Array]] = []  # rows of arrays over the batch: n is small, the batch is not
+    w: list[Array] = []
     with np.errstate(invalid="ignore", divide="ignore"):
-        for i in range(n):
-            for j in range(i + 1):
-                rest = P[..., i, j] - sum(L[i, k] * L[j, k] for k in range(j))
-                L[i, j] = rest / L[j, j] if j < i else np.sqrt(np.where(rest > 0, rest, np.nan))
-            out[..., i] = (e[..., i] - sum(L[i, k] * out[..., k] for k in range(i))) / L[i, i]
+        for i in range(e.shape[-1]):
+            row: list[Array] = []
+            for j in range(i):
+                row.append(_less(P[..., i, j], row, L[j]) / L[j][j])
+            row.append(np.sqrt(_less(P[..., i, i], row, row)))  # NaN or 0 where P is not definite, and so what follows
+            w.append(_less(e[..., i], row, w) / row[i])
+            L.append(row)
+            out[..., i] = w[i]
     out[~np.isfinite(out).all(axis=-1)] = np.nan
     return out
+
+
+def _less(value: Array, a: list[Array], b: list[Array]) -> Array:
+    """``value`` less the sum of the products, as many as the shorter list has."""
+    products = [x * y for x, y in zip(a, b, strict=False)]
+    return value - functools.reduce(operator.add, products) if products else value
 
 
 def standardise(error: Array, covariance: Array) -> Array:

@@ -26,7 +26,11 @@ class World:
         self.planned = planned_controls(truth)
         self.reference = motion.dead_reckoning(self.start, self.planned)
         self.linear = truth.sensor.model == "linear"
-        self._in_view = _in_view(truth, self.reference, self.landmarks) if self.linear else None
+        # noise on the odometry leaves the path as planned, and a linear world looks from it
+        self.planned_path = not self.linear and truth.motion.noise_on != "motion"
+        always = self.linear or self.planned_path
+        self._in_view = _in_view(truth, self.reference, self.landmarks) if always else None
+        self._z = self._noise_free(self.reference, *self._in_view) if self._in_view and self.planned_path else None
 
     def trial(self, run: int, seed: int) -> Trial:
         """Truth, controls and observations of run ``run``, as :func:`simulate`."""
@@ -34,10 +38,7 @@ class World:
         true_path, told = self._drive(generator(seed, run, MOTION_NOISE))
         step, landmark = self._in_view or _in_view(truth, true_path, landmarks)
         noise = generator(seed, run, OBSERVATION_NOISE).standard_normal((len(step), 3))
-        if self.linear:
-            z = _linear(truth, true_path[step + 1], self.reference[step + 1], landmarks[landmark])
-        else:
-            z = _measure(truth, true_path[step + 1], landmarks[landmark])
+        z = self._noise_free(true_path, step, landmark) if self._z is None else self._z
         z = z + noise * np.array(truth.sensor.sigma)
         if isinstance(truth.sensor, UvdSensor):
             low, high = truth.sensor.disparity
@@ -46,6 +47,12 @@ class World:
         first = np.searchsorted(step, np.arange(truth.steps + 1))
         return Trial(run, self.start, told, first, landmark, z, len(landmarks), true_path, landmarks)
 
+    def _noise_free(self, path: Array, step: Indices, landmark: Indices) -> Array:
+        """Observations (M, 3) of landmarks in steps (from 0)."""
+        if self.linear:
+            return _linear(self.truth, path[step + 1], self.reference[step + 1], self.landmarks[landmark])
+        return _measure(self.truth, path[step + 1], self.landmarks[landmark])
+
     def _drive(self, rng: np.random.Generator) -> tuple[Array, Array]:
         """True poses (T + 1, 3) and the controls (T, 3) that the filter is told."""
         truth, planned = self.truth, self.planned
@@ -53,9 +60,9 @@ class World:
         noise[:, 1:] = rng.standard_normal((truth.steps, 2)) * [truth.motion.sigma_v, truth.motion.sigma_omega]
         if self.linear:
             return _drive_linear(self.reference, planned, noise), planned
-        if truth.motion.noise_on == "motion":
-            return motion.dead_reckoning(self.start, planned + noise), planned
-        return self.reference, planned - noise
+        if self.planned_path:
+            return self.reference, planned - noise
+        return motion.dead_reckoning(self.start, planned + noise), planned
 
 
 def simulate(scenario: Scenario, run: int = 0, seed: int = 0) -> Trial:

@@ -99,15 +99,24 @@ def experiments() -> dict[str, ModuleType]:
 
 
 def _load(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"consistency_experiment_{path.stem}", path)
+    try:
+        return _executed(path, f"consistency_experiment_{path.stem}")
+    except Exception as error:
+        raise InputError(f"{path}: cannot be imported ({type(error).__name__}: {error})") from error
+
+
+def sibling(script: str, name: str) -> ModuleType:
+    """The module ``name`` beside a script, whose folder need not be on the path."""
+    return _executed(Path(script).with_name(f"{name}.py"), name)
+
+
+def _executed(path: Path, name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses of the script look for their names
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise InputError(f"{path}: cannot be imported ({type(error).__name__}: {error})") from error
+    sys.modules[name] = module  # where dataclasses of the script look for their names
+    spec.loader.exec_module(module)
     return module
 
 
@@ -164,6 +173,15 @@ def script(main: Callable[[Study], list[Finding]], arguments: Sequence[str] | No
         print_findings(main(Study(*values)))
     except (InputError, ValueError) as error:
         print(f"{Path(sys.argv[0]).name} [RUNS] [SEED]: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def command_line(command: Callable[[], None]) -> None:
+    """Run a script that reads its own arguments: unusable input ends in one line and exit status 2."""
+    try:
+        command()
+    except InputError as error:
+        print(f"{Path(sys.argv[0]).stem}: {error}", file=sys.stderr)
         sys.exit(2)
 
 

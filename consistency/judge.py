@@ -40,8 +40,8 @@ class Curves:
     failures: tuple[Failure, ...]
 
 
-def curves(results: Tables, filter_name: str) -> Curves:
-    """Arrays of one filter; of results in a folder nothing else is read.
+def curves(results: Tables, filter_name: str, steps: int | None = None) -> Curves:
+    """Arrays of one filter; of results in a folder nothing else is read but, unless ``steps`` is known, the steps.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def curves(results: Tables, filter_name: str) -> Curves:
         raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
     broken = results.failures[results.failures["filter"] == filter_name]
     runs = results.runs_of(filter_name)
-    steps = _steps(results)
+    steps = _steps(results) if steps is None else steps
     pose, covariance = np.full((len(runs), steps, 3), np.nan), np.full((len(runs), steps, 3, 3), np.nan)
     nis, nis_dof = np.full(pose.shape[:2], np.nan), np.zeros(pose.shape[:2], np.int64)
     nees = np.full(pose.shape[:2], np.nan) if results.has_truth else None
@@ -120,9 +120,9 @@ def analyse(
     """
     design = None if confidence is not None else design_of(results)
     false_alarm = design.look_false_alarm if design else _false_alarm(confidence)
-    verdicts = {}
+    verdicts, steps = {}, _steps(results)
     for name in filters or results.filters:
-        verdict = verdict_of(curves(results, name), false_alarm)
+        verdict = verdict_of(curves(results, name, steps), false_alarm)
         verdicts[name] = design.settle(verdict) if design else verdict
     return verdicts
 

@@ -9,7 +9,6 @@ What is in them and how it becomes a log: docs/kitti07.md.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import multiprocessing
 import os
 import sys
@@ -25,6 +24,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.diagnostics import anees_interval, chi2_mean_interval, coverage
+from consistency.findings import command_line, sibling
 from consistency.judge import curves
 from consistency.log import Log, write_log
 from consistency.models import point, stereo
@@ -38,10 +38,7 @@ from consistency.types import Array, Trial
 if TYPE_CHECKING:
     import kitti07_log as conversion
 else:
-    _spec = importlib.util.spec_from_file_location("kitti07_log", Path(__file__).with_name("kitti07_log.py"))
-    conversion = importlib.util.module_from_spec(_spec)
-    sys.modules[_spec.name] = conversion  # dataclasses look their module up
-    _spec.loader.exec_module(conversion)
+    conversion = sibling(__file__, "kitti07_log")
 
 FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
 
@@ -281,8 +278,4 @@ def command(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        command()
-    except cs.InputError as error:
-        print(f"e09_kitti07: {error}", file=sys.stderr)
-        sys.exit(2)
+    command_line(command)

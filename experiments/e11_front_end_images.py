@@ -8,7 +8,6 @@ DIR of ``--data`` holds the folders kitti06_f0-50, euroc_static and minnie_quad 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
 import sys
 import time
@@ -24,7 +23,7 @@ from scipy import stats
 import consistency as cs
 from consistency.atomic import write_whole
 from consistency.diagnostics import judge, nees
-from consistency.findings import OURS
+from consistency.findings import OURS, command_line, sibling
 from consistency.reporting.front_end import matches_png, samples_png
 from consistency.storage import require_free
 from consistency.table import print_findings
@@ -44,10 +43,7 @@ if TYPE_CHECKING:
     import front_end_data as data
     from front_end_data import Case
 else:
-    _spec = importlib.util.spec_from_file_location("front_end_data", Path(__file__).with_name("front_end_data.py"))
-    data = importlib.util.module_from_spec(_spec)
-    sys.modules[_spec.name] = data  # dataclasses look their module up
-    _spec.loader.exec_module(data)
+    data = sibling(__file__, "front_end_data")
     Case = data.Case
 
 FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
@@ -327,8 +323,4 @@ def command(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        command()
-    except cs.InputError as error:
-        print(f"e11_front_end_images: {error}", file=sys.stderr)
-        sys.exit(2)
+    command_line(command)

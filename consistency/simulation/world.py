@@ -27,10 +27,10 @@ class World:
         self.reference = motion.dead_reckoning(self.start, self.planned)
         self.linear = truth.sensor.model == "linear"
         # noise on the odometry leaves the path as planned, and a linear world looks from it
-        self.planned_path = not self.linear and truth.motion.noise_on != "motion"
-        always = self.linear or self.planned_path
+        self.undisturbed = not self.linear and truth.motion.noise_on != "motion"
+        always = self.linear or self.undisturbed
         self._in_view = _in_view(truth, self.reference, self.landmarks) if always else None
-        self._z = self._noise_free(self.reference, *self._in_view) if self._in_view and self.planned_path else None
+        self._z = self._noise_free(self.reference, *self._in_view) if self._in_view and self.undisturbed else None
 
     def trial(self, run: int, seed: int) -> Trial:
         """Truth, controls and observations of run ``run``, as :func:`simulate`."""
@@ -60,7 +60,7 @@ class World:
         noise[:, 1:] = rng.standard_normal((truth.steps, 2)) * [truth.motion.sigma_v, truth.motion.sigma_omega]
         if self.linear:
             return _drive_linear(self.reference, planned, noise), planned
-        if self.planned_path:
+        if self.undisturbed:
             return self.reference, planned - noise
         return motion.dead_reckoning(self.start, planned + noise), planned
 

@@ -10,6 +10,7 @@ from consistency.errors import InputError
 from consistency.types import Array
 
 ROUNDING = 1e-9  # of a covariance's largest entry: asymmetry and negative eigenvalues below are rounding
+ORTHONORMAL = 1e-6  # largest entry of R'R - I: a calibration file has about that many digits
 LARGEST = 1e75  # of a number: fourth powers of coordinates are still finite
 
 
@@ -25,6 +26,25 @@ def rows(name: str, value: Any, width: int) -> Array:
     if array.ndim != 2 or array.shape[1] != width:
         raise InputError(f"{name}: shape {array.shape}, allowed is (N, {width})")
     return array
+
+
+def freeze(record: Any, **shapes: tuple[int, ...]) -> None:
+    """Fields of a frozen record become read-only copies, as floats of these shapes; a field ``R`` is a rotation.
+
+    Raises
+    ------
+    InputError
+        Another shape, a value that is not finite, or R no rotation.
+    """
+    for name, shape in shapes.items():
+        value = floats(name, getattr(record, name)).copy()
+        if value.shape != shape:
+            raise InputError(f"{name}: shape {value.shape}, allowed is {shape}")
+        value.flags.writeable = False
+        object.__setattr__(record, name, value)
+    R = record.R
+    if np.abs(R.T @ R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(R) < 0.0:
+        raise InputError("R: not a rotation; its columns must be orthonormal and its determinant +1")
 
 
 def same_length(names: str, *arrays: Array) -> None:

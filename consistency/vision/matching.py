@@ -8,6 +8,7 @@ import numpy as np
 
 from consistency.types import Array, Indices
 from consistency.vision.features import Features
+from consistency.vision.pose import cross_matrix
 from consistency.vision.rig import StereoRig
 
 RATIO = 0.8  # distance of the best match over that of the second best, Lowe (2004) sec. 7.1
@@ -69,8 +70,7 @@ def epipolar_gate(rig: StereoRig, left: Array, right: Array, tolerance: float = 
 
 def fundamental(rig: StereoRig) -> Array:
     """F (3, 3) with x_right' F x_left = 0 for homogeneous pixels of one point, Hartley & Zisserman (2003) eq. 9.2."""
-    x, y, z = -rig.R.T @ rig.t
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = cross_matrix(-rig.R.T @ rig.t)
     return np.asarray(np.linalg.inv(rig.K_right).T @ cross @ rig.R.T @ np.linalg.inv(rig.K_left))
 
 

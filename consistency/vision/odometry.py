@@ -9,7 +9,7 @@ import numpy as np
 from consistency.progress import progress
 from consistency.types import Array
 from consistency.vision.motion import RelativeMotion, Settings, motion_between, stereo_features
-from consistency.vision.pose import angular
+from consistency.vision.pose import angular, cross_matrix
 from consistency.vision.sequence import Sequence
 
 
@@ -57,7 +57,7 @@ def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
         # p + R dt and R dR, with errors dp + dtheta x (R dt) + R d(dt) and dtheta + R d(phi)
         arm = R[-1] @ motion.pose.t
         F, G = np.eye(6), np.zeros((6, 6))
-        F[:3, 3:] = [[0.0, arm[2], -arm[1]], [-arm[2], 0.0, arm[0]], [arm[1], -arm[0], 0.0]]
+        F[:3, 3:] = -cross_matrix(arm)
         G[:3, :3], G[3:, 3:] = R[-1], R[-1] @ angular(motion.pose)
         grown = F @ P[-1] @ F.T + G @ motion.covariance @ G.T
         P.append(0.5 * (grown + grown.T))

@@ -17,7 +17,6 @@ from consistency.vision import checks
 from consistency.vision.errors import GimbalLockError
 
 LOCKED = 1e-6  # cosine of the pitch below which six digits of roll and yaw are left
-ORTHONORMAL = 1e-6  # largest entry of R'R - I that is rounding
 
 AXES = np.array(
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float
@@ -38,14 +37,7 @@ class RelativePose:
     t: Array  # (3,), m
 
     def __post_init__(self) -> None:
-        for name, shape in {"R": (3, 3), "t": (3,)}.items():
-            value = checks.floats(name, getattr(self, name)).copy()
-            if value.shape != shape:
-                raise InputError(f"{name}: shape {value.shape}, allowed is {shape}")
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
-        if np.abs(self.R.T @ self.R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(self.R) < 0.0:
-            raise InputError("R: not a rotation; its columns must be orthonormal and its determinant +1")
+        checks.freeze(self, R=(3, 3), t=(3,))
 
     @classmethod
     def from_vector(cls, vector: Array) -> RelativePose:
@@ -99,7 +91,7 @@ def rotation_derivatives(pose: RelativePose) -> tuple[Array, Array]:
     the frame 2 for roll, and frame 1 for yaw and, with e = Rz(yaw) e_y, for pitch.
     """
     R, (X, _, Z), yaw = pose.R, AXES, pose.rpy[2]
-    Y = _cross(np.array([-np.sin(yaw), np.cos(yaw), 0.0]))
+    Y = cross_matrix(np.array([-np.sin(yaw), np.cos(yaw), 0.0]))
     R_r, R_p, R_y = R @ X, Y @ R, Z @ R
     R_rp, R_ry, R_py = Y @ R_r, Z @ R_r, Z @ R_p
     second = [[R_r @ X, R_rp, R_ry], [R_rp, Y @ R_p, R_py], [R_ry, R_py, Z @ R_y]]
@@ -131,7 +123,7 @@ def compose(a: RelativePose, S_a: Array, b: RelativePose, S_b: Array) -> tuple[R
     both = a.compose(b)
     E_a, E_b, E_inverse = angular(a), angular(b), np.linalg.inv(angular(both))
     J_a, J_b = np.eye(6), np.zeros((6, 6))
-    J_a[:3, 3:] = -_cross(a.R @ b.t) @ E_a
+    J_a[:3, 3:] = -cross_matrix(a.R @ b.t) @ E_a
     J_a[3:, 3:] = E_inverse @ E_a
     J_b[:3, :3] = a.R
     J_b[3:, 3:] = E_inverse @ a.R @ E_b
@@ -144,12 +136,13 @@ def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
     inverse = pose.inverse()
     J = np.zeros((6, 6))
     J[:3, :3] = -pose.R.T
-    J[:3, 3:] = -pose.R.T @ _cross(pose.t) @ angular(pose)
+    J[:3, 3:] = -pose.R.T @ cross_matrix(pose.t) @ angular(pose)
     J[3:, 3:] = -np.linalg.inv(angular(inverse)) @ pose.R.T @ angular(pose)
     return inverse, _symmetric(J @ S @ J.T)
 
 
-def _cross(v: Array) -> Array:
+def cross_matrix(v: Array) -> Array:
+    """[v]x (3, 3), with [v]x w = v x w."""
     return np.asarray(np.tensordot(v, AXES, 1))
 
 

@@ -12,7 +12,6 @@ from consistency.types import Array
 from consistency.vision import checks, small
 from consistency.vision.errors import PointError
 
-ORTHONORMAL = 1e-6  # largest entry of R'R - I: a calibration file has about that many digits
 NEAREST = 1e-3  # depth in baselines up to which a point is at the camera: a disparity of a thousand focal lengths
 FARTHEST = 1e6  # depth in baselines from which on a point is at infinity
 # What A'A leaves of a coordinate's own entry when the others are eliminated: some 3e-13 at FARTHEST, up to 6e-16 by
@@ -48,17 +47,10 @@ class StereoRig:
     image_size: tuple[int, int]  # width, height, px
 
     def __post_init__(self) -> None:
-        for name, shape in {"K_left": (3, 3), "K_right": (3, 3), "R": (3, 3), "t": (3,)}.items():
-            value = checks.floats(name, getattr(self, name)).copy()
-            if value.shape != shape:
-                raise InputError(f"{name}: shape {value.shape}, allowed is {shape}")
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
+        checks.freeze(self, K_left=(3, 3), K_right=(3, 3), R=(3, 3), t=(3,))
         for name, K in (("K_left", self.K_left), ("K_right", self.K_right)):
             if np.tril(K, -1).any() or K[2, 2] != 1.0 or min(K[0, 0], K[1, 1]) <= 0.0:
                 raise InputError(f"{name}: give [[fu, skew, u0], [0, fv, v0], [0, 0, 1]] with positive fu and fv")
-        if np.abs(self.R.T @ self.R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(self.R) < 0.0:
-            raise InputError("R: not a rotation; its columns must be orthonormal and its determinant +1")
         if not self.t.any():
             raise InputError("t: no baseline between the cameras; depth needs one")
         if len(self.image_size) != 2 or min(self.image_size) < 1:

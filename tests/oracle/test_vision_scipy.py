@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rigs import MOTION, RIG
 from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
-from consistency.geometry import rotation
 from consistency.vision import (
     RelativePose,
-    StereoRig,
     refine_reprojection,
     register_horn,
     register_svd,
@@ -23,9 +22,6 @@ from consistency.vision import (
 )
 
 Array = np.ndarray[Any, Any]
-K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
-RIG = StereoRig(K, K, rotation(0.04, 0.016, 0.014), [0.385, 0.007, 0.0], (640, 480))
-MOTION = RelativePose.from_vector(np.array([0.3, -0.2, 0.9, 0.04, -0.03, 0.2]))
 
 
 def frames(rng: np.random.Generator, n: int, noise: float) -> tuple[Array, Array]:

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rigs import RIG
 from scipy import stats
 
-from consistency.geometry import rotation
 from consistency.vision import (
     RelativePose,
-    StereoRig,
     refine_reprojection,
     register_svd,
     register_weighted,
@@ -32,8 +31,6 @@ SAMPLES, CHUNK = 100_000, 10_000
 FALSE_ALARM = 1e-5  # of each test
 NOISE, LESS = 0.05, 0.01  # px
 POINTS = 8
-K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
-RIG = StereoRig(K, K, rotation(0.04, 0.016, 0.014), [0.385, 0.007, 0.0], (640, 480))
 MOTION = RelativePose.from_vector(np.array([0.3, -0.2, 0.4, 0.04, -0.5, 2.0]))  # far from the identity
 S_UV = NOISE**2 * (np.eye(4) + 0.3 * np.eye(4, k=1) + 0.3 * np.eye(4, k=-1))
 

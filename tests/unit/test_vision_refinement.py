@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rigs import MOTION, RIG
 
 from consistency.errors import InputError
-from consistency.geometry import rotation
 from consistency.vision import (
     ConvergenceError,
     DegenerateError,
     PointError,
     RelativePose,
-    StereoRig,
     implicit_covariance,
     refine_reprojection,
     register_svd,
@@ -26,9 +25,6 @@ from consistency.vision import (
 from consistency.vision import refinement as module
 
 Array = np.ndarray[Any, Any]
-K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
-RIG = StereoRig(K, K, rotation(0.04, 0.016, 0.014), [0.385, 0.007, 0.0], (640, 480))
-MOTION = RelativePose.from_vector(np.array([0.3, -0.2, 0.9, 0.04, -0.03, 0.2]))
 S = 0.25 * np.eye(4)
 
 

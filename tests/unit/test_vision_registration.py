@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs import MOTION
 from scipy.spatial.transform import Rotation
 
 from consistency.errors import InputError
@@ -24,7 +25,6 @@ from consistency.vision import (
 )
 
 Array = np.ndarray[Any, Any]
-MOTION = RelativePose.from_vector(np.array([0.3, -0.2, 0.9, 0.04, -0.03, 0.2]))
 BOTH = pytest.mark.parametrize("register", [register_svd, register_horn])
 
 

@@ -132,6 +132,7 @@ def joined(parts: Sequence[Results]) -> Results:
     """Results of several filters on the same trials as one."""
     manifest = parts[0].manifest | {
         "filters": [name for part in parts for name in part.filters],
+        "optimal_gain": [name for part in parts for name in part.manifest.get("optimal_gain", [])],
         "failures": sum(len(part.failures) for part in parts),
         "wall_time_s": round(sum(part.manifest["wall_time_s"] for part in parts), 3),
     }

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from consistency.diagnostics import blocks, judge, scale
-from consistency.types import Array, Failure, Verdict
+from consistency.diagnostics import Verdict, blocks, judge, scale
+from consistency.types import Array, Failure
 
 RUNS, STEPS = 61, 23
 

@@ -87,6 +87,19 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     return MeanTest(runs, ratio, nu, spread, above, below)
 
 
+def spreads_more(means: Array, dof: int) -> bool:
+    """Do run means (runs,) differ more than those of Gaussian errors can? Of such, nu is ``dof`` at least.
+
+    Either estimate of nu (:func:`scale_test`) lies more than one standard error below; not asked of fewer than 20 runs.
+    """
+    if len(means) < FEW or not means.min() > 0:
+        return False
+    by_spread, left_out = _log_nu_of_means(means)
+    by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
+    by_likelihood, error = _log_nu_of_gamma(means)
+    return bool(min(by_spread + np.sqrt(variance), by_likelihood + error) < np.log(dof))
+
+
 def run_means(nees: Array) -> tuple[Array, Array]:
     """Mean NEES of each run over the steps it has, and how many those are: (runs, steps) -> (runs,), (runs,)."""
     present = np.isfinite(nees)

@@ -17,7 +17,7 @@ from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, INNOVATIONS
 from consistency.diagnostics.records import Equivalence, Evidence, Innovations, Settings, Verdict
 from consistency.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.diagnostics.sample import shape_of as shape_of_arrays
-from consistency.diagnostics.scale import scale_test, simultaneous_band
+from consistency.diagnostics.scale import scale_test, simultaneous_band, spreads_more
 from consistency.diagnostics.scaling import INTERVAL, scale_of
 from consistency.types import Array
 
@@ -220,8 +220,8 @@ def _by_errors(verdict: Verdict, faults: set[str], sample: Sample, asked: Asked)
 
 
 def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: int) -> bool:
-    """Is the scale found at fault too if the runs may differ more than Gaussian errors would?"""
-    test = scale_test(means, dof, steps, gaussian=False)
+    """Is the scale found at fault too where the runs differ more than Gaussian errors can?"""
+    test = scale_test(means, dof, steps, gaussian=not spreads_more(means, dof))
     p = test.above if settings.one_sided else test.p_value
     return bool(p * questions <= SHARES[MAIN] * settings.false_alarm)
 

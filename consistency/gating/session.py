@@ -117,7 +117,7 @@ def needed_at(entry: Entry, rate: float) -> int:
 def lines(ledger: Ledger) -> Iterator[str]:
     """The summary for a terminal: a row a gate, and under it why it did not pass."""
     entries = ledger.entries()
-    rows = [("test", "gate", "outcome", "p", "runs", "needed", "inflation")]
+    rows = [("test", "gate", "outcome", "p", "runs", "planned", "inflation")]
     for e in entries:
         rows.append((e.test, e.gate, outcome(e), number(e.p_value), str(e.runs), str(e.needed), interval(e)))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

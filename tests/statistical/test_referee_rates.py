@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from referee import judge
 from scipy import stats
 
-from consistency.diagnostics import judge, mean_shape, mean_test, nis_whiteness, simultaneous_band
+from consistency.diagnostics import mean_shape, mean_test, nis_whiteness, simultaneous_band
 from consistency.types import Array
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))

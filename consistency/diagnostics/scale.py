@@ -95,7 +95,7 @@ def spreads_more(means: Array, dof: int) -> bool:
     if len(means) < FEW or not means.min() > 0:
         return False
     by_spread, left_out = _log_nu_of_means(means)
-    by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
+    _, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
     by_likelihood, error = _log_nu_of_gamma(means)
     return bool(min(by_spread + np.sqrt(variance), by_likelihood + error) < np.log(dof))
 

@@ -64,10 +64,10 @@ def test_consistent_is_said_at_a_look_and_a_fault_at_once() -> None:
     early = look(design, nees(values)(42), None)
     assert early.status == "undecided"
     assert early.faults == ()
-    bad, used = follow(design, nees(values * 3.0))
+    bad, used = follow(sequential_design(3), nees(values * 3.0))
     assert (bad.status, "scale" in bad.faults) == ("overconfident", True)
     assert used < 48
-    small, used = follow(design, nees(values * 0.3))
+    small, used = follow(sequential_design(3), nees(values * 0.3))
     assert (small.status, "scale" in small.faults) == ("conservative", True)
     assert used < 96
     stopped, used = follow(design, nees(values), limit=15)

@@ -193,7 +193,7 @@ def rows_of_case(case: Case, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def _kalman_runs(count: int, seed: int, folder: Path) -> Path:
-    """Put the errors (count, T, 3) of the exact Kalman filter, and the covariance that all its runs share, into a folder.
+    """Errors (count, T, 3) of the exact Kalman filter and the covariance that all its runs share, into a folder.
 
     From the first step on in which that is of full rank.
     """

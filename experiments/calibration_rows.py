@@ -78,23 +78,21 @@ def rows_of(table: dict[str, Any]) -> list[Row]:
 
 
 def markdown(table: dict[str, Any]) -> str:
-    """The table as docs/referee.md has it: worlds by what is asked in all of them, then the rest, then the worlds."""
-    rows, worlds = rows_of(table), table["worlds"]
+    """The table as docs/referee.md has it: questions, then worlds by what is asked in all of them, the rest, worlds."""
+    rows = rows_of(table)
     grid = [row for row in rows if row.question in EVERYWHERE and row.world in WORLDS]
-    columns = list(dict.fromkeys((row.question, row.ratio, row.runs, row.stated) for row in grid))
-    cells = {(row.world, row.question, row.ratio, row.runs, row.stated): row for row in grid}
-    head = ["world", *(_column(*column) for column in columns)]
-    lines = [_line(head), _line(["---"] * len(head))]
-    for world in dict.fromkeys(row.world for row in grid):
-        of_world = [cells.get((world, *column)) for column in columns]
-        lines.append(_line([world, *("" if row is None else _measured(row) for row in of_world)]))
-    lines += ["", _line(["what", "world", "ratio", "runs", "promised", "measured", "gates"]), _line(["---"] * 7)]
-    lines += [
-        _line([row.question, row.world, f"{row.ratio:.3g}", _runs(row), _promise(row), _measured(row), str(row.gates)])
+    columns = list(dict.fromkeys(_column(row) for row in grid))
+    cells = {(row.world, _column(row)): _measured(row) for row in grid}
+    worlds = dict.fromkeys(row.world for row in grid)
+    lines = [f"- *{question}*: {about}" for question, about in table["questions"].items()]
+    lines += ["", "In brackets: runs that a gate took until it was decided, their mean and 95 % quantile."]
+    lines += ["", *_table(["world", *columns], [[w, *(cells.get((w, c), "") for c in columns)] for w in worlds])]
+    others = [
+        [row.question, row.world, f"{row.ratio:.3g}", str(row.runs), _promise(row), _measured(row), str(row.gates)]
         for row in rows if row not in grid
     ]  # fmt: skip
-    lines += ["", _line(["world", "what it is"]), _line(["---"] * 2)]
-    lines += [_line([name, about]) for name, about in worlds.items()]
+    lines += ["", *_table(["question", "world", "ratio", "runs", "promised", "measured", "gates"], others)]
+    lines += ["", *_table(["world", "what it is"], [[name, about] for name, about in table["worlds"].items()])]
     return "\n".join(lines)
 
 
@@ -109,28 +107,23 @@ def write_docs(table: dict[str, Any], path: Path) -> None:
     path.write_text(new, encoding="utf-8")
 
 
-def _column(question: str, ratio: float, runs: int, stated: float) -> str:
-    fault = "" if ratio == 1.0 else f" x{ratio:.3g}"
-    up_to = "" if question in ("false alarm", "wrong all-clear") else "up to "
-    return f"{question}{fault}, {up_to}{runs} runs: at most {100 * stated:g} %"
-
-
-def _measured(row: Row) -> str:
-    return f"{100 * row.share:.1f} %"
+def _column(row: Row) -> str:
+    fault, up_to = "" if row.ratio == 1.0 else f" x{row.ratio:.3g}", "" if row.looks else "up to "
+    return f"{row.question}{fault} ({_promise(row)}), {up_to}{row.runs} runs, {row.gates} gates"
 
 
 def _promise(row: Row) -> str:
-    return f"at {'most' if row.bound == '<=' else 'least'} {100 * row.stated:g} %"
+    return f"{'≤' if row.bound == '<=' else '≥'} {100 * row.stated:g} %"
 
 
-def _runs(row: Row) -> str:
-    if row.looks == 1:
-        return str(row.runs)
-    return f"{row.mean_runs:.0f} on average, 95 % by {row.late_runs:.0f}"
+def _measured(row: Row) -> str:
+    """Share; of gates that end when they are decided also the mean number of runs and its 95 % quantile."""
+    taken = "" if row.looks else f" ({row.mean_runs:.0f}, {row.late_runs:.0f})"
+    return f"{100 * row.share:.1f} %{taken}"
 
 
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *lines)]
 
 
 def _without_nan(row: dict[str, Any]) -> dict[str, Any]:

@@ -201,10 +201,16 @@ def figure_caption() -> str:
 def calibration_text(c: Calibration) -> str:
     """What the appendix on the referee measures."""
     return (
-        "A gate is one verdict on one group of runs. A false alarm is a gate that finds a fault where the covariance "
-        "is exactly right; power is the share of gates that find a stated covariance which is wrong by the ratio "
-        "given, with as many runs as are planned for it. A gate with several looks ends at the look that finds a "
-        f"fault; its mean number of runs stands first. Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees "
-        f"of freedom, seed {c.seed}), with exact binomial intervals. The promise is broken where the whole interval of "
-        "a false-alarm rate lies above it, or that of a power below it."
+        "A gate is one verdict on one group of runs. Each line is a promise of the referee and the share of gates "
+        "that were counted, from the world where it is kept best to the one where it is kept worst. Where the true "
+        "over the stated covariance is 1 the filter is right, however its errors depend on each other. "
+        f"Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees of freedom where not said otherwise, seed "
+        f"{c.seed}), with exact binomial intervals. A promise is broken where the whole interval is on its wrong side."
     )
+
+
+def calibration_terms(c: Calibration) -> list[tuple[str, list[tuple[str, str]]]]:
+    """What the questions and the worlds of the appendix are: two lists of names with explanations."""
+    plain = [(name, about.replace("`", "")) for name, about in c.questions.items()]
+    worlds = [(name, about.replace("`", "")) for name, about in c.worlds.items()]
+    return [("What is counted", plain), ("Worlds", worlds)]

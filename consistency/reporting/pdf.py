@@ -104,7 +104,8 @@ def _calibration(report: Report) -> dict[str, Any] | None:
     if report.calibration is None:
         return None
     rows = [list(row) for row in wording.calibration_rows(report.calibration)]
-    return {"text": captions.calibration_text(report.calibration), "rows": rows}
+    terms = [[title, [list(term) for term in of]] for title, of in captions.calibration_terms(report.calibration)]
+    return {"text": captions.calibration_text(report.calibration), "rows": rows, "terms": terms}
 
 
 def _distribution(distribution: Any, prefix: str, folder: Path) -> dict[str, str]:

@@ -21,7 +21,7 @@ import calibration_cases
 import calibration_rows
 import calibration_worlds as worlds
 from calibration_cases import Case, Claim
-from calibration_gates import Draw, Gate, joined
+from calibration_gates import Draw, Gate, joined, random_walk_filter, turned
 from calibration_rows import Row, kept
 
 ROOT = Path(__file__).parents[2]
@@ -150,7 +150,7 @@ def two_sided(total: float, dof: int) -> float:
 def test_every_step_of_a_right_world_is_as_stated(name: str) -> None:
     """Under 150 p values at 1e-7; one and the same in every run of the tests."""
     rng = np.random.default_rng(20070)
-    gate = RIGHT[name].draw(Draw(rng, 1000, 30))
+    gate = RIGHT[name].draw(Draw(rng, 3000, 30))
     for step in (0, 14, 29):
         assert min(p_values(gate, step)) > 1e-7
     assert max(p_values(gate.wrong_by(1.5), 0)) < 1e-3  # negative control
@@ -195,6 +195,30 @@ def test_innovations_of_a_gain_that_is_not_optimal_are_not_white() -> None:
         u = gate.innovations
         assert u is not None
         assert (u[:, 1:] * u[:, :-1]).mean() > 0.1 * np.square(u).mean()
+
+
+def test_errors_of_a_filter_have_its_variance_and_turn_with_it() -> None:
+    """Means of products over 4,000 runs against their stated values, 6 standard errors of theirs."""
+    draw = Draw(np.random.default_rng(20070), 4000, 6)
+    error, variance = random_walk_filter(draw, start=2.0, process=0.5, noise=3.0, n=2)
+    stretched, variance = error * [1.0, 3.0], variance * [1.0, 9.0]
+    np.testing.assert_allclose(variance[0, 0], 1.0 / (1.0 / 2.5 + 1.0 / 3.0))  # information adds up
+    heading = np.array([0.0, 0.3, 1.2, -2.0, 4.0, 0.7])
+    for each in (0.0 * heading, heading):
+        body, covariance = turned(stretched, variance, np.broadcast_to(each, (4000, 6)))
+        products = np.einsum("rti,rtj->rtij", body, body)
+        away = products.mean(axis=0) - covariance[0]
+        assert (np.abs(away) < 6 * products.std(axis=0) / np.sqrt(4000)).all()
+    np.testing.assert_allclose(body[:, 1], stretched[:, 1] @ [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+
+
+def test_gates_take_their_own_runs_of_the_pool() -> None:
+    case = Case("linear-gaussian", 43, 7, ())
+    gates = [calibration.Growing(case, number, 1)(43).error for number in range(7)]
+    assert len(np.unique(np.concatenate(gates)[:, 0, 0])) == 301
+    grown = calibration.Growing(case, 2, 1)
+    grown(10)
+    np.testing.assert_array_equal(grown(43).error, gates[2])
 
 
 def test_runs_of_the_pool_are_all_taken_before_any_is_taken_again() -> None:

@@ -201,16 +201,16 @@ def figure_caption() -> str:
 def calibration_text(c: Calibration) -> str:
     """What the appendix on the referee measures."""
     return (
-        "A gate is one verdict on one group of runs. Each line is a promise of the referee and the share of gates "
-        "that were counted, from the world where it is kept best to the one where it is kept worst. Where the true "
-        "over the stated covariance is 1 the filter is right, however its errors depend on each other. "
+        "A gate is one verdict on one group of runs. Each line is a promise of the referee: which share of gates is "
+        "counted at most, or at least, and the shares measured, from the world where the promise is kept best to the "
+        "one where it is kept worst. Where the true over the stated covariance is 1 the filter is right, however its "
+        "errors depend on each other. Of gates that end when they are decided, the mean number of runs in the worst "
+        "world stands first. "
         f"Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees of freedom where not said otherwise, seed "
         f"{c.seed}), with exact binomial intervals. A promise is broken where the whole interval is on its wrong side."
     )
 
 
-def calibration_terms(c: Calibration) -> list[tuple[str, list[tuple[str, str]]]]:
-    """What the questions and the worlds of the appendix are: two lists of names with explanations."""
-    plain = [(name, about.replace("`", "")) for name, about in c.questions.items()]
-    worlds = [(name, about.replace("`", "")) for name, about in c.worlds.items()]
-    return [("What is counted", plain), ("Worlds", worlds)]
+def calibration_worlds(c: Calibration) -> list[tuple[str, str]]:
+    """The worlds of the appendix and what they are."""
+    return [(name, about.replace("`", "")) for name, about in c.worlds.items()]

@@ -175,7 +175,6 @@ def _count(value: int, noun: str) -> str:
 
 
 CALIBRATION_COLUMNS = (
-    "Counted",
     "True / stated covariance",
     "Runs",
     "Promised",
@@ -186,9 +185,12 @@ CALIBRATION_COLUMNS = (
 )
 
 
-def calibration_rows(c: Calibration) -> list[tuple[str, ...]]:
-    """Cells of the appendix, as CALIBRATION_COLUMNS: a promise a row, in all worlds in which it was measured."""
-    return [_promise_row(promise) for promise in c.promises]
+def calibration_groups(c: Calibration) -> list[tuple[str, list[tuple[str, ...]]]]:
+    """The appendix: what is counted, and for each promise about it, in all its worlds, cells as CALIBRATION_COLUMNS."""
+    return [
+        (f"{name}: {about.replace('`', '')}", [_promise_row(p) for p in c.promises if p.question == name])
+        for name, about in c.questions.items()
+    ]
 
 
 def _promise_row(promise: Promise) -> tuple[str, ...]:
@@ -199,9 +201,8 @@ def _promise_row(promise: Promise) -> tuple[str, ...]:
     gates = {rate.gates for rate in promise.rates}
     each = f"{min(gates)}" if len(gates) == 1 else f"{min(gates)} to {max(gates)}"
     return (
-        promise.question,
         "1, right" if worst.ratio == 1.0 else f"{worst.ratio:.3g}",
-        str(worst.runs) if worst.looks else f"up to {worst.runs}",
+        str(worst.runs) if worst.looks else f"{worst.mean_runs:.0f}, {worst.runs} at most",
         f"{'≤' if worst.at_most else '≥'} {100 * worst.promised:g} %",
         f"{each} in {len(promise.rates)} worlds" if several else each,
         f"{' to '.join(dict.fromkeys(ends))} %",

@@ -17,11 +17,12 @@ from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, INNOVATIONS
 from consistency.diagnostics.records import Equivalence, Evidence, Innovations, Settings, Verdict
 from consistency.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.diagnostics.sample import shape_of as shape_of_arrays
-from consistency.diagnostics.scale import scale_test, simultaneous_band, spreads_more
+from consistency.diagnostics.scale import scale_test, simultaneous_band, spreads_more, spreads_more_in_steps
 from consistency.diagnostics.scaling import INTERVAL, scale_of
 from consistency.types import Array
 
 DEFAULT = Settings()
+SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones
 
 
 @dataclass(frozen=True)
@@ -205,7 +206,7 @@ def _by_errors(verdict: Verdict, faults: set[str], sample: Sample, asked: Asked)
     """Which headline: of the scale only where it is no matter of a few large errors."""
     assert verdict.scale is not None
     assert verdict.location is not None
-    heavy = "outliers" in faults
+    heavy = "outliers" in faults or (STEP in faults and _heavy_steps(verdict, sample))
     if MAIN in faults:
         if _robust(sample.means(), sample.dof, sample.longest, verdict.settings, 1):
             return "overconfident" if verdict.scale.mean_anees > verdict.scale.dof else "conservative"
@@ -224,6 +225,19 @@ def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: i
     test = scale_test(means, dof, steps, gaussian=not spreads_more(means, dof))
     p = test.above if settings.one_sided else test.p_value
     return bool(p * questions <= SHARES[MAIN] * settings.false_alarm)
+
+
+def _heavy_steps(verdict: Verdict, sample: Sample) -> bool:
+    """Do the runs differ more than Gaussian errors can, in most steps, or in all of those outside the band?"""
+    assert verdict.location is not None
+    assert verdict.scale is not None
+    if spreads_more_in_steps(sample.nees, sample.dof):
+        return True
+    low, high = verdict.location.simultaneous.T
+    with np.errstate(invalid="ignore"):
+        outside = np.flatnonzero((verdict.scale.anees < low) | (verdict.scale.anees > high))
+    values = (sample.nees[sample.counted[:, k], k] / sample.dof for k in outside)
+    return all(spreads_more(value, sample.dof, SURE) for value in values)
 
 
 def _robust_axis(sample: Sample, asked: Asked, settings: Settings) -> bool:

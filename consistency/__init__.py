@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from consistency.diagnostics import anees, anees_interval, nees
+    from consistency.diagnostics import Alarm, Monitor, anees, anees_interval, nees
     from consistency.errors import InputError
     from consistency.filters import filter_names, get_filter
     from consistency.findings import Study
@@ -31,6 +31,8 @@ _HOME = {
     "nees": "diagnostics",
     "anees": "diagnostics",
     "anees_interval": "diagnostics",
+    "Alarm": "diagnostics",
+    "Monitor": "diagnostics",
     "analyse": "judge",
     "Finding": "types",
     "Study": "findings",
@@ -43,9 +45,9 @@ _HOME = {
 }
 
 __all__ = [
-    "Control", "Finding", "Gaussian", "Info", "InputError", "Observation", "Results", "Scenario", "Study", "Trial",
-    "Verdict", "analyse", "anees", "anees_interval", "filter_names", "get_filter", "load_scenario", "nees",
-    "read_results", "run_trials", "scenario_names", "simulate",
+    "Alarm", "Control", "Finding", "Gaussian", "Info", "InputError", "Monitor", "Observation", "Results", "Scenario",
+    "Study", "Trial", "Verdict", "analyse", "anees", "anees_interval", "filter_names", "get_filter", "load_scenario",
+    "nees", "read_results", "run_trials", "scenario_names", "simulate",
 ]  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from consistency.diagnostics.credibility import noncredibility
 from consistency.diagnostics.distribution import Pit, pit
 from consistency.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.diagnostics.monitor import Alarm, Monitor
 from consistency.diagnostics.nees import anees, nees
 from consistency.diagnostics.normality import Normality, normality
 from consistency.diagnostics.outliers import Outlier, outliers
@@ -22,6 +23,7 @@ from consistency.diagnostics.verdict import judge
 from consistency.diagnostics.whitening import spread_steps, standardise, whiten
 
 __all__ = [
+    "Alarm",
     "Answer",
     "Band",
     "Comparison",
@@ -29,6 +31,7 @@ __all__ = [
     "Difference",
     "Hotelling",
     "MeanTest",
+    "Monitor",
     "NisTest",
     "Normality",
     "Outlier",

@@ -156,6 +156,8 @@ def nis(axes: Axes, steps: Indices, ratio: Array, look: Style, log: bool = False
 def evidence(axes: Axes, steps: Array, values: Array, threshold: float, alarm: tuple[float, float] | None) -> None:
     """E-value after each step with the value at which an alarm is raised (dashed).
 
+    What goes on beyond the square of that value is cut off.
+
     Parameters
     ----------
     steps, values : (N,), (N,)
@@ -168,6 +170,7 @@ def evidence(axes: Axes, steps: Array, values: Array, threshold: float, alarm: t
     axes.plot(steps, values, color=COLOURS[0], linewidth=1.2, zorder=3)
     axes.set_yscale("log")
     axes.set(xlabel="step", ylabel="e-value")
+    axes.set_ylim(top=min(axes.get_ylim()[1], threshold**2))
     axes.margins(x=0.01)
     _frame(axes)
 

@@ -137,7 +137,9 @@ def print_watched(watched: Watched) -> None:
         table.add_column(column, justify="left" if column == "innovations" else "right")
     cells = [escape(watched.name), f"{monitor.steps}", f"{monitor.innovations}", *[f"{monitor.rejections}"] * gated]
     cells += [_number(monitor.ratio, ".3f"), *[_number(monitor.scale, ".3f")] * gated]
-    table.add_row(*cells, *(f"{value:.3g}" for value in (monitor.evidence, monitor.largest, monitor.threshold)))
+    table.add_row(
+        *cells, *(f"{value:.3g}" for value in (monitor.evidence, monitor.largest)), f"{monitor.threshold:.4g}"
+    )
     console = _console()
     console.print(table)
     if alarm is None:

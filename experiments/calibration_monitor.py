@@ -27,7 +27,7 @@ Array = NDArray[Any]
 
 STEPS, LATE = 10_000, 5_000  # of a mission; step after which a late fault begins
 MISSIONS = {0.05: 1_000, 0.01: 2_000}  # by the stated false-alarm rate
-DELAYS, PATIENCE = 500, 3_000  # missions with a fault; steps that they are watched for
+DELAYS, PATIENCE = 500, 5_000  # missions with a fault; steps that they are watched for
 TOLERANCES = (1.0, 1.2)
 GATES = (None, 0.99)
 RATIOS = (1.5, 2.0, 0.5)

@@ -14,8 +14,8 @@ RESTS = ((0.99, 2), (0.95, 5))  # share that the gate accepts, at least; innovat
 LARGEST = 1e300  # evidence is cut off here, which is on the safe side
 EXPONENT = 690.0  # exp() of it is just below LARGEST
 CAVEAT = (
-    "The NIS alone is judged, for a gain declared optimal; "
-    "the direction of an alarm, or silence, says nothing about the pose"
+    "Only the NIS is judged, under a gain declared optimal; "
+    "neither the direction of an alarm nor silence says anything about the pose"
 )
 
 

@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 from consistency import plots
 from consistency.monitoring import Watched
 from consistency.reporting.figures import RC, WIDTH
-from consistency.reporting.thin import LIMIT, thin
+from consistency.reporting.thin import thin
 from consistency.types import Array
 
 HEIGHT = 3.6  # inches
+POINTS = 600  # at most, of the NIS: few enough to see a change among them
 NO_DATE: dict[str, Any] = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
@@ -43,7 +44,7 @@ def averaged(step: Array, ratio: Array) -> tuple[Array, Array, int]:
     """Steps and ratios (N,) averaged over as many neighbours as leave few enough points; how many those are."""
     known = np.isfinite(ratio)
     step, ratio = step[known], ratio[known]
-    together = max(1, -(-len(ratio) // LIMIT))
+    together = max(1, -(-len(ratio) // POINTS))
     starts = np.arange(0, len(ratio), together)
     if together == 1:
         return step, ratio, 1

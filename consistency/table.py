@@ -129,7 +129,7 @@ def comparisons_json(compared: Sequence[Compared]) -> str:
 
 def print_watched(watched: Watched) -> None:
     """What the monitor said of a run: one row of numbers and a sentence."""
-    monitor, alarm = watched.monitor, watched.alarm
+    monitor = watched.monitor
     gated = monitor.gate is not None
     table = RichTable(box=None, pad_edge=False)
     heads = ["innovations", "steps", "judged", *["rejected"] * gated, "NIS/dof", *["scale"] * gated]
@@ -142,24 +142,31 @@ def print_watched(watched: Watched) -> None:
     )
     console = _console()
     console.print(table)
-    if alarm is None:
-        sentence = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
+    console.print(f"\n{_sentence(watched)}", markup=False, soft_wrap=not console.is_terminal)
+
+
+def _sentence(watched: Watched) -> str:
+    monitor = watched.monitor
+    if watched.alarm is None:
+        said = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
     else:
-        times = (
-            ""
-            if np.isnan(watched.alarm_t)
-            else f" Alarm at t = {watched.alarm_t:.10g} s, since {watched.since_t:.10g} s."
+        said = str(watched.alarm)
+        if np.isfinite(watched.alarm_t):
+            said += f" Alarm at t = {watched.alarm_t:.10g} s, since t = {watched.since_t:.10g} s."
+    if monitor.gate is not None and monitor.rejections:
+        said += (
+            f" The gate rejected {100 * monitor.rejections / monitor.measurements:.2g} % of the measurements "
+            f"(designed for {100 * (1 - monitor.gate):.2g} %), which is not judged."
         )
-        sentence = f"{alarm}{times}"
-    console.print(f"\n{sentence}", markup=False, soft_wrap=not console.is_terminal)
+    return said
 
 
 def watched_json(watched: Watched) -> str:
     """What the monitor said of a run; NaN and infinity become null."""
     monitor, alarm = watched.monitor, watched.alarm
     data = {
-        "innovations": watched.name, "steps": monitor.steps, "judged": monitor.innovations,
-        "rejected": monitor.rejections, "nis_ratio": monitor.ratio, "scale": monitor.scale,
+        "innovations": watched.name, "steps": monitor.steps, "measurements": monitor.measurements,
+        "rejected": monitor.rejections, "judged": monitor.innovations, "nis_ratio": monitor.ratio, "scale": monitor.scale,
         "evidence": monitor.evidence, "largest_evidence": monitor.largest, "threshold": monitor.threshold,
         "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance, "gate": monitor.gate,
         "mission": monitor.mission, "note": CAVEAT,

@@ -122,15 +122,17 @@ class Monitor:
     tolerance : 1 or more; 1 is the exact test, which in time alarms on every filter that is not exactly right
     gate : probability at which the filter's chi-square gate accepts the innovation of a right filter, such as 0.99;
         None without a gate. A NIS above its limit counts as rejected. Rejections are no evidence, and after one the
-        next 2 innovations (5 with a gate below 0.99) are not judged
+        next 2 innovations (5 with a gate below 0.99) are not judged; so a fault so large that the gate rejects nearly
+        everything goes unseen here: look at ``rejections`` as well
     mission : number of innovations after which no fault begins, if known: an early fault is then found a little
         later, a late one sooner. The false-alarm rate holds beyond it too
 
     Attributes
     ----------
     steps : calls of ``update``
-    innovations : those judged
+    measurements : those among them with a measurement
     rejections : measurements that the gate rejected
+    innovations : those that were judged
     evidence : e-value now; starts at 1
     largest : the largest so far; a right filter ever has 1 / a with probability at most a
     alarm : the first alarm, kept until ``reset``; None without
@@ -184,7 +186,7 @@ class Monitor:
     def reset(self) -> None:
         """Start anew, as after construction: the next alarm is false with probability ``false_alarm`` again."""
         count = 2 * len(RATIOS)
-        self.steps = self.innovations = self.rejections = 0
+        self.steps = self.measurements = self.rejections = self.innovations = 0
         self.evidence = self.largest = 1.0
         self.alarm: Alarm | None = None
         self._nis, self._dof = 0.0, 0
@@ -223,9 +225,11 @@ class Monitor:
             bet = self._bets[dof] = bet_on(int(dof), self.tolerance, self.gate)
         if not value <= bet.limit:  # above it, or NaN
             if self.gate is not None:
+                self.measurements += 1
                 self.rejections += 1
                 self._skip = self._rest
             return None
+        self.measurements += 1
         if self._skip:
             self._skip -= 1
             return None

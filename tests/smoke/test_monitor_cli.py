@@ -43,7 +43,7 @@ def test_an_alarm_with_plot_json_and_status(folder: Path) -> None:
     assert json.loads(done.stdout) == data
     done = consistency("monitor", "bad.csv", *OPTIMAL, cwd=folder)
     assert "overconfident since step 101" in done.stdout
-    assert "since 10.1 s" in done.stdout
+    assert "since t = 10.1 s" in done.stdout
     done = consistency("monitor", "bad.csv", *OPTIMAL, "--gate", "0.99", "--mission", "500", "--json", cwd=folder)
     data = json.loads(done.stdout)
     assert (data["gate"], data["mission"]) == (0.99, 500)

@@ -252,7 +252,7 @@ def test_a_rejection_is_no_evidence_and_the_next_innovations_are_not_judged(
         monitor.update(None, 0)  # a step without a measurement does not shorten it
         monitor.update(0.1, 3)
         assert monitor.evidence == before
-    assert (monitor.rejections, monitor.innovations) == (2, 2)
+    assert (monitor.rejections, monitor.innovations, monitor.measurements) == (2, 2, 5 + rest)
     monitor.update(0.1, 3)
     assert monitor.evidence != before
     assert monitor.innovations == 3

@@ -258,15 +258,17 @@ def test_empty_fields_of_a_line_are_a_step_without_an_innovation() -> None:
 
 
 def test_the_terminal_shows_numbers_and_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
-    print_watched(changed(gate=0.99, tolerance=1.0))
+    print_watched(changed(gate=0.99, tolerance=1.0))  # a NIS of 12 is above the gate
     out = capsys.readouterr().out
     assert "rejected" in out
     assert "$odd$" in out
+    assert "no alarm" in out
+    assert "rejected 50 % of the measurements (designed for 1 %), which is not judged" in out
     print_watched(changed())
     out = capsys.readouterr().out
     assert "rejected" not in out
     assert "overconfident since step 211" in out
-    assert "since 20 s" in out
+    assert "since t = 20 s" in out
     assert " 2.500 " in out  # NIS / dof over all
     print_watched(changed(1.0))
     assert "no alarm" in capsys.readouterr().out
@@ -279,7 +281,7 @@ def test_json_has_every_number() -> None:
     assert data["alarm"]["since_t"] == 20.0
     assert data["alarm"]["scale"] == pytest.approx(4.0)
     assert data["alarm"]["direction"] == "overconfident"
-    assert (data["steps"], data["judged"], data["rejected"]) == (400, 400, 0)
+    assert (data["steps"], data["measurements"], data["judged"], data["rejected"]) == (400, 400, 400, 0)
     assert data["largest_evidence"] == data["evidence"] == watched.monitor.evidence
     assert data["nis_ratio"] == 2.5
     assert "pose" in data["note"]

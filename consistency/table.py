@@ -166,9 +166,9 @@ def watched_json(watched: Watched) -> str:
     monitor, alarm = watched.monitor, watched.alarm
     data = {
         "innovations": watched.name, "steps": monitor.steps, "measurements": monitor.measurements,
-        "rejected": monitor.rejections, "judged": monitor.innovations, "nis_ratio": monitor.ratio, "scale": monitor.scale,
-        "evidence": monitor.evidence, "largest_evidence": monitor.largest, "threshold": monitor.threshold,
-        "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance, "gate": monitor.gate,
+        "rejected": monitor.rejections, "judged": monitor.innovations, "nis_ratio": monitor.ratio,
+        "scale": monitor.scale, "evidence": monitor.evidence, "largest_evidence": monitor.largest,
+        "threshold": monitor.threshold, "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance, "gate": monitor.gate,
         "mission": monitor.mission, "note": CAVEAT,
         "alarm": None if alarm is None else {
             "step": alarm.step, "since": alarm.since, "t": watched.alarm_t, "since_t": watched.since_t,

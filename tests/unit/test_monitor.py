@@ -167,19 +167,14 @@ def test_the_evidence_of_a_right_filter_is_a_martingale(gate: float | None) -> N
 
 
 def test_an_alarm_is_raised_at_the_inverse_of_the_rate() -> None:
-    rng = np.random.default_rng()
     for false_alarm in (0.2, 0.01):
-        monitor = cs.Monitor(false_alarm, tolerance=1.0)
-        assert monitor.threshold == pytest.approx(1 / false_alarm)
-        before = 1.0
-        for step in range(1, 10_000):
-            alarm = monitor.update(3.0 * rng.chisquare(2), 2)
-            if alarm:
-                assert before < 1 / false_alarm <= alarm.evidence == monitor.evidence
-                assert alarm.step == step
-                break
+        monitor, before = cs.Monitor(false_alarm, tolerance=1.0), 1.0
+        while not (alarm := monitor.update(2.6, 2)):  # evidence that grows by a few percent a step
             before = monitor.evidence
-        assert monitor.alarm is alarm
+            assert monitor.steps < 10_000
+        assert before < monitor.threshold <= alarm.evidence < 1.1 * monitor.threshold
+        assert monitor.threshold == pytest.approx(1 / false_alarm)
+        assert (alarm.evidence, alarm.step) == (monitor.evidence, monitor.steps)
 
 
 # --- since when, in which direction, by how much --------------------------------------------------------
@@ -198,6 +193,34 @@ def test_a_change_is_found_with_its_step_direction_and_scale(ratio: float, direc
     assert alarm.scale == pytest.approx(ratio)
     assert 201 < alarm.step < 280
     assert monitor.evidence > alarm.evidence  # still counted
+
+
+@pytest.mark.parametrize(("ratio", "direction"), [(1.07, "overconfident"), (0.93, "conservative")])
+def test_the_direction_of_a_small_fault(ratio: float, direction: str) -> None:
+    """The alternatives nearest to 1 on either side are the best there."""
+    alarm = fed(cs.Monitor(tolerance=1.0), [300.0 * ratio] * 200, 300)[0]
+    assert alarm.direction == direction
+    assert alarm.scale == pytest.approx(ratio)
+
+
+def test_since_when_by_its_definition() -> None:
+    """The step after the one at which the sum of log ratios of the r with the largest R was lowest."""
+    rng = np.random.default_rng()
+    constant, slope = np.array(bet_on(2, 1.0).terms).T
+    for _ in range(100):
+        monitor, nis = cs.Monitor(0.05, tolerance=1.0), []
+        while monitor.alarm is None:
+            nis.append((1.0 if monitor.steps < 30 else 1.8) * rng.chisquare(2))
+            monitor.update(nis[-1], 2)
+        steps = len(nis)
+        walk = np.vstack([np.zeros(len(slope)), np.cumsum(constant + slope * np.array(nis)[:, None], axis=0)])
+        shares = np.array([start_share(k) for k in range(1, steps + 1)])
+        R = (shares[:, None] * np.exp(walk[-1] - walk[:-1])).sum(axis=0)
+        best = int(R.argmax())
+        lowest = steps - int(np.argmin(walk[::-1, best]))  # the last one, if there are several
+        assert monitor.alarm.since == lowest + 1
+        assert monitor.alarm.scale == pytest.approx(np.mean(nis[lowest:]) / 2)
+        assert monitor.alarm.direction == ("overconfident" if best < len(RATIOS) else "conservative")
 
 
 def test_scales_within_the_tolerance_raise_nothing_and_begin_nothing() -> None:

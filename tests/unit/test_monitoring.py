@@ -270,6 +270,11 @@ def test_the_terminal_shows_numbers_and_a_sentence(capsys: pytest.CaptureFixture
     assert "overconfident since step 211" in out
     assert "since t = 20 s" in out
     assert " 2.500 " in out  # NIS / dof over all
+    none = NisLog(
+        "f", np.arange(1.0, 5), np.full(4, np.nan), np.array([50.0, 2.0, 3.0, np.nan]), np.array([2.0, 2, 2, 0])
+    )
+    print_watched(watch(none, make_monitor("optimal", gate=0.99)))
+    assert "rejected 33 % of the measurements" in capsys.readouterr().out  # a step without one does not count
     print_watched(changed(1.0))
     assert "no alarm" in capsys.readouterr().out
 
@@ -294,6 +299,7 @@ def test_many_innovations_are_averaged_before_they_are_drawn() -> None:
     assert len(y) <= POINTS
     assert together == 4
     np.testing.assert_allclose(y[:-1], 2.0)
+    assert (x[-1], y[-1]) == (3001.0, 1.0)  # one is left over
     np.testing.assert_allclose(x[0], np.mean([1, 3, 4, 6]))
     x, y, together = averaged(step[:30], ratio[:30])
     assert together == 1

@@ -168,8 +168,8 @@ def watched_json(watched: Watched) -> str:
         "innovations": watched.name, "steps": monitor.steps, "measurements": monitor.measurements,
         "rejected": monitor.rejections, "judged": monitor.innovations, "nis_ratio": monitor.ratio,
         "scale": monitor.scale, "evidence": monitor.evidence, "largest_evidence": monitor.largest,
-        "threshold": monitor.threshold, "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance, "gate": monitor.gate,
-        "mission": monitor.mission, "note": CAVEAT,
+        "threshold": monitor.threshold, "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance,
+        "gate": monitor.gate, "mission": monitor.mission, "note": CAVEAT,
         "alarm": None if alarm is None else {
             "step": alarm.step, "since": alarm.since, "t": watched.alarm_t, "since_t": watched.since_t,
             "direction": alarm.direction, "evidence": alarm.evidence, "scale": alarm.scale, "sentence": str(alarm),

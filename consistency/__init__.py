@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from consistency.diagnostics import Alarm, Monitor, anees, anees_interval, nees
+    from consistency.diagnostics.records import Verdict
     from consistency.errors import InputError
     from consistency.filters import filter_names, get_filter
     from consistency.findings import Study
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from consistency.results import Results, read_results
     from consistency.scenario import Scenario, load_scenario, scenario_names
     from consistency.simulation import simulate
-    from consistency.types import Control, Finding, Gaussian, Info, Observation, Trial, Verdict
+    from consistency.types import Control, Finding, Gaussian, Info, Observation, Trial
 
 _HOME = {
     "InputError": "errors",
@@ -41,7 +42,7 @@ _HOME = {
     "Info": "types",
     "Observation": "types",
     "Trial": "types",
-    "Verdict": "types",
+    "Verdict": "diagnostics.records",
 }
 
 __all__ = [

@@ -41,8 +41,8 @@ ul { margin: .25rem 0; padding-left: 1.2rem; color: var(--faint); }
 CLASSES = {
     "consistent": "consistent", "not worse": "consistent", "conservative": "conservative", "failed": "failed",
 }  # fmt: skip
-HEAD = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "needed", "inflation", "why")
-NUMBERS = {"p", "false-alarm rate", "runs", "needed", "inflation"}
+HEAD = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "planned", "inflation", "why")
+NUMBERS = {"p", "false-alarm rate", "runs", "planned", "inflation"}
 
 
 def as_json(ledger: Ledger) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from consistency.diagnostics import Verdict
 from consistency.errors import InputError
 from consistency.findings import read_findings
 from consistency.judge import Curves, analyse, curves
@@ -22,7 +23,7 @@ from consistency.results import read_results
 from consistency.scenario import Scenario
 from consistency.simulation import simulate
 from consistency.storage import read_manifest
-from consistency.types import Array, Verdict
+from consistency.types import Array
 
 DECADE = 10.0  # values that span more are drawn on a log axis
 DEGREES = np.array([1.0, 1.0, 180.0 / np.pi])

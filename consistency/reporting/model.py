@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from consistency.diagnostics import Verdict
 from consistency.reporting.calibration import Calibration
-from consistency.types import Array, Gaussian, Indices, Verdict
+from consistency.types import Array, Gaussian, Indices
 
 STATUSES = ("consistent", "overconfident", "conservative", "inconsistent", "undecided", "failed")
 SINGLE_RUN = 1

@@ -30,9 +30,9 @@ from calibration_rows import CONFIDENCE, Row, document, kept, write_docs
 from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
 
 import consistency as cs
-from consistency.diagnostics import judge, nees, sequential_design
+from consistency.diagnostics import Evidence, Settings, Verdict, e_process, follow, judge, nees, sequential_design
 from consistency.judge import curves
-from consistency.types import Array, Verdict
+from consistency.types import Array
 
 BATCH = 25  # gates handed to a worker at once
 CHUNK = 2000  # runs of the Kalman filter in memory at once
@@ -47,6 +47,7 @@ class Outcome:
 
     status: str
     fault: bool
+    wrong_scale: bool  # of whole trajectories, found
     located: bool  # an axis, or a late start, was named
     runs: int  # that it took
 
@@ -57,6 +58,7 @@ COUNTED: dict[str, Callable[[Outcome], bool]] = {
     "overconfident": lambda o: o.status == "overconfident",
     "conservative": lambda o: o.status == "conservative",
     "scale": lambda o: o.status in ("overconfident", "conservative"),
+    "wrong scale": lambda o: o.wrong_scale,
     "located": lambda o: o.located,
 }
 
@@ -66,35 +68,24 @@ COUNTED: dict[str, Callable[[Outcome], bool]] = {
 
 def _judge_one(gate: Gate, false_alarm: float) -> Verdict:
     """The verdict on a gate: the only place that calls ``judge``."""
-    return judge(
-        "gate", gate.error, gate.covariance, gate.nees, gate.nis, gate.nis_dof, false_alarm=false_alarm, dof=gate.dof,
-        innovations=gate.innovations, innovation_covariances=gate.innovation_covariances,
-    )  # fmt: skip
+    return judge(Evidence("gate", **vars(gate)), Settings(false_alarm, DETECT, POWER))
 
 
 def _follow_one(gate_of: Callable[[int], Gate], false_alarm: float, dof: int) -> tuple[Verdict, int]:
     """The verdict of ``--until-decided``, and the runs it took: the only place that does so."""
     design = sequential_design(dof, DETECT, false_alarm, POWER, MOST)
-    for runs in design.looks:
-        verdict = design.settle(_judge_one(gate_of(runs), design.look_false_alarm))
-        if verdict.status != "undecided":
-            break
-    return verdict, runs
+    return follow(design, lambda runs: Evidence("gate", **vars(gate_of(runs))))
 
 
 def _evidence_values(means: Array, dof: int) -> Array:
     """E-values after each run, from run means of the NEES over its degrees of freedom."""
-    e_process = importlib.import_module("consistency.diagnostics.eprocess").e_process
-    return np.asarray(e_process(means, dof).both)
-
-
-def _has_e_process() -> bool:
-    return importlib.util.find_spec("consistency.diagnostics.eprocess") is not None
+    return e_process(means, dof).both
 
 
 def _outcome(verdict: Verdict, runs: int) -> Outcome:
-    located = verdict.subset is not None or verdict.statistics.get("since") is not None
-    return Outcome(verdict.status, bool(verdict.faults), located, runs)
+    since = None if verdict.location is None else verdict.location.since
+    located = verdict.subset is not None or since is not None
+    return Outcome(verdict.status, bool(verdict.faults), "scale" in verdict.faults, located, runs)
 
 
 # --- gates --------------------------------------------------------------------------------------------------
@@ -141,9 +132,9 @@ def _betting(case: Case, gate_of: Growing) -> Outcome:
     means = run_means(gate) / dof
     crossed = np.flatnonzero(_evidence_values(means, dof) >= 1.0 / case.false_alarm)
     if not len(crossed):
-        return Outcome("undecided", False, False, case.runs)
+        return Outcome("undecided", False, False, False, case.runs)
     runs = int(crossed[0]) + 1
-    return Outcome("overconfident" if means[:runs].mean() > 1.0 else "conservative", True, False, runs)
+    return Outcome("overconfident" if means[:runs].mean() > 1.0 else "conservative", True, True, False, runs)
 
 
 def run_means(gate: Gate) -> Array:
@@ -163,7 +154,6 @@ def run_means(gate: Gate) -> Array:
 
 def measure(every: Sequence[Case], seed: int = SEED, workers: int = 2, pooled: int = POOLED) -> Iterator[Row]:
     """Rows of the cases, in their order, as they are done."""
-    every = [case for case in every if case.mode != "e-process" or _has_e_process()]
     wanted = max((case.gates * case.runs for case in every if case.world == "linear-gaussian"), default=0)
     with tempfile.TemporaryDirectory() as folder:
         pool_file = _kalman_runs(min(wanted, pooled), seed, Path(folder)) if wanted else None

@@ -14,6 +14,7 @@ FALSE_ALARM, POWER, DETECT = 0.05, 0.95, 1.5
 QUICK_FAILURE = 1e-3  # chance that the quick rows of a referee that keeps its promises fail
 MANY, SHOWING = 100, 50  # runs
 MOST = 500  # runs of --until-decided
+HEADLINE = 0.85  # of the planned runs, least share of verdicts named after the scale
 LOG_STEPS = 1000
 # ratio -> world -> runs with which the ratio is found with power 0.95
 FOUND_BY = {
@@ -53,7 +54,7 @@ def cases() -> list[Case]:
     """All that ``make calibrate`` measures."""
     return [
         *(case for runs, rate, gates in alarm_plans() for case in _alarms(WORLDS, runs, rate, gates)),
-        *_until_decided(WORLDS, 200),
+        *_until_decided(WORLDS, 1000),
         *_bets(WORLDS, 1000),
         *_all_clears(WORLDS, 1000),
         *_planned_power((1.2, 1.5, 2.0, 0.67), 1000),
@@ -135,9 +136,15 @@ def _all_clears(worlds: Iterable[str], gates: int) -> list[Case]:
 
 
 def _planned_power(ratios: Iterable[float], gates: int) -> list[Case]:
-    """The plan counts on the worst case, and approximates a verdict by its main question: 2 points less are allowed."""
+    """The plan counts on the worst case, and approximates a verdict by its main question: 2 points less are allowed.
+
+    A few runs cannot always tell a wrong scale from heavy tails, so that some headlines name the tails.
+    """
+    found = Claim("power", "wrong scale", POWER - 0.02, ">=")
     return [
-        Case("fully dependent", gate_runs(DOF, r, FALSE_ALARM, POWER), gates, (_power(r, POWER - 0.02),), r)
+        Case(
+            "fully dependent", gate_runs(DOF, r, FALSE_ALARM, POWER), gates, (found, _power(r, HEADLINE, "headline")), r
+        )
         for r in ratios
     ]
 
@@ -146,8 +153,8 @@ def _found_by(runs: dict[float, dict[str, int]], gates: int) -> list[Case]:
     return [Case(world, n, gates, (_power(r, POWER),), r) for r, of in runs.items() for world, n in of.items()]
 
 
-def _power(ratio: float, stated: float) -> Claim:
-    return Claim("power", "overconfident" if ratio > 1.0 else "conservative", stated, ">=")
+def _power(ratio: float, stated: float, question: str = "power") -> Claim:
+    return Claim(question, "overconfident" if ratio > 1.0 else "conservative", stated, ">=")
 
 
 def _one_log(gates: int) -> list[Case]:

@@ -21,7 +21,7 @@ from consistency.diagnostics.planning import PilotPlan, detectable_ratio, gate_r
 from consistency.diagnostics.questions import answers
 from consistency.diagnostics.records import Answer, Equivalence, Evidence, Interval, Settings, Verdict
 from consistency.diagnostics.scale import Band, MeanTest, mean_test, ratio_interval, simultaneous_band
-from consistency.diagnostics.sequential import Design, follow, look, sequential_design
+from consistency.diagnostics.sequential import Design, follow, look, sequential_design, speaks
 from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
 from consistency.diagnostics.verdict import judge
 from consistency.diagnostics.whitening import spread_steps, standardise, whiten
@@ -85,6 +85,7 @@ __all__ = [
     "rmse",
     "sequential_design",
     "simultaneous_band",
+    "speaks",
     "sphericity",
     "spread_steps",
     "standardise",

@@ -13,6 +13,7 @@ import consistency as cs
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 import calibration_monitor as calibration
+from calibration_rows import Row
 
 
 @pytest.mark.parametrize("gate", [None, 0.99, 0.95])
@@ -66,21 +67,30 @@ def test_a_filter_that_misses_a_measurement_knows_it(name: str) -> None:
     assert low < world.nis().sum() < high
 
 
-def test_rows_have_what_the_table_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_those_of_the_calibration_table(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "STEPS", 60)
-    monkeypatch.setattr(calibration, "LATE", 30)
-    monkeypatch.setattr(calibration, "PATIENCE", 400)
+    monkeypatch.setattr(calibration, "PATIENCE", 200)
+    monkeypatch.setattr(calibration, "QUICK_MISSIONS", {0.05: 20, 0.01: 40})
     monkeypatch.setattr(calibration, "WORLDS", {"position": calibration.Position})
-    rows = calibration.measure({0.05: 30, 0.01: 60}, faults=30)
-    right, faults = [row for row in rows if row["ratio"] == 1.0], [row for row in rows if row["ratio"] != 1.0]
-    assert [(row["tolerance"], row["gate"], row["false_alarm"], row["missions"]) for row in right] == [
-        (tolerance, gate, rate, missions)
-        for gate in (None, 0.99)
-        for tolerance in (1.0, 1.2)
-        for rate, missions in ((0.05, 30), (0.01, 60))
+    rows = [Row(**row) for row in calibration.rows(quick=True, seed=1)]
+    alarms, found = [row for row in rows if row.ratio == 1.0], [row for row in rows if row.ratio != 1.0]
+    assert [(row.world, row.question[-3:], row.stated, row.gates) for row in alarms] == [
+        (world, tolerance, rate, gates)
+        for world in ("position", "position, gate 0.99")
+        for tolerance in ("e 1", "1.2")
+        for rate, gates in ((0.05, 20), (0.01, 40))
     ]
-    assert all(0 <= row["found"] <= row["missions"] for row in right)
-    assert {(row["ratio"], row["since"]) for row in faults} == {(r, s) for r in (1.5, 2.0, 0.5) for s in (1, 31)}
-    assert all(1 <= row["median_delay"] <= row["p95_delay"] for row in faults)
-    slow, fast = (next(row for row in faults if row["ratio"] == ratio) for ratio in (1.5, 2.0))
-    assert fast["median_delay"] < slow["median_delay"]
+    assert all(row.bound == "<=" and row.found <= row.gates for row in alarms)
+    assert {(row.ratio, row.runs) for row in found} == {(r, n) for (r, _), n in calibration.FOUND_WITHIN.items()}
+    assert all(row.bound == ">=" and 0 < row.found <= row.gates for row in found)
+    assert {row.world for row in rows} | {row.question for row in rows} <= set(calibration.ABOUT)
+
+
+def test_a_delay_counts_the_steps_of_the_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So gross a fault is found in its first step, wherever that is."""
+    monkeypatch.setattr(calibration, "LATE", 20)
+    monkeypatch.setattr(calibration, "RATIOS", (1e6,))
+    found = calibration.delays("position", None, 30, seed=int(np.random.SeedSequence().generate_state(1)[0]))
+    assert set(found) == {(tolerance, 1e6, since) for tolerance in (1.0, 1.2) for since in (1, 21)}
+    assert all((steps == 1).all() for steps in found.values())
+    assert all(20 <= len(steps) <= 30 for steps in found.values())

@@ -13,6 +13,7 @@ from consistency.diagnostics.eprocess import EProcess, e_process, ever
 from consistency.diagnostics.equivalence import equivalence
 from consistency.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.diagnostics.monitor import Alarm, Monitor
 from consistency.diagnostics.nees import anees, nees
 from consistency.diagnostics.normality import Normality, normality
 from consistency.diagnostics.outliers import Outlier, outliers
@@ -26,6 +27,7 @@ from consistency.diagnostics.verdict import judge
 from consistency.diagnostics.whitening import spread_steps, standardise, whiten
 
 __all__ = [
+    "Alarm",
     "Answer",
     "Band",
     "Comparison",
@@ -38,6 +40,7 @@ __all__ = [
     "Interval",
     "Largest",
     "MeanTest",
+    "Monitor",
     "NisTest",
     "Normality",
     "Outlier",

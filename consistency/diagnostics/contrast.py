@@ -32,20 +32,18 @@ class Contrast:
         """One-sided p values: of a true value that is not above 0, and of one that is not below 0."""
         if self.variance == 0.0:
             return float(self.value <= 0.0), float(self.value >= 0.0)
-        t = self.value / self._error_at(-self.value)
+        move = min(abs(self.value), REACH * self.error)  # to the hypothesis
+        t = self.value / self._error(-self.slope * move if self.value > 0.0 else self.slope * move)
         return float(special.stdtr(self.freedom, -t)), float(special.stdtr(self.freedom, t))
 
     def half_width(self, tail: float) -> float:
         """From the value to a one-sided confidence limit, missed with probability ``tail`` at most."""
-        if self.variance == 0.0:
-            return 0.0
-        widest = max(self._error_at(move) for move in (-np.inf, np.inf))
-        return -float(special.stdtrit(self.freedom, tail)) * widest
+        widest = self._error(abs(self.slope) * REACH * self.error)
+        return -float(special.stdtrit(self.freedom, tail)) * widest if self.variance > 0.0 else 0.0
 
-    def _error_at(self, move: float) -> float:
-        """Standard error, to the safe side, if the true value were ``value + move``."""
-        growth = self.slope * float(np.clip(move, -REACH * self.error, REACH * self.error))
-        return self.error * float(np.exp(0.5 * (np.clip(growth, 0.0, LARGEST) + margin(self.freedom))))
+    def _error(self, growth: float) -> float:
+        """Standard error, to the safe side, where the log variance is larger by ``growth``."""
+        return self.error * float(np.exp(0.5 * (min(max(growth, 0.0), LARGEST) + margin(self.freedom))))
 
 
 def contrast(a: Array, b: Array, sign: float, paired: bool) -> Contrast:

@@ -127,6 +127,22 @@ def test_no_more_false_alarms_than_stated_on_the_same_trials(rng: np.random.Gene
         assert (np.array(p) <= rate).sum() <= stats.binom.isf(RATE, 400, rate)
 
 
+def test_calibration_rows_count_false_alarms(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "experiments")
+    import calibration_compare
+
+    rows = calibration_compare.rows(40, 20, 5)
+    assert [(r["runs"], r["false_alarm"], r["gates"]) for r in rows[:4]] == [
+        (8, 0.05, 40), (8, 0.01, 20), (21, 0.05, 40), (21, 0.01, 20),
+    ]  # fmt: skip
+    assert len({(r["world"], r["dof"], r["runs"], r["false_alarm"]) for r in rows}) == len(rows) == 24
+    assert json.loads(json.dumps(rows)) == rows
+    assert rows == calibration_compare.rows(40, 20, 5)
+    monkeypatch.setattr(calibration_compare, "_p_value", lambda *_: 0.03)
+    assert {r["found"] for r in calibration_compare.rows(4, 2, 5) if r["false_alarm"] == 0.05} == {4}
+    assert {r["found"] for r in calibration_compare.rows(4, 2, 5) if r["false_alarm"] == 0.01} == {0}
+
+
 def test_the_p_value_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each side the larger p value counts, of both sides the smaller, twice."""
     table = {

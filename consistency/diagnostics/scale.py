@@ -14,6 +14,7 @@ from consistency.types import Array
 
 FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete
 LARGE = 1e6  # shape of a Gamma distribution beyond which its information is 1/2 and rounding would rule
+LEAST = 4.0  # degrees of freedom of Student's t in an interval: with fewer it says nothing at all
 REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
 UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
 
@@ -149,7 +150,8 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = 0.95) -> Inte
     if len(means) > 1 and means.std() > 0:
         log_nu, left_out = _log_nu_of_means(means)
         if len(means) >= FEW:
-            nu, spread = float(np.exp(log_nu)), 2.0 / max(_jackknife(left_out, left_out), 2.0 / len(means))
+            variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
+            nu, spread = float(np.exp(log_nu)), max(2.0 / variance, LEAST)
         else:
             nu = min(nu, float(np.exp(log_nu)))
     elif len(means) >= FEW:

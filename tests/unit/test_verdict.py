@@ -131,7 +131,7 @@ def test_a_bias_does_not_hide_a_covariance_too_small() -> None:
     verdict = make(scale=3.0, bias=1.5).verdict()
     assert verdict.status == "overconfident"
     assert "biased: axis 0 +" in verdict.reasons[0]
-    assert "covariance too small by x" in verdict.reasons[0]
+    assert "covariance about the mean too small by x" in verdict.reasons[0]
 
 
 def test_overconfident_in_a_single_step_is_caught() -> None:

@@ -210,7 +210,6 @@ def distribution(axes: Axes, x: Array, y: Array, half_width: float, look: Style)
     axes.plot([0, 1], [0, 1], color="#555555", linewidth=0.8, zorder=1)
     axes.plot(x, y, color=look.colour, linewidth=1.3, drawstyle="steps-post", zorder=3)
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
-    axes.set_aspect("equal", adjustable="box")
     _frame(axes)
 
 

@@ -16,14 +16,14 @@ def no_truth(study: Study) -> str:
     """Why there are no error plots."""
     return (
         f"The truth of {study.name} is not known, so there are no pose errors and no NEES to show; the innovations "
-        f"below are {'all that can be judged' if _judged(study) else 'reported, and judge nothing'}."
+        f"below are {'all that can be judged' if _judged(study) else 'reported and not judged'}."
     )
 
 
 def verdict_caption(study: Study) -> str:
     """How large the study is, and how to read the table of verdicts."""
     text = f"{plural(study.runs, 'run')} of {plural(len(study.steps), 'step')}"
-    if study.single:
+    if study.single and study.has_truth:
         text += "; with one run the ANEES is the NEES of that run"
     if study.until_decided:
         when = [f"{track.name} after {plural(track.verdict.runs, 'run')}" for track in study.tracks]
@@ -181,6 +181,12 @@ def method(report: Report) -> str:
             " Half of the false-alarm rate belongs to the mean NEES of whole runs, for which the number of runs is "
             "planned; the other questions share the rest. Where a fault was absent before some step, the factor and "
             "the axes are those since that step."
+        )
+    if any(not study.has_truth for study in report.studies):
+        text += (
+            " Without truth the ratio is that of the NIS to its degrees of freedom, and only the innovations of a "
+            "filter that declares an optimal gain are judged: those of any other need be neither white nor of the "
+            "stated size."
         )
     if any(study.until_decided for study in report.studies):
         text += (

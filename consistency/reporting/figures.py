@@ -173,7 +173,7 @@ def nees_distribution(study: Study) -> Figure | None:
     if not found:
         return None
     rows = -(-len(found) // PANELS)
-    figure, axes = _figure(1.95 * rows, rows, PANELS)  # square panels leave room for their titles
+    figure, axes = _figure(1.85 * rows, rows, PANELS)  # panels that are nearly square
     for panel in axes.flat[len(found) :]:
         panel.set_axis_off()
     for number, ((track, of), panel) in enumerate(zip(found, axes.flat, strict=False)):

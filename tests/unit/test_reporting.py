@@ -485,6 +485,17 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     assert pdf.render_pdf(report).startswith(b"%PDF")
 
 
+def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
+    error, P = drawn(6, 24)
+    lost = (Failure("any", 3, 9, "singular"),)
+    late, early, whole = (
+        judge(Evidence("any", error[:runs], P[:runs], failures=failures))
+        for runs, failures in ((24, lost), (12, ()), (24, ()))
+    )
+    assert build._common({"early": early, "late": late}) is late
+    assert build._common({"late": late, "whole": whole, "early": early}) is whole
+
+
 def test_runs_of_a_fixed_number_say_nothing_of_looks(folder):
     report = build_report(folder)
     assert not report.studies[0].until_decided

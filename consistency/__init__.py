@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from consistency.diagnostics import anees, anees_interval, nees
+    from consistency.diagnostics import Alarm, Monitor, anees, anees_interval, nees
     from consistency.diagnostics.records import Verdict
     from consistency.errors import InputError
     from consistency.filters import filter_names, get_filter
@@ -32,6 +32,8 @@ _HOME = {
     "nees": "diagnostics",
     "anees": "diagnostics",
     "anees_interval": "diagnostics",
+    "Alarm": "diagnostics",
+    "Monitor": "diagnostics",
     "analyse": "judge",
     "Finding": "types",
     "Study": "findings",
@@ -44,9 +46,9 @@ _HOME = {
 }
 
 __all__ = [
-    "Control", "Finding", "Gaussian", "Info", "InputError", "Observation", "Results", "Scenario", "Study", "Trial",
-    "Verdict", "analyse", "anees", "anees_interval", "filter_names", "get_filter", "load_scenario", "nees",
-    "read_results", "run_trials", "scenario_names", "simulate",
+    "Alarm", "Control", "Finding", "Gaussian", "Info", "InputError", "Monitor", "Observation", "Results", "Scenario",
+    "Study", "Trial", "Verdict", "analyse", "anees", "anees_interval", "filter_names", "get_filter", "load_scenario",
+    "nees", "read_results", "run_trials", "scenario_names", "simulate",
 ]  # fmt: skip
 
 

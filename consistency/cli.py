@@ -448,6 +448,65 @@ def reproduce(
         raise typer.Exit(1)
 
 
+@app.command()
+def monitor(
+    path: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE", help="Innovations of one run: .csv, .parquet, .npz, a folder of 'run', or - for CSV lines."
+        ),
+    ],
+    innovations: Annotated[
+        str | None,
+        typer.Option("--innovations", help="'optimal': declares the optimal gain, without which nothing is judged."),
+    ] = None,
+    false_alarm: Annotated[
+        float, typer.Option("--false-alarm", help="Chance that a right filter ever raises an alarm.")
+    ] = 1e-3,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Scales of the NIS up to this ratio are no fault; 1 is the exact test.")
+    ] = 1.2,
+    gate: Annotated[
+        float | None, typer.Option("--gate", help="Probability of the filter's chi-square gate, such as 0.99.")
+    ] = None,
+    mission: Annotated[
+        int | None, typer.Option("--mission", help="Innovations of the whole mission, if known.")
+    ] = None,
+    filter_name: Annotated[str | None, typer.Option("--filter", help="Which, if FILE holds several.")] = None,
+    run: Annotated[int | None, typer.Option("--run", help="Which, if FILE holds several.")] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
+) -> None:
+    """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
+    from consistency.monitoring import make_monitor, read_innovations, watch, watch_lines
+    from consistency.reporting import require_plot, write_monitor_plot
+    from consistency.table import print_watched, watched_json
+
+    if fail_on not in (None, "alarm"):
+        raise InputError(f"--fail-on must be 'alarm', got '{fail_on}'")
+    watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
+    if path == "-":
+        given = _given(filter=filter_name, run=run, plot=plot)
+        if given:
+            raise InputError(f"--{next(iter(given))}: does not go with lines as they come (-)")
+        watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
+    else:
+        log = read_innovations(Path(path), filter_name, run)
+        if plot is not None:
+            require_plot(plot, overwrite)
+        watched = watch(log, watcher)
+    if plot is not None:
+        write_monitor_plot(plot, watched)
+    if as_json:
+        print(watched_json(watched))
+    else:
+        print_watched(watched)
+    if fail_on and watched.alarm is not None:
+        raise typer.Exit(1)
+
+
 def main(arguments: list[str] | None = None) -> Any:
     """Entry point: unusable input ends in one line and exit status 2; SIGTERM is taken as Ctrl-C."""
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL and threading.current_thread() is threading.main_thread():

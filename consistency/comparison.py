@@ -17,6 +17,8 @@ from consistency.judge import curves
 from consistency.results import POSE, Results, read_results
 from consistency.storage import SCHEMA_VERSION, manifest_of, plain
 
+DETECT = 1.5  # ratio that a sentence speaks of
+
 
 @dataclass(frozen=True)
 class Baseline:
@@ -49,8 +51,10 @@ class Compared:
         text += f": {c.runs} runs, {way}, p {c.p_value:.2g}"
         if c.distance == c.standard_error == 0.0:
             text += "; every run is the same in both"
+        elif not c.worse and c.at_most < np.log(DETECT):
+            text += f"; farther off by x{np.exp(max(c.at_most, 0.0)):.3g} at most"
         elif not c.worse:
-            text += f"; {c.needed_runs()} runs find a covariance farther off by x1.5 with power 0.95"
+            text += f"; {c.needed_runs(DETECT)} runs find a covariance farther off by x{DETECT:g} with power 0.95"
         if any(self.failures):
             text += f"; failed runs {self.failures[0]}, {self.failures[1]} in the reference"
         return f"{text}. {self.note}".rstrip(". ") if self.note else text

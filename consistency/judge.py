@@ -112,9 +112,9 @@ def run_means(c: Curves) -> Array:
 
 
 def wins(a: Curves, b: Curves) -> tuple[int, float]:
-    """Runs in which ``a`` has the lower mean NEES than ``b``, and the two-sided p value of a sign test."""
+    """Runs in which ``a`` has the lower mean NEES than ``b``, and the two-sided p value of a sign test without ties."""
     better, worse = (int((run_means(x) < run_means(y)).sum()) for x, y in ((a, b), (b, a)))
-    return better, float(stats.binomtest(better, better + worse).pvalue)
+    return better, float(stats.binomtest(better, better + worse).pvalue) if better + worse else 1.0
 
 
 def settings_of(confidence: float | None = None, **given: Any) -> Settings:

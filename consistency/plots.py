@@ -154,6 +154,28 @@ def nis(axes: Axes, steps: Indices, ratio: Array, look: Style, log: bool = False
     _frame(axes)
 
 
+def evidence(axes: Axes, steps: Array, values: Array, threshold: float, alarm: tuple[float, float] | None) -> None:
+    """E-value after each step with the value at which an alarm is raised (dashed).
+
+    What goes on beyond the square of that value is cut off.
+
+    Parameters
+    ----------
+    steps, values : (N,), (N,)
+    alarm : the step since which there is a fault and that of the alarm, shaded between; None without alarm
+    """
+    if alarm is not None:
+        axes.axvspan(*alarm, color=COLOURS[1], alpha=0.15, linewidth=0, zorder=0)
+        axes.axvline(alarm[1], color=COLOURS[1], linewidth=1.1, zorder=2)
+    axes.axhline(threshold, color="#333333", linewidth=0.9, dashes=(4, 3), zorder=1)
+    axes.plot(steps, values, color=COLOURS[0], linewidth=1.2, zorder=3)
+    axes.set_yscale("log")
+    axes.set(xlabel="step", ylabel="e-value")
+    axes.set_ylim(top=min(axes.get_ylim()[1], threshold**2))
+    axes.margins(x=0.01)
+    _frame(axes)
+
+
 def forest(
     axes: Axes,
     looks: Sequence[Style],

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from consistency.diagnostics import Design, Verdict, look, sequential_design
+from consistency.diagnostics import Design, Verdict, look, sequential_design, speaks
 from consistency.errors import InputError
 from consistency.judge import curves, evidence_of, refused
 from consistency.montecarlo import Interrupted, run_trials
@@ -59,8 +59,11 @@ def run_until_decided(
         source = results or previous
         assert source is not None
         open_ = [name for name in source.filters if name not in decided]
-        verdicts = {name: look(design, evidence_of(curves(source, name), runs), spent) for name in open_}
-        decided |= {name: v for name, v in verdicts.items() if settled(v) or runs == max_runs}
+        for name in open_:
+            evidence = evidence_of(curves(source, name), runs)
+            if runs == max_runs or speaks(design, evidence, spent):
+                verdict = look(design, evidence, spent)
+                decided |= {name: verdict} if settled(verdict) or runs == max_runs else {}
         open_ = [name for name in open_ if name not in decided]
         if runs > done:
             print(f"{runs} runs: {said(decided, open_)}", file=sys.stderr, flush=True)

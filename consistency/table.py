@@ -15,7 +15,9 @@ from rich.table import Table as RichTable
 
 from consistency.comparison import Compared
 from consistency.diagnostics import Interval, Verdict
+from consistency.diagnostics.monitor import CAVEAT, accepted_scales
 from consistency.diagnostics.wording import short
+from consistency.monitoring import Watched
 from consistency.storage import plain
 from consistency.types import Finding
 
@@ -129,6 +131,57 @@ def comparisons_json(compared: Sequence[Compared]) -> str:
         for each in compared
     ]
     return json.dumps(data, indent=2, allow_nan=False)
+
+
+def print_watched(watched: Watched) -> None:
+    """What the monitor said of a run: one row of numbers and a sentence."""
+    monitor = watched.monitor
+    gated = monitor.gate is not None
+    table = RichTable(box=None, pad_edge=False)
+    heads = ["innovations", "steps", "judged", *["rejected"] * gated, "NIS/dof", *["scale"] * gated]
+    for column in (*heads, "e-value", "largest", "alarm at"):
+        table.add_column(column, justify="left" if column == "innovations" else "right")
+    cells = [escape(watched.name), f"{monitor.steps}", f"{monitor.innovations}", *[f"{monitor.rejections}"] * gated]
+    cells += [_number(monitor.ratio, ".3f"), *[_number(monitor.scale, ".3f")] * gated]
+    table.add_row(
+        *cells, *(f"{value:.3g}" for value in (monitor.evidence, monitor.largest)), f"{monitor.threshold:.4g}"
+    )
+    console = _console()
+    console.print(table)
+    console.print(f"\n{_sentence(watched)}", markup=False, soft_wrap=not console.is_terminal)
+
+
+def _sentence(watched: Watched) -> str:
+    monitor = watched.monitor
+    if watched.alarm is None:
+        said = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
+    else:
+        said = str(watched.alarm)
+        if np.isfinite(watched.alarm_t):
+            said += f" Alarm at t = {watched.alarm_t:.10g} s, since t = {watched.since_t:.10g} s."
+    if monitor.gate is not None and monitor.rejections:
+        said += (
+            f" The gate rejected {100 * monitor.rejections / monitor.measurements:.2g} % of the measurements "
+            f"(designed for {100 * (1 - monitor.gate):.2g} %), which is not judged."
+        )
+    return said
+
+
+def watched_json(watched: Watched) -> str:
+    """What the monitor said of a run; NaN and infinity become null."""
+    monitor, alarm = watched.monitor, watched.alarm
+    data = {
+        "innovations": watched.name, "steps": monitor.steps, "measurements": monitor.measurements,
+        "rejected": monitor.rejections, "judged": monitor.innovations, "nis_ratio": monitor.ratio,
+        "scale": monitor.scale, "evidence": monitor.evidence, "largest_evidence": monitor.largest,
+        "threshold": monitor.threshold, "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance,
+        "gate": monitor.gate, "mission": monitor.mission, "note": CAVEAT,
+        "alarm": None if alarm is None else {
+            "step": alarm.step, "since": alarm.since, "t": watched.alarm_t, "since_t": watched.since_t,
+            "direction": alarm.direction, "evidence": alarm.evidence, "scale": alarm.scale, "sentence": str(alarm),
+        },
+    }  # fmt: skip
+    return json.dumps(plain(data), indent=2, allow_nan=False)
 
 
 def _interval(interval: Interval) -> str:

@@ -282,7 +282,9 @@ def _entry(
     statistics = seen.verdict.statistics if seen.verdict is not None else {}
     fields = _found(seen)
     if (c := seen.comparison) is not None:
-        fields |= {"distance": _finite(c.distance), "standard_error": _finite(c.standard_error)}
+        fields |= {key: _finite(getattr(c, key)) for key in ("distance", "standard_error")}
+        spread = {key: getattr(c, key) for key in ("at_most", "sum_error", "reference")}
+        fields["spread"] = {key: value for key, value in spread.items() if np.isfinite(value)}
         statistics = {"differences": [vars(d) for d in c.differences]}
     return Entry(
         gate=gate, name=given.name, outcome=outcome, p_value=_finite(seen.p_value),

@@ -13,6 +13,7 @@ from consistency.diagnostics.eprocess import EProcess, e_process, ever
 from consistency.diagnostics.equivalence import equivalence
 from consistency.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.diagnostics.monitor import Alarm, Monitor
 from consistency.diagnostics.nees import anees, nees
 from consistency.diagnostics.normality import Normality, normality
 from consistency.diagnostics.outliers import Outlier, outliers
@@ -20,12 +21,13 @@ from consistency.diagnostics.planning import PilotPlan, detectable_ratio, gate_r
 from consistency.diagnostics.questions import answers
 from consistency.diagnostics.records import Answer, Equivalence, Evidence, Interval, Settings, Verdict
 from consistency.diagnostics.scale import Band, MeanTest, mean_test, ratio_interval, simultaneous_band
-from consistency.diagnostics.sequential import Design, follow, look, sequential_design
+from consistency.diagnostics.sequential import Design, follow, look, sequential_design, speaks
 from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
 from consistency.diagnostics.verdict import judge
 from consistency.diagnostics.whitening import spread_steps, standardise, whiten
 
 __all__ = [
+    "Alarm",
     "Answer",
     "Band",
     "Comparison",
@@ -38,6 +40,7 @@ __all__ = [
     "Interval",
     "Largest",
     "MeanTest",
+    "Monitor",
     "NisTest",
     "Normality",
     "Outlier",
@@ -82,6 +85,7 @@ __all__ = [
     "rmse",
     "sequential_design",
     "simultaneous_band",
+    "speaks",
     "sphericity",
     "spread_steps",
     "standardise",

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
+from consistency.diagnostics.contrast import Contrast, contrast, margin
 from consistency.diagnostics.scale import run_means
 from consistency.types import Array, Indices
 
 FEWEST = 8  # runs; below, a standard error is worth nothing
+MOST = 10**15  # runs that a plan asks for; where these do not suffice, nothing does
 
 
 @dataclass(frozen=True)
@@ -44,9 +46,12 @@ class Comparison:
     paired: bool
     differences: tuple[Difference, ...]
     distance: float  # abs(log ratio_a) - abs(log ratio_b); above 0 a is farther from consistent
-    standard_error: float
-    p_value: float  # one-sided, that a is not worse
+    standard_error: float  # of log ratio_a - log ratio_b: of the distance where both err to the same side
+    p_value: float  # that a is not worse
     false_alarm: float
+    at_most: float = float("inf")  # upper limit of the distance with confidence 1 - false_alarm
+    sum_error: float = 0.0  # standard error of log ratio_a + log ratio_b
+    reference: float = 0.0  # lower limit of abs(log ratio_b) with confidence 1 - false_alarm
 
     @property
     def worse(self) -> bool:
@@ -54,11 +59,16 @@ class Comparison:
         return self.p_value <= self.false_alarm
 
     def needed_runs(self, detect: float = 1.5, power: float = 0.95) -> int:
-        """Runs with which a covariance ratio farther from 1 by ``detect`` would be found with ``power``."""
-        if self.standard_error == 0.0:
-            return self.runs
-        z = float(stats.norm.isf(self.false_alarm) + stats.norm.ppf(power))
-        return max(FEWEST, int(np.ceil(self.runs * (z * self.standard_error / np.log(max(detect, 1 / detect))) ** 2)))
+        """Runs with which a covariance ratio farther from 1 by ``detect`` is found with ``power``.
+
+        Planned with the test of :func:`compare` and the spread between these runs, for an ``a`` that errs to the side
+        to which ``b`` errs. Both logarithms have to be significant, so each may be missed with (1 - ``power``) / 2.
+        If these runs already show that ``a`` is not farther by ``detect``, no more than these are asked for.
+        """
+        least = abs(float(np.log(detect)))
+        sizes = (self.standard_error, least), (self.sum_error, least + 2.0 * self.reference)
+        needed = max(_planned(error, self.runs, size, self.false_alarm, power) for error, size in sizes)
+        return min(needed, self.runs) if self.at_most < least else needed
 
 
 def summary(
@@ -92,7 +102,13 @@ def compare(
     Runs are the unit. The same run numbers are the same trials (common random numbers) and are compared run by
     run; ``paired=False`` treats the runs as independent samples (Welch 1947). Ratios are studentised on
     the log scale with the jackknife's first-order influence of each run (Efron & Stein 1981) and Student's t.
-    'Worse' compares abs(log(ANEES / dof)): too small and too large a covariance count alike.
+
+    'Worse' compares abs(log ratio) with ratio = ANEES / dof: too small and too large a covariance count alike. It is
+    an intersection-union test (Berger 1982) in both directions: ``a`` is worse if log ratio_a > log ratio_b and
+    log ratio_a > -log ratio_b, or if both hold with < in place of >. Of a direction the larger of its two one-sided p
+    values counts, and the p value is twice the smaller of the two directions. So the false-alarm rate is
+    ``false_alarm`` at most wherever the ratios are, and half of it where both filters err to the same side. The
+    one-sided tests are those of :func:`consistency.diagnostics.contrast.contrast`.
 
     Parameters
     ----------
@@ -102,7 +118,7 @@ def compare(
     Raises
     ------
     ValueError
-        Different dimensions, too few runs, or ``paired`` without common runs.
+        Different dimensions, too few runs, or ``paired`` without common runs; a filter whose NEES are all 0.
     """
     if a.dof != b.dof:
         raise ValueError(f"the errors have {a.dof} and {b.dof} dimensions; compare filters of the same state")
@@ -122,9 +138,11 @@ def compare(
         differences.append(_ratio(f"RMSE {axis}", a.squared[:, i], b.squared[:, i], 0.5, paired, confidence))
     for i, axis in enumerate(names):
         differences.append(_share(f"2-sigma coverage {axis}", a.covered[:, i], b.covered[:, i], paired, confidence))
-    distance, error, freedom = _distance(a.nees, b.nees, paired)
-    p_value = float(stats.t.sf(distance / error, freedom)) if error > 0 else float(distance <= 0)
-    return Comparison(fewest, paired, tuple(differences), distance, error, p_value, false_alarm)
+    for side, x in (("a", a), ("b", b)):
+        if not x.nees.mean() > 0:
+            raise ValueError(f"every NEES of {side} is 0; a filter without errors cannot be compared")
+    gap, total = (contrast(a.nees, b.nees, sign, paired) for sign in (-1.0, 1.0))
+    return _comparison(fewest, paired, tuple(differences), gap, total, false_alarm)
 
 
 def _rows(x: RunSummary, chosen: Array) -> RunSummary:
@@ -134,11 +152,49 @@ def _rows(x: RunSummary, chosen: Array) -> RunSummary:
     )
 
 
-def _distance(a: Array, b: Array, paired: bool) -> tuple[float, float, float]:
-    log_a, log_b = np.log(a.mean()), np.log(b.mean())
-    sides = [1.0 if value >= 0 else -1.0 for value in (log_a, log_b)]
-    error, freedom = _error(sides[0] * a / a.mean(), sides[1] * b / b.mean(), paired)
-    return float(abs(log_a) - abs(log_b)), error, freedom
+def _comparison(
+    runs: int, paired: bool, differences: tuple[Difference, ...], gap: Contrast, total: Contrast, false_alarm: float
+) -> Comparison:
+    """From log ratio_a - log ratio_b (``gap``) and log ratio_a + log ratio_b (``total``)."""
+    above, below = (max(p) for p in zip(gap.p_values, total.p_values, strict=True))
+    log_a, log_b = 0.5 * (total.value + gap.value), 0.5 * (total.value - gap.value)
+    tail = 0.5 * false_alarm
+    width = 0.5 * (total.half_width(tail) + gap.half_width(tail))  # of log_b, at most
+    return Comparison(
+        runs=runs, paired=paired, differences=differences, distance=abs(log_a) - abs(log_b), standard_error=gap.error,
+        p_value=min(1.0, 2.0 * min(above, below)), false_alarm=false_alarm, at_most=_at_most(gap, total, tail),
+        sum_error=total.error, reference=max(0.0, abs(log_b) - width),
+    )  # fmt: skip
+
+
+def _at_most(gap: Contrast, total: Contrast, tail: float) -> float:
+    """Upper limit of abs(log ratio_a) - abs(log ratio_b), missed with probability ``2 * tail`` at most.
+
+    log ratio_a - abs(log ratio_b) is the smaller of gap and total, -log ratio_a - abs(log ratio_b) that of -gap and
+    -total; one of the two is the distance, and its limit needs a one-sided limit of gap and of total.
+    """
+    a_high = min(gap.value + gap.half_width(tail), total.value + total.half_width(tail))
+    a_low = min(gap.half_width(tail) - gap.value, total.half_width(tail) - total.value)
+    return max(a_high, a_low)
+
+
+def _planned(error: float, runs: int, size: float, false_alarm: float, power: float) -> int:
+    """Runs with which a contrast of ``size`` is significant, from its standard error in ``runs`` runs.
+
+    The margin of the test counts twice: what moves the variance costs about as much again.
+    """
+
+    def enough(count: int) -> bool:
+        quantiles = special.stdtrit(count - 1.0, [0.5 * false_alarm, 0.5 * (1.0 - power)])
+        return bool(-quantiles.sum() * error * np.sqrt(runs / count) * np.exp(margin(count - 1.0)) <= size)
+
+    low, high = FEWEST - 1, FEWEST
+    while not enough(high) and high < MOST:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return high
 
 
 def _ratio(name: str, a: Array, b: Array, power: float, paired: bool, confidence: float) -> Difference:
@@ -170,4 +226,4 @@ def _error(a: Array, b: Array, paired: bool) -> tuple[float, float]:
 
 
 def _half(error: float, freedom: float, confidence: float) -> float:
-    return float(stats.t.isf(0.5 * (1.0 - confidence), freedom)) * error
+    return -float(special.stdtrit(freedom, 0.5 * (1.0 - confidence))) * error

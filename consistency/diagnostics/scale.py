@@ -13,6 +13,8 @@ from consistency.diagnostics.records import Interval
 from consistency.types import Array
 
 FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete
+LARGE = 1e6  # shape of a Gamma distribution beyond which its information is 1/2 and rounding would rule
+LEAST = 4.0  # degrees of freedom of Student's t in an interval: with fewer it says nothing at all
 REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
 UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
 
@@ -87,6 +89,32 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     return MeanTest(runs, ratio, nu, spread, above, below)
 
 
+def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
+    """Do run means (runs,) differ more than those of Gaussian errors can? Of such, nu is ``dof`` at least.
+
+    Either estimate of nu (:func:`scale_test`) lies more than ``errors`` standard errors below; not asked of fewer than
+    20 runs.
+    """
+    if len(means) < FEW or not means.min() > 0:
+        return False
+    by_spread, left_out = _log_nu_of_means(means)
+    _, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
+    by_likelihood, error = _log_nu_of_gamma(means)
+    return bool(min(by_spread + errors * np.sqrt(variance), by_likelihood + errors * error) < np.log(dof))
+
+
+def spreads_more_in_steps(nees: Array, dof: int) -> bool:
+    """The same of the NEES (runs, steps) in single steps: log nu in the mean of the steps, with the error of one.
+
+    Steps need not be independent. Those in which a run has no value, or none of the runs an error, do not count.
+    """
+    whole = np.isfinite(nees).all(axis=0) & (nees > 0).all(axis=0)
+    if len(nees) < FEW or not whole.any():
+        return False
+    log_nu, error = _log_nu_of_gamma(nees[:, whole])
+    return bool((log_nu + error).mean() < np.log(dof))
+
+
 def run_means(nees: Array) -> tuple[Array, Array]:
     """Mean NEES of each run over the steps it has, and how many those are: (runs, steps) -> (runs,), (runs,)."""
     present = np.isfinite(nees)
@@ -122,7 +150,8 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = 0.95) -> Inte
     if len(means) > 1 and means.std() > 0:
         log_nu, left_out = _log_nu_of_means(means)
         if len(means) >= FEW:
-            nu, spread = float(np.exp(log_nu)), 2.0 / max(_jackknife(left_out, left_out), 2.0 / len(means))
+            variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
+            nu, spread = float(np.exp(log_nu)), max(2.0 / variance, LEAST)
         else:
             nu = min(nu, float(np.exp(log_nu)))
     elif len(means) >= FEW:
@@ -137,7 +166,7 @@ def _log_nu(means: Array) -> tuple[float, float]:
     by_spread, left_out = _log_nu_of_means(means)
     by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
     by_likelihood, error = _log_nu_of_gamma(means)
-    return min(by_spread - float(np.sqrt(variance)), by_likelihood - error), variance
+    return min(by_spread - float(np.sqrt(variance)), float(by_likelihood - error)), variance
 
 
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:
@@ -150,21 +179,19 @@ def _log_nu_of_means(means: Array) -> tuple[float, Array]:
     return float(np.log(2.0 / cv) - np.log1p(cv / runs)), np.log(2.0 * left**2 / np.maximum(variance, smallest))
 
 
-def _log_nu_of_gamma(means: Array) -> tuple[float, float]:
-    """log(2 a) of the Gamma distribution of shape a most likely to have made ``means`` (runs,), and its standard error.
+def _log_nu_of_gamma(means: Array) -> tuple[Array, Array]:
+    """log(2 a) of the Gamma distribution of shape a most likely to have made ``means`` (runs, ...), and its error.
 
-    The error is that of the expected information, 1 / (N (a^2 trigamma(a) - a)).
+    The error is the standard error by the expected information, 1 / (N (a^2 trigamma(a) - a)); (...) both.
     """
-    gap = max(float(np.log(means.mean()) - np.log(means).mean()), 1e-12)
-    start = (3.0 - gap + np.sqrt((gap - 3.0) ** 2 + 24.0 * gap)) / (12.0 * gap)  # Minka (2002)
-    log_a = float(np.log(start))
-    for _ in range(8):  # Newton in log a; the start is good to 1.5 %
+    gap = np.maximum(np.log(means.mean(axis=0)) - np.log(means).mean(axis=0), 1e-12)
+    log_a = np.log((3.0 - gap + np.sqrt((gap - 3.0) ** 2 + 24.0 * gap)) / (12.0 * gap))  # Minka (2002), to 1.5 %
+    for _ in range(5):  # Newton in log a
         a = np.exp(log_a)
-        step = (log_a - special.psi(a) - gap) / (1.0 - a * special.polygamma(1, a))
-        log_a -= float(np.clip(step, -2.0, 2.0))
-    a = float(np.exp(log_a))
-    information = 0.5 if a > 1e6 else a * a * float(special.polygamma(1, a)) - a
-    return float(np.log(2.0) + log_a), float(1.0 / np.sqrt(len(means) * information))
+        log_a = log_a - np.clip((log_a - special.psi(a) - gap) / (1.0 - a * special.polygamma(1, a)), -2.0, 2.0)
+    a = np.exp(np.minimum(log_a, np.log(LARGE)))
+    information = np.where(a < LARGE, a * a * special.polygamma(1, a) - a, 0.5)
+    return np.log(2.0) + log_a, 1.0 / np.sqrt(len(means) * information)
 
 
 def _left_out_mean(means: Array) -> Array:

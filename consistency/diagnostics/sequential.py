@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 from consistency.diagnostics.eprocess import e_process, ever
+from consistency.diagnostics.questions import MAIN, SHARES
 from consistency.diagnostics.records import Evidence, Settings, Verdict
 from consistency.diagnostics.sample import sample_of
 from consistency.diagnostics.verdict import Look, judge
@@ -63,13 +65,22 @@ def look(design: Design, evidence: Evidence, spent: float | None) -> Verdict:
 
     A filter without truth is judged by its innovations, at looks only.
     """
-    sample = sample_of(evidence, design.settings)
-    scale = 1.0 if sample is None else ever(e_process(sample.means(), sample.dof).both)
-    verdict = judge(evidence, design.settings, Look(spent, scale))
+    verdict = judge(evidence, design.settings, Look(spent, _scale(design, evidence)))
     if spent is None and verdict.consistent:
         text = "undecided: no fault found in the scale; the other questions are asked at the next look"
         return replace(verdict, status="undecided", reasons=(text, *verdict.reasons[1:]))
     return verdict
+
+
+def speaks(design: Design, evidence: Evidence, spent: float | None) -> bool:
+    """Can this inspection decide? Between looks only a scale at fault does."""
+    return spent is not None or _scale(design, evidence) <= SHARES[MAIN] * design.false_alarm
+
+
+def _scale(design: Design, evidence: Evidence) -> float:
+    """p value of the scale, valid at any time; 1 without truth."""
+    sample = sample_of(evidence, design.settings)
+    return 1.0 if sample is None else ever(e_process(sample.means(), sample.dof).both)
 
 
 def follow(design: Design, evidence_of: Callable[[int], Evidence], limit: int | None = None) -> tuple[Verdict, int]:
@@ -78,18 +89,19 @@ def follow(design: Design, evidence_of: Callable[[int], Evidence], limit: int | 
     Parameters
     ----------
     evidence_of : the first runs of a filter, as many as it is asked for
-    limit : runs that there are; the last inspection within them speaks
+    limit : runs that there are; the last inspection within them speaks, or all of them where they are fewer than 12
     """
-    verdict, used = None, 0
-    for runs, spent in design.inspections():
-        if limit is not None and runs > limit and verdict is not None:
-            break
-        used = runs if limit is None else min(runs, limit)
-        verdict = look(design, evidence_of(used), spent)
-        if verdict.status != "undecided" or used == limit:
-            break
-    assert verdict is not None
-    return verdict, used
+    inspections = list(takewhile(lambda each: each[0] <= limit, design.inspections())) if limit is not None else None
+    if inspections == []:
+        inspections = [(limit or 0, next(design.inspections())[1])]
+    for runs, spent in inspections if inspections is not None else design.inspections():
+        evidence = evidence_of(runs)
+        last = runs == design.max_runs or (inspections is not None and (runs, spent) == inspections[-1])
+        if last or speaks(design, evidence, spent):
+            verdict = look(design, evidence, spent)
+            if last or verdict.status != "undecided":
+                return verdict, runs
+    raise AssertionError("unreachable: a design without a last look is endless")
 
 
 def sequential_design(

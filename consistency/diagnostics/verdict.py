@@ -13,15 +13,16 @@ from consistency.diagnostics.innovations import nis_test, nis_whiteness, whitene
 from consistency.diagnostics.intervals import chi2_mean_interval
 from consistency.diagnostics.location import accuracy_of, axes_of, bias_of, location_of, shape_of, tails_of
 from consistency.diagnostics.nees import anees
-from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, INNOVATIONS, MAIN, SCALE, SHARES, STEP, answers
+from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, INNOVATIONS, MAIN, SHARES, STEP, answers
 from consistency.diagnostics.records import Equivalence, Evidence, Innovations, Settings, Verdict
 from consistency.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.diagnostics.sample import shape_of as shape_of_arrays
-from consistency.diagnostics.scale import scale_test, simultaneous_band
+from consistency.diagnostics.scale import scale_test, simultaneous_band, spreads_more, spreads_more_in_steps
 from consistency.diagnostics.scaling import INTERVAL, scale_of
 from consistency.types import Array
 
 DEFAULT = Settings()
+SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones
 
 
 @dataclass(frozen=True)
@@ -179,10 +180,10 @@ def _status(verdict: Verdict, sample: Sample | None, asked: Asked | None) -> str
     if sample is None or asked is None:
         return _by_innovations(verdict, faults)
     if faults & set(BIAS):
-        faults = _without_bias(verdict, sample)
+        sample, asked, faults = _without_bias(verdict, sample)
         if not faults:
             return "biased"
-    return _by_errors(verdict, faults, sample, asked)
+    return _by_errors(verdict.settings, faults, sample, asked)
 
 
 def _by_innovations(verdict: Verdict, faults: set[str]) -> str:
@@ -192,36 +193,52 @@ def _by_innovations(verdict: Verdict, faults: set[str]) -> str:
     return "overconfident" if verdict.innovations.ratio > 1.0 else "conservative"
 
 
-def _without_bias(verdict: Verdict, sample: Sample) -> set[str]:
-    """Faults that remain of the errors less their mean over runs."""
+def _without_bias(verdict: Verdict, sample: Sample) -> tuple[Sample, Asked, set[str]]:
+    """Errors less their mean over runs, what they are asked, and the faults that remain."""
     others = {a.question: a.p_value for a in verdict.answers if a.question in INNOVATIONS}
-    again = ask(sample.centred(), verdict.settings, others)
+    centred = sample.centred()
+    again = ask(centred, verdict.settings, others)
     p_values = {q: p for q, p in again.p_values.items() if q not in BIAS} | others
-    rate = verdict.settings.false_alarm
-    return {q for q, a in answers(p_values, rate).items() if a.found} & set(verdict.faults)
+    found = {q for q, a in answers(p_values, verdict.settings.false_alarm).items() if a.found}
+    return centred, again, found & set(verdict.faults)
 
 
-def _by_errors(verdict: Verdict, faults: set[str], sample: Sample, asked: Asked) -> str:
+def _by_errors(settings: Settings, faults: set[str], sample: Sample, asked: Asked) -> str:
     """Which headline: of the scale only where it is no matter of a few large errors."""
-    assert verdict.scale is not None
-    assert verdict.location is not None
-    heavy = "outliers" in faults
     if MAIN in faults:
-        if _robust(sample.means(), sample.dof, sample.longest, verdict.settings, 1):
-            return "overconfident" if verdict.scale.mean_anees > verdict.scale.dof else "conservative"
-        return "heavy-tailed"
-    if heavy and faults & set(SCALE) and not _robust_axis(sample, asked, verdict.settings):
-        return "heavy-tailed"
+        if not _robust(sample.means(), sample.dof, sample.longest, settings, 1):
+            return "heavy-tailed"
+        return "overconfident" if asked.main.ratio > 1.0 else "conservative"
+    heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, asked))
     if STEP in faults and not heavy:
-        return "overconfident" if verdict.location.above else "conservative"
+        return _by_step(sample, asked)
     if AXIS in faults or DIRECTION in faults:
-        return _by_axis(verdict, sample, asked)
+        if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, asked, settings)):
+            return _by_axis(settings, asked)
+        heavy = True
     return "heavy-tailed" if heavy else "inconsistent"
 
 
+def _by_step(sample: Sample, asked: Asked) -> str:
+    """The side on which the ANEES is farthest from its band."""
+    curve, band = anees(sample.nees), asked.band
+    with np.errstate(divide="ignore", invalid="ignore"):
+        above, below = np.nanmax(curve / band.high), np.nanmax(band.low / curve)
+    return "overconfident" if above >= below else "conservative"
+
+
+def _heavy_steps(sample: Sample, asked: Asked) -> bool:
+    """Do the runs differ more than Gaussian errors can, in most steps, or in all of those outside the band?"""
+    if spreads_more_in_steps(sample.nees, sample.dof):
+        return True
+    outside = np.flatnonzero(asked.band.outside)
+    values = (sample.nees[sample.counted[:, k], k] / sample.dof for k in outside)
+    return bool(len(outside)) and all(spreads_more(value, sample.dof, SURE) for value in values)
+
+
 def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: int) -> bool:
-    """Is the scale found at fault too if the runs may differ more than Gaussian errors would?"""
-    test = scale_test(means, dof, steps, gaussian=False)
+    """Is the scale found at fault too where the runs differ more than Gaussian errors can?"""
+    test = scale_test(means, dof, steps, gaussian=not spreads_more(means, dof))
     p = test.above if settings.one_sided else test.p_value
     return bool(p * questions <= SHARES[MAIN] * settings.false_alarm)
 
@@ -232,15 +249,16 @@ def _robust_axis(sample: Sample, asked: Asked, settings: Settings) -> bool:
     return any(
         _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups))
         for key, test in asked.axes.items()
-        if test.p_value * len(groups) <= settings.false_alarm
+        if (test.above if settings.one_sided else test.p_value) * len(groups) <= settings.false_alarm
     )
 
 
-def _by_axis(verdict: Verdict, sample: Sample, asked: Asked) -> str:
+def _by_axis(settings: Settings, asked: Asked) -> str:
     """Axes that err in one direction name the verdict, those that err in both do not."""
-    rate = verdict.settings.false_alarm
-    wrong = [t for t in asked.axes.values() if t.p_value * len(asked.axes) <= rate]
-    sides = {test.ratio > 1.0 for test in wrong} or ({True} if asked.largest is not None else set())
+    if settings.one_sided:
+        return "overconfident"
+    wrong = [t for t in asked.axes.values() if t.p_value * len(asked.axes) <= settings.false_alarm]
+    sides = {test.ratio > 1.0 for test in wrong}
     if len(sides) != 1:
         return "inconsistent"
-    return "overconfident" if sides.pop() or verdict.settings.one_sided else "conservative"
+    return "overconfident" if sides.pop() else "conservative"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from consistency.diagnostics.coverage import TWO_SIGMA
-from consistency.diagnostics.questions import BIAS, DIRECTION, MAIN, SCALE, SHAPE, STEP
+from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, MAIN, SCALE, SHAPE, STEP
 from consistency.diagnostics.records import Answer, Axes, Equivalence, Interval, Scale, Verdict
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
@@ -15,6 +15,8 @@ NOTABLE = 0.3  # difference of correlations that stands out in one step
 VISIBLE = 0.05  # difference of correlations that is worth a word
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 MUCH = 100_000  # runs; more are no advice
+MOST = 3  # axes that a sentence names with their figures
+TINY = 1e-12  # ratio of an error that is rounding
 
 Found = Mapping[str, Answer]
 
@@ -45,7 +47,9 @@ def reasons(v: Verdict) -> list[str]:
 def short(value: float) -> str:
     """Three digits, as a person says them."""
     return (
-        f"{value:.1e}"
+        f"{value:.2g}"
+        if value < 0.1
+        else f"{value:.1e}"
         if value >= 1e4
         else f"{value:.0f}"
         if value >= 100
@@ -55,12 +59,21 @@ def short(value: float) -> str:
     )
 
 
-def factor(interval: Interval) -> str:
-    """x1.6 [1.4, 1.9]; of a covariance too large, the inverse."""
+def off_by(interval: Interval) -> str:
+    """Too small by x1.6 [1.4, 1.9]; of a covariance too large, the inverse."""
     ratio, low, high = interval
-    if ratio < 1.0:
-        ratio, low, high = (1.0 / max(value, 1e-300) for value in (ratio, high, low))
-    return f"x{short(ratio)} [{short(low)}, {short(high)}]"
+    if ratio >= 1.0:
+        return f"too small by x{plain(interval)}"
+    if ratio < TINY:
+        return "too large: there is hardly any error"
+    return f"too large by x{plain(Interval(1.0 / ratio, 1.0 / high, 1.0 / max(low, TINY)))}"
+
+
+def plain(interval: Interval) -> str:
+    """1.02 [0.87, 1.19]: a ratio that may lie on either side of 1."""
+    if not interval.high < UNCERTAIN * interval.low:
+        return f"{short(interval.value)} (known to no better than a factor of {UNCERTAIN:g})"
+    return f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]"
 
 
 def p_text(p: float) -> str:
@@ -85,8 +98,8 @@ def _failures(v: Verdict) -> list[str]:
         row, step = v.impossible[0]
         count = len({r for r, _ in v.impossible})
         lines.append(
-            f"{count} of {v.runs} runs have an infinite error or a covariance with a negative variance, first run "
-            f"{row} in step {step}; those steps are left out"
+            f"{count} of {v.runs} runs {'has' if count == 1 else 'have'} an infinite error or a covariance with a "
+            f"negative variance, first run {row} in step {step}; those steps are left out"
         )
     return lines
 
@@ -104,7 +117,7 @@ def _sentence(v: Verdict, found: Found) -> str:
         parts.append(_bias(v, "bias" not in found))
     if v.status == "heavy-tailed":
         assert v.scale is not None
-        parts.append(f"in the mean the covariance ratio is {_plain(v.scale.inflation)}")
+        parts.append(f"in the mean the covariance ratio is {plain(v.scale.inflation)}")
     elif v.status != "biased":
         parts += [_scale(v, found)] if any(q in found for q in SCALE) else []
         parts += [_shape(v, found)] if any(q in found for q in SHAPE) else []
@@ -135,7 +148,7 @@ def _no_fault(v: Verdict) -> str:
     shown, inflation = v.scale.equivalence, v.scale.inflation
     tolerated = [a.question for a in v.answers if a.tolerated]
     none = "no fault beyond the tolerance" if tolerated else "no fault found"
-    size = f"covariance ratio {_plain(inflation)}"
+    size = f"covariance ratio {plain(inflation)}"
     if shown.shown:
         return f"{none} in {plural(v.runs, 'run')}, and the {size} is shown to be {_within(v, shown)}"
     advice = ""
@@ -154,25 +167,22 @@ def _do(runs: int) -> str:
     return "does" if runs == 1 else "do"
 
 
-def _plain(interval: Interval) -> str:
-    """1.02 [0.87, 1.19]: a ratio that may lie on either side of 1."""
-    return f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]"
-
-
 def _scale(v: Verdict, found: Found) -> str:
     assert v.scale is not None
     assert v.location is not None
-    where, inflation = v.location, v.scale.inflation
+    where, inflation, about = v.location, v.scale.inflation, ""
+    if v.bias is not None and v.bias.inflation_without is not None:
+        inflation, about = v.bias.inflation_without, " about the mean"
     if MAIN not in found and STEP not in found:
         return _one_axis(v)
     if not where.lasting and MAIN not in found:
         count = where.above + where.below
         side = "too small" if where.above else "too large"
         return f"covariance {side} in {count} of {v.scale.judged_steps} steps, first in step {where.first_step}"
-    text = f"covariance {_side(inflation.value)} by {factor(inflation)}"
-    if not inflation.high < UNCERTAIN * inflation.low and v.runs > 1:
-        size = short(max(inflation.value, 1.0 / max(inflation.value, 1e-300)))
-        text = f"covariance {_side(inflation.value)} by x{size} in the mean, which a few runs make"
+    text = f"covariance{about} {off_by(inflation)}"
+    if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
+        size = short(max(inflation.value, 1.0 / inflation.value))
+        text = f"covariance{about} {_side(inflation.value)} by x{size} in the mean, which a few runs make"
     elif inflation.holds(1.0) and v.runs > 1:
         text += ", an interval that holds 1: the runs differ more than Gaussian errors would"
     if where.subset:
@@ -190,13 +200,13 @@ def _first(scale: Scale) -> int:
 def _one_axis(v: Verdict) -> str:
     """The fault shows in an axis, a group or a direction alone."""
     assert v.axes is not None
-    sure = {a: i for a, i in v.axes.inflation.items() if not i.holds(1.0)}
+    one_sided = v.settings.one_sided
+    sure = {a: i for a, i in v.axes.inflation.items() if (i.low > 1.0 if one_sided else not i.holds(1.0))}
     sure = {a: i for a, i in sure.items() if a in v.axes.names} or sure
-    if sure:
-        return f"covariance of {', '.join(f'{a} {_side(i.value)} by {factor(i)}' for a, i in sure.items())}"
-    if v.axes.largest is not None and DIRECTION in v.faults:
-        return f"covariance too small by {factor(v.axes.largest)} in the direction {_direction(v.axes)}"
-    return "covariance of an axis wrong"
+    sure = dict(sorted(sure.items(), key=lambda item: -abs(np.log(max(item[1].value, TINY))))[:MOST])
+    if v.axes.largest is not None and DIRECTION in v.faults and AXIS not in v.faults:
+        return f"covariance {off_by(v.axes.largest)} in the direction {_direction(v.axes)}"
+    return f"covariance of {', '.join(f'{a} {off_by(i)}' for a, i in sure.items()) if sure else 'an axis wrong'}"
 
 
 def _direction(axes: Axes) -> str:
@@ -213,14 +223,20 @@ def _side(ratio: float) -> str:
 def _bias(v: Verdict, in_steps: bool) -> str:
     assert v.bias is not None
     rest = ""
-    if v.bias.inflation_without is not None:
-        rest = f"; without the bias the covariance ratio is {_plain(v.bias.inflation_without)}"
+    if v.bias.inflation_without is not None and v.status == "biased":
+        rest = f"; without the bias the covariance ratio is {plain(v.bias.inflation_without)}"
     if in_steps:
-        return f"biased in step {v.bias.step}, mainly {v.bias.axis}" + (rest if v.status == "biased" else "")
+        where = f"in step {v.bias.step}, mainly {v.bias.axis}"
+        return f"{where}{rest}" if v.status == "biased" else f"biased {where}"
     prefix = "" if v.status == "biased" else "biased: "
     sure = {axis: interval for axis, interval in v.bias.by_axis.items() if not interval.holds(0.0)}
-    named = [f"{a} {i.value:+.2f} sigma [{i.low:+.2f}, {i.high:+.2f}]" for a, i in sure.items()]
+    sure = dict(sorted(sure.items(), key=lambda item: -abs(item[1].value))[:MOST])
+    named = [f"{a} {_sigmas(i.value)} sigma [{_sigmas(i.low)}, {_sigmas(i.high)}]" for a, i in sure.items()]
     return f"{prefix}{', '.join(named) if named else 'in a combination of axes'}{rest}"
+
+
+def _sigmas(value: float) -> str:
+    return f"{value:+.2f}" if abs(value) < 100.0 else f"{value:+.1e}"
 
 
 def _shape(v: Verdict, found: Found) -> str:

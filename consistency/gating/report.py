@@ -42,8 +42,8 @@ tbody td:last-child { min-width: 22rem; }
 summary { cursor: pointer; }
 ul { margin: .25rem 0; padding-left: 1.2rem; color: var(--faint); }
 """
-HEAD = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "needed", "inflation", "why")
-NUMBERS = {"p", "false-alarm rate", "runs", "needed", "inflation"}
+HEAD = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "planned", "inflation", "why")
+NUMBERS = {"p", "false-alarm rate", "runs", "planned", "inflation"}
 
 
 def as_json(ledger: Ledger) -> str:

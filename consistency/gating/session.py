@@ -110,14 +110,14 @@ def needed_at(entry: Entry, rate: float) -> int:
 
     if entry.standard_error is None:
         return gate_runs(entry.dof, entry.detect, rate, entry.power, entry.allow)
-    comparison = Comparison(entry.runs, True, (), 0.0, entry.standard_error, 1.0, rate)
+    comparison = Comparison(entry.runs, True, (), 0.0, entry.standard_error, 1.0, rate, **entry.spread)
     return comparison.needed_runs(entry.detect, entry.power)
 
 
 def lines(ledger: Ledger) -> Iterator[str]:
     """The summary for a terminal: a row a gate, and under it why it did not pass."""
     entries = ledger.entries()
-    rows = [("test", "gate", "outcome", "p", "runs", "needed", "inflation")]
+    rows = [("test", "gate", "outcome", "p", "runs", "planned", "inflation")]
     for e in entries:
         rows.append((e.test, e.gate, outcome(e), number(e.p_value), str(e.runs), str(e.needed), interval(e)))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

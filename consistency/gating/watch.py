@@ -43,6 +43,7 @@ class Entry:
     faults: list[str] = field(default_factory=list)
     distance: float | None = None  # of a comparison
     standard_error: float | None = None
+    spread: dict[str, float] = field(default_factory=dict)  # what else plans the runs of a comparison
     late: dict[str, Any] = field(default_factory=dict)  # what changes here if the end of the session finds the fault
     statistics: dict[str, Any] = field(default_factory=dict)  # all of the verdict
     test: str = ""

@@ -265,10 +265,16 @@ def figure_caption() -> str:
 def calibration_text(c: Calibration) -> str:
     """What the appendix on the referee measures."""
     return (
-        "A gate is one verdict on one group of runs. A false alarm is a gate that finds a fault where the covariance "
-        "is exactly right; power is the share of gates that find a stated covariance which is wrong by the ratio "
-        "given, with as many runs as are planned for it. A gate with several looks ends at the look that finds a "
-        f"fault; its mean number of runs stands first. Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees "
-        f"of freedom, seed {c.seed}), with exact binomial intervals. The promise is broken where the whole interval of "
-        "a false-alarm rate lies above it, or that of a power below it."
+        "A gate is one verdict on one group of runs. Each line is a promise of the referee: which share of gates is "
+        "counted at most, or at least, and the shares measured, from the world where the promise is kept best to the "
+        "one where it is kept worst. Where the true over the stated covariance is 1 the filter is right, however its "
+        "errors depend on each other. Of gates that end when they are decided, the mean number of runs in the worst "
+        "world stands first. "
+        f"Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees of freedom where not said otherwise, seed "
+        f"{c.seed}), with exact binomial intervals. A promise is broken where the whole interval is on its wrong side."
     )
+
+
+def calibration_worlds(c: Calibration) -> list[tuple[str, str]]:
+    """The worlds of the appendix and what they are."""
+    return [(name, about.replace("`", "")) for name, about in c.worlds.items()]

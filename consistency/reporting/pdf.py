@@ -103,8 +103,9 @@ def _diagnosis(study: Study, save: Save) -> dict[str, Any]:
 def _calibration(report: Report) -> dict[str, Any] | None:
     if report.calibration is None:
         return None
-    rows = [list(row) for row in wording.calibration_rows(report.calibration)]
-    return {"text": captions.calibration_text(report.calibration), "rows": rows}
+    groups = [[title, [list(row) for row in rows]] for title, rows in wording.calibration_groups(report.calibration)]
+    worlds = [list(world) for world in captions.calibration_worlds(report.calibration)]
+    return {"text": captions.calibration_text(report.calibration), "groups": groups, "worlds": worlds}
 
 
 def _distribution(distribution: Any, prefix: str, folder: Path) -> dict[str, str]:

@@ -10,7 +10,7 @@ import numpy as np
 from consistency.diagnostics import Answer
 from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import UNCERTAIN, plural, short
-from consistency.reporting.calibration import Calibration, Rate
+from consistency.reporting.calibration import Calibration, Promise
 from consistency.reporting.model import Study, Track
 
 FIGURE_COLUMNS = (
@@ -25,11 +25,6 @@ FIGURE_COLUMNS = (
 FOUND, TOLERATED, NOT_FOUND, NOT_ASKED = "✗", "≈", "○", "–"
 MARKS = {FOUND: "found", TOLERATED: "found, within the tolerance", NOT_FOUND: "not found", NOT_ASKED: "not asked"}
 SMALLEST = 1e-6  # p value below which digits say nothing
-WORLDS = {
-    "independent": "independent NEES values",
-    "autocorrelated": "errors correlated over steps",
-    "linear-gaussian": "Kalman filter, linear world",
-}
 LISTED = 6  # pairs of filter and scenario that the first paragraph names one by one
 
 
@@ -228,23 +223,38 @@ def listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
-CALIBRATION_COLUMNS = ("World", "True / stated covariance", "Runs", "Promised", "Gates", "Measured", "99 % interval")
+CALIBRATION_COLUMNS = (
+    "True / stated covariance",
+    "Runs",
+    "Promised",
+    "Gates",
+    "Measured",
+    "Worst world",
+    "99 % interval there",
+)
 
 
-def calibration_rows(c: Calibration) -> list[tuple[str, ...]]:
-    """Cells of the appendix, as CALIBRATION_COLUMNS: false alarms, then power."""
-    return [_rate_row(rate, "≤") for rate in c.false_alarms] + [_rate_row(rate, "≥") for rate in c.power]
+def calibration_groups(c: Calibration) -> list[tuple[str, list[tuple[str, ...]]]]:
+    """The appendix: what is counted, and for each promise about it, in all its worlds, cells as CALIBRATION_COLUMNS."""
+    return [
+        (f"{name}: {about.replace('`', '')}", [_promise_row(p) for p in c.promises if p.question == name])
+        for name, about in c.questions.items()
+    ]
 
 
-def _rate_row(rate: Rate, bound: str) -> tuple[str, ...]:
-    low, high = rate.interval
-    runs = str(rate.runs) if rate.looks == 1 else f"{rate.mean_runs:.0f} of {rate.runs}, {rate.looks} looks"
+def _promise_row(promise: Promise) -> tuple[str, ...]:
+    worst, best = promise.worst, promise.best
+    low, high = worst.interval
+    several = len(promise.rates) > 1
+    ends = [f"{100 * rate.measured:.1f}" for rate in (best, worst)]
+    gates = {rate.gates for rate in promise.rates}
+    each = f"{min(gates)}" if len(gates) == 1 else f"{min(gates)} to {max(gates)}"
     return (
-        WORLDS.get(rate.world, rate.world),
-        "1, right" if rate.ratio == 1.0 else f"{rate.ratio:g}",
-        runs,
-        f"{bound} {100 * rate.promised:g} %",
-        str(rate.gates),
-        f"{100 * rate.measured:.1f} %",
+        "1, right" if worst.ratio == 1.0 else f"{worst.ratio:.3g}",
+        str(worst.runs) if worst.looks else f"{worst.mean_runs:.0f}, {worst.runs} at most",
+        f"{'≤' if worst.at_most else '≥'} {100 * worst.promised:g} %",
+        f"{each} in {len(promise.rates)} worlds" if several else each,
+        f"{' to '.join(dict.fromkeys(ends))} %",
+        worst.world,
         f"{100 * low:.1f} to {100 * high:.1f} %",
     )

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, special, stats
 
 import consistency as cs
-from consistency.comparison import baseline_of, compare_filters, compare_with, read_baseline, write_baseline
-from consistency.diagnostics import RunSummary, compare, summary
+from consistency.comparison import Compared, baseline_of, compare_filters, compare_with, read_baseline, write_baseline
+from consistency.diagnostics import Comparison, RunSummary, compare, summary
+from consistency.diagnostics.contrast import Contrast, contrast, margin
+from consistency.gating.session import needed_at
+from consistency.gating.watch import Watch, watching
+from consistency.testing import InsufficientTrials, assert_not_worse
 from consistency.types import Array
 
-RATE = 1e-4  # false-failure rate of each statistical test below
+RATE = 1e-5  # false-failure rate of each statistical assertion below
 
 
 def of_runs(means: Array, runs: Array | None = None) -> RunSummary:
@@ -62,16 +69,184 @@ def test_farther_from_consistent_is_worse_on_either_side(of_a: float, of_b: floa
     assert not compare(of_runs(b), of_runs(a), 1e-3).worse
 
 
-@pytest.mark.parametrize("ratio", [1.0, 3.0])
-def test_false_alarms_stay_below_the_stated_rate(ratio: float) -> None:
-    """400 pairs of equally consistent filters at 5 %; fails by chance less often than 1 in 10,000."""
-    rng = np.random.default_rng()
-    found = 0
+# --- the test of 'worse' ---------------------------------------------------------------------------
+
+
+def slow(rng: np.random.Generator, runs: int, n: int) -> Array:
+    """Mean NEES over n of runs with one error in all their steps."""
+    return rng.chisquare(n, runs) / n
+
+
+def mixed(rng: np.random.Generator, runs: int, n: int) -> Array:
+    """Mean NEES over n of runs of 100 independent steps."""
+    return rng.chisquare(100 * n, runs) / (100 * n)
+
+
+def now_and_then(rng: np.random.Generator, runs: int, n: int) -> Array:
+    """Three runs in ten are slow."""
+    return np.where(rng.random(runs) < 0.3, slow(rng, runs, n), mixed(rng, runs, n))
+
+
+def same_trials(rng: np.random.Generator, runs: int, n: int) -> tuple[Array, Array]:
+    """Two slow filters with errors that are correlated 0.9."""
+    e, d = rng.standard_normal((2, runs, n))
+    return np.square(e).mean(axis=1), np.square(0.9 * e + np.sqrt(0.19) * d).mean(axis=1)
+
+
+EQUALLY_CONSISTENT = {
+    "slow and mixed": (slow, mixed, 1.0, 1.0),
+    "mixed and slow": (mixed, slow, 1.0, 1.0),
+    "slow and mixed, both x0.5": (slow, mixed, 0.5, 0.5),
+    "mixed and slow, both x2": (mixed, slow, 2.0, 2.0),
+    "both slow, x1.5 and x1/1.5": (slow, slow, 1.5, 1 / 1.5),
+    "now and then and mixed, both x0.5": (now_and_then, mixed, 0.5, 0.5),
+}
+
+
+@pytest.mark.parametrize("world", EQUALLY_CONSISTENT)
+@pytest.mark.parametrize(("runs", "n", "paired"), [(8, 1, True), (12, 3, True), (30, 1, True), (20, 1, False)])
+def test_no_more_false_alarms_than_stated(
+    rng: np.random.Generator, world: str, runs: int, n: int, paired: bool
+) -> None:
+    """400 comparisons at 5 and 1 % of two filters that are equally far from consistent."""
+    of_a, of_b, scale_a, scale_b = EQUALLY_CONSISTENT[world]
+    pairs = [(scale_a * of_a(rng, runs, n), scale_b * of_b(rng, runs, n)) for _ in range(400)]
+    p = np.array([compare(of_runs(a), of_runs(b), paired=paired).p_value for a, b in pairs])
+    for rate in (0.05, 0.01):
+        assert (p <= rate).sum() <= stats.binom.isf(RATE, 400, rate)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0, 0.5])
+def test_no_more_false_alarms_than_stated_on_the_same_trials(rng: np.random.Generator, scale: float) -> None:
+    """400 comparisons at 5 and 1 %."""
+    p = []
     for _ in range(400):
-        shared = rng.gamma(4.0, 1.0, 40)
-        a, b = (ratio * (shared + rng.gamma(1.0, 1.0, 40)) / 5.0 for _ in range(2))
-        found += compare(of_runs(a), of_runs(b)).worse
-    assert found <= stats.binom.isf(RATE, 400, 0.06)  # Student's t on gamma means: at most 6 %
+        a, b = same_trials(rng, 20, 1)
+        p.append(compare(of_runs(scale * a), of_runs(scale * b)).p_value)
+    for rate in (0.05, 0.01):
+        assert (np.array(p) <= rate).sum() <= stats.binom.isf(RATE, 400, rate)
+
+
+def test_calibration_rows_count_false_alarms(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "experiments")
+    import calibration_compare
+
+    rows = calibration_compare.rows(40, 20, 5)
+    assert [(r["runs"], r["false_alarm"], r["gates"]) for r in rows[:4]] == [
+        (8, 0.05, 40), (8, 0.01, 20), (21, 0.05, 40), (21, 0.01, 20),
+    ]  # fmt: skip
+    assert len({(r["world"], r["dof"], r["runs"], r["false_alarm"]) for r in rows}) == len(rows) == 24
+    assert json.loads(json.dumps(rows)) == rows
+    assert rows == calibration_compare.rows(40, 20, 5)
+    monkeypatch.setattr(calibration_compare, "_p_value", lambda *_: 0.03)
+    assert {r["found"] for r in calibration_compare.rows(4, 2, 5) if r["false_alarm"] == 0.05} == {4}
+    assert {r["found"] for r in calibration_compare.rows(4, 2, 5) if r["false_alarm"] == 0.01} == {0}
+
+
+def test_the_p_value_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each side the larger p value counts, of both sides the smaller, twice."""
+    table = {
+        # one-sided p of log a - log b above and below 0, the same of log a + log b -> p
+        ((0.01, 0.99), (0.03, 0.97)): 0.06,  # over, decided by the sum
+        ((0.04, 0.96), (0.03, 0.97)): 0.08,  # over, decided by the difference
+        ((0.98, 0.02), (0.999, 0.001)): 0.04,  # under
+        ((0.01, 0.99), (0.99, 0.01)): 1.0,  # b is farther, on the other side: neither
+        ((0.45, 0.55), (0.52, 0.48)): 1.0,  # twice 0.52 is no probability
+        ((1.0, 1.0), (0.001, 0.999)): 1.0,  # no difference at all
+    }
+    a = of_runs(np.linspace(0.5, 1.5, 20))
+    for tails, wanted in table.items():
+        of_sign = {
+            sign: SimpleNamespace(p_values=p, value=0.0, error=1.0, half_width=lambda tail: 1.0)
+            for sign, p in zip((-1.0, 1.0), tails, strict=True)
+        }
+        monkeypatch.setattr(
+            "consistency.diagnostics.comparison.contrast", lambda a, b, sign, paired, of_sign=of_sign: of_sign[sign]
+        )
+        assert compare(a, a).p_value == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("paired", [True, False])
+def test_a_contrast_by_hand(rng: np.random.Generator, sign: float, paired: bool) -> None:
+    """Slope by a numerical derivative, gamma shape by its equation; limits are the terms of order 1 / runs."""
+    runs_a, runs_b = 3000, 3000 if paired else 2000
+    a, b = rng.gamma(0.6, 1.0, runs_a), rng.gamma(3.0, 1.0, runs_b)
+    b = b + 2.0 * a if paired else b
+    c = contrast(a, b, sign, paired)
+    assert c.value == pytest.approx(np.log(a.mean()) + sign * np.log(b.mean()))
+    assert c.freedom == runs_b - 1
+
+    def value_and_variance(of_a: Array, of_b: Array) -> tuple[float, float]:
+        mean_a, mean_b = (np.average(x, weights=w) for x, w in ((a, of_a), (b, of_b)))
+        x, y = a / mean_a - 1.0, sign * (b / mean_b - 1.0)
+        if paired:
+            variance = np.average((x + y) ** 2, weights=of_a) / runs_a
+        else:
+            variance = np.average(x**2, weights=of_a) / runs_a + np.average(y**2, weights=of_b) / runs_b
+        return float(np.log(mean_a) + sign * np.log(mean_b)), float(variance)
+
+    x, y = a / a.mean() - 1.0, sign * (b / b.mean() - 1.0)
+    of_a, of_b = (0.1 * (x + y) / runs_a,) * 2 if paired else (0.1 * x / runs_a, 0.1 * y / runs_b)
+    (up, v_up), (down, v_down) = (value_and_variance(1.0 + k * of_a, 1.0 + k * of_b) for k in (1.0, -1.0))
+    assert c.slope == pytest.approx(np.log(v_up / v_down) / (up - down), rel=0.01, abs=0.02)
+
+    def spread_of_gamma(means: Array) -> float:
+        gap = np.log(means.mean()) - np.log(means).mean()
+        return 1.0 / float(optimize.brentq(lambda shape: np.log(shape) - special.digamma(shape) - gap, 1e-3, 1e3))
+
+    hidden = [spread_of_gamma(a), spread_of_gamma(b)]
+    moments = [x.var(), y.var()]
+    factor = sum(map(max, moments, hidden)) / sum(moments)
+    _, variance = value_and_variance(np.ones(runs_a), np.ones(runs_b))
+    assert c.variance == pytest.approx(variance * factor, rel=0.02)
+
+
+def test_student_and_what_makes_it_safe() -> None:
+    c = Contrast(value=-0.6, variance=0.04, slope=1.5, freedom=9.0)
+    t = -0.6 / (0.2 * np.exp(0.5 * (1.5 * 0.6 + np.sqrt(2 / 9))))  # the hypothesis lies 0.6 above
+    assert c.p_values == pytest.approx((stats.t.sf(t, 9), stats.t.cdf(t, 9)))
+    t = 0.6 / (0.2 * np.exp(0.5 * np.sqrt(2 / 9)))  # a variance that would be smaller is left as it is
+    assert Contrast(0.6, 0.04, 1.5, 9.0).p_values == pytest.approx((stats.t.sf(t, 9), stats.t.cdf(t, 9)))
+    t = -2.0 / (0.2 * np.exp(0.5 * (1.5 * 0.8 + np.sqrt(2 / 9))))  # moved by 4 standard errors at most
+    assert Contrast(-2.0, 0.04, 1.5, 9.0).p_values[1] == pytest.approx(stats.t.cdf(t, 9))
+    half = stats.t.isf(0.01, 9) * 0.2 * np.exp(0.5 * (1.5 * 0.8 + np.sqrt(2 / 9)))
+    for slope in (1.5, -1.5):
+        assert Contrast(0.0, 0.04, slope, 9.0).half_width(0.01) == pytest.approx(half)
+    assert margin(8.0) == 0.5
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_contrasts_are_symmetric(rng: np.random.Generator, paired: bool) -> None:
+    a, b = gamma(rng, 20, 1.3), rng.gamma(1.0, 1.0, 20)
+    gap, total = (contrast(a, b, sign, paired) for sign in (-1.0, 1.0))
+    swapped = contrast(b, a, -1.0, paired)
+    assert (swapped.value, swapped.slope) == pytest.approx((-gap.value, -gap.slope))
+    assert swapped.p_values == pytest.approx(gap.p_values[::-1])
+    assert contrast(b, a, 1.0, paired).p_values == pytest.approx(total.p_values)
+    assert contrast(3.0 * a, 3.0 * b, -1.0, paired).p_values == pytest.approx(gap.p_values)
+    assert contrast(3.0 * a, b / 3.0, 1.0, paired).p_values == pytest.approx(total.p_values)
+    assert contrast(3.0 * a, 3.0 * b, 1.0, paired).value == pytest.approx(total.value + 2.0 * np.log(3.0))
+
+
+def test_samples_of_unequal_size_have_the_freedom_of_the_smaller(rng: np.random.Generator) -> None:
+    a, b = gamma(rng, 30, 1.0), gamma(rng, 10, 1.0)
+    c = contrast(a, b, -1.0, paired=False)
+    assert c.freedom == 9.0
+    assert c.variance >= (a / a.mean()).var(ddof=1) / 30 + (b / b.mean()).var(ddof=1) / 10
+
+
+def test_runs_without_spread_and_runs_of_zeros(rng: np.random.Generator) -> None:
+    one = np.ones(10)
+    assert compare(of_runs(2.0 * one), of_runs(one)).p_value == 0.0
+    assert compare(of_runs(one), of_runs(2.0 * one)).p_value == 1.0
+    assert compare(of_runs(one), of_runs(one)).at_most == 0.0
+    opposite = np.linspace(0.5, 1.5, 10)
+    assert compare(of_runs(opposite), of_runs(2.0 - opposite)).p_value == 1.0  # the sum has next to no spread
+    some = np.where(np.arange(10) < 3, 0.0, 1.0)
+    assert compare(of_runs(some), of_runs(gamma(rng, 10, 1.0))).p_value <= 1.0
+    with pytest.raises(ValueError, match="every NEES of b is 0"):
+        compare(of_runs(one), of_runs(0.0 * one))
 
 
 def test_common_runs_are_paired_and_others_left_out() -> None:
@@ -94,15 +269,115 @@ def test_refusals() -> None:
         compare(a, RunSummary(a.runs, 2, a.nees, a.squared, a.covered))
 
 
-def test_needed_runs_is_what_the_power_takes() -> None:
-    """Power of 300 comparisons at the number asked for: at least 0.95 less 5 points; 1 in 10,000 by chance."""
-    rng = np.random.default_rng()
-    pilot = compare(of_runs(gamma(rng, 4000, 1.5)), of_runs(gamma(rng, 4000, 1.0)), 0.05)
-    needed = pilot.needed_runs(1.5, 0.95)
-    found = sum(
-        compare(of_runs(gamma(rng, needed, 1.5)), of_runs(gamma(rng, needed, 1.0)), 0.05).worse for _ in range(300)
-    )
-    assert found >= stats.binom.ppf(RATE, 300, 0.90)
+# --- the runs that it takes ------------------------------------------------------------------------
+
+
+Pair = Callable[[np.random.Generator, int], tuple[Array, Array]]
+
+
+def found(rng: np.random.Generator, pair: Pair, runs: int, scale: float, rate: float, ratio: float) -> int:
+    """Of 300 comparisons, those that find a candidate farther off by ``ratio``."""
+    count = 0
+    for _ in range(300):
+        a, b = pair(rng, runs)
+        count += compare(of_runs(scale * ratio * a), of_runs(scale * b), rate).worse
+    return count
+
+
+def independent(rng: np.random.Generator, runs: int) -> tuple[Array, Array]:
+    return gamma(rng, runs, 1.0), gamma(rng, runs, 1.0)
+
+
+def together(rng: np.random.Generator, runs: int) -> tuple[Array, Array]:
+    return same_trials(rng, runs, 8)
+
+
+@pytest.mark.parametrize(
+    ("scale", "ratio", "rate"), [(1.0, 1.5, 0.05), (1.0, 1 / 1.5, 1e-3), (2.0, 1.5, 1e-3), (0.5, 1 / 1.5, 0.05)]
+)
+@pytest.mark.parametrize("pair", [independent, together])
+def test_needed_runs_are_what_the_power_takes(
+    rng: np.random.Generator, pair: Pair, scale: float, ratio: float, rate: float
+) -> None:
+    """Power of 300 comparisons at the number planned: 95 %; a third of the runs would not do."""
+    a, b = pair(rng, 4000)
+    needed = compare(of_runs(scale * a), of_runs(scale * b), rate)
+    runs = replace(needed, at_most=np.inf).needed_runs(1.5, 0.95)
+    assert found(rng, pair, runs, scale, rate, ratio) >= stats.binom.ppf(RATE, 300, 0.95)
+    assert found(rng, pair, max(8, runs // 3), scale, rate, ratio) < stats.binom.ppf(RATE, 300, 0.95)
+
+
+def test_the_same_trials_help_beside_a_reference_that_is_off(rng: np.random.Generator) -> None:
+    """Limits are many standard errors from the values."""
+    a, b = together(rng, 4000)
+    right, off = (replace(compare(of_runs(s * a), of_runs(s * b)), at_most=np.inf) for s in (1.0, 2.0))
+    assert right.sum_error == pytest.approx(off.sum_error)
+    assert right.needed_runs() > 3 * off.needed_runs()
+    assert right.reference < 0.1 < off.reference < np.log(2.0) + 0.1
+
+
+def test_a_plan_by_hand() -> None:
+    c = Comparison(50, True, (), 0.0, 0.1, 1.0, 0.05)
+    n = c.needed_runs(1.5, 0.9)
+
+    def size(runs: int) -> float:
+        z = stats.t.isf(0.025, runs - 1) + stats.t.isf(0.05, runs - 1)
+        return float(z * 0.1 * np.sqrt(50 / runs) * np.exp(np.sqrt(2 / (runs - 1))))
+
+    assert size(n) <= np.log(1.5) < size(n - 1)
+    assert c.needed_runs(1 / 1.5, 0.9) == n
+    assert replace(c, sum_error=0.1).needed_runs(1.5, 0.9) == n
+    assert replace(c, sum_error=0.2, reference=0.5 * np.log(1.5)).needed_runs(1.5, 0.9) == n
+    assert replace(c, sum_error=0.2).needed_runs(1.5, 0.9) > 3 * n
+    assert replace(c, standard_error=1.0, at_most=0.4).needed_runs(1.5) == 50
+    assert replace(c, standard_error=1.0, at_most=0.41).needed_runs(1.5) > 50
+    assert c.needed_runs(1.0 + 1e-6) > 10**9
+    assert replace(c, standard_error=0.0).needed_runs() == 8
+
+
+def test_limits_of_the_distance_by_hand() -> None:
+    """With next to no spread the limits are the distance and the reference themselves."""
+    wiggle = 1.0 + 1e-6 * np.linspace(-1.0, 1.0, 20)
+    for of_a, of_b in ((3.0, 2.0), (2.0, 3.0), (0.2, 0.5), (0.5, 0.2), (3.0, 0.5), (0.5, 3.0), (0.2, 2.0), (1.0, 1.0)):
+        c = compare(of_runs(of_a * wiggle), of_runs(of_b * wiggle[::-1]))
+        distance = abs(np.log(of_a)) - abs(np.log(of_b))
+        assert c.distance == pytest.approx(distance, abs=1e-4)
+        assert c.at_most == pytest.approx(distance, abs=1e-4)
+        assert c.reference == pytest.approx(abs(np.log(of_b)), abs=1e-4)
+        assert c.worse == (distance > 1e-4)
+
+
+def test_limits_hold_with_their_confidence(rng: np.random.Generator) -> None:
+    """400 comparisons at 5 %; the true distance is 0 and the reference is off by x2."""
+    below = above = 0
+    for _ in range(400):
+        c = compare(of_runs(2.0 * slow(rng, 12, 1)), of_runs(2.0 * slow(rng, 12, 1)))
+        below += c.at_most < 0.0
+        above += c.reference > np.log(2.0)
+    assert max(below, above) <= stats.binom.isf(RATE, 400, 0.05)
+
+
+def test_runs_that_show_that_nothing_is_lost_are_enough(rng: np.random.Generator) -> None:
+    """Another rounding of the same filter needs no more runs; a filter that could be farther off does."""
+    nees = rng.chisquare(3, (10, 1))
+    rounded = nees * (1.0 + 1e-12 * rng.standard_normal((10, 1)))
+    c = assert_not_worse(nees_a=rounded, nees_b=nees, dof=3)
+    assert not c.worse
+    assert c.at_most < 1e-9
+    sentence = Compared("f", "f", compare(of_runs(rounded[:, 0]), of_runs(nees[:, 0])), (0, 0)).sentence
+    assert "farther off by x1 at most" in sentence
+    with pytest.raises(InsufficientTrials):
+        assert_not_worse(nees_a=rng.chisquare(3, (10, 1)), nees_b=rng.chisquare(3, (10, 1)), dof=3, false_alarm=1e-9)
+
+
+def test_the_end_of_a_session_plans_as_the_gate_did(rng: np.random.Generator) -> None:
+    entries = []
+    a, b = together(rng, 400)
+    for scale in (1.0, 2.0):
+        with watching(Watch(keep=entries.append)):
+            c = assert_not_worse(nees_a=scale * a[:, None], nees_b=scale * b[:, None], dof=1, false_alarm=1e-9)
+        assert needed_at(entries[-1], 1e-9) == entries[-1].needed == c.needed_runs()
+        assert needed_at(replace(entries[-1], detect=1.01), 1e-9) == c.needed_runs(1.01)
 
 
 # --- results and files -----------------------------------------------------------------------------

@@ -575,33 +575,42 @@ def test_every_status_reads_well_among_the_gates(dark):
 
 
 CALIBRATION = {
-    "steps": 100, "dof": 3, "seed": 1, "power": 0.95, "wall_time_s": 1.0,
+    "steps": 100, "dof": 3, "seed": 1, "wall_time_s": 1.0,
+    "questions": {"false alarm": "a right filter is found at fault", "power": "`plan` keeps its word"},
+    "worlds": {"independent": "independent steps", "elsewhere": "steps that <depend> on each other"},
     "rows": [
-        {"world": "independent", "ratio": 1.0, "runs": 21, "false_alarm": 0.05, "power": 0.95, "gates": 200,
-         "found": 9},
-        {"world": "elsewhere", "ratio": 1.5, "runs": 61, "false_alarm": 0.05, "power": 0.95, "gates": 100,
-         "found": 100},
-        {"world": "independent", "ratio": 1.5, "runs": 73, "looks": 3, "mean_runs": 19.0, "false_alarm": 0.05,
-         "power": 0.95, "gates": 100, "found": 99},
+        {"world": "independent", "question": "power", "ratio": 1.5, "runs": 61, "looks": 1, "stated": 0.95,
+         "bound": ">=", "gates": 100, "found": 100},
+        {"world": "independent", "question": "false alarm", "ratio": 1.0, "runs": 21, "looks": 1, "stated": 0.05,
+         "bound": "<=", "gates": 200, "found": 2},
+        {"world": "elsewhere", "question": "false alarm", "ratio": 1.0, "runs": 21, "looks": 1, "stated": 0.05,
+         "bound": "<=", "gates": 200, "found": 9},
+        {"world": "elsewhere", "question": "power", "ratio": 1.5, "runs": 500, "looks": 0, "mean_runs": 19.0,
+         "late_runs": 30.0, "stated": 0.95, "bound": ">=", "gates": 100, "found": 80},
     ],
 }  # fmt: skip
 
 
-def test_the_calibration_is_a_table_of_rates_with_intervals(folder, tmp_path):
+def test_the_calibration_is_a_table_of_promises_with_the_interval_of_the_worst_world(folder, tmp_path):
     path = tmp_path / "calibration.json"
     path.write_text(json.dumps(CALIBRATION))
     found = calibration(path)
-    assert found.gates == 400
-    alarm, power, looks = wording.calibration_rows(found)
+    assert found.gates == 600
+    (first, (alarm,)), (second, (power, decided)) = wording.calibration_groups(found)
+    assert (first, second) == ("false alarm: a right filter is found at fault", "power: plan keeps its word")
     # Clopper & Pearson of 9 in 200 at 99 %
     low, high = stats.beta.ppf(0.005, 9, 192), stats.beta.ppf(0.995, 10, 191)
     interval = f"{100 * low:.1f} to {100 * high:.1f} %"
-    assert alarm == ("independent NEES values", "1, right", "21", "≤ 5 %", "200", "4.5 %", interval)
-    assert power[:6] == ("elsewhere", "1.5", "61", "≥ 95 %", "100", "100.0 %")
-    assert looks[2] == "19 of 73, 3 looks"
-    assert {len(row) for row in (alarm, power, looks)} == {len(wording.CALIBRATION_COLUMNS)}
+    assert alarm == ("1, right", "21", "≤ 5 %", "200 in 2 worlds", "1.0 to 4.5 %", "elsewhere", interval)
+    assert power[:6] == ("1.5", "61", "≥ 95 %", "100", "100.0 %", "independent")
+    assert decided[1] == "19, 500 at most"
+    assert [promise.worst.broken for promise in found.promises] == [False, False, True]
+    assert {len(row) for row in (alarm, power, decided)} == {len(wording.CALIBRATION_COLUMNS)}
     report = replace(build_report(folder), calibration=found)
-    assert "How far the referee can be trusted" in html.render_html(report)
+    page = html.render_html(report)
+    assert "How far the referee can be trusted" in page
+    assert "steps that &lt;depend&gt; on each other" in page
+    assert "plan keeps its word" in page
     assert pdf.render_pdf(report).startswith(b"%PDF")
 
 

@@ -23,6 +23,7 @@ from consistency.vision import (
     register_weighted,
     registration_covariance,
 )
+from consistency.vision.consensus import squared_distances
 
 Array = np.ndarray[Any, Any]
 BOTH = pytest.mark.parametrize("register", [register_svd, register_horn])
@@ -157,6 +158,59 @@ def test_covariances_let_far_points_in(rng: np.random.Generator) -> None:
     _, inliers = register_ransac(p1, p2, threshold=4.0, rng=rng, S1=S, S2=np.zeros((3, 3)))
     assert not inliers[:20].any()
     assert inliers[20:].mean() > 0.95
+
+
+def long_covariances(rng: np.random.Generator, n: int) -> Array:
+    """Noise of 1 m along one direction and 0.01 m across it, another direction for each point."""
+    along = Rotation.random(n, rng=rng).as_matrix()
+    return along @ np.diag([1.0, 1e-4, 1e-4]) @ np.swapaxes(along, 1, 2)
+
+
+def test_distances_by_hand(rng: np.random.Generator) -> None:
+    """e' (S1 + R S2 R')^-1 e, point by point, for one motion and for many; the covariances are long and thin."""
+    p1, p2 = scene(rng, 6), scene(rng, 6)
+    S1, S2 = long_covariances(rng, 6), long_covariances(rng, 6)
+    turns, shifts = Rotation.random(4, rng=rng).as_matrix(), rng.normal(size=(4, 3))
+    wanted, plain = np.empty((4, 6)), np.empty((4, 6))
+    for k, (R, t) in enumerate(zip(turns, shifts, strict=True)):
+        for i in range(6):
+            e = p1[i] - (R @ p2[i] + t)
+            plain[k, i] = e @ e
+            wanted[k, i] = e @ np.linalg.inv(S1[i] + R @ S2[i] @ R.T) @ e
+    np.testing.assert_allclose(squared_distances(p1, p2, turns, shifts, S1, S2), wanted, rtol=1e-9)
+    np.testing.assert_allclose(squared_distances(p1, p2, turns, shifts), plain, rtol=1e-12)
+    np.testing.assert_allclose(squared_distances(p1, p2, turns[0], shifts[0], S1, S2), wanted[0], rtol=1e-9)
+
+
+def test_noise_of_the_second_frame_is_turned(rng: np.random.Generator) -> None:
+    """Noise of frame 2 that is long in x is long in y after a quarter turn.
+
+    Of 40 points one is farther off than 6 sigma with a probability of 3e-6.
+    """
+    quarter = RelativePose(Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.array([0.3, -0.2, 0.5]))
+    p2 = scene(rng, 40)
+    S2 = np.diag([0.25, 1e-6, 1e-6])
+    noisy = p2 + rng.normal(size=(40, 3)) * np.sqrt(np.diag(S2))
+    p1 = quarter.apply(p2)
+    S1 = 1e-6 * np.eye(3)
+    distances = squared_distances(p1, noisy, quarter.R, quarter.t, np.tile(S1, (40, 1, 1)), np.tile(S2, (40, 1, 1)))
+    assert (distances < 36.0).all()
+    p1[:5, 0] += 1.0  # across the noise
+    again = squared_distances(p1, noisy, quarter.R, quarter.t, np.tile(S1, (40, 1, 1)), np.tile(S2, (40, 1, 1)))
+    assert (again[:5] > 1e4).all()
+
+
+def test_points_that_are_off_across_their_noise_are_no_inliers(rng: np.random.Generator) -> None:
+    """The long noise of frame 2 would let them in along it."""
+    turned = RelativePose(Rotation.from_euler("z", 50, degrees=True).as_matrix(), np.array([0.3, -0.2, 0.5]))
+    p2 = scene(rng, 80)
+    S2 = np.diag([0.04**2, 1e-8, 1e-8])
+    p1 = turned.apply(p2)
+    p1[:20] += turned.R @ [0.0, 0.03, 0.0]
+    noisy = p2 + rng.normal(size=(80, 3)) * np.sqrt(np.diag(S2)) * 1e-3
+    _, inliers = register_ransac(p1, noisy, threshold=4.0, rng=rng, S1=1e-8 * np.eye(3), S2=S2)
+    assert not inliers[:20].any()
+    assert inliers[20:].all()
 
 
 def test_all_outliers(rng: np.random.Generator) -> None:

@@ -55,8 +55,8 @@ def _study(study: Study, prefix: str, folder: Path) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "name": study.name,
         "summary": study.summary,
-        "runs": study.runs,
-        "steps": len(study.steps),
+        "verdict_caption": f"{study.name}: {captions.verdict_caption(study)}",
+        "shown_inside": wording.equivalence_interval(study),
         "verdicts": [list(wording.verdict_row(track)) for track in study.tracks],
         "reasons": [
             {"filter": track.name, "sentence": track.verdict.reasons[0], "reasons": list(track.verdict.reasons[1:])}

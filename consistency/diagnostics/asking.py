@@ -56,8 +56,8 @@ def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: fl
             key: scale_test(sample.group_means(index), len(index), sample.longest)
             for key, index in sample.errors.groups.items()
         }
-        worst = min((t.above if settings.one_sided else t.p_value for t in axes.values()), default=1.0)
-        p[AXIS] = min(1.0, worst * len(axes)) if n > 1 else float("nan")
+        worst = np.array([t.above if settings.one_sided else t.p_value for t in axes.values()])
+        p[AXIS] = _least(worst)[0] if n > 1 else float("nan")
         bias_step = _bias(w, p)
         outlier = outliers(w)
         p["outliers"] = outlier.p_value

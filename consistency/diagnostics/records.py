@@ -10,13 +10,13 @@ from consistency.types import Array, Failure, Indices
 
 # status -> what it means; the order is that of reports
 STATUSES = {
-    "consistent": "the errors are shown to be as large as the covariance says",
+    "consistent": "no fault is found, and the errors are shown to be as large as the covariance says",
     "overconfident": "the errors are larger than the covariance says",
     "conservative": "the errors are smaller than the covariance says",
     "biased": "the errors have a mean; about it they are as large as the covariance says",
     "heavy-tailed": "a few errors are far larger than a Gaussian of the stated covariance has them",
     "inconsistent": "the errors are otherwise than the covariance says, in more than their size",
-    "undecided": "no fault is found, and the runs are too few to show that there is none",
+    "undecided": "no fault is found, and it is not shown that there is none",
     "failed": "a run broke down, or there was nothing to judge",
 }
 

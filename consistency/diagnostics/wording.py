@@ -106,7 +106,9 @@ def _failures(v: Verdict) -> list[str]:
 
 def _since(v: Verdict, found: Found) -> str:
     since = v.location.since if v.location is not None else None
-    return f" since step {since}" if found and since is not None else ""
+    if not found or since is None or v.status in ("biased", "heavy-tailed"):  # it is that of the scale
+        return ""
+    return f" since step {since}"
 
 
 def _sentence(v: Verdict, found: Found) -> str:

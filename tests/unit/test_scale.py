@@ -1,4 +1,4 @@
-"""The test of run means against computations of their own: a likelihood maximised numerically, runs left out one by one.
+"""The test of run means against computations of its own: a likelihood maximised, runs left out one by one.
 
 Everything random has a fixed seed that was not chosen, and no assertion here depends on luck but the counts, which have
 limits at 1e-5.
@@ -41,7 +41,9 @@ def gamma_shape(means: Array) -> tuple[float, float]:
         a = float(np.exp(log_a))
         return -float(stats.gamma.logpdf(means, a, scale=means.mean() / a).sum())
 
-    best = optimize.minimize_scalar(minus_log_likelihood, bounds=(-8.0, 14.0), method="bounded", options={"xatol": 1e-10})
+    best = optimize.minimize_scalar(
+        minus_log_likelihood, bounds=(-8.0, 14.0), method="bounded", options={"xatol": 1e-10}
+    )
     h = 1e-3
     curve = [minus_log_likelihood(best.x + d) for d in (-h, 0.0, h)]
     return float(best.x), float(1.0 / np.sqrt((curve[0] - 2.0 * curve[1] + curve[2]) / h**2))
@@ -74,9 +76,7 @@ def oracle(means: Array, dof: int, steps: int, gaussian: bool = True) -> Oracle:
     by_likelihood = np.log(2.0) + log_a - error
     nu = min(np.exp(min(by_spread, by_likelihood)), dof * steps)
     nu, spread = (dof, np.inf) if gaussian and nu <= dof else (nu, 2.0 / variance)
-    return Oracle(
-        nu, spread, by_spread, by_likelihood, shift, abs(distance) > reach, unfloored < 2.0 / N
-    )
+    return Oracle(nu, spread, by_spread, by_likelihood, shift, abs(distance) > reach, unfloored < 2.0 / N)
 
 
 def tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
@@ -280,7 +280,11 @@ def test_ratio_interval_from_twenty_runs_on(confidence: float) -> None:
 
 def test_ratio_interval_of_few_runs() -> None:
     """As if all steps were one, or by the spread that is seen if that is larger."""
-    for means, dof in ((np.array([1.0, 1.1, 0.9, 1.05]), 3), (np.array([0.02, 5.0, 0.01, 0.1]), 3), (np.array([2.0]), 2)):
+    for means, dof in (
+        (np.array([1.0, 1.1, 0.9, 1.05]), 3),
+        (np.array([0.02, 5.0, 0.01, 0.1]), 3),
+        (np.array([2.0]), 2),
+    ):
         nu = float(dof)
         if len(means) > 1:
             cv2 = means.var(ddof=1) / means.mean() ** 2
@@ -290,6 +294,16 @@ def test_ratio_interval_of_few_runs() -> None:
         assert low == pytest.approx(value * k / stats.chi2.isf(0.025, k), rel=1e-6)
         assert high == pytest.approx(value * k / stats.chi2.ppf(0.025, k), rel=1e-6)
     assert ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 6)[2] < ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 1)[2]
+
+
+@pytest.mark.xfail(
+    strict=True, reason="Student's t with less than one degree of freedom, where a few runs carry the spread"
+)
+def test_ratio_interval_of_a_right_filter_says_something() -> None:
+    """20 runs of one component, fully dependent: none in 300 draws from practically 0 to practically infinity."""
+    rng = np.random.default_rng(10)
+    intervals = [ratio_interval(gamma_means(rng, 20, 1.0)) for _ in range(300)]
+    assert max(i.high / max(i.low, 1e-300) for i in intervals) < 1e4
 
 
 def test_ratio_interval_where_there_is_nothing_to_spread() -> None:
@@ -329,7 +343,9 @@ def test_digamma_equation_holds() -> None:
         means = rng.gamma(shape, 1.0 / shape, 400).clip(1e-300)
         gap = np.log(means.mean()) - np.log(means).mean()
         a = optimize.brentq(lambda x, gap=gap: np.log(x) - special.psi(x) - gap, 1e-4, 1e9)
-        error = 1.0 / np.sqrt(len(means) * (a * a * special.polygamma(1, a) - a)) if a < 1e6 else np.sqrt(2 / len(means))
+        error = (
+            1.0 / np.sqrt(len(means) * (a * a * special.polygamma(1, a) - a)) if a < 1e6 else np.sqrt(2 / len(means))
+        )
         test = scale_test(means, 1, 10**9, gaussian=False)
         assert test.effective_dof <= 2.0 * a * np.exp(-error) * (1 + 1e-6)
         if oracle(means, 1, 10**9, gaussian=False).by_likelihood < oracle(means, 1, 10**9, False).by_spread:

@@ -112,9 +112,9 @@ def correlated(w: Array, correlation: float = 0.8) -> Array:
 
 
 def oblique(w: Array) -> Array:
-    """x1.6 in the direction (1, ..., 1), the rest x0.7."""
-    n = w.shape[-1]
-    u = np.ones(n) / np.sqrt(n)
+    """x1.6 in a direction between the axes, the rest x0.7."""
+    u = 0.5 ** np.arange(w.shape[-1])
+    u /= np.linalg.norm(u)
     along = w @ u
     return np.sqrt(0.7) * w + (np.sqrt(1.6) - np.sqrt(0.7)) * along[..., None] * u
 

@@ -98,7 +98,7 @@ def pilot_plan(
     _require(dof, false_alarm, power)
     if len(means) < FEW:
         raise ValueError(f"a pilot needs at least {FEW} runs, got {len(means)}")
-    test = scale_test(means, dof, steps)
+    test = scale_test(means / means.mean(), dof, steps)
     share = SHARES[MAIN] * false_alarm
     least = required_runs(test.effective_dof, detect, share, power, two_sided=allow is None)
     runs = min(int(np.ceil(MARGIN * least)), gate_runs(dof, detect, false_alarm, power, allow))

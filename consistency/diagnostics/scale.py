@@ -195,7 +195,9 @@ def _log_nu_of_gamma(means: Array) -> tuple[Array, Array]:
 
 
 def _left_out_mean(means: Array) -> Array:
-    return np.asarray((means.sum() - means) / (len(means) - 1))
+    """Mean without each run; what is left beside a run that diverged is no smaller than its rounding."""
+    total = means.sum()
+    return np.asarray(np.maximum(total - means, np.finfo(float).eps * total) / (len(means) - 1))
 
 
 def _jackknife(a: Array, b: Array) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from consistency.diagnostics.coverage import TWO_SIGMA
-from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, MAIN, SCALE, SHAPE, STEP
+from consistency.diagnostics.questions import BIAS, DIRECTION, MAIN, SCALE, SHAPE, STEP
 from consistency.diagnostics.records import Answer, Axes, Equivalence, Interval, Scale, Verdict
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
@@ -71,6 +71,8 @@ def off_by(interval: Interval) -> str:
 
 def plain(interval: Interval) -> str:
     """1.02 [0.87, 1.19]: a ratio that may lie on either side of 1."""
+    if interval.value < TINY:
+        return f"below {TINY:g}"
     if not interval.high < UNCERTAIN * interval.low:
         return f"{short(interval.value)} (known to no better than a factor of {UNCERTAIN:g})"
     return f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]"
@@ -177,6 +179,8 @@ def _scale(v: Verdict, found: Found) -> str:
         inflation, about = v.bias.inflation_without, " about the mean"
     if MAIN not in found and STEP not in found:
         return _one_axis(v)
+    if about and v.status != ("overconfident" if inflation.value > 1.0 else "conservative"):
+        return f"covariance{about} too {'small' if v.status == 'overconfident' else 'large'} in some steps"
     if not where.lasting and MAIN not in found:
         count = where.above + where.below
         side = "too small" if where.above else "too large"
@@ -206,8 +210,9 @@ def _one_axis(v: Verdict) -> str:
     sure = {a: i for a, i in v.axes.inflation.items() if (i.low > 1.0 if one_sided else not i.holds(1.0))}
     sure = {a: i for a, i in sure.items() if a in v.axes.names} or sure
     sure = dict(sorted(sure.items(), key=lambda item: -abs(np.log(max(item[1].value, TINY))))[:MOST])
-    if v.axes.largest is not None and DIRECTION in v.faults and AXIS not in v.faults:
-        return f"covariance {off_by(v.axes.largest)} in the direction {_direction(v.axes)}"
+    largest = v.axes.largest
+    if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for i in sure.values()):
+        return f"covariance {off_by(largest)} in the direction {_direction(v.axes)}"
     return f"covariance of {', '.join(f'{a} {off_by(i)}' for a, i in sure.items()) if sure else 'an axis wrong'}"
 
 

@@ -135,14 +135,12 @@ def test_an_oblique_fault_is_found(fault: Callable[[Array], Array], n: int, worl
         assert any("in the direction" in v.reasons[0] for v in found)
 
 
-@pytest.mark.xfail(strict=True, reason="axes that are too large count, though that is no fault")
 def test_an_oblique_fault_beside_small_errors_is_overconfident() -> None:
     rng = np.random.default_rng(52)
     verdicts = [verdict_on(oblique(independent(rng, 100, 60, 6)), allow="conservative") for _ in range(10)]
     assert {v.status for v in verdicts} == {"overconfident"}
 
 
-@pytest.mark.xfail(strict=True, reason="names the axes that are too large, though that is no fault")
 def test_the_sentence_on_an_oblique_fault_names_the_direction() -> None:
     rng = np.random.default_rng(53)
     for _ in range(5):
@@ -171,7 +169,6 @@ def test_it_is_asked_only_where_too_large_is_allowed() -> None:
     assert "scale in some direction" not in {a.question for a in verdict_on(w).answers}
 
 
-@pytest.mark.xfail(strict=True, reason="axes that are too large count, though that is no fault")
 def test_a_large_axis_beside_small_ones_is_overconfident() -> None:
     """x1.6 in one axis and x0.5 in the others: what is too large is allowed, so that only one side speaks."""
     rng = np.random.default_rng(51)

@@ -19,9 +19,8 @@ from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.diagnostics import Settings
 from consistency.cli import main
-from consistency.diagnostics import nees
+from consistency.diagnostics import Settings, nees
 from consistency.errors import InputError
 from consistency.judge import analyse_recordings
 from consistency.recording import (

@@ -296,9 +296,6 @@ def test_ratio_interval_of_few_runs() -> None:
     assert ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 6)[2] < ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 1)[2]
 
 
-@pytest.mark.xfail(
-    strict=True, reason="Student's t with less than one degree of freedom, where a few runs carry the spread"
-)
 def test_ratio_interval_of_a_right_filter_says_something() -> None:
     """20 runs of one component, fully dependent: none in 300 draws from practically 0 to practically infinity."""
     rng = np.random.default_rng(10)

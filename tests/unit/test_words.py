@@ -22,7 +22,7 @@ from scipy import stats
 
 from consistency.diagnostics import Evidence, Interval, Settings, Verdict, judge
 from consistency.diagnostics.records import STATUSES
-from consistency.diagnostics.wording import factor, p_text, plural, short
+from consistency.diagnostics.wording import off_by, p_text, plural, short
 from consistency.storage import plain
 from consistency.types import Array, Failure
 
@@ -55,10 +55,9 @@ def test_an_offset_and_a_wrong_scale_are_both_said(rng: np.random.Generator) -> 
     assert verdict.status == "overconfident"
     assert {"scale", "bias"} <= set(verdict.faults)
     assert "biased: axis 0 +" in verdict.reasons[0]
-    assert "covariance too small by x" in verdict.reasons[0]
+    assert "covariance about the mean too small by x" in verdict.reasons[0]
 
 
-@pytest.mark.xfail(strict=True, reason="the side of the headline is that of the errors with their bias")
 def test_an_offset_does_not_make_a_small_error_large(rng: np.random.Generator) -> None:
     """Errors of half the stated variance about a mean of 1.2 sigma in every axis: not 'overconfident'."""
     verdict = verdict_on(np.sqrt(0.5) * independent(rng, 100, 30, 3) + 1.2, false_alarm=SURE)
@@ -89,7 +88,6 @@ def test_a_few_large_errors_are_heavy_tails(rng: np.random.Generator) -> None:
     assert "sigma from the other runs in step" in verdict.reasons[0]
 
 
-@pytest.mark.xfail(strict=True, reason="a step, or an axis, that is found is not asked whether a few errors make it")
 def test_heavy_tails_of_the_right_covariance_are_not_a_wrong_scale(rng: np.random.Generator) -> None:
     """60 draws of 21 runs with Laplace errors in independent steps; at 5 % more than 12 have a probability of 1e-5."""
     laplace = (rng.laplace(0.0, np.sqrt(0.5), (21, 60, 3)) for _ in range(60))
@@ -288,7 +286,7 @@ def gap(text: str) -> bool:
 
 
 def long(text: str) -> bool:
-    return len(text) >= 300
+    return len(text) >= 400
 
 
 def same_correlations(text: str) -> bool:
@@ -326,16 +324,6 @@ FLAWS = [
     said_twice,
 ]
 KINDS = [worlds, one_component, six_components, some_diverged, without_error]
-KNOWN = {
-    (worlds, zero_end): "0.00 for small ratios",
-    (one_component, zero_end): "0.00 for small ratios",
-    (one_component, placeholder): "an interval that says nothing",
-    (some_diverged, zero_end): "0.00 for small ratios, and an interval that says nothing",
-    (some_diverged, placeholder): "an interval that says nothing",
-    (some_diverged, long): "every figure of every axis",
-    (without_error, placeholder): "the inverse of a ratio of 0",
-    (without_error, zero_end): "0.00 for small ratios",
-}
 
 
 @functools.cache
@@ -352,12 +340,7 @@ def sentences(kind: Callable[..., Iterator[Array]]) -> list[tuple[str, int]]:
 
 
 def pairs() -> list[Any]:
-    marks = {pair: pytest.mark.xfail(strict=True, reason=f"says {reason}") for pair, reason in KNOWN.items()}
-    return [
-        pytest.param(kind, flaw, marks=[marks[kind, flaw]] if (kind, flaw) in marks else [])
-        for kind in KINDS
-        for flaw in FLAWS
-    ]
+    return [pytest.param(kind, flaw) for kind in KINDS for flaw in FLAWS]
 
 
 @pytest.mark.parametrize(("kind", "flaw"), pairs())
@@ -370,7 +353,6 @@ def test_what_one_run_does_is_not_that_of_a_few(kind: Callable[..., Iterator[Arr
     assert not any("a few runs" in text for text, runs in sentences(kind) if runs == 1)
 
 
-@pytest.mark.xfail(strict=True, reason="an interval from 0 to 0 is not narrow by the rule of a few runs")
 def test_no_error_at_all_is_not_made_by_a_few_runs() -> None:
     assert not any("a few runs" in text for text, _ in sentences(without_error))
 
@@ -383,7 +365,7 @@ def test_the_flaws_are_seen() -> None:
         zero_end: "covariance ratio 1.20 [0.00, 3.00]",
         wrong_number: "no fault found in 1 runs, and",
         gap: "consistent: ",
-        long: 300 * "x",
+        long: 400 * "x",
         same_correlations: "are correlated +0.69, stated +0.68",
         outside: "covariance ratio 1.20 [1.30, 3.00]",
         contradiction: "overconfident: covariance of x too large by x1.2 [1.1, 1.3]",
@@ -423,7 +405,6 @@ def test_correlations_that_look_the_same_are_not_named(rng: np.random.Generator)
     assert "correlated +0.90, stated +0.68" in far.reasons[0]
 
 
-@pytest.mark.xfail(strict=True, reason="'1 of 40 runs have an infinite error'")
 def test_one_run_that_failed_is_said_in_the_singular(rng: np.random.Generator) -> None:
     error = independent(rng, 40, 10, 2)
     covariance = identities(error).copy()
@@ -433,7 +414,6 @@ def test_one_run_that_failed_is_said_in_the_singular(rng: np.random.Generator) -
     assert "1 of 40 runs has " in verdict.reasons[0]
 
 
-@pytest.mark.xfail(strict=True, reason="'biased: biased in step 12'")
 def test_a_bias_in_a_step_is_said_once(rng: np.random.Generator) -> None:
     error = independent(rng, 100, 30, 3)
     error[:, 11, 1] += 2.0
@@ -452,15 +432,16 @@ def test_three_digits(value: float, text: str) -> None:
     assert short(value) == text
 
 
-@pytest.mark.xfail(strict=True, reason="two decimals below 10, so 0.00")
 def test_small_numbers_keep_their_digits() -> None:
     for value in (0.004, 1e-3, 3e-6):
         assert float(short(value)) == pytest.approx(value, rel=0.05)
 
 
 def test_factor_is_above_one_on_either_side() -> None:
-    assert factor(Interval(2.0, 1.6, 2.5)) == "x2.00 [1.60, 2.50]"
-    assert factor(Interval(0.5, 0.4, 0.625)) == "x2.00 [1.60, 2.50]"
+    assert off_by(Interval(2.0, 1.6, 2.5)) == "too small by x2.00 [1.60, 2.50]"
+    assert off_by(Interval(0.5, 0.4, 0.625)) == "too large by x2.00 [1.60, 2.50]"
+    assert off_by(Interval(0.0, 0.0, 0.0)) == "too large: there is hardly any error"
+    assert off_by(Interval(2.0, 0.01, 20.0)) == "too small by x2.00 (known to no better than a factor of 100)"
 
 
 def test_plural_and_p() -> None:
@@ -471,7 +452,6 @@ def test_plural_and_p() -> None:
 # --- the whole verdict in text -------------------------------------------------------------------------------
 
 
-@pytest.mark.xfail(strict=True, reason="every axis with its interval")
 def test_a_sentence_about_many_axes_is_short(rng: np.random.Generator) -> None:
     error = 1.5 * independent(rng, 50, 8, 6) + 1.0
     axes = ["x", "y", "z", "roll", "pitch", "yaw"]
@@ -726,9 +706,6 @@ def only_one_run_errs(evidence: Evidence) -> bool:
     return int((np.nan_to_num(evidence.error) != 0.0).any(axis=(1, 2)).sum()) == 1
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the mean of the other runs is a difference of large numbers, and comes out as 0"
-)
 @pytest.mark.parametrize("runs", [2, 25])
 @pytest.mark.parametrize("size", [1e9, 1e12])
 def test_there_is_a_verdict_on_a_run_that_diverged(rng: np.random.Generator, runs: int, size: float) -> None:
@@ -739,7 +716,6 @@ def test_there_is_a_verdict_on_a_run_that_diverged(rng: np.random.Generator, run
     assert not zero_end(text)
 
 
-@pytest.mark.xfail(strict=True, reason="the logarithm of the mean of the other runs, which is 0")
 @pytest.mark.parametrize("runs", [2, 5, 25])
 def test_there_is_a_verdict_where_only_one_run_errs(runs: int) -> None:
     error = np.zeros((runs, 3, 2))

@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: reproduce calibrate test test-all bench lint format clean
+.PHONY: reproduce calibrate calibrate-quick test test-all bench lint format clean
 
 .venv/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -18,7 +18,11 @@ test-all: .venv/.done
 	$(BIN)/python -m pytest -n 2
 
 calibrate: .venv/.done
-	$(BIN)/python experiments/calibration.py 2000 reports/reference/calibration.json
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python experiments/calibration.py \
+		--out reports/reference/calibration.json --docs docs/referee.md
+
+calibrate-quick: .venv/.done
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python experiments/calibration.py --quick
 
 bench: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python experiments/bench.py

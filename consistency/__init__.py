@@ -6,7 +6,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from consistency.diagnostics import anees, anees_interval, nees
+    from consistency.diagnostics import Alarm, Monitor, anees, anees_interval, nees
+    from consistency.diagnostics.records import Verdict
     from consistency.errors import InputError
     from consistency.filters import filter_names, get_filter
     from consistency.findings import Study
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from consistency.results import Results, read_results
     from consistency.scenario import Scenario, load_scenario, scenario_names
     from consistency.simulation import simulate
-    from consistency.types import Control, Finding, Gaussian, Info, Observation, Trial, Verdict
+    from consistency.types import Control, Finding, Gaussian, Info, Observation, Trial
 
 _HOME = {
     "InputError": "errors",
@@ -31,6 +32,8 @@ _HOME = {
     "nees": "diagnostics",
     "anees": "diagnostics",
     "anees_interval": "diagnostics",
+    "Alarm": "diagnostics",
+    "Monitor": "diagnostics",
     "analyse": "judge",
     "Finding": "types",
     "Study": "findings",
@@ -39,13 +42,13 @@ _HOME = {
     "Info": "types",
     "Observation": "types",
     "Trial": "types",
-    "Verdict": "types",
+    "Verdict": "diagnostics.records",
 }
 
 __all__ = [
-    "Control", "Finding", "Gaussian", "Info", "InputError", "Observation", "Results", "Scenario", "Study", "Trial",
-    "Verdict", "analyse", "anees", "anees_interval", "filter_names", "get_filter", "load_scenario", "nees",
-    "read_results", "run_trials", "scenario_names", "simulate",
+    "Alarm", "Control", "Finding", "Gaussian", "Info", "InputError", "Monitor", "Observation", "Results", "Scenario",
+    "Study", "Trial", "Verdict", "analyse", "anees", "anees_interval", "filter_names", "get_filter", "load_scenario",
+    "nees", "read_results", "run_trials", "scenario_names", "simulate",
 ]  # fmt: skip
 
 

@@ -243,21 +243,40 @@ def analyse(
         float | None, typer.Option("--max-dt", help="Seconds between an estimate and its truth at most [0.01].")
     ] = None,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
+    false_alarm: Annotated[
+        float | None, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none [0.05].")
+    ] = None,
+    detect: Annotated[
+        float | None,
+        typer.Option("--detect", help="Consistent is a covariance ratio shown inside [1/R, R] [1.5].", metavar="R"),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option("--tolerance", help="A covariance ratio shown inside [1/R, R] is no fault.", metavar="R"),
+    ] = None,
+    innovations: Annotated[
+        str | None,
+        typer.Option("--innovations", help="'optimal': of an optimal gain without a gate, so that they are judged."),
+    ] = None,
     confidence: Annotated[
-        float | None, typer.Option("--confidence", help="1 less the false-alarm rate of the verdict [0.95].")
+        float | None, typer.Option("--confidence", help="The same as --false-alarm, which is 1 less it.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
 ) -> None:
-    """Judge results, or files of another estimator: consistent, overconfident, conservative or failed, and why."""
+    """Judge results, or files of another estimator: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.judge import analyse as judge_results
-    from consistency.judge import analyse_recordings
+    from consistency.judge import analyse_recordings, settings_of
     from consistency.recording import is_recording, read_recordings
     from consistency.results import open_results
     from consistency.table import print_verdicts, verdicts_json
 
     if fail_on not in (None, "inconsistent"):
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
+    if innovations not in (None, "optimal"):
+        raise InputError(f"--innovations must be 'optimal', got '{innovations}'")
+    given = _given(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance)
+    settings = settings_of(**given) if given else None
     options: dict[str, Any] = {
         "truth": truth, "covariance": covariance, "convention": error,
         "state": None if state is None else [name.strip() for name in state.split(",")],
@@ -265,12 +284,16 @@ def analyse(
     }  # fmt: skip
     if is_recording(path, **options):
         recordings = read_recordings(path, **options)
-        verdicts = analyse_recordings(recordings, filters, confidence)
+        verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         for note in dict.fromkeys(note for recording in recordings for note in recording.notes):
             print(f"consistency: {note}", file=sys.stderr)
     else:
         results = open_results(path)
-        verdicts = judge_results(results, filters, confidence)
+        if innovations is not None:
+            raise InputError(
+                "--innovations is for files of another estimator; filters of the bench declare it themselves"
+            )
+        verdicts = judge_results(results, filters, settings=settings)
         if not results.manifest["complete"]:
             done, asked = results.manifest["finished_runs"], results.manifest["runs"]
             text = f"{path}: only {done} of {asked} runs are there; the same 'consistency run' with --resume goes on"
@@ -287,6 +310,15 @@ def analyse(
 
 @app.command()
 def plan(
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="[SCENARIO]", help="Run a short pilot of it to learn how steps depend.")
+    ] = None,
+    filters: Annotated[list[str] | None, typer.Option("--filter", help="Filter of the pilot; may be repeated.")] = None,
+    like: Annotated[
+        Path | None, typer.Option("--like", metavar="RESULTS", help="Results to learn from, in place of a pilot.")
+    ] = None,
+    pilot_runs: Annotated[int, typer.Option("--pilot-runs", help="Runs of the pilot.")] = 40,
+    seed: Seed = 0,
     detect: Annotated[float, typer.Option("--detect", help=f"{DETECT_HELP.capitalize()}.")] = 1.5,
     dof: Annotated[int, typer.Option("--dof", help="Dimension of the error; 3 for a planar pose.")] = 3,
     false_alarm: FalseAlarm = 0.05,
@@ -296,11 +328,27 @@ def plan(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
-    """How many runs a verdict takes."""
+    """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
+    from consistency.judge import pilots_of
     from consistency.judge import plan as plan_runs
+    from consistency.montecarlo import run_trials
+    from consistency.results import open_results
+    from consistency.scenario import load_scenario
     from consistency.table import print_plan
 
-    planned = plan_runs(dof, detect, false_alarm, power, allow)
+    if scenario is not None and like is not None:
+        raise InputError("give either a SCENARIO for a pilot or --like RESULTS")
+    if filters and scenario is None and like is None:
+        raise InputError("--filter goes with a SCENARIO or --like RESULTS")
+    if scenario is not None and not filters:
+        raise InputError(f"--filter: name the filter to plan for in {scenario}")
+    pilots = None
+    if like is not None:
+        pilots = pilots_of(open_results(like), filters)
+    elif scenario is not None:
+        plan_runs(dof, detect, false_alarm, power, allow)  # refuse before the work
+        pilots = pilots_of(run_trials(load_scenario(scenario), filters or [], pilot_runs, seed), filters)
+    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots)
     if as_json:
         print(json.dumps(planned, indent=2))
     else:
@@ -397,6 +445,65 @@ def reproduce(
     if missed:
         print(f"not reproduced: {', '.join(missed)}", file=sys.stderr)
     if any(finding.id in missed and not finding.source.startswith(OURS) for finding in findings):
+        raise typer.Exit(1)
+
+
+@app.command()
+def monitor(
+    path: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE", help="Innovations of one run: .csv, .parquet, .npz, a folder of 'run', or - for CSV lines."
+        ),
+    ],
+    innovations: Annotated[
+        str | None,
+        typer.Option("--innovations", help="'optimal': declares the optimal gain, without which nothing is judged."),
+    ] = None,
+    false_alarm: Annotated[
+        float, typer.Option("--false-alarm", help="Chance that a right filter ever raises an alarm.")
+    ] = 1e-3,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Scales of the NIS up to this ratio are no fault; 1 is the exact test.")
+    ] = 1.2,
+    gate: Annotated[
+        float | None, typer.Option("--gate", help="Probability of the filter's chi-square gate, such as 0.99.")
+    ] = None,
+    mission: Annotated[
+        int | None, typer.Option("--mission", help="Innovations of the whole mission, if known.")
+    ] = None,
+    filter_name: Annotated[str | None, typer.Option("--filter", help="Which, if FILE holds several.")] = None,
+    run: Annotated[int | None, typer.Option("--run", help="Which, if FILE holds several.")] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
+) -> None:
+    """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
+    from consistency.monitoring import make_monitor, read_innovations, watch, watch_lines
+    from consistency.reporting import require_plot, write_monitor_plot
+    from consistency.table import print_watched, watched_json
+
+    if fail_on not in (None, "alarm"):
+        raise InputError(f"--fail-on must be 'alarm', got '{fail_on}'")
+    watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
+    if path == "-":
+        given = _given(filter=filter_name, run=run, plot=plot)
+        if given:
+            raise InputError(f"--{next(iter(given))}: does not go with lines as they come (-)")
+        watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
+    else:
+        log = read_innovations(Path(path), filter_name, run)
+        if plot is not None:
+            require_plot(plot, overwrite)
+        watched = watch(log, watcher)
+    if plot is not None:
+        write_monitor_plot(plot, watched)
+    if as_json:
+        print(watched_json(watched))
+    else:
+        print_watched(watched)
+    if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import pandas as pd
 
+from consistency.diagnostics import Verdict
 from consistency.errors import InputError
 from consistency.judge import Curves, analyse, curves
 from consistency.montecarlo import run_trials
@@ -21,7 +22,7 @@ from consistency.results import Results, joined
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.storage import manifest_of, require_free, write_folder
 from consistency.table import print_findings
-from consistency.types import Finding, Verdict
+from consistency.types import Finding
 
 OURS = "this project"  # how the source of a question begins that no paper asks
 REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"

@@ -17,7 +17,7 @@ import pandas as pd
 from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter
 from consistency.filters.compiled import Compiled, one_blas_thread
-from consistency.filters.stepping import name_of, run_filter
+from consistency.filters.stepping import name_of, optimal_gain, run_filter
 from consistency.gather import Gathered
 from consistency.log import Log, write_log
 from consistency.progress import progress
@@ -215,6 +215,7 @@ def _finish(
                 advance(1)
     except KeyboardInterrupt:
         complete = False
+    said = said | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
     manifest = manifest_of(filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **said)
     if complete:
         return gathered.results(manifest, landmarks)

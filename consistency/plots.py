@@ -36,6 +36,7 @@ NARROWEST = 0.15  # span of one axis of a map over that of the other, at least: 
 BESIDE = 0.66  # of the figure's width is left of a legend that stands beside the axes
 AXES = (("x", "m"), ("y", "m"), ("heading", "deg"))
 PERCENT = 100.0
+LEAST_CORRELATION = 0.1  # drawn on either side of zero, so that noise does not look large
 Interval = tuple[float, float, float]  # value, low, high; the ends may be infinite
 
 
@@ -153,6 +154,28 @@ def nis(axes: Axes, steps: Indices, ratio: Array, look: Style, log: bool = False
     _frame(axes)
 
 
+def evidence(axes: Axes, steps: Array, values: Array, threshold: float, alarm: tuple[float, float] | None) -> None:
+    """E-value after each step with the value at which an alarm is raised (dashed).
+
+    What goes on beyond the square of that value is cut off.
+
+    Parameters
+    ----------
+    steps, values : (N,), (N,)
+    alarm : the step since which there is a fault and that of the alarm, shaded between; None without alarm
+    """
+    if alarm is not None:
+        axes.axvspan(*alarm, color=COLOURS[1], alpha=0.15, linewidth=0, zorder=0)
+        axes.axvline(alarm[1], color=COLOURS[1], linewidth=1.1, zorder=2)
+    axes.axhline(threshold, color="#333333", linewidth=0.9, dashes=(4, 3), zorder=1)
+    axes.plot(steps, values, color=COLOURS[0], linewidth=1.2, zorder=3)
+    axes.set_yscale("log")
+    axes.set(xlabel="step", ylabel="e-value")
+    axes.set_ylim(top=min(axes.get_ylim()[1], threshold**2))
+    axes.margins(x=0.01)
+    _frame(axes)
+
+
 def forest(
     axes: Axes,
     looks: Sequence[Style],
@@ -209,19 +232,20 @@ def distribution(axes: Axes, x: Array, y: Array, half_width: float, look: Style)
     axes.plot([0, 1], [0, 1], color="#555555", linewidth=0.8, zorder=1)
     axes.plot(x, y, color=look.colour, linewidth=1.3, drawstyle="steps-post", zorder=3)
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
-    axes.set_aspect("equal", adjustable="box")
     _frame(axes)
 
 
-def autocorrelation(axes: Axes, values: Array, bound: float, look: Style) -> None:
-    """Autocorrelation of lag 1, 2, ... (lags,) and the bound that each stays within."""
-    axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0)
+def autocorrelation(axes: Axes, values: Array, bound: float | None, look: Style) -> None:
+    """Autocorrelation of lag 1, 2, ... (lags,), and the bound that each stays within where it is judged."""
+    if bound is not None:
+        axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0)
     axes.axhline(0.0, color="#555555", linewidth=0.8, zorder=1)
     number = range(1, len(values) + 1)
     axes.vlines(number, 0.0, values, color=look.colour, linewidth=1.3, zorder=3)
     axes.plot(number, values, look.marker, color=look.colour, markersize=3.6, markeredgewidth=0.8, zorder=4)
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axes.set(xlabel="lag (steps)", ylabel="correlation", xlim=(0.4, len(values) + 0.6))
+    reach = 1.15 * max(float(np.abs(values).max()), bound or 0.0, LEAST_CORRELATION)
+    axes.set(xlabel="lag (steps)", ylabel="correlation", xlim=(0.4, len(values) + 0.6), ylim=(-reach, reach))
     _frame(axes)
 
 

@@ -37,7 +37,9 @@ class Sensor(Protocol):
 class Filter(Protocol):
     """Any object with these four; ``name`` is optional and defaults to the class name.
 
-    ``update`` may return None in the place of Info: then there is no NIS.
+    ``update`` may return None in the place of Info: then there is no NIS. An attribute ``innovations = "optimal"``
+    declares that the gain is optimal and no measurement is gated away, so that innovations are white if the
+    filter is right; they are then judged, and otherwise only reported.
     """
 
     def init(self, problem: Problem) -> Any: ...

@@ -19,7 +19,7 @@ from consistency.gating.watch import DEFAULTS, Entry, Watch, watching
 
 NAME = "consistency-gates"
 MARKER = (
-    "consistency(dof=3, detect=1.5, false_alarm=0.001, power=0.95, allow=None): "
+    "consistency(dof=3, detect=1.5, false_alarm=0.001, power=0.95, tolerance=None, allow=None): "
     "what the gates of a test ask; plans the number of runs that the fixture consistency_runs gives"
 )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,21 @@ class Tables(ABC):
             return Scenario.model_validate(data) if data else None
         except ValidationError as error:
             raise InputError(f"manifest.json: key 'scenario': {explain(error, Scenario)}") from None
+
+    def _repr_html_(self) -> str:
+        """What is there, for a notebook; ``consistency.analyse`` judges it."""
+        world = self.manifest.get("scenario") or {}
+        title = f"Results of {world.get('name') or self.manifest.get('log') or 'runs'}"
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th><td>{len(self.runs_of(name))}</td>"
+            f"<td>{int((self.failures['filter'] == name).sum())}</td></tr>"
+            for name in self.filters
+        )
+        truth = "with truth" if self.has_truth else "without truth"
+        return (
+            f"<div><p><strong>{escape(str(title))}</strong>, {truth}, seed {escape(str(self.manifest.get('seed')))}</p>"
+            f"<table><tr><th>filter</th><th>runs</th><th>failed</th></tr>{rows}</table></div>"
+        )
 
     def finished_runs(self, filters: Sequence[str]) -> set[int]:
         """Runs that every one of ``filters`` has finished, well or not."""
@@ -132,6 +148,7 @@ def joined(parts: Sequence[Results]) -> Results:
     """Results of several filters on the same trials as one."""
     manifest = parts[0].manifest | {
         "filters": [name for part in parts for name in part.filters],
+        "optimal_gain": [name for part in parts for name in part.manifest.get("optimal_gain", [])],
         "failures": sum(len(part.failures) for part in parts),
         "wall_time_s": round(sum(part.manifest["wall_time_s"] for part in parts), 3),
     }

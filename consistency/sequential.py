@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from consistency.diagnostics import Design, sequential_design
+from consistency.diagnostics import Design, Verdict, look, sequential_design, speaks
 from consistency.errors import InputError
-from consistency.judge import curves, refused, verdict_of
+from consistency.judge import curves, evidence_of, refused
 from consistency.montecarlo import Interrupted, run_trials
 from consistency.protocols import Filter
 from consistency.results import POSE, Results, Tables
 from consistency.scenario import Scenario
-from consistency.types import Verdict
 
 
 def run_until_decided(
@@ -30,10 +29,11 @@ def run_until_decided(
     timeout: float | None = None,
     previous: Tables | None = None,
 ) -> tuple[Results, dict[str, Verdict]]:
-    """Simulate and judge at the looks of :func:`sequential_design` until every filter is decided.
+    """Simulate and judge at the inspections of a :class:`Design` until every filter is decided.
 
-    A filter is decided at the first look that finds a fault, or at the last. With ``max_runs`` below what
-    ``detect`` needs, a filter without a fault ends undecided. Which runs are drawn does not depend on the looks.
+    A filter is decided at the first inspection that finds a fault, or shows the ratio of true to stated covariance to
+    lie in [1 / detect, detect]; what is said then stands, however many runs other filters take. With ``max_runs``
+    what is open after so many runs ends undecided. Which runs are drawn does not depend on the looks.
 
     Returns
     -------
@@ -49,29 +49,48 @@ def run_until_decided(
     }  # fmt: skip
     design = plan_of(plan)
     done = 0 if previous is None else 1 + max(previous.finished_runs(previous.filters), default=-1)
-    looks = [n for n in design.looks if n > done]
-    if not looks:
-        raise InputError(
-            f"the results to resume have {done} runs; the plan looks for the last time at {design.looks[-1]}"
-        )
+    if max_runs is not None and done >= max_runs:
+        raise InputError(f"the results to resume have {done} runs; the plan looks for the last time at {max_runs}")
     decided: dict[str, Verdict] = {}
     results: Results | None = None
-    for look in looks:
-        try:
-            results = run_trials(scenario, filters, look, seed, jobs, timeout, results or previous)
-        except Interrupted as stop:
-            manifest = stop.results.manifest | {"until_decided": plan}
-            raise Interrupted(replace(stop.results, manifest=manifest)) from None
-        results = replace(results, manifest=results.manifest | {"until_decided": plan})
-        verdicts = {n: design.settle(verdict_of(curves(results, n), design.look_false_alarm)) for n in results.filters}
-        final = look == looks[-1]
-        decided |= {n: v for n, v in verdicts.items() if n not in decided and (final or settled(v))}
-        open_ = [name for name in results.filters if name not in decided]
-        print(f"{look} runs: {said(decided, open_)}", file=sys.stderr, flush=True)
+    for runs, spent in design.inspections():
+        if runs > done:
+            results = _more(scenario, filters, runs, seed, jobs, timeout, results or previous, plan)
+        source = results or previous
+        assert source is not None
+        open_ = [name for name in source.filters if name not in decided]
+        for name in open_:
+            evidence = evidence_of(curves(source, name), runs)
+            if runs == max_runs or speaks(design, evidence, spent):
+                verdict = look(design, evidence, spent)
+                decided |= {name: verdict} if settled(verdict) or runs == max_runs else {}
+        open_ = [name for name in open_ if name not in decided]
+        if runs > done:
+            print(f"{runs} runs: {said(decided, open_)}", file=sys.stderr, flush=True)
         if not open_:
             break
-    assert results is not None
+    if results is None:
+        raise InputError(f"the {done} runs of the results to resume have decided every filter")
     return results, {name: decided[name] for name in results.filters}
+
+
+def _more(
+    scenario: Scenario,
+    filters: Sequence[str | Filter],
+    runs: int,
+    seed: int,
+    jobs: int,
+    timeout: float | None,
+    previous: Tables | None,
+    plan: dict[str, Any],
+) -> Results:
+    """Results of ``runs`` runs, with the plan in their manifest."""
+    try:
+        results = run_trials(scenario, filters, runs, seed, jobs, timeout, previous)
+    except Interrupted as stop:
+        manifest = stop.results.manifest | {"until_decided": plan}
+        raise Interrupted(replace(stop.results, manifest=manifest)) from None
+    return replace(results, manifest=results.manifest | {"until_decided": plan})
 
 
 def plan_of(plan: dict[str, Any]) -> Design:

@@ -14,12 +14,16 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from consistency.comparison import Compared
+from consistency.diagnostics import Interval, Verdict
+from consistency.diagnostics.monitor import CAVEAT, accepted_scales
+from consistency.diagnostics.wording import short
+from consistency.monitoring import Watched
 from consistency.storage import plain
-from consistency.types import Finding, Verdict
+from consistency.types import Finding
 
 COLOURS = {
-    "consistent": "green", "overconfident": "red", "conservative": "yellow", "inconsistent": "red", "failed": "red",
-    "undecided": "yellow",
+    "consistent": "green", "overconfident": "red", "conservative": "yellow", "biased": "red", "heavy-tailed": "red",
+    "inconsistent": "red", "failed": "red", "undecided": "yellow",
     "reproduced": "green", "not reproduced": "yellow", "refuted": "red",
 }  # fmt: skip
 
@@ -30,24 +34,23 @@ def _console() -> Console:
 
 
 def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
-    """One row a filter; with ``reasons`` also why. ``finds``: the covariance ratio that the runs suffice for."""
+    """One row a filter; with ``reasons`` also why. ``ratio``: of true to stated covariance, with its 95 % interval."""
     table = RichTable(box=None, pad_edge=False)
-    columns = ("filter", "verdict", "ANEES", "share in band", "RMSE m", "RMSE deg", "NIS/dof", "failed", "finds")
+    columns = ("filter", "verdict", "ANEES", "ratio", "RMSE m", "RMSE deg", "NIS/dof", "failed")
     for column in columns:
         table.add_column(column, justify="left" if column in ("filter", "verdict") else "right")
     for name, verdict in verdicts.items():
-        s = verdict.statistics
+        scale, accuracy, innovations = verdict.scale, verdict.accuracy, verdict.innovations
         colour = COLOURS[verdict.status]
         table.add_row(
             escape(name),
-            f"[{colour}]{verdict.status}[/{colour}]{'' if 'anees' in s else ' (NIS only)'}",
-            _number(s.get("mean_anees"), ".2f"),
-            _number(s.get("share_inside"), ".2f"),
-            _number(s.get("rmse_position"), ".3f"),
-            _number(np.rad2deg(s.get("rmse_heading", np.nan)), ".2f"),
-            _number(s.get("nis_ratio"), ".3f"),
-            f"{len(s['failures'])} of {s['runs']}",
-            f"x{s['detectable']:.2g}" if np.isfinite(s.get("detectable", np.nan)) else "-",
+            f"[{colour}]{verdict.status}[/{colour}]{' (NIS only)' if scale is None else ''}",
+            _number(scale.mean_anees if scale else None, ".2f"),
+            _interval(scale.inflation) if scale else "-",
+            _number(accuracy.rmse_position if accuracy else None, ".3f"),
+            _number(np.rad2deg(accuracy.rmse_heading) if accuracy else None, ".2f"),
+            _number(innovations.ratio if innovations else None, ".3f"),
+            f"{len(verdict.failures)} of {verdict.runs}",
         )
     console = _console()
     console.print(table)
@@ -91,8 +94,13 @@ def print_plan(planned: dict[str, Any]) -> None:
     )
     print(
         f"{p['one_step']} runs would do for a single chi-square test of one step, at the same rates; "
-        f"--until-decided looks at {', '.join(map(str, p['looks']))} runs"
+        f"--until-decided asks everything after {', '.join(map(str, p['looks']))}, ... runs and stops when it is clear"
     )
+    for name, like in p.get("like", {}).items():
+        print(
+            f"{like['runs']} runs do where steps depend on each other as those of {name} in {like['pilot_runs']} pilot "
+            f"runs: a run is worth {like['effective_dof']:.3g} degrees of freedom or more, {p['dof']} in the worst case"
+        )
 
 
 def print_comparisons(compared: Sequence[Compared]) -> None:
@@ -123,6 +131,63 @@ def comparisons_json(compared: Sequence[Compared]) -> str:
         for each in compared
     ]
     return json.dumps(data, indent=2, allow_nan=False)
+
+
+def print_watched(watched: Watched) -> None:
+    """What the monitor said of a run: one row of numbers and a sentence."""
+    monitor = watched.monitor
+    gated = monitor.gate is not None
+    table = RichTable(box=None, pad_edge=False)
+    heads = ["innovations", "steps", "judged", *["rejected"] * gated, "NIS/dof", *["scale"] * gated]
+    for column in (*heads, "e-value", "largest", "alarm at"):
+        table.add_column(column, justify="left" if column == "innovations" else "right")
+    cells = [escape(watched.name), f"{monitor.steps}", f"{monitor.innovations}", *[f"{monitor.rejections}"] * gated]
+    cells += [_number(monitor.ratio, ".3f"), *[_number(monitor.scale, ".3f")] * gated]
+    table.add_row(
+        *cells, *(f"{value:.3g}" for value in (monitor.evidence, monitor.largest)), f"{monitor.threshold:.4g}"
+    )
+    console = _console()
+    console.print(table)
+    console.print(f"\n{_sentence(watched)}", markup=False, soft_wrap=not console.is_terminal)
+
+
+def _sentence(watched: Watched) -> str:
+    monitor = watched.monitor
+    if watched.alarm is None:
+        said = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
+    else:
+        said = str(watched.alarm)
+        if np.isfinite(watched.alarm_t):
+            said += f" Alarm at t = {watched.alarm_t:.10g} s, since t = {watched.since_t:.10g} s."
+    if monitor.gate is not None and monitor.rejections:
+        said += (
+            f" The gate rejected {100 * monitor.rejections / monitor.measurements:.2g} % of the measurements "
+            f"(designed for {100 * (1 - monitor.gate):.2g} %), which is not judged."
+        )
+    return said
+
+
+def watched_json(watched: Watched) -> str:
+    """What the monitor said of a run; NaN and infinity become null."""
+    monitor, alarm = watched.monitor, watched.alarm
+    data = {
+        "innovations": watched.name, "steps": monitor.steps, "measurements": monitor.measurements,
+        "rejected": monitor.rejections, "judged": monitor.innovations, "nis_ratio": monitor.ratio,
+        "scale": monitor.scale, "evidence": monitor.evidence, "largest_evidence": monitor.largest,
+        "threshold": monitor.threshold, "false_alarm": monitor.false_alarm, "tolerance": monitor.tolerance,
+        "gate": monitor.gate, "mission": monitor.mission, "note": CAVEAT,
+        "alarm": None if alarm is None else {
+            "step": alarm.step, "since": alarm.since, "t": watched.alarm_t, "since_t": watched.since_t,
+            "direction": alarm.direction, "evidence": alarm.evidence, "scale": alarm.scale, "sentence": str(alarm),
+        },
+    }  # fmt: skip
+    return json.dumps(plain(data), indent=2, allow_nan=False)
+
+
+def _interval(interval: Interval) -> str:
+    if not np.isfinite(interval.value):
+        return "-"
+    return escape(f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]")
 
 
 def _number(value: Any, form: str) -> str:

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.diagnostics import Comparison, gate_runs
+from consistency.diagnostics import Comparison, Verdict, gate_runs
 from consistency.diagnostics.comparison import FEWEST
-from consistency.gating.checks import Evidence, evidence, of_results
+from consistency.gating.checks import Candidate, evidence, of_results
 from consistency.gating.comparing import Sides, of_arrays, of_filters
 from consistency.gating.watch import Entry, Terms, current, terms
-from consistency.gating.wording import fault_text, few_text, plan_command
-from consistency.types import Verdict
+from consistency.gating.wording import fault_text, few_to_compare, undecided_text
 
 if TYPE_CHECKING:
     from consistency.comparison import Baseline
@@ -52,6 +51,7 @@ def assert_consistent(
     false_alarm: float | None = None,
     detect: float | None = None,
     power: float | None = None,
+    tolerance: float | None = None,
     allow: str | None = None,
     axes: Sequence[str] | None = None,
     subsets: Mapping[str, Sequence[int]] | None = None,
@@ -60,12 +60,14 @@ def assert_consistent(
     innovation_covariances: ArrayLike | None = None,
     nis: ArrayLike | None = None,
     nis_dof: ArrayLike | None = None,
+    optimal_gain: bool = False,
     name: str | None = None,
 ) -> Verdict:
-    """Pass an estimator whose errors have the covariance that it states, with enough runs to know.
+    """Pass an estimator whose errors are shown to have the covariance that it states.
 
     The referee is :func:`consistency.diagnostics.judge`: a run is one observation, and a right filter is found at
-    fault in any question with probability ``false_alarm`` at most.
+    fault in any question with probability ``false_alarm`` at most. One whose ratio of true to stated covariance is
+    ``detect`` or its inverse, or farther from 1, passes with probability 1 - ``power`` at most.
 
     Parameters
     ----------
@@ -74,12 +76,16 @@ def assert_consistent(
     covariances : (runs, steps, n, n), in the squared units of the errors
     nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances
     false_alarm : chance to fail a right filter; 0.001 where neither argument, marker nor session says
-    detect : ratio of true to stated covariance, in all steps, that must be found (1.5)
-    power : chance to find it (0.95)
+    detect : ratio of true to stated covariance, in all steps, that must not pass (1.5)
+    power : chance that it does not (0.95)
+    tolerance : a ratio shown to lie in [1 / tolerance, tolerance] is no fault; nothing is tolerated by default
     allow : "conservative" accepts a covariance that is too large
-    axes, subsets, method : see :func:`consistency.diagnostics.judge`
+    axes : names of the n components
+    subsets : further groups of components to look at, name -> indices
+    method : of the band over all steps, see :func:`consistency.diagnostics.simultaneous_band`
     innovations, innovation_covariances : (runs, steps, m), (runs, steps, m, m); all NaN in steps without any
     nis, nis_dof : (runs, steps); nis_dof is 0 in steps without any, and may be one number
+    optimal_gain : the innovations are those of an optimal gain, and none was gated away: judge them, not only report
     name : of the estimator, for messages
 
     Returns
@@ -91,12 +97,13 @@ def assert_consistent(
     ConsistencyError
         A fault at the stated false-alarm rate, however few the runs; or failed runs in results.
     InsufficientTrials
-        No fault, and fewer runs than :func:`consistency.diagnostics.gate_runs` asks for.
+        No fault, and too few runs to show that the ratio is inside; :func:`consistency.diagnostics.gate_runs` are
+        enough for nearly every right filter.
     ValueError
         Input that cannot be judged, named by run (from 0) and step (from 1); options that do not fit.
     """
     __tracebackhide__ = True
-    asked = terms(false_alarm, detect, power, allow)
+    asked = terms(false_alarm, detect, power, allow, tolerance)
     arrays: dict[str, Any] = {
         "covariances": covariances, "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
         "innovations": innovations, "innovation_covariances": innovation_covariances, "axes": axes,
@@ -107,12 +114,16 @@ def assert_consistent(
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
-        given = evidence(name or "the estimator", cast(ArrayLike, errors), subsets=subsets, method=method, **arrays)
+        given = evidence(
+            name or "the estimator", cast(ArrayLike, errors), subsets=subsets, method=method,
+            optimal_gain=optimal_gain, **arrays,
+        )  # fmt: skip
 
     def look(rate: float) -> _Look:
-        verdict = given.judge(rate, asked.allow)
+        verdict = given.judge(rate, asked)
         sure = bool(given.failures) or verdict.status == "failed"
-        return _Look(not verdict.consistent, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
+        bad = verdict.status not in ("consistent", "undecided")
+        return _Look(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
         return gate_runs(given.planned_dof, asked.detect, rate, asked.power, asked.allow)
@@ -190,7 +201,7 @@ def _compare(sides: Sides, asked: Terms) -> Comparison:
     if sides.usable_runs < FEWEST:
         if sides.failed_more:
             found = f"worse than {sides.name_b}: {sides.failures[0]} runs failed, of {sides.name_b} {sides.failures[1]}"
-            verdict = sides.candidate.judge(asked.false_alarm, None)
+            verdict = sides.candidate.judge(asked.false_alarm, asked)
             raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [found]), verdict)
         raise InsufficientTrials(
             f"assert_not_worse: {sides.usable_runs} runs are too few for a standard error; simulate {FEWEST} at least",
@@ -230,7 +241,7 @@ class _Look:
 
 
 def _settle(
-    gate: str, given: Evidence, asked: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
+    gate: str, given: Candidate, asked: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
 ) -> _Look:
     """Record what a gate found, and raise where that is settled now."""
     __tracebackhide__ = True
@@ -239,25 +250,34 @@ def _settle(
     if not fault and asked.budget is not None and seen.p_value <= asked.budget:
         late = look(max(seen.p_value, 1e-300))  # in case the end of the session finds it
     least = needed(asked.planned)
-    few = not fault and given.runs < least
+    few = not fault and (given.runs < least if seen.verdict is None else seen.status == "undecided")
     outcome = "fault found" if fault else "too few runs" if few else "passed"
-    if few and asked.budget is not None:  # ask for what is enough at the end of the session too
-        least = needed(asked.false_alarm)
+    if few:  # ask for what is enough at the end of the session too, and for more than there are
+        least = max(needed(asked.false_alarm), _deciding(seen, given.runs))
     current().keep(_entry(gate, given, asked, seen, late, outcome, least))
     if fault:
-        verdict = seen.verdict or given.judge(asked.false_alarm, asked.allow)
+        verdict = seen.verdict or given.judge(asked.false_alarm, asked)
         raise ConsistencyError(fault_text(gate, given.name, seen.reasons), verdict, seen.comparison)
     if few:
         plan = asked.detect, asked.false_alarm, asked.power
-        command = None if seen.comparison else plan_command(given.planned_dof, *plan, asked.allow)
-        raise InsufficientTrials(
-            few_text(gate, given.name, given.runs, least, *plan, command), least, given.runs, seen.verdict
-        )
+        if seen.verdict is None:
+            text = few_to_compare(gate, given.name, given.runs, least, *plan)
+        else:
+            text = undecided_text(gate, given.name, seen.reasons[0], least, given.planned_dof, *plan, asked.allow)
+        raise InsufficientTrials(text, least, given.runs, seen.verdict)
     return seen
 
 
+def _deciding(seen: _Look, runs: int) -> int:
+    """Runs that would probably decide, more than there are; 0 for a comparison, which says so itself."""
+    if seen.verdict is None:
+        return 0
+    shown = seen.verdict.equivalence
+    return max(runs + 1, (shown.runs or 0) if shown is not None else 0)
+
+
 def _entry(
-    gate: str, given: Evidence, asked: Terms, seen: _Look, late: _Look | None, outcome: str, least: int
+    gate: str, given: Candidate, asked: Terms, seen: _Look, late: _Look | None, outcome: str, least: int
 ) -> Entry:
     statistics = seen.verdict.statistics if seen.verdict is not None else {}
     fields = _found(seen)

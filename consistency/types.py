@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -117,64 +117,6 @@ class Estimates:
     nis: Array  # (T,), NaN where no known landmark was seen
     nis_dof: Indices  # (T,)
     failure: Failure | None = None
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The referee's answer for one filter."""
-
-    filter: str
-    status: str  # consistent | overconfident | conservative | inconsistent | failed | undecided
-    reasons: tuple[str, ...]  # the first is a sentence to act on
-    statistics: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def consistent(self) -> bool:
-        return self.status == "consistent"
-
-    @property
-    def p_value(self) -> float:
-        """False-alarm rate at which some fault would just be found, all questions together."""
-        return float(self.statistics.get("p_value", float("nan")))
-
-    @property
-    def statistic(self) -> float:
-        """Mean NEES over runs and steps; without truth, NIS per degree of freedom."""
-        return float(self.statistics.get("mean_anees", self.statistics.get("nis_ratio", float("nan"))))
-
-    @property
-    def threshold(self) -> tuple[float, float]:
-        """Interval in which ``statistic`` is accepted."""
-        low, high = self.statistics.get("acceptance", self.statistics.get("nis_interval", (float("nan"),) * 2))
-        return float(low), float(high)
-
-    @property
-    def inflation(self) -> float:
-        """Factor by which the stated covariance has to grow (below 1: shrink) to be that of the errors."""
-        return float(self.statistics.get("ratio", float("nan")))
-
-    @property
-    def inflation_interval(self) -> tuple[float, float]:
-        """95 % interval of ``inflation``, from the spread between runs."""
-        low, high = self.statistics.get("ratio_interval", (float("nan"),) * 2)
-        return float(low), float(high)
-
-    @property
-    def first_step(self) -> int | None:
-        """First step in which the ANEES is outside its simultaneous band; None if in none."""
-        step: int | None = self.statistics.get("first_step")
-        return step
-
-    @property
-    def subset(self) -> str | None:
-        """Axes that carry the fault; None if no axis stands out."""
-        subset: str | None = self.statistics.get("subset")
-        return subset
-
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """Questions in which a fault was found."""
-        return tuple(answer["question"] for answer in self.statistics.get("answers", ()) if answer["found"])
 
 
 @dataclass(frozen=True)

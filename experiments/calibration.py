@@ -1,231 +1,285 @@
-"""Does the referee keep its promises? False-alarm rates and power of the verdict, measured over thousands of gates.
+"""Does the referee keep its promises? False alarms, power and wrong all-clears, counted over thousands of verdicts.
 
-``calibration.py [GATES] [FILE]`` writes the table that docs/referee.md and the report's appendix show. Three worlds:
+``make calibrate`` measures all rows and writes reports/reference/calibration.json, which the appendix of every report
+shows, and the table of docs/referee.md. ``make calibrate-quick`` measures fewer gates of fewer rows with fresh random
+numbers, writes nothing, and fails where a promise is broken: by chance less than once in 1,000 runs.
 
-- ``independent``: NEES values drawn from chi-square(3), no errors given;
-- ``autocorrelated``: Gaussian errors with lag-1 correlation 0.95 and a covariance that changes from step to step;
-- ``linear-gaussian``: the Kalman filter on 100 steps of that scenario. The runs are drawn once; gates for false
-  alarms are disjoint groups of them; where they are too few for that (power, several looks) each gate draws its
-  runs from all of them without replacement;
-- ``fully dependent``: the same error in all steps of a run, where a trajectory is worth no more than one step.
-
-The number of runs of a gate is what ``gate_runs`` plans for the ratio; for false alarms that of ratio 2, the fewest and
-so the hardest. Rows with several looks are ``--until-decided``. A fault of ratio r is a stated covariance r
-times smaller than the right one.
+Worlds are in ``calibration_worlds.py`` and promises in ``calibration_cases.py``; ``calibration_monitor.py`` and
+``calibration_compare.py`` have those on the monitor and on comparisons.
 """
 
 from __future__ import annotations
 
+import argparse
+import importlib
+import importlib.util
 import json
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy import stats
+from calibration_cases import DETECT, MOST, POWER, QUICK_FAILURE, Case, cases, quick_cases, quick_confidence
+from calibration_gates import DOF, SEED, STEPS, Draw, Gate, joined
+from calibration_rows import CONFIDENCE, Row, document, kept, write_docs
+from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
 
 import consistency as cs
-from consistency.diagnostics import gate_runs, judge, sequential_design
+from consistency.diagnostics import Evidence, Settings, Verdict, e_process, follow, judge, nees, sequential_design
 from consistency.judge import curves
+from consistency.types import Array
 
-GATES, STEPS, DOF, SEED = 2000, 100, 3, 20070101
-FALSE_ALARMS = (0.05, 0.01)
-RATIOS = (1.2, 1.5, 2.0, 0.67)
-HARDEST = 2.0  # ratio whose plan takes the fewest runs: there calibration is hardest
-STOPPING = 1.5  # ratio for which --until-decided plans
-POWER = 0.95
-CORRELATION = 0.95  # of the errors in neighbouring steps
-CHUNK = 2000  # runs of the Kalman filter in memory at once
 BATCH = 25  # gates handed to a worker at once
-
-Gate = dict[str, Any]  # arguments of judge
+CHUNK = 2000  # runs of the Kalman filter in memory at once
+POOLED, QUICK_POOLED = 54_000, 6_000  # of them in all: as many as the false alarms at 1 % take
+MODULES = ("calibration_monitor", "calibration_compare")  # each: rows(quick, seed), and ABOUT, its worlds and questions
+ANY = WORLDS | LOGS | HEAVY
 
 
 @dataclass(frozen=True)
-class Case:
-    """One row of the table: a world, a fault and a way of judging."""
+class Outcome:
+    """What became of one gate."""
 
-    world: str
-    ratio: float  # of true to stated covariance
-    false_alarm: float
-    looks: tuple[int, ...]  # runs at each; one look is a gate
-    look_false_alarm: float
-
-    @property
-    def wanted(self) -> str | None:
-        """The status that is right; None: any fault found is a false alarm."""
-        return None if self.ratio == 1.0 else "overconfident" if self.ratio > 1.0 else "conservative"
+    status: str
+    fault: bool
+    wrong_scale: bool  # of whole trajectories, found
+    located: bool  # an axis, or a late start, was named
+    runs: int  # that it took
 
 
-def cases() -> list[Case]:
-    """All rows."""
-    rows = []
-    for world in WORLDS:
-        for false_alarm in FALSE_ALARMS:
-            runs = gate_runs(DOF, HARDEST, false_alarm, POWER)
-            rows.append(Case(world, 1.0, false_alarm, (runs,), false_alarm))
-        for ratio in RATIOS:
-            runs = gate_runs(DOF, ratio, FALSE_ALARMS[0], POWER)
-            rows.append(Case(world, ratio, FALSE_ALARMS[0], (runs,), FALSE_ALARMS[0]))
-        design = sequential_design(DOF, STOPPING, FALSE_ALARMS[0], POWER)
-        for ratio in (1.0, STOPPING):
-            rows.append(Case(world, ratio, FALSE_ALARMS[0], design.looks, design.look_false_alarm))
-    return rows
-
-
-def main(gates: int = GATES, power_gates: int | None = None, workers: int = 2) -> dict[str, Any]:
-    """The table, as a JSON document."""
-    started = time.monotonic()
-    every = cases()
-    of_pool = max(case.looks[-1] for case in every if case.ratio == 1.0 and len(case.looks) == 1)
-    with ProcessPoolExecutor(workers) as pool:
-        kalman = kalman_runs(gates * of_pool)
-        rows = [_row(pool, case, gates if case.ratio == 1.0 else power_gates or gates // 2, kalman) for case in every]
-    return {
-        "steps": STEPS, "dof": DOF, "seed": SEED, "power": POWER, "rows": rows,
-        "wall_time_s": round(time.monotonic() - started, 1),
-    }  # fmt: skip
-
-
-def promises_kept(row: dict[str, Any], confidence: float = 0.99) -> bool:
-    """Is the row within its promise, as far as its number of gates can tell?
-
-    False alarms: not above the stated rate (upper binomial quantile) and, of a gate, not below a fifth of it (lower
-    quantile). Power: at least the stated one minus 2 points (lower quantile).
-    """
-    gates, found, rate = row["gates"], row["found"], row["false_alarm"]
-    if row["ratio"] == 1.0:
-        low = 0.0 if row["looks"] > 1 else stats.binom.ppf(1 - confidence, gates, rate / 5)
-        return bool(low <= found <= stats.binom.ppf(confidence, gates, rate))
-    return bool(found >= stats.binom.ppf(1 - confidence, gates, row["power"] - 0.02))
-
-
-def markdown(table: dict[str, Any]) -> str:
-    """The table as docs/referee.md has it."""
-    lines = ["| world | runs | looks | stated | measured | gates |", "| --- | --- | --- | --- | --- | --- |"]
-    for row in table["rows"]:
-        rate = f"{100 * row['found'] / row['gates']:.1f} %"
-        if row["ratio"] == 1.0:
-            stated = f"false alarm {100 * row['false_alarm']:g} %"
-        else:
-            stated = f"x{row['ratio']:g} found with {100 * row['power']:g} %"
-        looks = "1" if row["looks"] == 1 else f"{row['looks']}, {row['mean_runs']:.0f} runs on average"
-        lines.append(f"| {row['world']} | {row['runs']} | {looks} | {stated} | {rate} | {row['gates']} |")
-    return "\n".join(lines)
-
-
-def _row(pool: ProcessPoolExecutor, case: Case, gates: int, kalman: Any) -> dict[str, Any]:
-    runs = case.looks[-1]
-    rng = np.random.default_rng((SEED, 1 if case.ratio == 1.0 else 2, len(case.looks)))
-    disjoint = gates * runs <= len(kalman[0])
-    drawn = WORLDS[case.world](rng, gates, runs, kalman, disjoint)
-    pending, answers = [], []
-    while batch := list(islice(drawn, BATCH)):
-        pending.append(pool.submit(_judged, case, batch))
-        if len(pending) > 8:
-            answers += pending.pop(0).result()
-    for future in pending:
-        answers += future.result()
-    found = sum(status != "consistent" if case.wanted is None else status == case.wanted for status, _ in answers)
-    row = {
-        "world": case.world, "ratio": case.ratio, "runs": runs, "looks": len(case.looks),
-        "mean_runs": round(float(np.mean([used for _, used in answers])), 1), "false_alarm": case.false_alarm,
-        "power": POWER, "gates": gates, "found": found,
-    }  # fmt: skip
-    print(
-        f"{case.world:<16} ratio {case.ratio:<4} {runs:>4} runs in {len(case.looks)} looks, false alarm "
-        f"{case.false_alarm}: {found} of {gates}", flush=True,
-    )  # fmt: skip
-    return row
-
-
-def _judged(case: Case, batch: list[Gate]) -> list[tuple[str, int]]:
-    """Status and runs used of each gate, at the first look that finds a fault or the last."""
-    answers = []
-    for gate in batch:
-        status, used = "consistent", 0
-        for used in case.looks:
-            status = judge("gate", **_first(gate, used, case.ratio), false_alarm=case.look_false_alarm).status
-            if status != "consistent":
-                break
-        answers.append((status, used))
-    return answers
-
-
-def _first(gate: Gate, runs: int, ratio: float) -> Gate:
-    """The first runs of a gate, with a stated covariance that is ``ratio`` times too small."""
-    if "nees" in gate:
-        return gate | {"nees": gate["nees"][:runs] * ratio}
-    error, covariance = gate["error"][:runs], gate["covariance"] / ratio  # one covariance for all runs
-    return {"error": error, "covariance": np.broadcast_to(covariance, (len(error), *covariance.shape))}
-
-
-# --- worlds ------------------------------------------------------------------------------------------
-
-
-def independent(rng: np.random.Generator, gates: int, runs: int, pool: Any, disjoint: bool) -> Iterator[Gate]:
-    """Independent NEES values."""
-    for _ in range(gates):
-        yield {"nees": rng.chisquare(DOF, (runs, STEPS)), "dof": DOF}
-
-
-def autocorrelated(rng: np.random.Generator, gates: int, runs: int, pool: Any, disjoint: bool) -> Iterator[Gate]:
-    """Stationary first-order autoregressive errors seen through a root of the covariance of each step."""
-    root = np.eye(DOF) + 0.3 * np.random.default_rng(SEED).standard_normal((STEPS, DOF, DOF))
-    covariance = root @ np.swapaxes(root, -1, -2)
-    fresh = np.sqrt(1.0 - CORRELATION**2)
-    for _ in range(gates):
-        w = rng.standard_normal((runs, STEPS, DOF))
-        for k in range(1, STEPS):
-            w[:, k] = CORRELATION * w[:, k - 1] + fresh * w[:, k]
-        yield {"error": (root @ w[..., None])[..., 0], "covariance": covariance}
-
-
-def fully_dependent(rng: np.random.Generator, gates: int, runs: int, pool: Any, disjoint: bool) -> Iterator[Gate]:
-    """One error a run, the same in every step: the worst case that the plan is for."""
-    for _ in range(gates):
-        error = np.repeat(rng.standard_normal((runs, 1, DOF)), STEPS, axis=1)
-        yield {"error": error, "covariance": np.broadcast_to(np.eye(DOF), (STEPS, DOF, DOF))}
-
-
-def linear_gaussian(
-    rng: np.random.Generator, gates: int, runs: int, pool: tuple[np.ndarray, np.ndarray], disjoint: bool
-) -> Iterator[Gate]:
-    """The exact Kalman filter's errors."""
-    error, covariance = pool
-    for gate in range(gates):
-        rows = slice(gate * runs, (gate + 1) * runs) if disjoint else rng.choice(len(error), runs, replace=False)
-        yield {"error": error[rows], "covariance": covariance}
-
-
-def kalman_runs(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (count, steps, 3) and the covariance (steps, 3, 3) that all runs share, from the first full rank on."""
-    scenario = cs.load_scenario("linear-gaussian").variant("linear-gaussian-short", truth__steps=STEPS + 1)
-    errors = []
-    for chunk in range(-(-count // CHUNK)):
-        c = curves(cs.run_trials(scenario, ["kf"], runs=min(CHUNK, count - chunk * CHUNK), seed=SEED + chunk), "kf")
-        assert c.error is not None
-        assert (c.covariance == c.covariance[0]).all()
-        errors.append(c.error[:, 1:])
-    return np.concatenate(errors), c.covariance[0, 1:]
-
-
-WORLDS: dict[str, Callable[..., Iterator[Gate]]] = {
-    "independent": independent,
-    "autocorrelated": autocorrelated,
-    "linear-gaussian": linear_gaussian,
-    "fully dependent": fully_dependent,
+COUNTED: dict[str, Callable[[Outcome], bool]] = {
+    "fault": lambda o: o.fault,
+    "consistent": lambda o: o.status == "consistent",
+    "overconfident": lambda o: o.status == "overconfident",
+    "conservative": lambda o: o.status == "conservative",
+    "scale": lambda o: o.status in ("overconfident", "conservative"),
+    "wrong scale": lambda o: o.wrong_scale,
+    "located": lambda o: o.located,
 }
 
 
+# --- the referee --------------------------------------------------------------------------------------------
+
+
+def _judge_one(gate: Gate, false_alarm: float) -> Verdict:
+    """The verdict on a gate: the only place that calls ``judge``."""
+    return judge(Evidence("gate", **vars(gate)), Settings(false_alarm, DETECT, POWER))
+
+
+def _follow_one(gate_of: Callable[[int], Gate], false_alarm: float, dof: int) -> tuple[Verdict, int]:
+    """The verdict of ``--until-decided``, and the runs it took: the only place that does so."""
+    design = sequential_design(dof, DETECT, false_alarm, POWER, MOST)
+    return follow(design, lambda runs: Evidence("gate", **vars(gate_of(runs))))
+
+
+def _evidence_values(means: Array, dof: int) -> Array:
+    """E-values after each run, from run means of the NEES over its degrees of freedom."""
+    return e_process(means, dof).both
+
+
+def _outcome(verdict: Verdict, runs: int) -> Outcome:
+    since = None if verdict.location is None else verdict.location.since
+    located = verdict.subset is not None or since is not None
+    return Outcome(verdict.status, bool(verdict.faults), "scale" in verdict.faults, located, runs)
+
+
+# --- gates --------------------------------------------------------------------------------------------------
+
+
+class Growing:
+    """Runs of one gate, drawn when they are asked for."""
+
+    def __init__(self, case: Case, number: int, seed: int) -> None:
+        self.case = case
+        self.first = number * case.runs
+        key = zlib.crc32(f"{case.world} {case.ratio} {case.mode} {case.runs} {case.false_alarm} {case.steps}".encode())
+        self.rng = np.random.default_rng((seed, key, number))
+        self.parts: list[Gate] = []
+        self.drawn = 0
+
+    def __call__(self, runs: int) -> Gate:
+        """The gate of the first ``runs`` runs."""
+        if runs > self.drawn:
+            draw = Draw(self.rng, runs - self.drawn, self.case.steps, self.first + self.drawn)
+            self.parts = [joined([*self.parts, ANY[self.case.world].draw(draw).wrong_by(self.case.ratio)])]
+            self.drawn = runs
+        (gate,) = self.parts
+        return gate if runs == self.drawn else gate.first(runs)
+
+
+def judged(case: Case, numbers: Sequence[int], seed: int) -> list[Outcome]:
+    """Outcomes of the gates with these numbers: a gate depends on the seed, its case and its number alone."""
+    of_mode = {"gate": _at_once, "until decided": _until_decided, "e-process": _betting}[case.mode]
+    return [of_mode(case, Growing(case, number, seed)) for number in numbers]
+
+
+def _at_once(case: Case, gate_of: Growing) -> Outcome:
+    return _outcome(_judge_one(gate_of(case.runs), case.false_alarm), case.runs)
+
+
+def _until_decided(case: Case, gate_of: Growing) -> Outcome:
+    return _outcome(*_follow_one(gate_of, case.false_alarm, ANY[case.world].dof or DOF))
+
+
+def _betting(case: Case, gate_of: Growing) -> Outcome:
+    gate, dof = gate_of(case.runs), ANY[case.world].dof
+    assert dof is not None
+    means = run_means(gate) / dof
+    crossed = np.flatnonzero(_evidence_values(means, dof) >= 1.0 / case.false_alarm)
+    if not len(crossed):
+        return Outcome("undecided", False, False, False, case.runs)
+    runs = int(crossed[0]) + 1
+    return Outcome("overconfident" if means[:runs].mean() > 1.0 else "conservative", True, True, False, runs)
+
+
+def run_means(gate: Gate) -> Array:
+    """Mean NEES of each run over the steps it has, (R,)."""
+    values = gate.nees
+    if values is None:
+        assert gate.error is not None
+        assert gate.covariance is not None
+        there = np.isfinite(gate.error).all(axis=-1)
+        values = np.full(there.shape, np.nan)
+        values[there] = nees(gate.error[there], gate.covariance[there])
+    return np.asarray(np.nanmean(values, axis=1))
+
+
+# --- rows ---------------------------------------------------------------------------------------------------
+
+
+def measure(every: Sequence[Case], seed: int = SEED, workers: int = 2, pooled: int = POOLED) -> Iterator[Row]:
+    """Rows of the cases, in their order, as they are done."""
+    wanted = max((case.gates * case.runs for case in every if case.world == "linear-gaussian"), default=0)
+    with tempfile.TemporaryDirectory() as folder:
+        pool_file = _kalman_runs(min(wanted, pooled), seed, Path(folder)) if wanted else None
+        with ProcessPoolExecutor(workers, initializer=_share, initargs=(pool_file,)) as pool:
+            batches = [
+                [
+                    pool.submit(judged, case, range(k, min(k + BATCH, case.gates)), seed)
+                    for k in range(0, case.gates, BATCH)
+                ]
+                for case in every
+            ]
+            for case, futures in zip(every, batches, strict=True):
+                yield from rows_of_case(case, [outcome for future in futures for outcome in future.result()])
+
+
+def rows_of_case(case: Case, outcomes: Sequence[Outcome]) -> list[Row]:
+    """One row for each claim of a case."""
+    took = np.array([outcome.runs for outcome in outcomes])
+    return [
+        Row(
+            case.world, claim.question, case.ratio, case.runs, int(case.mode == "gate"), claim.stated, claim.bound,
+            len(outcomes), sum(map(COUNTED[claim.counted], outcomes)),
+            round(float(took.mean()), 1), float(np.quantile(took, 0.95, method="higher")),
+        )
+        for claim in case.claims
+    ]  # fmt: skip
+
+
+def _kalman_runs(count: int, seed: int, folder: Path) -> Path:
+    """Errors (count, T, 3) of the exact Kalman filter and the covariance that all its runs share, into a folder.
+
+    From the first step on in which that is of full rank.
+    """
+    scenario = cs.load_scenario("linear-gaussian").variant("linear-gaussian-short", truth__steps=STEPS + 1)
+    errors = []
+    for chunk in range(-(-count // CHUNK)):
+        runs = min(CHUNK, count - chunk * CHUNK)
+        of_chunk = int(np.random.default_rng((seed, chunk)).integers(2**31))
+        c = curves(cs.run_trials(scenario, ["kf"], runs=runs, seed=of_chunk), "kf")
+        assert c.error is not None
+        assert (c.covariance == c.covariance[0]).all()
+        errors.append(c.error[:, 1:])
+    np.save(folder / "covariance.npy", c.covariance[0, 1:])
+    np.save(folder / "error.npy", np.concatenate(errors))
+    return folder
+
+
+def _share(folder: Path | None) -> None:
+    """In a worker: the runs of the pool."""
+    if folder is not None:
+        error = np.load(folder / "error.npy", mmap_mode="r")
+        POOL["linear-gaussian"] = error, np.load(folder / "covariance.npy")
+
+
+def further_rows(quick: bool, seed: int) -> tuple[list[Row], dict[str, str]]:
+    """Rows of the other modules, and what their worlds and questions are."""
+    rows: list[Row] = []
+    about: dict[str, str] = {}
+    for name in MODULES:
+        if importlib.util.find_spec(name) is not None:
+            module = importlib.import_module(name)
+            rows += [Row(**row) for row in module.rows(quick, seed)]
+            about |= module.ABOUT
+    return rows, about
+
+
+# --- command ------------------------------------------------------------------------------------------------
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, write what is asked for, and say whether all promises are kept."""
+    options = _options(arguments)
+    fresh = int(np.random.SeedSequence().generate_state(1)[0])
+    seed = options.seed if options.seed is not None else fresh if options.quick else SEED
+    print(f"seed {seed}", flush=True)
+    started = time.monotonic()
+    rows, about = _measured(options, seed)
+    seconds = round(time.monotonic() - started, 1)
+    table = document(rows, about, seed=seed, wall_time_s=seconds)
+    if options.out is not None:
+        options.out.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+    if options.docs is not None:
+        write_docs(table, options.docs)
+    broken = [row for row in rows if not kept(row, quick_confidence(len(rows)) if options.quick else CONFIDENCE)]
+    chance = f" (by chance: less than once in {1 / QUICK_FAILURE:,.0f} runs)" if options.quick else ""
+    print(f"{seconds} s, {len(rows)} rows, promises broken: {len(broken)}{chance}", *map(said, broken), sep="\n")
+    return int(bool(broken))
+
+
+def _measured(options: argparse.Namespace, seed: int) -> tuple[list[Row], dict[str, str]]:
+    """All rows that are asked for, each printed as it comes, and what further worlds are."""
+    every = [
+        replace(case, gates=min(case.gates, options.gates))
+        for case in (quick_cases() if options.quick else cases())
+        if options.only in f"{case.world} {case.claims}"
+    ]
+    rows = []
+    for row in measure(every, seed, options.workers, QUICK_POOLED if options.quick else POOLED):
+        rows.append(row)
+        print(said(row), flush=True)
+    further, about = ([], {}) if options.only else further_rows(options.quick, seed)
+    for row in further:
+        print(said(row), flush=True)
+    return rows + further, about
+
+
+def said(row: Row) -> str:
+    """A row as a line."""
+    runs = f"{row.runs} runs" if row.looks == 1 else f"{row.mean_runs:.0f} runs, 95 %: {row.late_runs:.0f}"
+    return (
+        f"{row.question:<28} {row.world:<24} x{row.ratio:<5.3g} {runs:<20} "
+        f"{row.bound} {100 * row.stated:g} %: {100 * row.share:.1f} % of {row.gates}"
+    )
+
+
+def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Measure the rates of the referee.")
+    parser.add_argument("--quick", action="store_true", help="fewer gates of fewer rows, with fresh random numbers")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    parser.add_argument("--docs", type=Path, help="document whose table to replace")
+    parser.add_argument("--only", default="", help="rows whose world or question contains this text")
+    parser.add_argument("--gates", type=int, default=10**9, help="of a row, at most")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument("--workers", type=int, default=2)
+    return parser.parse_args(arguments)
+
+
 if __name__ == "__main__":
-    table = main(int(sys.argv[1]) if len(sys.argv) > 1 else GATES)
-    target = Path(sys.argv[2] if len(sys.argv) > 2 else "reports/calibration.json")
-    target.write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
-    print(f"{table['wall_time_s']} s; {target}")
-    sys.exit(not all(promises_kept(row) for row in table["rows"]))
+    sys.exit(main())

@@ -23,23 +23,25 @@ def main(study: cs.Study) -> list[cs.Finding]:
     """Average NEES of the robot pose, fig. 11a."""
     verdict, c = study.judged("herath2007-xyz", "ekf-xyz")
     exact, _ = study.judged("linear-gaussian", "kf")
-    s = verdict.statistics
+    scale, exact_scale = verdict.scale, exact.scale
     assert c.nees is not None
-    band = simultaneous_band(c.nees, s["dof"], ALARM, method="bonferroni")
+    assert scale is not None
+    assert exact_scale is not None
+    band = simultaneous_band(c.nees, scale.dof, ALARM, method="bonferroni")
     return [
         study.finding(
-            not s["failures"]
+            not verdict.failures
             and not band.outside.any()
-            and detectable_ratio(s["dof"], s["runs"], ALARM / s["judged_steps"]) <= DETECT,
+            and detectable_ratio(scale.dof, verdict.runs, ALARM / scale.judged_steps) <= DETECT,
             scenario="herath2007-xyz",
             id="fig11a",
             source="Herath 2007, fig. 11a and sec. 4.5",
             claim="for a small loop the average NEES of a standard EKF is well bounded",
             statistic="ANEES over all steps against its band",
             published="inside [2.36, 3.72]",
-            measured=f"{verdict.status}: mean ANEES {s['mean_anees']:.2f}, {100 * s['share_inside']:.0f} % of steps "
-            f"inside (exact Kalman filter of linear-gaussian: {exact.statistics['mean_anees']:.2f}, "
-            f"{100 * exact.statistics['share_inside']:.0f} %)",
+            measured=f"{verdict.status}: mean ANEES {scale.mean_anees:.2f}, {100 * scale.share_inside:.0f} % of steps "
+            f"inside (exact Kalman filter of linear-gaussian: {exact_scale.mean_anees:.2f}, "
+            f"{100 * exact_scale.share_inside:.0f} %)",
             accept=ACCEPT,
         )
     ]

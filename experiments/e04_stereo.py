@@ -85,10 +85,11 @@ def removed(ekf: Curves, ukf: Curves, seed: int) -> tuple[float, float, float]:
 
 def said(verdict: cs.Verdict, curves: Curves) -> str:
     """Filter, verdict, and mean NEES over all, in the median and in the worst run, in words."""
-    runs = run_means(curves)
+    runs, accuracy = run_means(curves), verdict.accuracy
+    assert accuracy is not None
     return (
         f"{verdict.filter} {verdict.status}, mean ANEES {runs.mean():.1f}, median run {np.median(runs):.1f}, "
-        f"worst run {runs.max():.0f}, RMSE {verdict.statistics['rmse_position']:.2f} m"
+        f"worst run {runs.max():.0f}, RMSE {accuracy.rmse_position:.2f} m"
     )
 
 

@@ -44,7 +44,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
                 f"{mean:.2f} at {baseline:g} m ({verdict.status})"
                 for mean, baseline, verdict in zip(means, BASELINES, verdicts, strict=True)
             )
-            + f"; ekf-uvd at 0.5 m: {best.statistics['mean_anees']:.2f} ({best.status})",
+            + f"; ekf-uvd at 0.5 m: {best.statistic:.2f} ({best.status})",
             accept=ACCEPT,
         )
     ]

@@ -24,7 +24,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     for name, (stereo, points) in worlds().items():
         here = verdicts(study, stereo, points)
         holds &= all(here[key].status == first[key].status for key in first)
-        parts = [f"{key} {v.status} ({v.statistics['mean_anees']:.1f})" for key, v in here.items()]
+        parts = [f"{key} {v.status} ({v.statistic:.1f})" for key, v in here.items()]
         found.append(f"{name}: {', '.join(parts)}")
     return [
         study.finding(

@@ -30,10 +30,11 @@ def main(study: cs.Study) -> list[cs.Finding]:
     worse, p_value = wins(xyz_curves, uvd_curves)
     text = [f"ekf-uvd higher in {worse} of {study.runs} runs"]
     for verdict, curves in ((uvd, uvd_curves), (xyz, xyz_curves)):
-        runs = run_means(curves)
+        runs, accuracy = run_means(curves), verdict.accuracy
+        assert accuracy is not None
         text.append(
             f"{verdict.filter} {verdict.status}, mean ANEES {runs.mean():.0f}, median run {np.median(runs):.0f}, "
-            f"worst run {runs.max():.0f}, RMSE {verdict.statistics['rmse_position']:.2f} m"
+            f"worst run {runs.max():.0f}, RMSE {accuracy.rmse_position:.2f} m"
         )
     return [
         study.finding(

@@ -22,12 +22,12 @@ from scipy import stats
 
 import consistency as cs
 from consistency.atomic import write_whole
-from consistency.diagnostics import judge, nees
+from consistency.diagnostics import Evidence, Verdict, judge, nees
 from consistency.findings import OURS, command_line, sibling
 from consistency.reporting.front_end import matches_png, samples_png
 from consistency.storage import require_free
 from consistency.table import print_findings
-from consistency.types import Array, Verdict
+from consistency.types import Array
 from consistency.vision import (
     RelativePose,
     StereoRig,
@@ -155,7 +155,7 @@ def halves(case: Case, rng: np.random.Generator) -> tuple[Array, Array]:
 
 def referee(errors: Array, covariances: Array) -> Verdict:
     """The bench's verdict with every motion as a run of one step."""
-    return judge("motions", errors[:, None], covariances[:, None], axes=AXES)
+    return judge(Evidence("motions", errors[:, None], covariances[:, None], axes=AXES))
 
 
 def floored(errors: Array, covariances: Array) -> tuple[Array, Array]:

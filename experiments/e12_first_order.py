@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.diagnostics import detectable_ratio, judge
+from consistency.diagnostics import Evidence, Settings, detectable_ratio, judge
 from consistency.errors import InputError
 from consistency.findings import OURS, script
 from consistency.types import Array, Failure
@@ -67,9 +67,8 @@ class Errors:
 
     def row(self) -> dict[str, object]:
         """What the referee says."""
-        verdict = judge(
-            self.name, self.error[:, None], self.covariance[:, None], failures=self.failures, false_alarm=ALARM
-        )
+        evidence = Evidence(self.name, self.error[:, None], self.covariance[:, None], failures=self.failures)
+        verdict = judge(evidence, Settings(false_alarm=ALARM))
         dof = self.error.shape[1]
         return {
             "estimator": self.name, "status": verdict.status, "mean_nees": verdict.statistic,

@@ -7,33 +7,48 @@ from consistency.diagnostics.bias import Hotelling, hotelling, t_squared
 from consistency.diagnostics.comparison import Comparison, Difference, RunSummary, compare, summary
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
+from consistency.diagnostics.direction import Largest, largest_direction
 from consistency.diagnostics.distribution import Pit, pit
+from consistency.diagnostics.eprocess import EProcess, e_process, ever
+from consistency.diagnostics.equivalence import equivalence
 from consistency.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.diagnostics.monitor import Alarm, Monitor
 from consistency.diagnostics.nees import anees, nees
 from consistency.diagnostics.normality import Normality, normality
 from consistency.diagnostics.outliers import Outlier, outliers
-from consistency.diagnostics.planning import detectable_ratio, gate_runs, power_of, required_runs
-from consistency.diagnostics.questions import Answer, answers
+from consistency.diagnostics.planning import PilotPlan, detectable_ratio, gate_runs, pilot_plan, power_of, required_runs
+from consistency.diagnostics.questions import answers
+from consistency.diagnostics.records import Answer, Equivalence, Evidence, Interval, Settings, Verdict
 from consistency.diagnostics.scale import Band, MeanTest, mean_test, ratio_interval, simultaneous_band
-from consistency.diagnostics.sequential import Design, sequential_design
+from consistency.diagnostics.sequential import Design, follow, look, sequential_design, speaks
 from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
 from consistency.diagnostics.verdict import judge
 from consistency.diagnostics.whitening import spread_steps, standardise, whiten
 
 __all__ = [
+    "Alarm",
     "Answer",
     "Band",
     "Comparison",
     "Design",
     "Difference",
+    "EProcess",
+    "Equivalence",
+    "Evidence",
     "Hotelling",
+    "Interval",
+    "Largest",
     "MeanTest",
+    "Monitor",
     "NisTest",
     "Normality",
     "Outlier",
+    "PilotPlan",
     "Pit",
     "RunSummary",
+    "Settings",
+    "Verdict",
     "Whiteness",
     "anees",
     "anees_interval",
@@ -43,10 +58,16 @@ __all__ = [
     "coverage",
     "coverage_interval",
     "detectable_ratio",
+    "e_process",
+    "equivalence",
+    "ever",
+    "follow",
     "gate_runs",
     "hotelling",
     "identity_statistic",
     "judge",
+    "largest_direction",
+    "look",
     "mean_shape",
     "mean_test",
     "nees",
@@ -56,6 +77,7 @@ __all__ = [
     "noncredibility",
     "normality",
     "outliers",
+    "pilot_plan",
     "pit",
     "power_of",
     "ratio_interval",
@@ -63,6 +85,7 @@ __all__ = [
     "rmse",
     "sequential_design",
     "simultaneous_band",
+    "speaks",
     "sphericity",
     "spread_steps",
     "standardise",

@@ -3,127 +3,214 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from scipy import stats
 
-from consistency.diagnostics.bias import hotelling, moments
-from consistency.diagnostics.blocks import blocks, by_runs
-from consistency.diagnostics.questions import BIAS, SCALE, Answer
-from consistency.diagnostics.scale import Band, ratio_interval, run_means
-from consistency.diagnostics.whitening import mean_of_runs, squared_length, standardise, whiten
-from consistency.types import Array
+from consistency.diagnostics.asking import Asked
+from consistency.diagnostics.bias import hotelling
+from consistency.diagnostics.blocks import blocks
+from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
+from consistency.diagnostics.credibility import noncredibility
+from consistency.diagnostics.nees import anees
+from consistency.diagnostics.questions import BIAS, SCALE, STEP
+from consistency.diagnostics.records import (
+    Accuracy,
+    Answer,
+    Axes,
+    Bias,
+    Interval,
+    Location,
+    Shape,
+    Tails,
+)  # fmt: skip
+from consistency.diagnostics.sample import ATTITUDE, POSITION, Errors, Sample
+from consistency.diagnostics.scale import Band, ratio_interval
+from consistency.diagnostics.scaling import INTERVAL, pointwise_band
+from consistency.diagnostics.whitening import mean_of_runs, standardise
+from consistency.types import Array, Indices
 
-INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
+FEWEST = 8  # runs; with fewer the axes are not told apart
+SURE = 0.04  # false-alarm rate of naming an axis, or a beginning, that does not stand out
+
+Found = Mapping[str, Answer]
 
 
-def locate(s: dict[str, Any], nees: Array, dof: int, band: Band, found: Mapping[str, Answer]) -> None:
-    """Into the statistics: the band, the steps outside, since when, and the covariance ratio since then."""
-    above, below = band.above, band.below
-    s |= {
-        "simultaneous": np.stack([band.low, band.high], axis=-1),
-        "steps_above": int(above.sum()),
-        "steps_below": int(below.sum()),
-        "first_outside": int(np.argmax(band.outside)) + 1 if band.outside.any() else None,
-        "first_step": None,
-        "since": None,
-        "lasting": False,
-        "subset": None,
+def location_of(sample: Sample, band: Band, found: Found) -> Location:
+    """Steps outside the band, since when, and which axes."""
+    outside = band.outside
+    first = int(np.argmax(outside)) if outside.any() else None
+    faulty = first is not None and _any(found, (STEP,))
+    since, lasting = None, False
+    if first is not None and faulty:
+        sign = 1 if band.above[first] else -1
+        lasting = _lasting(sample, first, sign)
+        since = first + 1 if lasting and _absent_before(sample, first, sign) else None
+    late = slice(0 if since is None else since - 1, None)
+    return Location(
+        simultaneous=np.stack([band.low, band.high], axis=-1),
+        above=int(band.above.sum()),
+        below=int(band.below.sum()),
+        first_outside=None if first is None else first + 1,
+        first_step=first + 1 if first is not None and faulty else None,
+        since=since,
+        lasting=lasting,
+        subset=chief_axes(sample, late) if sample.errors is not None and _any(found, SCALE) else None,
+    )
+
+
+def _lasting(sample: Sample, first: int, sign: int) -> bool:
+    """Is the ANEES on that side of its pointwise band in most steps from ``first`` on?"""
+    curve, band = anees(sample.nees)[first:], pointwise_band(sample.counted.sum(axis=0), sample.dof)[first:]
+    beyond = curve > band[:, 1] if sign > 0 else curve < band[:, 0]
+    return bool(beyond[np.isfinite(curve)].mean() > 0.5)
+
+
+def _absent_before(sample: Sample, first: int, sign: int) -> bool:
+    """Are the steps before ``first`` shown to have less than half of the fault, on the logarithm?
+
+    One-sided Student's t of the log mean before, with the standard error of the runs.
+    """
+    early, late = sample.means(slice(0, first)), sample.means(slice(first, None))
+    if len(early) < FEWEST or not early.mean() > 0 or not late.mean() > 0:
+        return False
+    error = float(early.std(ddof=1) / (early.mean() * np.sqrt(len(early))))
+    upper = sign * np.log(early.mean()) + float(stats.t.isf(1.0 - INTERVAL, len(early) - 1)) * error
+    return bool(upper < 0.5 * sign * np.log(late.mean()))
+
+
+def chief_axes(sample: Sample, steps: slice = slice(None)) -> str | None:
+    """Axes that carry the fault: those farther from 1 than the others together, beyond what chance makes.
+
+    With Y_ij the mean NEES of axis j alone in run i and O_ij that of the other axes, each over its mean over runs,
+    D_i = Y_ij - O_ij has the standard error of log mean Y_j - log mean O_j to first order; Student's t, two-sided,
+    Bonferroni over axes. None where no axis stands out, or with fewer than 8 runs.
+    """
+    assert sample.errors is not None
+    names, n = sample.errors.names, sample.dof
+    if n == 1 or np.isfinite(sample.nees[:, steps]).any(axis=1).sum() < FEWEST:
+        return None
+    Y = np.stack([sample.group_means([j], steps) for j in range(n)], axis=-1)
+    if not (Y.mean(axis=0) > 0).all():  # an axis without any error
+        chief = [name for name, mean in zip(names, Y.mean(axis=0), strict=True) if not mean > 0]
+        return ", ".join(chief) if len(chief) < n else None
+    chief = [name for j, name in enumerate(names) if _stands_out(Y[:, j], (Y.sum(axis=1) - Y[:, j]) / (n - 1), n)]
+    return ", ".join(chief) if 0 < len(chief) < n else None
+
+
+def _stands_out(own: Array, others: Array, axes: int) -> bool:
+    gap = float(np.log(own.mean()) - np.log(others.mean()))
+    error = float((own / own.mean() - others / others.mean()).std(ddof=1) / np.sqrt(len(own)))
+    if abs(np.log(own.mean())) <= abs(np.log(others.mean())):
+        return False
+    if error == 0.0:
+        return gap != 0.0
+    return bool(2.0 * axes * stats.t.sf(abs(gap) / error, len(own) - 1) <= SURE)
+
+
+# --- records -----------------------------------------------------------------------------------------
+
+
+def axes_of(sample: Sample, asked: Asked, location: Location) -> Axes:
+    """Inflation of each component and group, since the fault began."""
+    errors = _errors(sample)
+    late, confidence = _late(location), 1.0 - (1.0 - INTERVAL) / len(errors.groups)
+    inflation = {
+        key: ratio_interval(sample.group_means(index, late), len(index), confidence)
+        for key, index in errors.groups.items()
     }
-    if not _found(found, ("scale in some step",)) or not band.outside.any():
-        return
-    first = int(np.argmax(band.outside))
-    s["first_step"] = first + 1
-    pointwise = s["anees"] > s["band"][:, 1] if above[first] else s["anees"] < s["band"][:, 0]
-    s["lasting"] = bool(pointwise[first:][np.isfinite(s["anees"][first:])].mean() > 0.5)
-    if s["lasting"] and first > int(np.argmax(np.isfinite(s["anees"]))):
-        s["since"] = first + 1
-        means, counts = run_means(nees[:, first:])
-        ratio, low, high = ratio_interval(means[counts > 0] / dof, INTERVAL)
-        s["ratio"], s["ratio_interval"] = ratio, (low, high)
+    largest = asked.largest
+    return Axes(
+        errors.names, errors.groups, inflation,
+        None if largest is None else largest.ratio, None if largest is None else largest.direction,
+    )  # fmt: skip
 
 
-def locate_axes(
-    s: dict[str, Any], nees: Array, error: Array, covariance: Array, whitened: Array, found: Mapping[str, Answer]
-) -> None:
-    """Into the statistics: ratio and bias of each axis, what is left without the bias, correlations, main axes."""
-    late = slice(0 if s["since"] is None else s["since"] - 1, None)
-    groups = s["groups"]
-    confidence = 1.0 - (1.0 - INTERVAL) / len(groups)
-    counted = np.isfinite(nees[:, late])
-    s["of_axes"] = {}
-    for key, index in groups.items():
-        of_runs = _run_means_of(error[:, late], covariance[:, late], counted, index)
-        s["of_axes"][key] = ratio_interval(of_runs[~np.isnan(of_runs)] / len(index), confidence)
-    standard = standardise(error[:, late], covariance[:, late])
-    standard[~counted] = np.nan
-    rows, n = counted.any(axis=1), error.shape[-1]
-    if rows.sum() > n:
-        test = hotelling(mean_of_runs(standard)[rows])
-        s["bias"] = {axis: (test.mean[i], *test.interval[i]) for i, axis in enumerate(s["axes"])}
-    if _found(found, SCALE):
-        s["subset"] = _main_axes(s)
-    if _found(found, BIAS):
-        s["ratio_without_bias"] = _without_bias(whitened[:, late])
-        k = s.get("bias_step")
-        if k:
-            at = standardise(error[:, k - 1], covariance[:, k - 1])
-            at = at[np.isfinite(nees[:, k - 1])]
-            s["bias_axis"] = s["axes"][int(np.argmax(np.abs(at.mean(axis=0)) / at.std(axis=0, ddof=1).clip(1e-300)))]
-    if n > 1 and "shape_step" in s:
-        in_step = "shape" not in found or not found["shape"].found
-        here = slice(s["shape_step"] - 1, s["shape_step"]) if in_step and s["shape_step"] else slice(None)
-        s["correlation"] = _correlation(error[:, here], covariance[:, here], np.isfinite(nees[:, here]))
+def bias_of(sample: Sample, asked: Asked, location: Location, found: Found) -> Bias:
+    """Mean error of each axis, and what the scale is without it."""
+    errors, late = _errors(sample), _late(location)
+    standard = standardise(errors.error[:, late], errors.covariance[:, late])
+    standard[~sample.counted[:, late]] = np.nan
+    of_runs = mean_of_runs(standard)
+    of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
+    by_axis = {}
+    if len(of_runs) > sample.dof:
+        test = hotelling(of_runs, INTERVAL)
+        by_axis = {a: Interval(test.mean[i], *test.interval[i]) for i, a in enumerate(errors.names)}
+    if not _any(found, BIAS):
+        return Bias(by_axis, asked.bias_step, None, None)
+    without = ratio_interval(sample.centred().means(late), sample.dof, INTERVAL)
+    return Bias(by_axis, asked.bias_step, _axis_in_step(sample, asked.bias_step), without)
 
 
-def subset(error: Array, covariance: Array, index: list[int]) -> Array:
-    """Whitened errors of a group of components, (runs, steps, len(index))."""
-
-    def of_block(e: Array, P: Array) -> Array:
-        e, P = e[..., index], P[..., index, :][..., index]
-        return standardise(e, P) if len(index) == 1 else whiten(e, P)
-
-    return by_runs(of_block, error, covariance)
+def _axis_in_step(sample: Sample, step: int | None) -> str | None:
+    if step is None:
+        return None
+    errors = _errors(sample)
+    at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
+    return errors.names[int(np.argmax(np.abs(at.mean(axis=0)) / at.std(axis=0, ddof=1).clip(1e-300)))]
 
 
-def _run_means_of(error: Array, covariance: Array, counted: Array, index: list[int]) -> Array:
-    """Mean NEES of each run by a group of components alone, (runs,); NaN where it has none."""
+def shape_of(sample: Sample, asked: Asked, found: Found) -> Shape | None:
+    """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
+    if asked.matrix is None or sample.dof == 1:
+        return None
+    errors = _errors(sample)
+    in_step = not _any(found, ("shape",)) and asked.shape_step is not None
+    here = slice(asked.shape_step - 1, asked.shape_step) if in_step and asked.shape_step else slice(None)
+    pair, actual, stated = _correlation(errors.error[:, here], errors.covariance[:, here], sample.counted[:, here])
+    return Shape(asked.matrix, asked.shape_step, pair, actual, stated)
 
-    def of_block(e: Array, P: Array, counted: Array) -> Array:
-        return run_means(np.where(counted, squared_length(subset(e, P, index)), np.nan))[0]
 
-    return by_runs(of_block, error, covariance, counted)
+def tails_of(asked: Asked, run_numbers: Indices | None) -> Tails:
+    """The error that stands out most, and the whole distribution."""
+    odd = asked.outlier
+    if odd is None:
+        return Tails(-1, 0, float("nan"), asked.pit.values, asked.pit.half_width)
+    run = int(run_numbers[odd.run]) if run_numbers is not None and odd.run >= 0 else odd.run
+    return Tails(run, odd.step + 1, odd.distance, asked.pit.values, asked.pit.half_width)
 
 
-def _found(found: Mapping[str, Answer], questions: tuple[str, ...]) -> bool:
+def accuracy_of(sample: Sample) -> Accuracy:
+    """Coverage, RMSE and the noncredibility index."""
+    errors = _errors(sample)
+    index, inclination = noncredibility(errors.error, sample.nees)
+    error = np.where(sample.counted[..., None], errors.error, np.nan)
+    inside, interval = coverage_interval(error, errors.covariance)
+
+    def rmse_of(members: set[str]) -> float:
+        chosen = [i for i, axis in enumerate(errors.names) if axis in members]
+        return rmse(error[..., chosen]) if chosen else float("nan")
+
+    return Accuracy(
+        coverage=coverage(error, errors.covariance),
+        coverage_one_step=inside,
+        coverage_interval=interval,
+        rmse=np.array([rmse(error[..., [i]]) for i in range(sample.dof)]),
+        rmse_position=rmse_of(POSITION),
+        rmse_heading=rmse_of(ATTITUDE),
+        nci=float(np.nanmean(index)) if np.isfinite(index).any() else float("nan"),
+        inclination=float(np.nanmean(inclination)) if np.isfinite(inclination).any() else float("nan"),
+    )
+
+
+def _errors(sample: Sample) -> Errors:
+    assert sample.errors is not None
+    return sample.errors
+
+
+def _late(location: Location) -> slice:
+    return slice(0 if location.since is None else location.since - 1, None)
+
+
+def _any(found: Found, questions: tuple[str, ...]) -> bool:
     return any(q in found and found[q].found for q in questions)
 
 
-def _main_axes(s: dict[str, Any]) -> str | None:
-    """The axes that carry the fault; None where no axis stands out or all do."""
-    wrong = {a: s["of_axes"][a] for a in s["axes"] if not s["of_axes"][a][1] <= 1.0 <= s["of_axes"][a][2]}
-    if not wrong:
-        return None
-    largest = max(abs(np.log(max(ratio, 1e-300))) for ratio, _, _ in wrong.values())
-    chief = [a for a, (ratio, _, _) in wrong.items() if abs(np.log(max(ratio, 1e-300))) > 0.5 * largest]
-    return None if len(chief) == len(s["axes"]) else ", ".join(chief)
-
-
-def _without_bias(whitened: Array) -> tuple[float, float, float]:
-    """Covariance ratio of the errors less their mean over the runs in each step."""
-    N, mean, _ = moments(whitened)
-
-    def squares(w: Array) -> Array:
-        return np.where(N > 1, np.square(w - mean).sum(axis=-1) * (N / np.maximum(N - 1, 1)), np.nan)
-
-    means, counts = run_means(by_runs(squares, whitened))
-    return ratio_interval(means[counts > 0] / whitened.shape[-1], INTERVAL)
-
-
-def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[int, int, float, float]:
+def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple[int, int] | None, float, float]:
     """The two axes whose errors are correlated least as stated, with both correlations, averaged over steps."""
     if not counted.any():
-        return 0, 1, float("nan"), float("nan")
+        return None, float("nan"), float("nan")
     n, count = error.shape[-1], int(counted.sum())
     parts = list(blocks(*counted.shape))
 
@@ -142,4 +229,4 @@ def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[int, 
         gap = np.nan_to_num(second / np.outer(scale, scale) - stated)
     np.fill_diagonal(gap, 0.0)
     i, j = sorted(int(k) for k in np.unravel_index(np.abs(gap).argmax(), gap.shape))
-    return i, j, float(stated[i, j] + gap[i, j]), float(stated[i, j])
+    return (i, j), float(stated[i, j] + gap[i, j]), float(stated[i, j])

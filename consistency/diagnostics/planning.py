@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import numpy as np
 from scipy import stats
 
 from consistency.diagnostics.questions import MAIN, SHARES
+from consistency.diagnostics.scale import FEW, scale_test
+from consistency.types import Array
 
 LARGEST = 10**7  # runs; more is refused as a mistake
+MARGIN = 1.15  # on the runs of a pilot's plan, measured: it then keeps its power
 
 
 def required_runs(
-    dof: int, ratio: float, false_alarm: float = 0.05, power: float = 0.95, two_sided: bool = True
+    dof: float, ratio: float, false_alarm: float = 0.05, power: float = 0.95, two_sided: bool = True
 ) -> int:
     """Runs that find a covariance wrong by ``ratio`` with ``power`` in the average NEES of one step.
 
@@ -20,7 +26,7 @@ def required_runs(
 
     Parameters
     ----------
-    dof : dimension of the error
+    dof : dimension of the error, or the effective degrees of freedom of a run
     ratio : true over stated covariance; above 1 overconfident, below 1 conservative
     false_alarm : of the test on a consistent filter
     power : chance that the fault is found
@@ -54,7 +60,52 @@ def gate_runs(dof: int, detect: float, false_alarm: float = 0.05, power: float =
     return required_runs(dof, detect, SHARES[MAIN] * false_alarm, power, two_sided=allow is None)
 
 
-def power_of(dof: int, runs: int, ratio: float, false_alarm: float = 0.05, two_sided: bool = True) -> float:
+@dataclass(frozen=True)
+class PilotPlan:
+    """What a pilot says of the runs that a verdict takes."""
+
+    pilot_runs: int
+    effective_dof: float  # of one run, one standard error to the safe side
+    standard_error: float  # of its logarithm
+    runs: int
+
+
+def pilot_plan(
+    means: Array,
+    dof: int,
+    steps: int,
+    detect: float,
+    false_alarm: float = 0.05,
+    power: float = 0.95,
+    allow: str | None = None,
+) -> PilotPlan:
+    """Runs that :func:`judge` takes where steps depend on each other as in a pilot, and not completely.
+
+    :func:`gate_runs` at the pilot's effective degrees of freedom, one standard error to the safe side, times 1.15: a
+    verdict estimates them again from its own runs. At least 20 runs, with which it does. Scale and bias of the pilot
+    do not matter, only how its run means spread.
+
+    Parameters
+    ----------
+    means : (runs,), mean NEES of each run over ``dof``; at least 20
+    steps : of a run
+
+    Raises
+    ------
+    ValueError
+        As :func:`required_runs`; too few runs.
+    """
+    _require(dof, false_alarm, power)
+    if len(means) < FEW:
+        raise ValueError(f"a pilot needs at least {FEW} runs, got {len(means)}")
+    test = scale_test(means, dof, steps)
+    share = SHARES[MAIN] * false_alarm
+    least = required_runs(test.effective_dof, detect, share, power, two_sided=allow is None)
+    runs = min(int(np.ceil(MARGIN * least)), gate_runs(dof, detect, false_alarm, power, allow))
+    return PilotPlan(len(means), test.effective_dof, float(np.sqrt(2.0 / test.spread)), max(runs, FEW))
+
+
+def power_of(dof: float, runs: int, ratio: float, false_alarm: float = 0.05, two_sided: bool = True) -> float:
     """Chance that ``runs`` runs find a covariance wrong by ``ratio``; the complement of :func:`required_runs`."""
     tail, k = false_alarm / (2 if two_sided else 1), dof * runs
     if ratio > 1.0:
@@ -71,8 +122,8 @@ def detectable_ratio(
     return float(stats.chi2.isf(tail, dof * runs) / stats.chi2.ppf(1.0 - power, dof * runs))
 
 
-def _require(dof: int, false_alarm: float, power: float) -> None:
-    if dof < 1:
+def _require(dof: float, false_alarm: float, power: float) -> None:
+    if not dof >= 1:
         raise ValueError(f"dof must be at least 1, got {dof}")
     for name, value in (("false_alarm", false_alarm), ("power", power)):
         if not 0.0 < value < 1.0:

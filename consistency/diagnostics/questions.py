@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-MAIN = "scale"
-SCALE = (MAIN, "scale in some step", "scale of an axis")
+from consistency.diagnostics.records import Answer
+
+MAIN, STEP, AXIS, DIRECTION = "scale", "scale in some step", "scale of an axis", "scale in some direction"
+SCALE = (MAIN, STEP, AXIS, DIRECTION)
 BIAS = ("bias", "bias in some step")
 SHAPE = ("shape", "shape in some step")
-# Share of the false-alarm rate of each question. Half goes to the mean over the trajectory, so that the
-# number of runs planned for a covariance ratio does not depend on what else is asked.
+TAILS = ("outliers", "distribution")
+INNOVATIONS = ("innovation scale", "innovation whiteness")
+# Share of the false-alarm rate of each question; those that are asked share what the main one leaves. Half goes to
+# the mean over the trajectory, so that the number of runs planned for a covariance ratio does not depend on what
+# else is asked.
 SHARES = {
     MAIN: 0.5,
-    "scale in some step": 0.1,
-    "scale of an axis": 0.1,
+    STEP: 0.1,
+    AXIS: 0.1,
+    DIRECTION: 0.1,
     "bias": 0.05,
     "bias in some step": 0.05,
     "shape": 0.05,
@@ -28,8 +33,9 @@ SHARES = {
 }
 ABOUT = {
     MAIN: "mean NEES of whole trajectories against its degrees of freedom",
-    "scale in some step": "ANEES of every step against its simultaneous band",
-    "scale of an axis": "the same mean for each axis and subset by itself",
+    STEP: "ANEES of every step against its simultaneous band",
+    AXIS: "the same mean for each axis and subset by itself",
+    DIRECTION: "largest eigenvalue of the mean whitened second moment, where only too small a covariance is a fault",
     "bias": "Hotelling's T-squared of the mean whitened error of a trajectory",
     "bias in some step": "Hotelling's T-squared of every step",
     "shape": "mean products of different whitened components over a trajectory",
@@ -39,17 +45,6 @@ ABOUT = {
     "innovation scale": "total NIS against its degrees of freedom",
     "innovation whiteness": "portmanteau test of the autocorrelation over steps",
 }
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What one question found."""
-
-    question: str
-    p_value: float
-    share: float  # of the false-alarm rate; all of a verdict add to 1
-    adjusted: float  # p value corrected for all questions asked
-    found: bool  # adjusted is at most the false-alarm rate of the verdict
 
 
 def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answer]:

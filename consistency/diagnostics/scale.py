@@ -9,11 +9,14 @@ from scipy import optimize, special, stats
 
 from consistency.diagnostics.blocks import blocks
 from consistency.diagnostics.nees import anees
+from consistency.diagnostics.records import Interval
 from consistency.types import Array
 
 FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete
+LARGE = 1e6  # shape of a Gamma distribution beyond which its information is 1/2 and rounding would rule
+LEAST = 4.0  # degrees of freedom of Student's t in an interval: with fewer it says nothing at all
 REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
-BLOCK = 1024  # runs whose scalar products are in memory at once
+UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
 
 
 # --- the whole trajectory --------------------------------------------------------------------------
@@ -23,6 +26,7 @@ BLOCK = 1024  # runs whose scalar products are in memory at once
 class MeanTest:
     """Test that the mean NEES of whole trajectories is the degrees of freedom."""
 
+    runs: int
     ratio: float  # mean NEES over dof
     effective_dof: float  # nu of one run: its mean NEES spreads as chi-square(nu) / nu
     spread: float  # degrees of freedom with which nu is known
@@ -35,52 +39,80 @@ class MeanTest:
         return float(np.minimum(1.0, 2.0 * np.minimum(self.above, self.below)))
 
 
-def mean_test(nees: Array, dof: int, whitened: Array | None = None) -> MeanTest:
-    """Test of the mean NEES over whole trajectories, with each run one observation.
-
-    A run's mean NEES is a sum of dependent chi-squares. It is approximated by chi-square(nu) / nu with
-    the same mean and variance (Satterthwaite 1946; Box 1954, Theorem 3.1). With the whitened errors w_i of run i,
-    stacked over steps, nu = (tr C)^2 / tr C^2 where C is their covariance, and the mean of (w_i' w_j)^2
-    over pairs of different runs estimates tr C^2 without bias (Chen, Zhang & Zhong 2010). It assumes
-    Gaussian errors, as the chi-square does, and nothing about their dependence. Without the errors nu
-    comes from the spread of the runs' means.
-
-    nu is estimated from the same runs as the mean. The jackknife over runs says how well it is known and how
-    it moves with the mean; it is taken at a mean of 1, one standard error to the safe side, and what
-    doubt remains makes Student's t of the normal. From the spread of the means alone it is taken two standard
-    errors to the safe side: skewed means hide their spread. nu lies between ``dof``, its value where all steps of a
-    run are one and the same, and that times the number of steps. With fewer than 20 runs, or where runs have
-    values in different steps, nu is ``dof``: the test is the chi-square of one step.
+def mean_test(nees: Array, dof: int) -> MeanTest:
+    """Test of the mean NEES over whole trajectories, with each run one observation; see :func:`scale_test`.
 
     Parameters
     ----------
     nees : (runs, steps), NaN where a run has no value
     dof : dimension of the error
-    whitened : (runs, steps, dof), see :func:`whiten`; NaN in the same places
     """
     means, counts = run_means(nees)
-    means, counts = means[counts > 0] / dof, counts[counts > 0]
+    return scale_test(means[counts > 0] / dof, dof, int(counts.max(initial=0)))
+
+
+def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> MeanTest:
+    """Test that run means of the NEES over its degrees of freedom, Y_i (runs,), have the mean 1.
+
+    A run's mean NEES is a sum of dependent chi-squares. It is approximated by chi-square(nu) / nu with
+    the same mean and variance (Satterthwaite 1946; Box 1954, Theorem 3.1). Nothing is assumed of how the steps of a
+    run depend on each other, nor that they do so in the same way in every run: nu comes from the run means alone,
+    which are independent. Two estimates are taken, each one standard error to the safe side, and the smaller counts:
+
+    - from the coefficient of variation, nu = 2 / CV^2 less its first-order bias. The jackknife over runs says how
+      well it is known and how it moves with the mean; where that lowers it, it is taken at a mean of 1;
+    - from the likelihood of a Gamma distribution of shape a = nu / 2, log a - digamma(a) = log mean Y - mean log Y
+      (Fisher 1922), which small values enter as strongly as large ones.
+
+    What doubt remains makes Student's t of the normal. nu lies between ``dof``, its value where all steps of a
+    run are one and the same, and that times ``steps``. With fewer than 20 runs nu is ``dof``: the test is the
+    chi-square of one step.
+
+    Parameters
+    ----------
+    means : (runs,), mean NEES of each run over ``dof``
+    dof : dimension of the error
+    steps : of the longest run
+    gaussian : False lets nu fall below ``dof``, where only errors with heavy tails can have it
+    """
     runs = len(means)
     if runs == 0:
-        return MeanTest(float("nan"), float("nan"), float("inf"), float("nan"), float("nan"))
+        return MeanTest(0, float("nan"), float("nan"), float("inf"), float("nan"), float("nan"))
     ratio = float(means.mean())
     nu, spread = float(dof), float("inf")
-    present = np.isfinite(nees)
-    some = present.any(axis=1)
-    present = present[some]
-    if runs >= FEW and counts[0] > 1 and ratio > 0 and (present == present[0]).all():
-        if whitened is not None:
-            log_nu, left_out = _log_nu_of_errors(whitened if some.all() else whitened[some], counts * dof, means)
-            floor, caution = 0.0, 1.0
-        else:
-            log_nu, left_out = _log_nu_of_means(means)
-            floor, caution = 2.0 / runs, 2.0
-        log_nu, variance = _at_mean_one(log_nu, left_out, means, floor)
-        log_nu = min(log_nu - caution * np.sqrt(variance), float(np.log(dof * counts[0])))
-        if log_nu > np.log(dof):
+    if runs >= FEW and (steps > 1 or not gaussian) and means.min() > 0:
+        log_nu, variance = _log_nu(means)
+        log_nu = min(log_nu, float(np.log(dof * steps)))
+        if log_nu > np.log(dof) or not gaussian:
             nu, spread = float(np.exp(log_nu)), 2.0 / variance
     above, below = _tails(ratio, runs * nu, spread)
-    return MeanTest(ratio, nu, spread, above, below)
+    return MeanTest(runs, ratio, nu, spread, above, below)
+
+
+def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
+    """Do run means (runs,) differ more than those of Gaussian errors can? Of such, nu is ``dof`` at least.
+
+    Either estimate of nu (:func:`scale_test`) lies more than ``errors`` standard errors below; not asked of fewer than
+    20 runs.
+    """
+    if len(means) < FEW or not means.min() > 0:
+        return False
+    by_spread, left_out = _log_nu_of_means(means)
+    _, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
+    by_likelihood, error = _log_nu_of_gamma(means)
+    return bool(min(by_spread + errors * np.sqrt(variance), by_likelihood + errors * error) < np.log(dof))
+
+
+def spreads_more_in_steps(nees: Array, dof: int) -> bool:
+    """The same of the NEES (runs, steps) in single steps: log nu in the mean of the steps, with the error of one.
+
+    Steps need not be independent. Those in which a run has no value, or none of the runs an error, do not count.
+    """
+    whole = np.isfinite(nees).all(axis=0) & (nees > 0).all(axis=0)
+    if len(nees) < FEW or not whole.any():
+        return False
+    log_nu, error = _log_nu_of_gamma(nees[:, whole])
+    return bool((log_nu + error).mean() < np.log(dof))
 
 
 def run_means(nees: Array) -> tuple[Array, Array]:
@@ -91,59 +123,50 @@ def run_means(nees: Array) -> tuple[Array, Array]:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
 
 
-def acceptance(
-    test: MeanTest, runs: int, dof: int, false_alarm: float, allow: str | None = None
-) -> tuple[float, float]:
+def acceptance(test: MeanTest, dof: int, false_alarm: float, allow: str | None = None) -> tuple[float, float]:
     """Interval of the mean NEES that :func:`mean_test` accepts at ``false_alarm``."""
+    if not test.runs:
+        return float("nan"), float("nan")
     z = float(stats.t.isf(false_alarm if allow else false_alarm / 2, test.spread))
-    k = runs * test.effective_dof
+    k = test.runs * test.effective_dof
     low = 0.0 if allow == "conservative" else float(stats.chi2.ppf(stats.norm.sf(z), k)) * dof / k
     return low, float(stats.chi2.isf(stats.norm.sf(z), k)) * dof / k
 
 
-def ratio_interval(means: Array, confidence: float = 0.95) -> tuple[float, float, float]:
+def ratio_interval(means: Array, dof: int = 1, confidence: float = 0.95) -> Interval:
     """Ratio of true to stated covariance (1 is right) and its interval, from the runs' mean NEES over dof (runs,).
 
-    The spread between the runs is taken as it is, so that neither dependence between steps nor heavy tails
-    make the interval too short. With fewer than 2 runs the interval is (0, inf).
+    From 20 runs on the spread between the runs is taken as it is, so that neither dependence between steps nor heavy
+    tails make the interval too short. Fewer runs do not know their spread well: it is taken as that of runs whose
+    steps are all one and the same, or as the larger one that is seen. Without a run the interval is NaN.
     """
     means = np.asarray(means, float)
-    ratio = float(means.mean()) if len(means) else float("nan")
-    if len(means) < 2 or not means.std() > 0:
-        return ratio, (0.0 if len(means) < 2 else ratio), (float("inf") if len(means) < 2 else ratio)
-    log_nu, left_out = _log_nu_of_means(means)
-    variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
-    z = float(stats.t.isf(0.5 * (1.0 - confidence), 2.0 / variance))
-    k = len(means) * float(np.exp(log_nu))
+    if not len(means):
+        return UNKNOWN
+    ratio, tail = float(means.mean()), 0.5 * (1.0 - confidence)
+    if not means.max() > 0:
+        return Interval(ratio, ratio, ratio)
+    nu, spread = float(dof), float("inf")
+    if len(means) > 1 and means.std() > 0:
+        log_nu, left_out = _log_nu_of_means(means)
+        if len(means) >= FEW:
+            variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
+            nu, spread = float(np.exp(log_nu)), max(2.0 / variance, LEAST)
+        else:
+            nu = min(nu, float(np.exp(log_nu)))
+    elif len(means) >= FEW:
+        return Interval(ratio, ratio, ratio)
+    z, k = float(stats.t.isf(tail, spread)), len(means) * nu
     low, high = (float(stats.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
-    return ratio, ratio * k / low, (ratio * k / high if high > 0 else float("inf"))
+    return Interval(ratio, ratio * k / low, ratio * k / max(high, 1e-300))
 
 
-def _log_nu_of_errors(w: Array, size: Array, means: Array) -> tuple[float, Array]:
-    """log((tr C)^2 / tr C^2) from whitened errors (runs, steps, n), and the same with each run left out.
-
-    ``size`` (runs,) counts the values in each run, ``means`` (runs,) their mean squares.
-    """
-    runs = len(w)
-    scale = np.sqrt(size)[:, None]
-
-    def flat(here: slice) -> Array:
-        block = w[here].reshape(len(w[here]), -1) / scale[here]
-        block[~np.isfinite(block)] = 0.0
-        return block
-
-    parts = [slice(k, k + BLOCK) for k in range(0, runs, BLOCK)]
-    if runs > w[0].size:
-        products = sum(block.T @ block for block in map(flat, parts))
-        with_others = np.concatenate([np.einsum("ij,ij->i", block @ products, block) for block in map(flat, parts)])
-    else:
-        everything = flat(slice(None))
-        with_others = np.concatenate([np.square(everything[here] @ everything.T).sum(axis=1) for here in parts])
-    with_others = with_others - np.square(means)
-    total = with_others.sum()
-    t2 = np.maximum(total / (runs * (runs - 1)), 1e-300)
-    t2_left = np.maximum((total - 2.0 * with_others) / ((runs - 1) * (runs - 2)), 1e-300)
-    return float(np.log(means.mean() ** 2 / t2)), np.log(_left_out_mean(means) ** 2 / t2_left)
+def _log_nu(means: Array) -> tuple[float, float]:
+    """The smaller of both estimates of log nu on the safe side, and the variance of the first."""
+    by_spread, left_out = _log_nu_of_means(means)
+    by_spread, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
+    by_likelihood, error = _log_nu_of_gamma(means)
+    return min(by_spread - float(np.sqrt(variance)), float(by_likelihood - error)), variance
 
 
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:
@@ -156,6 +179,21 @@ def _log_nu_of_means(means: Array) -> tuple[float, Array]:
     return float(np.log(2.0 / cv) - np.log1p(cv / runs)), np.log(2.0 * left**2 / np.maximum(variance, smallest))
 
 
+def _log_nu_of_gamma(means: Array) -> tuple[Array, Array]:
+    """log(2 a) of the Gamma distribution of shape a most likely to have made ``means`` (runs, ...), and its error.
+
+    The error is the standard error by the expected information, 1 / (N (a^2 trigamma(a) - a)); (...) both.
+    """
+    gap = np.maximum(np.log(means.mean(axis=0)) - np.log(means).mean(axis=0), 1e-12)
+    log_a = np.log((3.0 - gap + np.sqrt((gap - 3.0) ** 2 + 24.0 * gap)) / (12.0 * gap))  # Minka (2002), to 1.5 %
+    for _ in range(5):  # Newton in log a
+        a = np.exp(log_a)
+        log_a = log_a - np.clip((log_a - special.psi(a) - gap) / (1.0 - a * special.polygamma(1, a)), -2.0, 2.0)
+    a = np.exp(np.minimum(log_a, np.log(LARGE)))
+    information = np.where(a < LARGE, a * a * special.polygamma(1, a) - a, 0.5)
+    return np.log(2.0) + log_a, 1.0 / np.sqrt(len(means) * information)
+
+
 def _left_out_mean(means: Array) -> Array:
     return np.asarray((means.sum() - means) / (len(means) - 1))
 
@@ -166,14 +204,13 @@ def _jackknife(a: Array, b: Array) -> float:
 
 
 def _at_mean_one(log_nu: float, left_out: Array, means: Array, floor: float) -> tuple[float, float]:
-    """log nu moved to where it would be at a mean of 1, up by one standard error at most; the variance that is left."""
+    """log nu moved down to where it would be at a mean of 1, never up, and the variance that is left."""
     log_mean = np.log(_left_out_mean(means))
     of_mean, both = _jackknife(log_mean, log_mean), _jackknife(left_out, log_mean)
     slope = both / of_mean if of_mean > 0 else 0.0
     reach = REACH * np.sqrt(of_mean)  # no farther than chance carries the mean
-    variance = max(_jackknife(left_out, left_out) - slope * both, floor, 1e-9)
-    shift = -slope * float(np.clip(np.log(means.mean()), -reach, reach))
-    return log_nu + min(shift, abs(slope) * np.sqrt(of_mean)), variance
+    variance = max(_jackknife(left_out, left_out) - slope * both, floor)
+    return log_nu + min(-slope * float(np.clip(np.log(means.mean()), -reach, reach)), 0.0), variance
 
 
 def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:

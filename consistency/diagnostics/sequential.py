@@ -1,69 +1,117 @@
-"""Looking at the runs while they come, with error rates that hold for all looks together."""
+"""Looking at the runs while they come, with error rates that hold whenever it stops."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
-from consistency.diagnostics.planning import gate_runs
-from consistency.types import Verdict
+from consistency.diagnostics.eprocess import e_process, ever
+from consistency.diagnostics.questions import MAIN, SHARES
+from consistency.diagnostics.records import Evidence, Settings, Verdict
+from consistency.diagnostics.sample import sample_of
+from consistency.diagnostics.verdict import Look, judge
 
-FIRST = 12  # runs at the first look at least; with fewer hardly anything but a failed run would be found
+FIRST = 12  # runs at the first look; with fewer hardly anything but a failed run would be found
+PARTS = 4  # times that the scale is looked at from one look to the next
 
 
 @dataclass(frozen=True)
 class Design:
-    """A group-sequential plan: when to look, and what each look may cost."""
+    """When to look, and what each look may cost.
+
+    The scale is carried by an e-process, which is valid whenever it is looked at. All other questions are asked at
+    looks after 12, 24, 48, ... runs; look j = 0, 1, ... may cost the part 1 / ((j + 1) (j + 2)) of their false-alarm
+    rate, which adds to 1 however many looks it takes (Bonferroni).
+    """
 
     dof: int
-    detect: float  # covariance ratio that must be found
-    false_alarm: float  # of all looks together
-    power: float
-    looks: tuple[int, ...]  # runs at each look
-    needed: int  # runs at which no fault found means consistent
-    look_false_alarm: float  # of one look: an equal part for each planned look
+    detect: float = 1.5
+    false_alarm: float = 0.05  # of all looks together
+    power: float = 0.95
+    max_runs: int | None = None  # what is open then is undecided
 
-    def settle(self, verdict: Verdict) -> Verdict:
-        """The verdict at a look: where no fault is found before ``needed`` runs it is undecided."""
-        runs = int(verdict.statistics["runs"])
-        if verdict.status != "consistent" or runs >= self.needed:
-            return verdict
-        text = (
-            f"undecided: no fault found in {runs} runs; {self.needed} are needed to find a covariance wrong by "
-            f"x{self.detect:g} with power {self.power:g}"
-        )
+    def __post_init__(self) -> None:
+        if self.max_runs is not None and self.max_runs < 1:
+            raise ValueError(f"max_runs must be at least 1, got {self.max_runs}")
+        if self.dof < 1:
+            raise ValueError(f"dof must be at least 1, got {self.dof}")
+        _ = self.settings
+
+    @property
+    def settings(self) -> Settings:
+        """What each look is asked."""
+        return Settings(self.false_alarm, self.detect, self.power)
+
+    def inspections(self) -> Iterator[tuple[int, float | None]]:
+        """Runs after which to look, and what the look may cost; None where only the scale is looked at."""
+        runs, j, last = FIRST, 0, self.max_runs
+        while True:
+            spent = 1.0 / ((j + 1) * (j + 2))
+            if last is not None and runs >= last:
+                yield last, spent
+                return
+            yield runs, spent
+            for part in range(1, PARTS):
+                between = runs + runs * part // PARTS
+                if last is not None and between >= last:
+                    break
+                yield between, None
+            runs, j = 2 * runs, j + 1
+
+
+def look(design: Design, evidence: Evidence, spent: float | None) -> Verdict:
+    """The verdict at one inspection: `undecided` means that the runs go on.
+
+    A filter without truth is judged by its innovations, at looks only.
+    """
+    verdict = judge(evidence, design.settings, Look(spent, _scale(design, evidence)))
+    if spent is None and verdict.consistent:
+        text = "undecided: no fault found in the scale; the other questions are asked at the next look"
         return replace(verdict, status="undecided", reasons=(text, *verdict.reasons[1:]))
+    return verdict
+
+
+def speaks(design: Design, evidence: Evidence, spent: float | None) -> bool:
+    """Can this inspection decide? Between looks only a scale at fault does."""
+    return spent is not None or _scale(design, evidence) <= SHARES[MAIN] * design.false_alarm
+
+
+def _scale(design: Design, evidence: Evidence) -> float:
+    """p value of the scale, valid at any time; 1 without truth."""
+    sample = sample_of(evidence, design.settings)
+    return 1.0 if sample is None else ever(e_process(sample.means(), sample.dof).both)
+
+
+def follow(design: Design, evidence_of: Callable[[int], Evidence], limit: int | None = None) -> tuple[Verdict, int]:
+    """Look until decided: the verdict, and the runs that it took.
+
+    Parameters
+    ----------
+    evidence_of : the first runs of a filter, as many as it is asked for
+    limit : runs that there are; the last inspection within them speaks, or all of them where they are fewer than 12
+    """
+    inspections = list(takewhile(lambda each: each[0] <= limit, design.inspections())) if limit is not None else None
+    if inspections == []:
+        inspections = [(limit or 0, next(design.inspections())[1])]
+    for runs, spent in inspections if inspections is not None else design.inspections():
+        evidence = evidence_of(runs)
+        last = runs == design.max_runs or (inspections is not None and (runs, spent) == inspections[-1])
+        if last or speaks(design, evidence, spent):
+            verdict = look(design, evidence, spent)
+            if last or verdict.status != "undecided":
+                return verdict, runs
+    raise AssertionError("unreachable: a design without a last look is endless")
 
 
 def sequential_design(
     dof: int, detect: float = 1.5, false_alarm: float = 0.05, power: float = 0.95, max_runs: int | None = None
 ) -> Design:
-    """Looks at doubling numbers of runs, the last at what :func:`gate_runs` plans.
-
-    Each of the L looks is the same verdict as ever at a false-alarm rate of ``false_alarm`` / L, so that the
-    chance of a false alarm at any of them is at most ``false_alarm`` under any dependence between looks (Bonferroni;
-    the constant spending of Pocock 1977 and Lan & DeMets 1983 without its assumption on increments). A fault stops
-    at the first look that finds it; that none is there takes the last look, where the power is the stated
-    one. Looks beyond ``max_runs`` are replaced by one at ``max_runs``; what is open then is undecided.
+    """A :class:`Design`.
 
     Raises
     ------
     ValueError
-        As :func:`required_runs`; ``max_runs`` below 1.
+        A value out of its range.
     """
-    if max_runs is not None and max_runs < 1:
-        raise ValueError(f"max_runs must be at least 1, got {max_runs}")
-    count, needed = planned_looks(dof, detect, false_alarm, power)
-    looks = [-(-needed // 2**k) for k in reversed(range(count))]
-    if max_runs is not None and max_runs < needed:
-        looks = [*(n for n in looks if n < max_runs), max_runs]
-    return Design(dof, detect, false_alarm, power, tuple(looks), needed, false_alarm / count)
-
-
-def planned_looks(dof: int, detect: float, false_alarm: float, power: float) -> tuple[int, int]:
-    """Number of looks and runs at the last: the most looks whose first one has enough runs."""
-    count, needed = 1, gate_runs(dof, detect, false_alarm, power)
-    while True:
-        more = gate_runs(dof, detect, false_alarm / (count + 1), power)
-        if more < FIRST * 2**count:
-            return count, needed
-        count, needed = count + 1, more
+    return Design(dof, detect, false_alarm, power, max_runs)

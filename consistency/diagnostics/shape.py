@@ -66,7 +66,7 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
     present = np.asarray(np.isfinite(whitened).all(axis=-1))
     n = whitened.shape[-1]
     count = present.sum(axis=1)
-    M = by_runs(_second_moments, whitened, present)[count > 0] / count[count > 0, None, None]
+    M = by_runs(second_moments, whitened, present)[count > 0] / count[count > 0, None, None]
     mean = M.mean(axis=0) if len(M) else np.full((n, n), np.nan)
     trace = float(np.trace(mean))
     scaled = mean * n / trace if trace > 0 else mean
@@ -77,7 +77,7 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
     return scaled, hotelling(M[:, i, j]).p_value
 
 
-def _second_moments(whitened: Array, present: Array) -> Array:
+def second_moments(whitened: Array, present: Array) -> Array:
     """Sum of w w' over the steps of each run, (runs, steps, n) -> (runs, n, n)."""
     w = np.where(present[..., None], whitened, 0.0)
     return np.asarray(np.swapaxes(w, -1, -2) @ w)

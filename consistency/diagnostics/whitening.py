@@ -51,6 +51,16 @@ def standardise(error: Array, covariance: Array) -> Array:
     return by_runs(lambda e, v: e / np.sqrt(np.where(v > 0, v, np.nan)), np.asarray(error, float), variance)
 
 
+def subset(error: Array, covariance: Array, index: list[int]) -> Array:
+    """Whitened errors of a group of components, (runs, steps, len(index))."""
+
+    def of_block(e: Array, P: Array) -> Array:
+        e, P = e[..., index], P[..., index, :][..., index]
+        return standardise(e, P) if len(index) == 1 else whiten(e, P)
+
+    return by_runs(of_block, error, covariance)
+
+
 def squared_length(whitened: Array) -> Array:
     """(runs, steps, n) -> (runs, steps): the NEES, if nothing is missing."""
     return by_runs(lambda w: np.square(w).sum(axis=-1), whitened)

@@ -3,55 +3,53 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from consistency.diagnostics.coverage import TWO_SIGMA
-from consistency.diagnostics.questions import BIAS, MAIN, SCALE, SHAPE
+from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, MAIN, SCALE, SHAPE, STEP
+from consistency.diagnostics.records import Answer, Axes, Equivalence, Interval, Scale, Verdict
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 NOTABLE = 0.3  # difference of correlations that stands out in one step
+VISIBLE = 0.05  # difference of correlations that is worth a word
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
+MUCH = 100_000  # runs; more are no advice
+MOST = 3  # axes that a sentence names with their figures
+TINY = 1e-12  # ratio of an error that is rounding
+
+Found = Mapping[str, Answer]
 
 
-def reasons(status: str, s: Mapping[str, Any]) -> list[str]:
-    """First the sentence, then the figures; from the statistics of a verdict."""
-    found = {a["question"]: a for a in s["answers"] if a["found"]}
-    lines = []
-    if s["failures"]:
-        (run, step, why), count = s["failures"][0], len({f[0] for f in s["failures"]})
-        lines.append(f"{count} of {s['runs']} runs failed, first run {run} in step {step}: {why}")
-    if s.get("impossible"):
-        row, step = s["impossible"][0]
-        count = len({r for r, _ in s["impossible"]})
-        lines.append(
-            f"{count} of {s['runs']} runs have an infinite error or a covariance with a negative variance, first run "
-            f"{row} in step {step}; those steps are left out"
-        )
-    if not s["answers"] or s.get("judged_steps") == 0:
-        if "anees" in s:
-            lines.append("no step has a covariance of full rank to judge")
-        else:
-            lines.append("neither truth nor innovations to judge")
-    elif "anees" in s:
-        lines.insert(0 if found else len(lines), _sentence(s, found))
-        lines.append(_level(s))
-        lines += _coverage(s)
+def reasons(v: Verdict) -> list[str]:
+    """First the sentence, then the figures."""
+    found = {a.question: a for a in v.answers if a.found and not a.tolerated}
+    broken = _failures(v)
+    judged = v.scale is not None and v.scale.judged_steps > 0
+    lines: list[str] = []
+    if judged:
+        assert v.scale is not None
+        lines = [_sentence(v, found), *_level(v), *_coverage(v)]
+    elif v.scale is not None:
+        lines = ["no step has a covariance of full rank to judge"]
+    elif v.innovations is not None and v.innovations.dof:
+        lines = [_without_truth(v, found)]
     else:
-        lines.insert(0 if found else len(lines), _without_truth(s, found))
-    if "nis_ratio" in s:
-        lines.append(_nis(s))
-    if s["answers"]:
-        lines.append(_asked(s, found))
-    since = f" since step {s['since']}" if found and s.get("since") is not None else ""
-    return [f"{status}{since}: {lines[0]}", *lines[1:]]
+        lines = ["neither truth nor innovations to judge"]
+    lines = [lines[0], *broken, *lines[1:]] if found else [*broken, *lines]
+    if v.innovations is not None:
+        lines.append(_nis(v))
+    if v.answers:
+        lines.append(_asked(v, found))
+    return [f"{v.status}{_since(v, found)}: {lines[0]}", *lines[1:]]
 
 
 def short(value: float) -> str:
     """Three digits, as a person says them."""
     return (
-        f"{value:.1e}"
+        f"{value:.2g}"
+        if value < 0.1
+        else f"{value:.1e}"
         if value >= 1e4
         else f"{value:.0f}"
         if value >= 100
@@ -61,11 +59,21 @@ def short(value: float) -> str:
     )
 
 
-def factor(ratio: float, low: float, high: float) -> str:
-    """x1.6 [1.4, 1.9]; of a covariance too large, the inverse."""
-    if ratio < 1.0:
-        ratio, low, high = (1.0 / max(value, 1e-300) for value in (ratio, high, low))
-    return f"x{short(ratio)} [{short(low)}, {short(high)}]"
+def off_by(interval: Interval) -> str:
+    """Too small by x1.6 [1.4, 1.9]; of a covariance too large, the inverse."""
+    ratio, low, high = interval
+    if ratio >= 1.0:
+        return f"too small by x{plain(interval)}"
+    if ratio < TINY:
+        return "too large: there is hardly any error"
+    return f"too large by x{plain(Interval(1.0 / ratio, 1.0 / high, 1.0 / max(low, TINY)))}"
+
+
+def plain(interval: Interval) -> str:
+    """1.02 [0.87, 1.19]: a ratio that may lie on either side of 1."""
+    if not interval.high < UNCERTAIN * interval.low:
+        return f"{short(interval.value)} (known to no better than a factor of {UNCERTAIN:g})"
+    return f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]"
 
 
 def p_text(p: float) -> str:
@@ -73,133 +81,252 @@ def p_text(p: float) -> str:
     return f"{p:.2g}" if p >= 1e-6 else "below 1e-6"
 
 
-def _sentence(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+def plural(count: int, noun: str) -> str:
+    """1 run, 2 runs."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+# --- the sentence ------------------------------------------------------------------------------------
+
+
+def _failures(v: Verdict) -> list[str]:
+    lines = []
+    if v.failures:
+        first, count = v.failures[0], len({f.run for f in v.failures})
+        lines.append(f"{count} of {v.runs} runs failed, first run {first.run} in step {first.step}: {first.reason}")
+    if v.impossible:
+        row, step = v.impossible[0]
+        count = len({r for r, _ in v.impossible})
+        lines.append(
+            f"{count} of {v.runs} runs {'has' if count == 1 else 'have'} an infinite error or a covariance with a "
+            f"negative variance, first run {row} in step {step}; those steps are left out"
+        )
+    return lines
+
+
+def _since(v: Verdict, found: Found) -> str:
+    since = v.location.since if v.location is not None else None
+    if not found or since is None or v.status in ("biased", "heavy-tailed"):  # it is that of the scale
+        return ""
+    return f" since step {since}"
+
+
+def _sentence(v: Verdict, found: Found) -> str:
     if not found:
-        return f"no fault found; {_runs(s)} would show a covariance too small by x{s['detectable']:.2g} with power 0.95"
+        return _no_fault(v)
     parts = []
     if any(q in found for q in BIAS):
-        parts.append(_bias(s, "bias" not in found))
-    if any(q in found for q in SCALE):
-        parts.append(_scale(s, found))
-    if any(q in found for q in SHAPE):
-        parts.append(_shape(s, found))
+        parts.append(_bias(v, "bias" not in found))
+    if v.status == "heavy-tailed":
+        assert v.scale is not None
+        parts.append(f"in the mean the covariance ratio is {plain(v.scale.inflation)}")
+    elif v.status != "biased":
+        parts += [_scale(v, found)] if any(q in found for q in SCALE) else []
+        parts += [_shape(v, found)] if any(q in found for q in SHAPE) else []
     if "outliers" in found:
-        o = s["outlier"]
-        text = f"heavy tails: run {o['run']} lies {short(o['distance'])} sigma from the other runs in step {o['step']}"
-        low, high = s["ratio_interval"]
-        parts.insert(0 if low <= 1.0 <= high or not high < UNCERTAIN * low else len(parts), text)
+        assert v.tails is not None
+        where = f"run {v.tails.run} lies {short(v.tails.distance)} sigma from the other runs in step {v.tails.step}"
+        parts.insert(0 if v.status == "heavy-tailed" else len(parts), f"heavy tails: {where}")
+    elif v.status == "heavy-tailed":
+        parts.insert(0, "heavy tails: the runs differ more than Gaussian errors would")
     if "distribution" in found and len(found) == 1:
         parts.append("the NEES does not follow the chi-square distribution")
-    if "innovation scale" in found:
-        parts.append(f"innovations {'larger' if s['nis_ratio'] > 1 else 'smaller'} than stated")
+    if "innovation scale" in found and v.innovations is not None:
+        parts.append(f"innovations {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
     if "innovation whiteness" in found:
         parts.append("innovations correlated over steps")
-    asked = {a["question"] for a in s["answers"]}
-    if any(q in found for q in SCALE) and asked & set(BIAS) and not set(found) & set(BIAS):
+    if any(q in found for q in SCALE) and v.status != "heavy-tailed" and _no_bias(v):
         parts.append("no bias found")
     return "; ".join(parts)
 
 
-def _scale(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    ratio, (low, high) = s["ratio"], s["ratio_interval"]
-    if MAIN not in found and "scale in some step" not in found:  # one axis alone
-        sure = {a: i for a, i in s["of_axes"].items() if not i[1] <= 1.0 <= i[2]}
-        sure = {a: i for a, i in sure.items() if a in s["axes"]} or sure
-        wrong = [f"{a} {_side(i[0])} by {factor(*i)}" for a, i in sure.items()]
-        return f"covariance of {', '.join(wrong) if wrong else 'an axis'}" + ("" if wrong else " wrong")
-    if not s["lasting"] and MAIN not in found:
-        count = s["steps_above"] + s["steps_below"]
-        side = "too small" if s["steps_above"] else "too large"
-        return f"covariance {side} in {count} of {s['judged_steps']} steps, first in step {s['first_step']}"
-    text = f"covariance {_side(ratio)} by {factor(ratio, low, high)}"
-    if not high < UNCERTAIN * low:
-        size = short(max(ratio, 1.0 / max(ratio, 1e-300)))
-        text = f"covariance {_side(ratio)} by x{size} in the mean, which a few runs make"
-    elif low <= 1.0 <= high:
+def _no_bias(v: Verdict) -> bool:
+    """A bias was looked for and not found."""
+    return any(a.question in BIAS for a in v.answers) and not set(v.faults) & set(BIAS)
+
+
+def _no_fault(v: Verdict) -> str:
+    assert v.scale is not None
+    shown, inflation = v.scale.equivalence, v.scale.inflation
+    tolerated = [a.question for a in v.answers if a.tolerated]
+    none = "no fault beyond the tolerance" if tolerated else "no fault found"
+    size = f"covariance ratio {plain(inflation)}"
+    if shown.shown:
+        return f"{none} in {plural(v.runs, 'run')}, and the {size} is shown to be {_within(v, shown)}"
+    advice = ""
+    if shown.runs is not None and shown.runs <= MUCH:
+        advice = f"; {max(shown.runs, v.runs + 1)} such runs would probably decide"
+    return f"{none}, but {plural(v.runs, 'run')} {_do(v.runs)} not show the {size} to be {_within(v, shown)}{advice}"
+
+
+def _within(v: Verdict, shown: Equivalence) -> str:
+    if v.settings.one_sided:
+        return f"below {short(shown.factor)}"
+    return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
+
+
+def _do(runs: int) -> str:
+    return "does" if runs == 1 else "do"
+
+
+def _scale(v: Verdict, found: Found) -> str:
+    assert v.scale is not None
+    assert v.location is not None
+    where, inflation, about = v.location, v.scale.inflation, ""
+    if v.bias is not None and v.bias.inflation_without is not None:
+        inflation, about = v.bias.inflation_without, " about the mean"
+    if MAIN not in found and STEP not in found:
+        return _one_axis(v)
+    if not where.lasting and MAIN not in found:
+        count = where.above + where.below
+        side = "too small" if where.above else "too large"
+        return f"covariance {side} in {count} of {v.scale.judged_steps} steps, first in step {where.first_step}"
+    text = f"covariance{about} {off_by(inflation)}"
+    if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
+        size = short(max(inflation.value, 1.0 / inflation.value))
+        text = f"covariance{about} {_side(inflation.value)} by x{size} in the mean, which a few runs make"
+    elif inflation.holds(1.0) and v.runs > 1:
         text += ", an interval that holds 1: the runs differ more than Gaussian errors would"
-    if s.get("subset"):
-        text += f", mainly {s['subset']}"
+    if where.subset:
+        text += f", mainly {where.subset}"
+    if where.lasting and where.since is None and where.first_step is not None and where.first_step > _first(v.scale):
+        text += f", first visible in step {where.first_step}"
     return text
+
+
+def _first(scale: Scale) -> int:
+    """The first judged step."""
+    return int(np.argmax(scale.alive > 0)) + 1
+
+
+def _one_axis(v: Verdict) -> str:
+    """The fault shows in an axis, a group or a direction alone."""
+    assert v.axes is not None
+    one_sided = v.settings.one_sided
+    sure = {a: i for a, i in v.axes.inflation.items() if (i.low > 1.0 if one_sided else not i.holds(1.0))}
+    sure = {a: i for a, i in sure.items() if a in v.axes.names} or sure
+    sure = dict(sorted(sure.items(), key=lambda item: -abs(np.log(max(item[1].value, TINY))))[:MOST])
+    if v.axes.largest is not None and DIRECTION in v.faults and AXIS not in v.faults:
+        return f"covariance {off_by(v.axes.largest)} in the direction {_direction(v.axes)}"
+    return f"covariance of {', '.join(f'{a} {off_by(i)}' for a, i in sure.items()) if sure else 'an axis wrong'}"
+
+
+def _direction(axes: Axes) -> str:
+    """+0.71 x -0.70 y, of errors in stated standard deviations."""
+    assert axes.direction is not None
+    u = axes.direction * np.sign(axes.direction[np.argmax(np.abs(axes.direction))])
+    return " ".join(f"{value:+.2f} {name}" for value, name in zip(u, axes.names, strict=True) if abs(value) > 0.1)
 
 
 def _side(ratio: float) -> str:
     return "too small" if ratio > 1.0 else "too large"
 
 
-def _bias(s: Mapping[str, Any], in_steps: bool) -> str:
+def _bias(v: Verdict, in_steps: bool) -> str:
+    assert v.bias is not None
+    rest = ""
+    if v.bias.inflation_without is not None and v.status == "biased":
+        rest = f"; without the bias the covariance ratio is {plain(v.bias.inflation_without)}"
     if in_steps:
-        return f"biased in step {s['bias_step']}, mainly {s['bias_axis']}"
-    sure = [f"{a} {m:+.2f} sigma [{lo:+.2f}, {hi:+.2f}]" for a, (m, lo, hi) in s["bias"].items() if not lo <= 0 <= hi]
-    ratio, low, high = s["ratio_without_bias"]
-    rest = f"; without the bias the covariance ratio is {short(ratio)} [{short(low)}, {short(high)}]"
-    return f"biased: {', '.join(sure) if sure else 'in a combination of axes'}{rest}"
+        where = f"in step {v.bias.step}, mainly {v.bias.axis}"
+        return f"{where}{rest}" if v.status == "biased" else f"biased {where}"
+    prefix = "" if v.status == "biased" else "biased: "
+    sure = {axis: interval for axis, interval in v.bias.by_axis.items() if not interval.holds(0.0)}
+    sure = dict(sorted(sure.items(), key=lambda item: -abs(item[1].value))[:MOST])
+    named = [f"{a} {_sigmas(i.value)} sigma [{_sigmas(i.low)}, {_sigmas(i.high)}]" for a, i in sure.items()]
+    return f"{prefix}{', '.join(named) if named else 'in a combination of axes'}{rest}"
 
 
-def _shape(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    where = "" if "shape" in found else f" in step {s['shape_step']}"
+def _sigmas(value: float) -> str:
+    return f"{value:+.2f}" if abs(value) < 100.0 else f"{value:+.1e}"
+
+
+def _shape(v: Verdict, found: Found) -> str:
+    assert v.shape is not None
+    assert v.axes is not None
+    where = "" if "shape" in found else f" in step {v.shape.step}"
     text = f"covariance of the wrong shape{where}"
-    i, j, actual, stated = s["correlation"]
-    if "shape" in found or abs(actual - stated) > NOTABLE:
-        a, b = s["axes"][i], s["axes"][j]
-        return f"{text}: {a} and {b} are correlated {actual:+.2f}, stated {stated:+.2f}"
-    return f"{text}: axes are wrong by different factors"
+    gap = abs(v.shape.actual - v.shape.stated)
+    if v.shape.pair is not None and gap > (VISIBLE if "shape" in found else NOTABLE):
+        a, b = (v.axes.names[i] for i in v.shape.pair)
+        return f"{text}: {a} and {b} are correlated {v.shape.actual:+.2f}, stated {v.shape.stated:+.2f}"
+    return text if "shape" in found else f"{text}: axes are wrong by different factors"
 
 
-def _level(s: Mapping[str, Any]) -> str:
-    low, high = s["acceptance"]
-    text = f"mean NEES {short(s['mean_anees'])}, accepted {short(low)} to {short(high)} ({s['dof']} expected)"
-    if s["worst_run"] > SPREAD * s["median_run"]:
-        text += f"; {short(s['median_run'])} in the median and {short(s['worst_run'])} in the worst run"
-    if s["judged_steps"] > 1:
-        where = [f"{s[f'steps_{side}']} {side}" for side in ("above", "below") if s[f"steps_{side}"]]
+# --- the figures behind it -----------------------------------------------------------------------------
+
+
+def _level(v: Verdict) -> list[str]:
+    assert v.scale is not None
+    assert v.location is not None
+    s, (low, high) = v.scale, v.scale.accepted
+    text = f"mean NEES {short(s.mean_anees)}, accepted {short(low)} to {short(high)} ({s.dof} expected)"
+    if s.worst_run > SPREAD * s.median_run:
+        text += f"; {short(s.median_run)} in the median and {short(s.worst_run)} in the worst run"
+    if s.judged_steps > 1:
+        counts = {"above": v.location.above, "below": v.location.below}
+        where = [f"{count} {side}" for side, count in counts.items() if count]
         text += f"; steps outside the simultaneous band: {' and '.join(where) if where else 'none'}"
-        text += f" of {s['judged_steps']}"
-    return text
+        text += f" of {s.judged_steps}"
+    tolerated = [a.question for a in v.answers if a.tolerated]
+    lines = [text]
+    if tolerated:
+        lines.append(
+            f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"
+        )
+    return lines
 
 
-def _coverage(s: Mapping[str, Any]) -> list[str]:
-    if "axes" not in s:
+def _coverage(v: Verdict) -> list[str]:
+    if v.accuracy is None or v.axes is None:
         return []
-    known = [(axis, c) for axis, c in zip(s["axes"], s["coverage"], strict=True) if np.isfinite(c)]
+    known = [(axis, c) for axis, c in zip(v.axes.names, v.accuracy.coverage, strict=True) if np.isfinite(c)]
     if not known:
         return []
     covered = ", ".join(f"{axis} {100 * c:.1f} %" for axis, c in known)
     text = f"2-sigma coverage {covered} ({100 * TWO_SIGMA:.1f} % expected)"
-    if np.isfinite(s["nci"]):
-        text += f"; noncredibility index {s['nci']:.1f} dB, inclination {s['inclination']:+.1f} dB"
+    if np.isfinite(v.accuracy.nci):
+        text += f"; noncredibility index {v.accuracy.nci:.1f} dB, inclination {v.accuracy.inclination:+.1f} dB"
     return [text]
 
 
-def _without_truth(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+def _without_truth(v: Verdict, found: Found) -> str:
+    assert v.innovations is not None
+    if not v.innovations.judged:
+        return (
+            "no truth, and innovations decide nothing unless the filter declares an optimal gain: those of any other "
+            "filter are neither white nor of the stated size even if it is right"
+        )
     parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
     if "innovation scale" in found:
-        parts.append(f"they are {'larger' if s['nis_ratio'] > 1 else 'smaller'} than stated")
+        parts.append(f"they are {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
     if "innovation whiteness" in found:
         parts.append("they are correlated over steps")
+    shown = v.innovations.equivalence
+    if not found and shown is not None:
+        is_shown = "is shown to be" if shown.shown else "is not shown to be"
+        parts.append(f"their NIS {is_shown} {_within(v, shown)} times its degrees of freedom")
     return "; ".join(parts)
 
 
-def _nis(s: Mapping[str, Any]) -> str:
-    (low, high), ratio = s["nis_interval"], s["nis_ratio"]
-    if not np.isfinite(ratio):
+def _nis(v: Verdict) -> str:
+    assert v.innovations is not None
+    i = v.innovations
+    if not np.isfinite(i.ratio):
         return "no NIS: the filter reports no innovations"
-    text = f"NIS per degree of freedom {ratio:.3f} ({low:.3f} to {high:.3f} expected)"
-    r = np.asarray(s.get("autocorrelation", []))
-    if len(r):
-        text += f", autocorrelation {r[0]:+.3f} at lag 1 (within {s['autocorrelation_bound']:.3f} expected)"
+    text = f"NIS per degree of freedom {i.ratio:.3f}"
+    if not i.judged:
+        return f"{text}, reported and not judged: no optimal gain is declared"
+    text += f" ({i.interval[0]:.3f} to {i.interval[1]:.3f} expected)"
+    if len(i.autocorrelation):
+        text += f", autocorrelation {i.autocorrelation[0]:+.3f} at lag 1 (within {i.bound:.3f} expected)"
     return text
 
 
-def _asked(s: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    asked = [a["question"] for a in s["answers"]]
-    text = f"{len(asked)} questions at a false-alarm rate of {s['false_alarm']:.3g} together"
-    if len(asked) == 1:
-        text = f"1 question at a false-alarm rate of {s['false_alarm']:.3g}"
+def _asked(v: Verdict, found: Found) -> str:
+    count, rate = len(v.answers), v.settings.false_alarm
+    text = f"{plural(count, 'question')} at a false-alarm rate of {rate:.3g}{' together' if count > 1 else ''}"
     if not found:
-        least = min(s["answers"], key=lambda a: a["adjusted"])
-        return f"{text}; nearest to a fault: {least['question']} (corrected p {p_text(least['adjusted'])})"
-    return f"{text}; found: " + ", ".join(f"{q} (p {p_text(a['adjusted'])})" for q, a in found.items())
-
-
-def _runs(s: Mapping[str, Any]) -> str:
-    return f"{s['runs']} run{'s' * (s['runs'] != 1)}"
+        least = min(v.answers, key=lambda a: a.adjusted)
+        return f"{text}; nearest to a fault: {least.question} (corrected p {p_text(least.adjusted)})"
+    return f"{text}; found: " + ", ".join(f"{q} (p {p_text(a.adjusted)})" for q, a in found.items())

@@ -48,12 +48,16 @@ class Compiled:
     """``init``, ``predict``, ``update``, ``pose`` of the twin, and ``run`` of the kernel.
 
     ``local_from``: variables in the state from which the kernel updates locally; the numbers are the same.
+    ``innovations``: "optimal" where they are white if the belief is right, see :class:`consistency.protocols.Filter`.
     """
 
     local_from = LOCAL_FROM
 
-    def __init__(self, twin: ExtendedKalman, rule: int, model: int, sensors: tuple[str, ...]) -> None:
+    def __init__(
+        self, twin: ExtendedKalman, rule: int, model: int, sensors: tuple[str, ...], innovations: str | None = None
+    ) -> None:
         self.twin, self.rule, self.model, self.sensors = twin, rule, model, sensors
+        self.innovations = innovations
         self.name = twin.name
 
     def init(self, problem: Problem) -> Any:

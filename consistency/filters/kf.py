@@ -5,4 +5,4 @@ from consistency.filters.observation import LINEAR
 from consistency.filters.rules import FIXED
 from consistency.filters.textbook import LinearKalman
 
-FILTER = Compiled(LinearKalman("kf", uvd=False), rule=FIXED, model=LINEAR, sensors=("linear",))
+FILTER = Compiled(LinearKalman("kf", uvd=False), rule=FIXED, model=LINEAR, sensors=("linear",), innovations="optimal")

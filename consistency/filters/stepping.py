@@ -16,6 +16,12 @@ from consistency.types import Array, Estimates, Failure, Trial
 SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
 
 
+def optimal_gain(filter_: Filter) -> bool:
+    """Does the filter declare that its gain is optimal, so that its innovations may be judged?"""
+    declared = getattr(filter_, "innovations", None)
+    return isinstance(declared, str) and declared == "optimal"
+
+
 def name_of(filter_: Filter) -> str:
     """``name`` of a filter, or its class's."""
     return str(getattr(filter_, "name", type(filter_).__name__))

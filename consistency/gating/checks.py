@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.diagnostics import judge, nis_of
-from consistency.types import Array, Failure, Indices, Verdict
+from consistency.diagnostics import Evidence, Settings, Verdict, judge, nis_of
+from consistency.gating.watch import Terms
+from consistency.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
     from consistency.results import Results
@@ -20,18 +21,29 @@ SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix; below, its inve
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """The runs of one estimator, as the referee takes them."""
+class Candidate:
+    """The runs of one estimator, and how it wants to be looked at."""
 
-    name: str
+    evidence: Evidence
     runs: int
     planned_dof: int  # degrees of freedom that one run is sure to bring
-    arrays: Mapping[str, Any]  # of judge
-    failures: tuple[Failure, ...] = ()
+    subsets: Mapping[str, Sequence[int]] | None = None
+    method: str = "max"
 
-    def judge(self, false_alarm: float, allow: str | None) -> Verdict:
+    @property
+    def name(self) -> str:
+        return self.evidence.name
+
+    @property
+    def failures(self) -> tuple[Failure, ...]:
+        return self.evidence.failures
+
+    def judge(self, false_alarm: float, asked: Terms) -> Verdict:
         """See :func:`consistency.diagnostics.judge`."""
-        return judge(self.name, failures=self.failures, false_alarm=false_alarm, allow=allow, **self.arrays)
+        settings = Settings(
+            false_alarm, asked.detect, asked.power, asked.tolerance, asked.allow, self.method, self.subsets
+        )
+        return judge(self.evidence, settings)
 
 
 def evidence(
@@ -47,9 +59,10 @@ def evidence(
     axes: Sequence[str] | None,
     subsets: Mapping[str, Sequence[int]] | None,
     method: str,
-) -> Evidence:
+    optimal_gain: bool = False,
+) -> Candidate:
     """Checked arrays of one estimator; shapes and errors as :func:`consistency.testing.assert_consistent`."""
-    given: dict[str, Any] = {"axes": axes, "subsets": subsets, "method": method}
+    given: dict[str, Any] = {"axes": axes}
     if (errors is None) != (covariances is None):
         there, missing = ("covariances", "errors") if errors is None else ("errors", "covariances")
         raise ValueError(f"{there} without {missing}: give both")
@@ -67,8 +80,8 @@ def evidence(
         if dof < 1:
             raise ValueError(f"dof must be at least 1, got {dof}")
         given |= {"nees": values("nees", nees), "dof": dof}
-        for key in ("axes", "subsets"):
-            if given[key] is not None:
+        for key, value in (("axes", axes), ("subsets", subsets)):
+            if value is not None:
                 raise ValueError(f"{key} needs errors and covariances: the nees does not know its components")
     given |= _innovations(nis, nis_dof, innovations, innovation_covariances)
     first = next((given[key] for key in ("error", "nees", "nis") if key in given), None)
@@ -78,8 +91,13 @@ def evidence(
         if key in given and given[key].shape[:2] != first.shape[:2]:
             raise ValueError(f"{key} has {given[key].shape[:2]} runs and steps, the errors have {first.shape[:2]}")
     if dof is None or ("error" not in given and "nees" not in given):
+        if not optimal_gain:
+            raise ValueError(
+                "innovations alone are judged only with optimal_gain=True: those of any other gain are not white, nor "
+                "of the stated size, even if the filter is right"
+            )
         dof = max(1, int(given["nis_dof"].sum(axis=1).min()))
-    return Evidence(name, len(first), dof, given)
+    return Candidate(Evidence(name, **given, optimal_gain=optimal_gain), len(first), dof, subsets, method)
 
 
 def of_results(
@@ -88,7 +106,7 @@ def of_results(
     name: str | None = None,
     subsets: Mapping[str, Sequence[int]] | None = None,
     method: str = "max",
-) -> Evidence:
+) -> Candidate:
     """One filter of the bench's own results, with its failed runs.
 
     Steps whose covariance is rank-deficient are left out, as everywhere in the bench.
@@ -98,7 +116,7 @@ def of_results(
     ValueError
         No results, no such filter, or more than one to choose from.
     """
-    from consistency.judge import curves
+    from consistency.judge import curves, evidence_of
     from consistency.results import POSE, Results
 
     if not isinstance(results, Results):
@@ -108,12 +126,9 @@ def of_results(
             raise ValueError(f"filter: name one of {', '.join(results.filters)}")
         filter_name = results.filters[0]
     c = curves(results, filter_name)
-    arrays = {
-        "error": c.error, "covariance": c.covariance, "nees": c.nees, "nis": c.nis, "nis_dof": c.nis_dof,
-        "axes": POSE, "run_numbers": c.runs, "subsets": subsets, "method": method,
-    }  # fmt: skip
+    given = evidence_of(c)
     dof = len(POSE) if c.error is not None else max(1, int(c.nis_dof.sum(axis=1).min()))
-    return Evidence(name or filter_name, len(c.runs), dof, arrays, c.failures)
+    return Candidate(replace(given, name=name or filter_name), len(c.runs), dof, subsets, method)
 
 
 # --- arrays ----------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.diagnostics import Comparison, RunSummary, compare, summary, whiten
-from consistency.gating.checks import Evidence, evidence, of_results
+from consistency.gating.checks import Candidate, evidence, of_results
 
 if TYPE_CHECKING:
     from consistency.comparison import Baseline
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Sides:
     """Two filters to compare."""
 
-    candidate: Evidence
+    candidate: Candidate
     a: RunSummary
     b: RunSummary
     name_b: str
@@ -93,13 +93,14 @@ def _side(
     nees: ArrayLike | None,
     dof: int | None,
     axes: Sequence[str] | None,
-) -> tuple[Evidence, RunSummary]:
+) -> tuple[Candidate, RunSummary]:
     try:
         given = evidence(name, errors, covariances, nees, dof, None, None, None, None, axes, None, "max")
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
-    e, P = given.arrays.get("error"), given.arrays.get("covariance")
-    values = given.arrays["nees"] if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
+    e, P = given.evidence.error, given.evidence.covariance
+    values = given.evidence.nees if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
+    assert values is not None
     return given, summary(values, given.planned_dof, e, P)
 
 

@@ -17,9 +17,9 @@ SUFFIXES = (".json", ".html")
 # colours of the bench's report, and lighter ones on dark ground with a contrast above 4.5
 STYLE = """
 :root { color-scheme: light dark; --ink: #1a1a1a; --ground: #fff; --line: #d5d5d5; --faint: #444;
-  --consistent: #00664a; --overconfident: #a84300; --conservative: #00507d; }
+  --consistent: #00664a; --overconfident: #a84300; --conservative: #00507d; --biased: #8a2a63; --undecided: #4d4d4d; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e8e8e8; --ground: #16181a; --line: #44484c; --faint: #b5b5b5;
-  --consistent: #4fd1a5; --overconfident: #ff9d5c; --conservative: #6cb8f0; } }
+  --consistent: #4fd1a5; --overconfident: #ff9d5c; --conservative: #6cb8f0; --biased: #f09cc8; --undecided: #b5b5b5; } }
 body { margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 96rem; color: var(--ink); background: var(--ground);
   font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 .scroll { overflow-x: auto; }
@@ -31,18 +31,19 @@ tbody td:last-child { min-width: 22rem; }
 .number { text-align: right; white-space: nowrap; }
 .verdict { display: inline-block; padding: 0 .5em; border: 1.5px solid currentColor; border-radius: .7em;
   font-weight: 600; white-space: nowrap; }
-.consistent { color: var(--consistent); }
-.overconfident { color: var(--overconfident); }
+.consistent, .not-worse { color: var(--consistent); }
+.overconfident, .worse { color: var(--overconfident); }
 .conservative { color: var(--conservative); border-style: dashed; }
+.biased { color: var(--biased); }
+.heavy-tailed { color: var(--biased); border-style: dashed; }
+.inconsistent { color: var(--overconfident); border-style: dashed; }
+.undecided { color: var(--undecided); border-style: dotted; }
 .failed { color: var(--ground); background: var(--ink); border-color: var(--ink); }
 summary { cursor: pointer; }
 ul { margin: .25rem 0; padding-left: 1.2rem; color: var(--faint); }
 """
-CLASSES = {
-    "consistent": "consistent", "not worse": "consistent", "conservative": "conservative", "failed": "failed",
-}  # fmt: skip
-HEAD = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "needed", "inflation", "why")
-NUMBERS = {"p", "false-alarm rate", "runs", "needed", "inflation"}
+HEAD = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "planned", "inflation", "why")
+NUMBERS = {"p", "false-alarm rate", "runs", "planned", "inflation"}
 
 
 def as_json(ledger: Ledger) -> str:
@@ -90,7 +91,7 @@ def as_html(ledger: Ledger) -> str:
 
 def _row(e: Entry) -> str:
     first, *rest = e.reasons
-    colour = CLASSES.get(e.status, "overconfident")
+    colour = e.status.replace(" ", "-")
     more = "".join(f"<li>{escape(reason)}</li>" for reason in rest)
     cells = [
         escape(e.gate), escape(e.name), escape(outcome(e)), f'<span class="verdict {colour}">{escape(e.status)}</span>',

@@ -9,7 +9,7 @@ from typing import Any
 
 from consistency.gating.budget import final_rate
 from consistency.gating.watch import Entry
-from consistency.gating.wording import fault_text, few_text, plan_command
+from consistency.gating.wording import fault_text, few_to_compare
 
 PROPERTY = "consistency"  # of a test, one a gate: JSON without the statistics
 STATISTICS = "consistency_statistics"  # attribute of its reports: of every gate, as JSON
@@ -98,10 +98,8 @@ def settled(entry: Entry, rate: float, budget: float, gates: int) -> tuple[Entry
     if entry.p_value is not None and entry.p_value <= rate:
         entry = replace(entry, outcome="fault found", **entry.late)
         return entry, f"{fault_text(entry.gate, entry.name, entry.reasons)}\n{share}"
-    if entry.runs < needed:
-        plan = entry.detect, rate, entry.power
-        command = None if entry.standard_error is not None else plan_command(entry.dof, *plan, entry.allow)
-        text = few_text(entry.gate, entry.name, entry.runs, needed, *plan, command)
+    if entry.standard_error is not None and entry.runs < needed:
+        text = few_to_compare(entry.gate, entry.name, entry.runs, needed, entry.detect, rate, entry.power)
         return replace(entry, outcome="too few runs"), f"{text}\n{share}"
     return entry, ""
 
@@ -119,7 +117,7 @@ def needed_at(entry: Entry, rate: float) -> int:
 def lines(ledger: Ledger) -> Iterator[str]:
     """The summary for a terminal: a row a gate, and under it why it did not pass."""
     entries = ledger.entries()
-    rows = [("test", "gate", "outcome", "p", "runs", "needed", "inflation")]
+    rows = [("test", "gate", "outcome", "p", "runs", "planned", "inflation")]
     for e in entries:
         rows.append((e.test, e.gate, outcome(e), number(e.p_value), str(e.runs), str(e.needed), interval(e)))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

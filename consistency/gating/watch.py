@@ -10,7 +10,9 @@ from typing import Any
 from consistency.gating.budget import in_place_rate
 
 # of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose
-DEFAULTS: dict[str, Any] = {"dof": 3, "detect": 1.5, "false_alarm": 1e-3, "power": 0.95, "allow": None}
+DEFAULTS: dict[str, Any] = {
+    "dof": 3, "detect": 1.5, "false_alarm": 1e-3, "power": 0.95, "tolerance": None, "allow": None,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Terms:
     detect: float
     power: float
     allow: str | None
+    tolerance: float | None = None
     budget: float | None = None  # of the whole session; ``false_alarm`` is then provisional
     may_fail: bool = True  # in place
 
@@ -94,7 +97,13 @@ def watching(watch: Watch) -> Iterator[None]:
         _watches.remove(watch)
 
 
-def terms(false_alarm: float | None, detect: float | None, power: float | None, allow: str | None) -> Terms:
+def terms(
+    false_alarm: float | None,
+    detect: float | None,
+    power: float | None,
+    allow: str | None,
+    tolerance: float | None = None,
+) -> Terms:
     """Arguments first, then the marker of the running test, then the session's budget, then the defaults.
 
     Raises
@@ -103,8 +112,10 @@ def terms(false_alarm: float | None, detect: float | None, power: float | None, 
         An argument out of its range.
     """
     watch = current()
-    said: dict[str, Any] = {"false_alarm": false_alarm, "detect": detect, "power": power, "allow": allow}
-    chosen: dict[str, Any] = dict(watch.marked) | {key: value for key, value in said.items() if value is not None}
+    given: dict[str, Any] = {
+        "false_alarm": false_alarm, "detect": detect, "power": power, "allow": allow, "tolerance": tolerance,
+    }  # fmt: skip
+    chosen: dict[str, Any] = dict(watch.marked) | {key: value for key, value in given.items() if value is not None}
     asked = DEFAULTS | chosen
     for key in ("false_alarm", "power"):
         if not 0.0 < asked[key] < 1.0:
@@ -115,7 +126,10 @@ def terms(false_alarm: float | None, detect: float | None, power: float | None, 
         raise ValueError(f"allow must be 'conservative' or None, got '{asked['allow']}'")
     if asked["allow"] == "conservative" and asked["detect"] < 1.0:
         raise ValueError(f"detect {asked['detect']} is a covariance too large, which allow='conservative' accepts")
-    rest = float(asked["detect"]), float(asked["power"]), asked["allow"]
+    wide = asked["tolerance"]
+    if wide is not None and (not 0.0 < wide < float("inf") or wide == 1.0):
+        raise ValueError(f"tolerance must be a positive ratio of true to stated covariance, not 1; got {wide}")
+    rest = float(asked["detect"]), float(asked["power"]), asked["allow"], wide
     if watch.budget is None or "false_alarm" in chosen:
         return Terms(float(asked["false_alarm"]), *rest)
     rate = in_place_rate(watch.budget, watch.tests, watch.budgeted)

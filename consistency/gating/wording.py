@@ -19,18 +19,31 @@ def plan_command(dof: int, detect: float, false_alarm: float, power: float, allo
     )  # fmt: skip
 
 
-def few_text(
-    gate: str, name: str, runs: int, needed: int, detect: float, false_alarm: float, power: float, command: str | None
+def undecided_text(
+    gate: str,
+    name: str,
+    sentence: str,
+    needed: int,
+    dof: int,
+    detect: float,
+    false_alarm: float,
+    power: float,
+    allow: str | None,
 ) -> str:
-    """How many runs are missing, for what, and where the number comes from."""
-    found, fault = "has no fault found", "a covariance wrong by"
-    if command is None:
-        found, fault = "is not found worse", "a covariance ratio farther from 1 by"
-    text = (
-        f"{gate}: {name} {found}, but {runs} run{'s are' if runs != 1 else ' is'} too few to pass: "
-        f"{needed} find {fault} x{detect:g} with power {power:g} "
-        f"at a false-alarm rate of {false_alarm:.3g}"
+    """Neither a fault nor that there is none: how many runs to simulate, and where the number comes from."""
+    return (
+        f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for a larger detect; the number that is enough "
+        f"however the steps depend on each other: {plan_command(dof, detect, false_alarm, power, allow)}"
     )
-    if command is None:  # of a comparison: the spread between the runs decides, not a table
-        return f"{text}, at the spread between these runs. Simulate more runs, or ask for a larger detect."
-    return f"{text}. Simulate {needed} runs, or ask for a larger detect; the same number: {command}"
+
+
+def few_to_compare(
+    gate: str, name: str, runs: int, needed: int, detect: float, false_alarm: float, power: float
+) -> str:
+    """How many runs a comparison lacks, and for what."""
+    return (
+        f"{gate}: {name} is not found worse, but {runs} run{'s are' if runs != 1 else ' is'} too few to pass: "
+        f"{needed} find a covariance ratio farther from 1 by x{detect:g} with power {power:g} "
+        f"at a false-alarm rate of {false_alarm:.3g}, at the spread between these runs. Simulate more runs, or ask for "
+        "a larger detect."
+    )

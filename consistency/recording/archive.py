@@ -26,7 +26,7 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
     dimension. Optional: ``nis`` and ``nis_dof`` (runs, steps), ``axes`` (n,), ``t`` (steps,), and ``lengths``
     (runs,), the number of steps of each run, where they differ.
     """
-    arrays = _load(path)
+    arrays = load_arrays(path)
     kind = next((keys for keys in NEEDED if set(keys) <= set(arrays)), None)
     if kind is None:
         raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(arrays)) or 'nothing'}")
@@ -53,7 +53,7 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
     runs, steps, n = error.shape
     if covariances.shape != (runs, steps, n, n):
         raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {(runs, steps, n, n)}")
-    lengths = _lengths(path, arrays, runs, steps)
+    lengths = run_lengths(path, arrays, runs, steps)
     nis, dof = _nis(path, arrays, (runs, steps))
     tracks = []
     for run, length in enumerate(lengths):
@@ -62,14 +62,23 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
         cut = (None if values is None else values[run, :length] for values in (nis, dof))
         tracks.append(Track(run, np.arange(length), place, error[run, :length], P, *cut))
     notes = [f"error convention {chosen}: {PLANAR[chosen]}"] if chosen else []
-    return [assemble(path.stem, tracks, _times(path, arrays, steps), _axes(path, arrays, n), str(path), chosen, notes)]
+    return [
+        assemble(path.stem, tracks, step_times(path, arrays, steps), _axes(path, arrays, n), str(path), chosen, notes)
+    ]
 
 
-def _load(path: Path) -> dict[str, Array]:
+def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
+    """All arrays of an archive; ``keys`` says in messages which it should hold.
+
+    Raises
+    ------
+    InputError
+        The file is missing, or not an archive of arrays.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             if not hasattr(archive, "files"):
-                raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {KINDS}")
+                raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
             return {key: archive[key] for key in archive.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
@@ -100,7 +109,8 @@ def _require_truth(path: Path, truth: Array, estimates: Array) -> None:
         raise InputError(f"{path}: key 'truth', run {run}, step {step + 1}: not finite")
 
 
-def _lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> list[int]:
+def run_lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> list[int]:
+    """Steps of each run; key ``lengths`` where they differ."""
     if "lengths" not in arrays:
         return [steps] * runs
     lengths = np.atleast_1d(arrays["lengths"])
@@ -127,7 +137,8 @@ def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[
     return nis, np.where(known, dof, 0.0)
 
 
-def _times(path: Path, arrays: dict[str, Array], steps: int) -> Array:
+def step_times(path: Path, arrays: dict[str, Array], steps: int) -> Array:
+    """Key ``t``, (steps,) in s; NaN without it."""
     if "t" not in arrays:
         return np.full(steps, np.nan)
     t = arrays["t"]
@@ -158,7 +169,7 @@ def _of_nees(path: Path, arrays: dict[str, Array]) -> Recording:
     n = int(dof)
     nis, nis_dof = _nis(path, arrays, (runs, steps))
     failures = []
-    for run, length in enumerate(_lengths(path, arrays, runs, steps)):
+    for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
         nees[run, length:] = np.nan
         finite = np.isfinite(nees[run, :length])
         first = int(np.argmax(finite)) if finite.any() else 0
@@ -168,6 +179,6 @@ def _of_nees(path: Path, arrays: dict[str, Array]) -> Recording:
             nees[run, step:] = np.nan
             failures.append(Failure(path.stem, run, step + 1, "NEES is not finite"))
     axes = _axes(path, arrays, n)
-    t = _times(path, arrays, steps)
+    t = step_times(path, arrays, steps)
     empty = Recording(path.stem, np.arange(runs), t, None, None, nees, n, nis, nis_dof, axes, ())
     return replace(empty, failures=tuple(failures))

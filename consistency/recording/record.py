@@ -246,5 +246,5 @@ def count(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-def listed(numbers: Sequence[int]) -> str:
+def listed(numbers: Sequence[object]) -> str:
     return ", ".join(map(str, numbers[:5])) + ", …" * (len(numbers) > 5)

@@ -96,7 +96,7 @@ def _recording(
     max_dt: float | None,
 ) -> Recording:
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet.data), int)
-    order = _order(sheet, runs, key)
+    order = row_order(sheet, runs, key)
     sheet, runs = sheet.rows(order), runs[order]
     keys = sheet.numbers(key, finite=True)
     error = covariance = None
@@ -141,8 +141,8 @@ def _recording(
     return made if truth is not None else replace(made, error=None, dof=0)
 
 
-def _order(sheet: Sheet, runs: Array, key: str) -> Indices:
-    """Rows by run and step. Timestamps must be in order already: a jump back is another run or another clock."""
+def row_order(sheet: Sheet, runs: Array, key: str) -> Indices:
+    """Rows by run and ``key`` (step or t). Timestamps must be in order: a jump back is another run or another clock."""
     values = sheet.numbers(key, finite=True, whole=key == "step")
     order = np.argsort(runs, kind="stable") if key == "t" else np.lexsort((values, runs))
     same = np.diff(runs[order]) == 0
@@ -171,7 +171,7 @@ def _matched(
     _require(truth, axes)
     values = np.column_stack([truth.numbers(axis, finite=True) for axis in axes])
     true_runs = truth.numbers("run", whole=True).astype(int) if "run" in truth else None
-    order = _order(truth, true_runs if true_runs is not None else np.zeros(len(values), int), key)
+    order = row_order(truth, true_runs if true_runs is not None else np.zeros(len(values), int), key)
     true_keys = truth.numbers(key)
     tolerance = 0.0 if key == "step" else _default_dt(max_dt)
     keep, true = np.zeros(len(keys), bool), np.full((len(keys), len(axes)), np.nan)

@@ -8,11 +8,17 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from consistency.atomic import write_whole
 from consistency.errors import InputError
 
-__all__ = ["write_reports"]
+if TYPE_CHECKING:
+    from consistency.monitoring import Watched
+
+__all__ = ["require_plot", "write_monitor_plot", "write_reports"]
+
+KINDS = (".png", ".pdf", ".svg")  # of a plot
 
 
 def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: bool) -> list[Path]:
@@ -54,6 +60,26 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     for path, content in contents:
         _write(path, content)
     return targets
+
+
+def require_plot(path: Path, overwrite: bool) -> None:
+    """Refuse, before any work, a plot that cannot be written.
+
+    Raises
+    ------
+    InputError
+        The kind of file is unknown, the file exists, or it cannot be written.
+    """
+    if path.suffix.lower() not in KINDS:
+        raise InputError(f"--plot {path}: must end in {', '.join(KINDS)}")
+    _require_writable(path, overwrite)
+
+
+def write_monitor_plot(path: Path, watched: Watched) -> None:
+    """NIS and evidence of a run over its steps, as PNG, PDF or SVG by the suffix of ``path``."""
+    from consistency.reporting.monitor import monitor_plot
+
+    _write(path, monitor_plot(watched, path.suffix.lower().removeprefix(".")))
 
 
 def _require_writable(path: Path, overwrite: bool) -> None:

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from consistency.diagnostics import Verdict
 from consistency.errors import InputError
 from consistency.findings import read_findings
-from consistency.judge import Curves, analyse, curves
+from consistency.judge import Curves, analyse, curves, design_of
 from consistency.models.motion import dead_reckoning
 from consistency.reporting.calibration import calibration
 from consistency.reporting.distributions import distributions
@@ -22,7 +23,7 @@ from consistency.results import read_results
 from consistency.scenario import Scenario
 from consistency.simulation import simulate
 from consistency.storage import read_manifest
-from consistency.types import Array, Verdict
+from consistency.types import Array
 
 DECADE = 10.0  # values that span more are drawn on a log axis
 DEGREES = np.array([1.0, 1.0, 180.0 / np.pi])
@@ -65,7 +66,7 @@ def _study(folder: Path, styles: dict[str, int], said: tuple[tuple[str, str], ..
     steps = max((len(c.t) for c in all_curves.values()), default=0)
     for name in results.filters:
         styles.setdefault(name, len(styles))
-    common = _common_band(verdicts)
+    common = _common(verdicts)
     paths = {name: _path(results.estimates, name, shown, steps) for name in results.filters}
     tracks = tuple(_track(all_curves[n], verdicts[n], shown, styles[n], common, paths[n]) for n in results.filters)
     resolved = results.manifest.get("scenario") or results.manifest.get("belief") or {}
@@ -82,22 +83,19 @@ def _study(folder: Path, styles: dict[str, int], said: tuple[tuple[str, str], ..
         anees_log=_wide([v for t in tracks for v in (t.anees, t.simultaneous) if v is not None]),
         nis_log=_wide([t.nis_ratio for t in tracks]),
         is_log=scenario is None,
+        until_decided=design_of(results) is not None,
         provenance=tuple(row for row in _provenance(results.manifest) if row not in said),
         resolved=json.dumps(_rounded(resolved), indent=2, ensure_ascii=False),
     )
 
 
-def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | None, path: Array) -> Track:
+def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Verdict | None, path: Array) -> Track:
     steps = len(c.t)
     row = int(np.searchsorted(c.runs, shown))
     has_run = row < len(c.runs) and c.runs[row] == shown
-    s = verdict.statistics
-    band = s.get("band")
+    scale, location = verdict.scale, verdict.location
     variance = np.diagonal(c.covariance, axis1=-2, axis2=-1)
-    known = np.isfinite(c.nis) & (c.nis_dof > 0)
-    dof = np.where(known, c.nis_dof, 0).sum(axis=0)
-    total = np.where(known, c.nis, 0.0).sum(axis=0)
-    ratio = np.where(dof > 0, total / np.maximum(dof, 1), np.nan)
+    ratio = _nis_ratio(c, verdict.runs)
     empty = np.full((steps, 3), np.nan)
     return Track(
         name=c.filter,
@@ -106,24 +104,38 @@ def _track(c: Curves, verdict: Verdict, shown: int, style: int, common: Array | 
         path=path,
         error=None if c.error is None else DEGREES * (c.error[row] if has_run else empty),
         sigma=DEGREES * np.sqrt(np.maximum(variance[row], 0.0)) if has_run else empty,
-        anees=s.get("anees"),
-        band=band,
-        simultaneous=s.get("simultaneous"),
-        own_band=bool(c.failures) and not _same(band, common),
+        anees=None if scale is None else scale.anees,
+        band=None if scale is None else scale.band,
+        simultaneous=None if location is None else location.simultaneous,
+        own_band=_fewer(verdict, common),
         nis_ratio=ratio,
         nis_log=_wide([ratio]),
+        failures=c.failures,
     )
 
 
-def _same(a: Array | None, b: Array | None) -> bool:
-    return a is None or b is None or np.array_equal(a, b, equal_nan=True)
+def _nis_ratio(c: Curves, runs: int) -> Array:
+    """NIS of the first ``runs`` runs over their degrees of freedom in each step, (steps,)."""
+    nis, nis_dof = c.nis[:runs], c.nis_dof[:runs]
+    known = np.isfinite(nis) & (nis_dof > 0)
+    dof = np.where(known, nis_dof, 0).sum(axis=0)
+    total = np.where(known, nis, 0.0).sum(axis=0)
+    return np.asarray(np.where(dof > 0, total / np.maximum(dof, 1), np.nan))
 
 
-def _common_band(verdicts: dict[str, Verdict]) -> Array | None:
-    """The band of the filter with the fewest failed runs: those of the others are wider."""
-    judged = [v.statistics for v in verdicts.values() if v.statistics.get("judged_steps")]
-    best = min(judged, key=lambda s: (len(s["failures"]), -int(s["alive"].sum())), default=None)
-    return None if best is None else best["band"]
+def _common(verdicts: dict[str, Verdict]) -> Verdict | None:
+    """The verdict of most runs whose band is drawn for all filters: those of the others are wider."""
+    judged = [(v, v.scale) for v in verdicts.values() if v.scale is not None and v.scale.judged_steps]
+    best = min(judged, key=lambda p: (-p[0].runs, len(p[0].failures), -int(p[1].alive.sum())), default=None)
+    return None if best is None else best[0]
+
+
+def _fewer(verdict: Verdict, common: Verdict | None) -> bool:
+    """Whether failed runs, or an earlier decision, have made the band another one than the common band."""
+    if verdict.scale is None or common is None or common.scale is None:
+        return False
+    same = np.array_equal(verdict.scale.band, common.scale.band, equal_nan=True)
+    return not same and (bool(verdict.failures) or verdict.runs < common.runs)
 
 
 def _wide(values: list[Array]) -> bool:

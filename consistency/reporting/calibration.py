@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,33 +18,68 @@ CONFIDENCE = 0.99  # of the interval of a measured share
 
 @dataclass(frozen=True)
 class Rate:
-    """Share of gates in which a fault was found, for one world and one ratio of true to stated covariance."""
+    """Share of gates of one world that answered a question as is counted."""
 
     world: str
-    ratio: float  # 1: nothing is wrong
+    question: str
+    ratio: float  # of true to stated covariance; 1: nothing is wrong
     runs: int  # of a gate, at most
-    looks: int  # at which a gate may end early
+    looks: int  # 1, or 0 where a gate ends when it is decided
     mean_runs: float  # that a gate took
-    promised: float  # at most this false-alarm rate, or at least this power
+    promised: float
+    at_most: bool  # the share is promised to be at most, else at least, that
     gates: int
     measured: float
     interval: tuple[float, float]  # exact binomial, Clopper & Pearson (1934)
 
+    @property
+    def broken(self) -> bool:
+        """The whole interval lies on the wrong side of the promise."""
+        low, high = self.interval
+        return low > self.promised if self.at_most else high < self.promised
+
+
+@dataclass(frozen=True)
+class Promise:
+    """One promise in all worlds in which it was measured."""
+
+    question: str
+    rates: tuple[Rate, ...]  # alike in ratio, runs and promise
+
+    @property
+    def worst(self) -> Rate:
+        """The world that is nearest to breaking the promise, or breaks it most."""
+        return max(self.rates, key=lambda rate: rate.measured if rate.at_most else -rate.measured)
+
+    @property
+    def best(self) -> Rate:
+        return min(self.rates, key=lambda rate: rate.measured if rate.at_most else -rate.measured)
+
 
 @dataclass(frozen=True)
 class Calibration:
-    """Measured false-alarm rates and power."""
+    """Measured false alarms, power and wrong all-clears."""
 
     steps: int
     dof: int
     seed: int
-    false_alarms: tuple[Rate, ...]
-    power: tuple[Rate, ...]
+    questions: dict[str, str]  # name -> what is counted
+    worlds: dict[str, str]  # name -> what it is
+    rates: tuple[Rate, ...]
 
     @property
     def gates(self) -> int:
         """Verdicts in all rows together."""
-        return sum(rate.gates for rate in self.false_alarms + self.power)
+        return sum(rate.gates for rate in self.rates)
+
+    @property
+    def promises(self) -> list[Promise]:
+        """Rates by promise; questions in the order of ``questions``."""
+        found: dict[tuple[Any, ...], list[Rate]] = {}
+        for rate in sorted(self.rates, key=lambda rate: list(self.questions).index(rate.question)):
+            key = rate.question, rate.ratio, rate.runs, rate.looks, rate.promised, rate.at_most
+            found.setdefault(key, []).append(rate)
+        return [Promise(str(key[0]), tuple(rates)) for key, rates in found.items()]
 
 
 def calibration(path: Path | None = None) -> Calibration | None:
@@ -52,9 +88,9 @@ def calibration(path: Path | None = None) -> Calibration | None:
     if path is None or not path.is_file():
         return None
     data = json.loads(path.read_text(encoding="utf-8"))
-    rates = [_rate(row) for row in data["rows"]]
-    right, wrong = (tuple(r for r in rates if (r.ratio == 1.0) == same) for same in (True, False))
-    return Calibration(data["steps"], data["dof"], data["seed"], right, wrong)
+    return Calibration(
+        data["steps"], data["dof"], data["seed"], data["questions"], data["worlds"], tuple(_rates(data["rows"]))
+    )
 
 
 def shipped() -> Path | None:
@@ -63,11 +99,11 @@ def shipped() -> Path | None:
     return next((place / NAME for place in places if (place / NAME).is_file()), None)
 
 
-def _rate(row: dict[str, Any]) -> Rate:
-    gates, found = int(row["gates"]), int(row["found"])
-    ends = stats.binomtest(found, gates).proportion_ci(CONFIDENCE, "exact")
-    promised = row["false_alarm"] if row["ratio"] == 1.0 else row["power"]
-    return Rate(
-        row["world"], row["ratio"], row["runs"], row.get("looks", 1), row.get("mean_runs", row["runs"]), promised,
-        gates, found / gates, (float(ends.low), float(ends.high)),
-    )  # fmt: skip
+def _rates(rows: Iterable[dict[str, Any]]) -> Iterable[Rate]:
+    for row in rows:
+        gates, found = int(row["gates"]), int(row["found"])
+        ends = stats.binomtest(found, gates).proportion_ci(CONFIDENCE, "exact")
+        yield Rate(
+            row["world"], row["question"], row["ratio"], row["runs"], row["looks"], row.get("mean_runs", row["runs"]),
+            row["stated"], row["bound"] == "<=", gates, found / gates, (float(ends.low), float(ends.high)),
+        )  # fmt: skip

@@ -4,18 +4,40 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.diagnostics.questions import MAIN, STEP
+from consistency.diagnostics.wording import plural, short
 from consistency.reporting.calibration import Calibration
-from consistency.reporting.diagnosis import forests, lags
+from consistency.reporting.diagnosis import DIRECTION, forests, lags
 from consistency.reporting.model import Distribution, FirstOrder, Report, Scenes, Shares, Study, Track
-from consistency.reporting.wording import FOUND, NOT_ASKED, NOT_FOUND, listed
+from consistency.reporting.wording import FOUND, NOT_ASKED, NOT_FOUND, TOLERATED, equivalence_interval, listed
 
 
 def no_truth(study: Study) -> str:
     """Why there are no error plots."""
     return (
-        f"The truth of {study.name} is not known, so there are no pose errors and no NEES to show; "
-        "the innovations below are what the filter can be judged by."
+        f"The truth of {study.name} is not known, so there are no pose errors and no NEES to show; the innovations "
+        f"below are {'all that can be judged' if _judged(study) else 'reported and not judged'}."
     )
+
+
+def verdict_caption(study: Study) -> str:
+    """How large the study is, and how to read the table of verdicts."""
+    text = f"{plural(study.runs, 'run')} of {plural(len(study.steps), 'step')}"
+    if study.single and study.has_truth:
+        text += "; with one run the ANEES is the NEES of that run"
+    if study.until_decided:
+        when = [f"{track.name} after {plural(track.verdict.runs, 'run')}" for track in study.tracks]
+        text += f", until decided: a verdict is that of the look that decided, {listed(when)}"
+    what = "of true to stated covariance" if study.has_truth else "of the NIS to its degrees of freedom"
+    text += f". Shown inside {equivalence_interval(study)}: whether the ratio {what} is shown to lie there"
+    if len(_judged(study)) < len(study.tracks):
+        text += ". NIS in parentheses: reported and not judged, as no optimal gain is declared"
+    return f"{text}."
+
+
+def _judged(study: Study) -> list[str]:
+    """Filters whose innovations are judged."""
+    return [track.name for track in study.tracks if track.innovations_judged]
 
 
 def scenario_caption(study: Study) -> str:
@@ -42,9 +64,10 @@ def error_caption(study: Study) -> str:
 
 def anees_caption(study: Study) -> str:
     """What the ANEES chart shows."""
-    what = f"NEES of the single run {study.shown_run}" if study.single else f"Average NEES over {study.runs} runs"
     common = study.common_band
-    n = common.verdict.statistics["dof"] if common else 3
+    runs = common.verdict.runs if common else study.runs
+    what = f"NEES of the single run {study.shown_run}" if study.single else f"Average NEES over {runs} runs"
+    n = f"{common.expected:g}" if common else "3"
     own = [track.name for track in study.tracks if track.own_band]
     extra = (
         f" Fewer runs carry the curve of {listed(own)}; its wider bands are thin lines in its colour." if own else ""
@@ -66,24 +89,28 @@ def anees_caption(study: Study) -> str:
 
 def _step_rate(track: Track) -> float | None:
     """Share of the false-alarm rate that the band over all steps has."""
-    s = track.verdict.statistics
-    shares = [a["share"] for a in s.get("answers", ()) if a["question"] == "scale in some step"]
-    return float(shares[0] * s["false_alarm"]) if shares else None
+    shares = [a.share for a in track.verdict.answers if a.question == STEP]
+    return shares[0] * track.verdict.settings.false_alarm if shares else None
 
 
 def innovation_caption(study: Study, panels: bool) -> str:
     """What the figures of innovations show; ``panels``: each filter has axes of its own."""
+    over = "" if study.single else ", summed over the runs of its verdict"
+    judged, every = _judged(study), len(study.tracks)
     text = (
-        "Normalized innovation squared over its degrees of freedom, one point a step"
-        + ("" if study.single else f", summed over {study.runs} runs")
-        + "; not smoothed. 1 is expected (line)."
+        f"Normalized innovation squared over its degrees of freedom, one point a step{over}; not smoothed. "
+        "1 (line) is expected of a right filter with an optimal gain."
     )
-    if panels:
+    if not judged:
+        text += " No filter here declares one: its innovations are reported and not judged."
+    elif len(judged) < every:
+        declare = "declare" if len(judged) > 1 else "declares"
+        text += f" Only {listed(judged)} {declare} one; the innovations of the others are reported and not judged."
+    if panels and every > 1:
         text += " Axes differ between filters."
     if any(lags(track) for track in study.tracks):
-        text += (" Right: " if panels else " Below: ") + (
-            "autocorrelation over steps; of white innovations 95 % of the lags stay within the shaded bound."
-        )
+        text += (" Right: " if panels else " Below: ") + "autocorrelation over steps"
+        text += "; 95 % of the lags stay within the shaded bound if the innovations are white." if judged else "."
     return text
 
 
@@ -129,48 +156,85 @@ def first_order_caption(found: FirstOrder) -> str:
     return (
         "Where the first-order covariance breaks: mean NEES over its degrees of freedom against the standard deviation "
         "of the disparity over the disparity, log axes; a cell is one depth, baseline and pixel noise, with "
-        f"{found.runs} runs ({found.points} points a registration, one a triangulation; {found.failed} runs failed in "
-        "all). Accepted: the referee calls the errors consistent. It rejects a right covariance in a cell with "
-        f"probability {100 * found.false_alarm:g} % at most, and a wrong one also for what the mean does not show, "
-        f"such as bias or outliers. First order is asked to hold up to {100 * found.holds:g} % (dashed). Source: this "
-        f"project, beyond Valencia & Andrade-Cetto (2018) sec. 2.3.3.{note}"
+        f"{found.runs} runs ({found.points} points a registration, one a triangulation; {found.failed} runs failed "
+        "in all). Accepted: the referee shows the errors to be consistent. It finds a right covariance at fault in a "
+        f"cell with probability {100 * found.false_alarm:g} % at most, and a wrong one also for what the mean does not "
+        f"show, such as bias or outliers. First order is asked to hold up to {100 * found.holds:g} % (dashed). Source: "
+        f"this project, beyond Valencia & Andrade-Cetto (2018) sec. 2.3.3.{note}"
     )
 
 
 def method(report: Report) -> str:
     """How a verdict comes about, in one paragraph."""
-    rates = [t.verdict.statistics["false_alarm"] for study in report.studies for t in study.tracks]
+    tracks = [track for study in report.studies for track in study.tracks]
+    rates = [track.verdict.settings.false_alarm for track in tracks]
     rate = f"{100 * rates[0]:.2g} %" if rates else "the false-alarm rate"
     text = (
         "A run is one observation: runs are independent, steps are not. The questions of a verdict together find a "
         f"fault in a right filter with probability {rate} at most, whatever they have to do with each other "
         "(Holm 1979, weighted)."
     )
+    if tracks:
+        text += _shown(tracks[0])
     if any(study.has_truth for study in report.studies):
         text += (
-            " Half of that rate belongs to the mean NEES of whole runs, for which the number of runs is planned; the "
-            "other questions share the rest. Where the ANEES leaves its band and stays out, the factor and the axes "
-            "are those since that step."
+            " Half of the false-alarm rate belongs to the mean NEES of whole runs, for which the number of runs is "
+            "planned; the other questions share the rest. Where a fault was absent before some step, the factor and "
+            "the axes are those since that step."
+        )
+    if any(not study.has_truth for study in report.studies):
+        text += (
+            " Without truth the ratio is that of the NIS to its degrees of freedom, and only the innovations of a "
+            "filter that declares an optimal gain are judged: those of any other need be neither white nor of the "
+            "stated size."
+        )
+    if any(study.until_decided for study in report.studies):
+        text += (
+            " In a run until decided the scale is judged by an e-process, a bet against the filter that may be looked "
+            "at at any time (Ville 1939); the other questions are asked after 12, 24, 48, ... runs, each time at a "
+            "part of their share."
         )
     return text
 
 
+def _shown(track: Track) -> str:
+    """What consistent and undecided mean."""
+    settings = track.verdict.settings
+    upper = short(settings.factor)
+    tests, inside = "two one-sided tests, each", f"between {short(1.0 / settings.factor)} and {upper}"
+    if settings.one_sided:
+        tests, inside = "a one-sided test", f"below {upper}"
+    return (
+        f" Consistent is shown: no question found a fault, and {tests} at {100 * (1.0 - settings.power):.2g} %, put "
+        f"the ratio of true to stated covariance {inside}. With neither a fault nor that, a filter is undecided: its "
+        "sentence has the ratio, its interval, and the number of runs that would probably decide."
+    )
+
+
 def question_caption(study: Study) -> str:
     """How to read the table of questions."""
-    rate = 100 * study.tracks[0].verdict.statistics["false_alarm"] if study.tracks else 5.0
-    return (
-        f"{FOUND} a fault was found, {NOT_FOUND} none was found, {NOT_ASKED} could not be asked. The number is the "
-        f"corrected p value: the false-alarm rate of the whole verdict at which the fault would just be found "
-        f"({rate:.2g} % or less is a fault)."
+    rate = 100 * study.tracks[0].verdict.settings.false_alarm if study.tracks else 5.0
+    answers = [answer for track in study.tracks for answer in track.verdict.answers]
+    tolerance = next((track.verdict.settings.tolerated for track in study.tracks), 1.0)
+    within = f"{TOLERATED} one was found, but is shown to lie within the tolerance of ×{tolerance:g}, "
+    text = (
+        f"{FOUND} a fault was found, {within if any(a.tolerated for a in answers) else ''}{NOT_FOUND} none was found, "
+        f"{NOT_ASKED} could not be asked. The number is the corrected p value: the false-alarm rate of the whole "
+        f"verdict at which the fault would just be found ({rate:.2g} % or less is a fault)."
     )
+    if study.until_decided:
+        text += f" A verdict between two looks asks {MAIN} alone; the p values of the others are then 1."
+    return text
 
 
 def axis_caption(study: Study) -> str:
     """What the figure of axes shows."""
     parts = {part.name for part in forests(study)}
     text = "By axis of the pose. Covariance ratio: 1 is right (line), above is overconfident; log axis."
-    if any(track.verdict.statistics.get("since") is not None for track in study.tracks):
+    if any(t.verdict.location is not None and t.verdict.location.since is not None for t in study.tracks):
         text += " Ratio and bias are those since the step that the verdict names."
+    if any(track.verdict.axes is not None and track.verdict.axes.largest is not None for track in study.tracks):
+        text += f" {DIRECTION.capitalize()}: chosen by one half of the runs and measured in the other."
     if "bias" in parts:
         text += " Bias: mean error in units of the stated sigma; 0 is right."
     if "coverage" in parts:
@@ -201,10 +265,16 @@ def figure_caption() -> str:
 def calibration_text(c: Calibration) -> str:
     """What the appendix on the referee measures."""
     return (
-        "A gate is one verdict on one group of runs. A false alarm is a gate that finds a fault where the covariance "
-        "is exactly right; power is the share of gates that find a stated covariance which is wrong by the ratio "
-        "given, with as many runs as are planned for it. A gate with several looks ends at the look that finds a "
-        f"fault; its mean number of runs stands first. Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees "
-        f"of freedom, seed {c.seed}), with exact binomial intervals. The promise is broken where the whole interval of "
-        "a false-alarm rate lies above it, or that of a power below it."
+        "A gate is one verdict on one group of runs. Each line is a promise of the referee: which share of gates is "
+        "counted at most, or at least, and the shares measured, from the world where the promise is kept best to the "
+        "one where it is kept worst. Where the true over the stated covariance is 1 the filter is right, however its "
+        "errors depend on each other. Of gates that end when they are decided, the mean number of runs in the worst "
+        "world stands first. "
+        f"Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees of freedom where not said otherwise, seed "
+        f"{c.seed}), with exact binomial intervals. A promise is broken where the whole interval is on its wrong side."
     )
+
+
+def calibration_worlds(c: Calibration) -> list[tuple[str, str]]:
+    """The worlds of the appendix and what they are."""
+    return [(name, about.replace("`", "")) for name, about in c.worlds.items()]

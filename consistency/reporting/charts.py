@@ -171,8 +171,7 @@ def _common_band(chart: Any, study: Study, common: Track, limit: int) -> None:
     outer = columns(step=study.steps[keep], low=common.simultaneous[keep, 0], high=common.simultaneous[keep, 1])
     for column in ("low", "high"):
         chart.line("step", column, source=outer, color="#333333", line_dash=[6, 4], line_width=1.2)
-    expected = float(common.verdict.statistics["dof"])
-    chart.add_layout(Span(location=expected, dimension="width", line_color="#555555", line_width=1.0))
+    chart.add_layout(Span(location=common.expected, dimension="width", line_color="#555555", line_width=1.0))
 
 
 def _nis(study: Study, index: int, shared: Any, limit: int) -> Any:

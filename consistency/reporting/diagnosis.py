@@ -1,20 +1,20 @@
-"""What the referee asked and found, as a report shows it: the statistics of verdicts in order, nothing worked out."""
+"""What the referee asked and found, as a report shows it: the records of verdicts in order, nothing worked out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from consistency.diagnostics import Answer, Verdict
 from consistency.diagnostics.coverage import TWO_SIGMA
 from consistency.diagnostics.questions import ABOUT
 from consistency.plots import Interval
 from consistency.reporting.model import Study, Track
 from consistency.types import Array
 
-WHOLE = "all axes"
+WHOLE, DIRECTION = "all axes", "worst direction"
 FAR = 30.0  # an interval that reaches further than this factor beyond all values is cut off
 
 
@@ -52,9 +52,17 @@ class Steps:
     half_width: float
 
 
-def asked(study: Study) -> list[tuple[str, str, list[dict[str, Any] | None]]]:
+@dataclass(frozen=True)
+class Lags:
+    """Autocorrelation of the innovations."""
+
+    values: Array  # (lags,), of lag 1, 2, ...
+    bound: float | None  # that 95 % of the lags stay within, if white; None where they are not judged
+
+
+def asked(study: Study) -> list[tuple[str, str, list[Answer | None]]]:
     """Question, what is compared, and each filter's answer (None: could not be asked), in the referee's order."""
-    by_filter = [{a["question"]: a for a in track.verdict.statistics.get("answers", ())} for track in study.tracks]
+    by_filter = [{a.question: a for a in track.verdict.answers} for track in study.tracks]
     known = list(ABOUT) + [q for answers in by_filter for q in answers if q not in ABOUT]
     questions = [q for q in dict.fromkeys(known) if any(q in answers for answers in by_filter)]
     return [(q, ABOUT.get(q, ""), [answers.get(q) for answers in by_filter]) for q in questions]
@@ -83,33 +91,33 @@ def aligned(parts: tuple[Forest, ...]) -> list[str]:
 
 
 def _rows(
-    study: Study, read: Callable[[Mapping[str, Any]], dict[str, Interval]]
+    study: Study, read: Callable[[Verdict], dict[str, Interval]]
 ) -> tuple[tuple[str, tuple[Interval | None, ...]], ...]:
-    by_filter = [{k: i for k, i in read(t.verdict.statistics).items() if np.isfinite(i[0])} for t in study.tracks]
+    by_filter = [{k: i for k, i in read(t.verdict).items() if np.isfinite(i[0])} for t in study.tracks]
     names = dict.fromkeys(name for intervals in by_filter for name in intervals)
     return tuple((name, tuple(intervals.get(name) for intervals in by_filter)) for name in names)
 
 
-def _ratios(s: Mapping[str, Any]) -> dict[str, Interval]:
-    found = {name: _interval(*values) for name, values in s.get("of_axes", {}).items()}
-    if "ratio" in s:
-        found[WHOLE] = _interval(s["ratio"], *s.get("ratio_interval", (0.0, np.inf)))
+def _ratios(v: Verdict) -> dict[str, Interval]:
+    found: dict[str, Interval] = {}
+    if v.axes is not None:
+        found |= v.axes.inflation
+        if v.axes.largest is not None:
+            found[DIRECTION] = v.axes.largest
+    if v.scale is not None:
+        found[WHOLE] = v.scale.inflation
     return {name: interval for name, interval in found.items() if interval[0] > 0}
 
 
-def _biases(s: Mapping[str, Any]) -> dict[str, Interval]:
-    return {axis: _interval(*values) for axis, values in s.get("bias", {}).items()}
+def _biases(v: Verdict) -> dict[str, Interval]:
+    return {} if v.bias is None else dict(v.bias.by_axis)
 
 
-def _coverages(s: Mapping[str, Any]) -> dict[str, Interval]:
-    if "coverage_one_step" not in s or "coverage_interval" not in s:
+def _coverages(v: Verdict) -> dict[str, Interval]:
+    if v.accuracy is None or v.axes is None:
         return {}
-    rows = zip(s["axes"], s["coverage_one_step"], s["coverage_interval"], strict=True)
-    return {axis: _interval(*(100.0 * float(v) for v in (share, *ends))) for axis, share, ends in rows}
-
-
-def _interval(value: float, low: float, high: float) -> Interval:
-    return float(value), float(low), float(high)
+    rows = zip(v.axes.names, v.accuracy.coverage_one_step, v.accuracy.coverage_interval, strict=True)
+    return {axis: (100.0 * float(share), 100.0 * float(low), 100.0 * float(high)) for axis, share, (low, high) in rows}
 
 
 def _ratio_window(intervals: list[Interval]) -> tuple[float, float]:
@@ -131,18 +139,18 @@ def _coverage_window(intervals: list[Interval]) -> tuple[float, float]:
 
 def steps(track: Track, keep: Callable[[Array], Array]) -> Steps | None:
     """Empirical distribution of chi-square's distribution function at the NEES; ``keep`` chooses rows to draw."""
-    values = np.asarray(track.verdict.statistics.get("pit", ()), float)
-    half = float(track.verdict.statistics.get("pit_half_width", np.nan))
-    if not len(values) or not np.isfinite(half):
+    tails = track.verdict.tails
+    if tails is None or not len(tails.pit) or not np.isfinite(tails.half_width):
         return None
-    height = np.arange(1, len(values) + 1) / len(values)
+    values, height = tails.pit, np.arange(1, len(tails.pit) + 1) / len(tails.pit)
     rows = keep(values)
-    return Steps(np.concatenate([[0.0], values[rows], [1.0]]), np.concatenate([[0.0], height[rows], [1.0]]), half)
+    x, y = (np.concatenate([[0.0], column[rows], [1.0]]) for column in (values, height))
+    return Steps(x, y, tails.half_width)
 
 
-def lags(track: Track) -> tuple[Array, float] | None:
-    """Autocorrelation of lag 1, 2, ... and the bound of each."""
-    values = np.asarray(track.verdict.statistics.get("autocorrelation", ()), float)
-    if not len(values) or not np.isfinite(values).all():
+def lags(track: Track) -> Lags | None:
+    """Autocorrelation of lag 1, 2, ...; None with too few innovations."""
+    found = track.verdict.innovations
+    if found is None or not len(found.autocorrelation) or not np.isfinite(found.autocorrelation).all():
         return None
-    return values, float(track.verdict.statistics["autocorrelation_bound"])
+    return Lags(found.autocorrelation, found.bound if found.judged else None)

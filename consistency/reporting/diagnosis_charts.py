@@ -8,7 +8,7 @@ import numpy as np
 from bokeh.models import BasicTickFormatter, ColumnDataSource, DataRange1d, FixedTicker, Range1d
 from bokeh.models.annotations import BoxAnnotation, Span
 
-from consistency.plots import BAND, Interval, dodge, style
+from consistency.plots import BAND, LEAST_CORRELATION, Interval, dodge, style
 from consistency.reporting.charts import MARKERS, add_hover, add_line, base_figure, columns, pixels, tag
 from consistency.reporting.diagnosis import Forest, forests, lags, steps
 from consistency.reporting.model import Study, Track
@@ -106,17 +106,22 @@ def _distribution(study: Study, index: int, limit: int) -> Any:
 
 
 def _lags(study: Study, index: int) -> Any:
-    chart = base_figure("lag (steps)", "autocorrelation", 240, y_range=DataRange1d(only_visible=True))
+    chart = base_figure(
+        "lag (steps)",
+        "autocorrelation",
+        240,
+        y_range=DataRange1d(only_visible=True, min_interval=2 * LEAST_CORRELATION),
+    )
     found = [(slot, track, of) for slot, track in enumerate(study.tracks) if (of := lags(track)) is not None]
-    same = len({bound for _, _, (_, bound) in found}) == 1
-    if same:
-        bound = found[0][2][1]
+    bounds = {of.bound for _, _, of in found if of.bound is not None}
+    if len(bounds) == 1:
+        (bound,) = bounds
         chart.add_layout(BoxAnnotation(bottom=-bound, top=bound, fill_color=BAND, level="image"))
     points = []
-    for slot, track, (values, bound) in found:
+    for slot, track, of in found:
         look, label = style(track.style), tag(index, track)
-        lag = np.arange(1, len(values) + 1)
-        data = columns(x=lag + 0.6 * dodge(slot, len(study.tracks)), value=values, lag=lag)
+        lag = np.arange(1, len(of.values) + 1)
+        data = columns(x=lag + 0.6 * dodge(slot, len(study.tracks)), value=of.values, lag=lag)
         stems = chart.segment("x", 0, "x", "value", source=data, line_color=look.colour, line_width=1.6)
         dots = chart.scatter(
             "x", "value", source=data, marker=MARKERS[look.marker], size=6, fill_color=look.colour,
@@ -124,11 +129,11 @@ def _lags(study: Study, index: int) -> Any:
         )  # fmt: skip
         stems.tags = dots.tags = [label]
         points.append(dots)
-        if not same:
-            for side in (-bound, bound):
-                ends = columns(x=[0.5, len(values) + 0.5], bound=[side, side])
+        if len(bounds) > 1 and of.bound is not None:
+            for side in (-of.bound, of.bound):
+                ends = columns(x=[0.5, len(of.values) + 0.5], bound=[side, side])
                 add_line(chart, ends, "x", "bound", track, label, line_width=0.9, line_dash=[1, 3])
     chart.add_layout(Span(location=0.0, dimension="width", line_color="#555555", line_width=1.0))
-    chart.xaxis.ticker = FixedTicker(ticks=list(range(1, max(len(values) for _, _, (values, _) in found) + 1)))
+    chart.xaxis.ticker = FixedTicker(ticks=list(range(1, max(len(of.values) for _, _, of in found) + 1)))
     add_hover(chart, points, [("lag", "@lag"), ("autocorrelation", "@value{0.000}")])
     return chart

@@ -109,8 +109,7 @@ def anees(study: Study) -> Figure:
         assert track.simultaneous is not None
         keep = thin(track.band[:, 1])
         look = plots.style(track.style) if track.own_band else None
-        expected = float(track.verdict.statistics["dof"])
-        plots.anees_band(panel, study.steps[keep], track.band[keep], track.simultaneous[keep], expected, look)
+        plots.anees_band(panel, study.steps[keep], track.band[keep], track.simultaneous[keep], track.expected, look)
     lines = []
     for track in study.tracks:
         if track.anees is not None:
@@ -140,7 +139,7 @@ def innovations(study: Study) -> list[Figure]:
         axes[0, 0].set_xlim(0, len(study.steps))
         plots.title(axes[0, 0], _wrapped(track.name, 90))
         if lags is not None:
-            plots.autocorrelation(axes[0, 1], *lags, look)
+            plots.autocorrelation(axes[0, 1], lags.values, lags.bound, look)
         elif columns == 2:
             axes[0, 1].set_axis_off()
             axes[0, 1].text(0.5, 0.5, "too few innovations", transform=axes[0, 1].transAxes, ha="center")
@@ -174,7 +173,7 @@ def nees_distribution(study: Study) -> Figure | None:
     if not found:
         return None
     rows = -(-len(found) // PANELS)
-    figure, axes = _figure(0.2 + 1.6 * rows, rows, PANELS)
+    figure, axes = _figure(1.85 * rows, rows, PANELS)  # panels that are nearly square
     for panel in axes.flat[len(found) :]:
         panel.set_axis_off()
     for number, ((track, of), panel) in enumerate(zip(found, axes.flat, strict=False)):
@@ -254,7 +253,7 @@ def first_order(found: FirstOrder) -> Figure:
         panel.set_axis_off()
     for panel in axes.flat[max(len(found.estimators) - 3, 0) : len(found.estimators)]:
         panel.tick_params(labelbottom=True)
-    marks = {"accepted": plots.ACCEPTED, "rejected": plots.REJECTED}
+    marks = {"accepted": plots.ACCEPTED, "not accepted": plots.REJECTED}
     entries: list[tuple[str, Any]] = [
         (name, Line2D([], [], linestyle="", marker=look.marker, color=look.colour, markersize=5, markeredgewidth=0))
         for name, look in marks.items()

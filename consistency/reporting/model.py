@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from consistency.diagnostics import Verdict
 from consistency.reporting.calibration import Calibration
-from consistency.types import Array, Gaussian, Indices, Verdict
+from consistency.types import Array, Failure, Gaussian, Indices
 
-STATUSES = ("consistent", "overconfident", "conservative", "inconsistent", "undecided", "failed")
 SINGLE_RUN = 1
 
 
@@ -28,6 +28,17 @@ class Track:
     own_band: bool  # failed runs have made the bands differ from those of the study
     nis_ratio: Array  # (T,), NIS of all runs over their degrees of freedom
     nis_log: bool
+    failures: tuple[Failure, ...]  # of all runs, also of those after the look that decided
+
+    @property
+    def expected(self) -> float:
+        """Mean NEES of a right filter; NaN where the truth is not known."""
+        return float("nan") if self.verdict.scale is None else float(self.verdict.scale.dof)
+
+    @property
+    def innovations_judged(self) -> bool:
+        """Whether the filter declares an optimal gain; innovations of any other are reported only."""
+        return self.verdict.innovations is not None and self.verdict.innovations.judged
 
 
 @dataclass(frozen=True)
@@ -46,6 +57,7 @@ class Study:
     anees_log: bool
     nis_log: bool
     is_log: bool
+    until_decided: bool  # each verdict is that of the look that decided it
     provenance: tuple[tuple[str, str], ...]
     resolved: str  # the scenario, or the log's belief, as JSON
 
@@ -71,9 +83,9 @@ class Study:
     def failures(self) -> list[tuple[str, int, int, str]]:
         """Filter, run, step and reason of every failed run."""
         return [
-            (track.name, int(run), int(step), str(reason))
+            (track.name, int(failure.run), int(failure.step), failure.reason)
             for track in self.tracks
-            for run, step, reason in track.verdict.statistics["failures"]
+            for failure in track.failures
         ]
 
 

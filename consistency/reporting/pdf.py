@@ -55,8 +55,8 @@ def _study(study: Study, prefix: str, folder: Path) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "name": study.name,
         "summary": study.summary,
-        "runs": study.runs,
-        "steps": len(study.steps),
+        "verdict_caption": f"{study.name}: {captions.verdict_caption(study)}",
+        "shown_inside": wording.equivalence_interval(study),
         "verdicts": [list(wording.verdict_row(track)) for track in study.tracks],
         "reasons": [
             {"filter": track.name, "sentence": track.verdict.reasons[0], "reasons": list(track.verdict.reasons[1:])}
@@ -103,8 +103,9 @@ def _diagnosis(study: Study, save: Save) -> dict[str, Any]:
 def _calibration(report: Report) -> dict[str, Any] | None:
     if report.calibration is None:
         return None
-    rows = [list(row) for row in wording.calibration_rows(report.calibration)]
-    return {"text": captions.calibration_text(report.calibration), "rows": rows}
+    groups = [[title, [list(row) for row in rows]] for title, rows in wording.calibration_groups(report.calibration)]
+    worlds = [list(world) for world in captions.calibration_worlds(report.calibration)]
+    return {"text": captions.calibration_text(report.calibration), "groups": groups, "worlds": worlds}
 
 
 def _distribution(distribution: Any, prefix: str, folder: Path) -> dict[str, str]:

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 import consistency as cs
+from consistency.diagnostics.records import STATUSES
 from consistency.reporting import write_reports
+from consistency.reporting.wording import MARKS
 
 pytestmark = pytest.mark.browser
 
@@ -118,7 +120,11 @@ def test_the_diagnosis_is_drawn_for_every_filter(browser):
         assert drawn[label] == ["0:0", "0:1"], label
     cells = browser.find_elements("css selector", "table.questions td")
     assert len(cells) >= 2 * 6
-    assert all(cell.text[0] in "✗○–" for cell in cells)
+    assert all(cell.text[0] in MARKS for cell in cells)
+    spoken = {cell.find_element("css selector", "span").get_attribute("aria-label") for cell in cells}
+    assert spoken <= set(MARKS.values())
+    assert {"found", "not found"} <= spoken
+    assert {pill.text for pill in browser.find_elements("css selector", ".verdict")} <= set(STATUSES)
 
 
 def test_the_innovations_of_the_filters_left_fill_the_chart(browser):

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from referee import judge
 
-from consistency.diagnostics import blocks, judge, scale
-from consistency.types import Array, Failure, Verdict
+from consistency.diagnostics import Verdict, blocks
+from consistency.types import Array, Failure
 
 RUNS, STEPS = 61, 23
 
@@ -60,7 +61,6 @@ def test_blocks_do_not_change_the_verdict(
     whole = verdicts(arrays, failures=failures)
     before = {name: array.copy() for name, array in arrays.items()}
     monkeypatch.setattr(blocks, "ROWS", size)
-    monkeypatch.setattr(scale, "BLOCK", max(size // 5, 1))
     for a, b in zip(whole, verdicts(arrays, failures=failures), strict=True):
         assert (a.status, a.reasons) == (b.status, b.reasons)
         equal(a.statistics, b.statistics)
@@ -85,7 +85,6 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(
     """Error, covariance, NIS and its degrees of freedom are 112 bytes a run and step."""
     arrays = sample(rng, 400, 100)
     monkeypatch.setattr(blocks, "ROWS", 1000)
-    monkeypatch.setattr(scale, "BLOCK", 10)
     peaks = []
     for rows in (blocks.ROWS, 10**9):  # the second is the negative control
         monkeypatch.setattr(blocks, "ROWS", rows)

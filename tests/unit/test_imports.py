@@ -25,7 +25,7 @@ RANK = {
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
     "parquet": 4, "storage": 5, "results": 6, "gather": 7,
     "log": 7, "recording": 7,
-    "montecarlo": 8, "judge": 8, "frontend": 8,
+    "montecarlo": 8, "judge": 8, "frontend": 8, "monitoring": 8,
     "sequential": 9, "comparison": 9,
     "plots": 10, "table": 10,
     "findings": 11,

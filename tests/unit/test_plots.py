@@ -147,6 +147,16 @@ def test_autocorrelation_starts_at_lag_one_within_its_bound(axes):
     assert (axes.patches[0].get_y(), axes.patches[0].get_height()) == (-0.2, 0.4)
 
 
+def test_autocorrelation_that_is_not_judged_has_no_bound_and_does_not_look_large(axes):
+    plots.autocorrelation(axes, np.array([0.03, -0.01]), None, plots.style(0))
+    assert not axes.patches
+    low, high = axes.get_ylim()
+    assert low == -high
+    assert high >= 0.1
+    plots.autocorrelation(axes, np.array([0.9, -0.1]), 0.2, plots.style(0))
+    assert 0.9 < axes.get_ylim()[1] < 1.1
+
+
 def test_other_figures_draw_what_they_are_given(axes):
     plots.nis(axes, STEPS, np.ones(5), plots.style(2))
     assert axes.lines[0].get_marker() == plots.style(2).marker

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.diagnostics import judge
+from consistency.diagnostics import Evidence, compare, judge, summary
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 
@@ -38,7 +38,7 @@ def nees(runs, factor=1.0):
 def nees_with(p, runs):
     """NEES just so much too large that the verdict's p value is p."""
     def excess(log_factor):
-        return np.log(judge("", nees=nees(runs, np.exp(log_factor)), dof=3).p_value / p)
+        return np.log(judge(Evidence("", nees=nees(runs, np.exp(log_factor)), dof=3)).p_value / p)
     return nees(runs, np.exp(optimize.brentq(excess, 0.01, 1.5)))
 
 
@@ -77,7 +77,7 @@ def test_bad(consistency_runs):
     gate(nees(consistency_runs, 2.0))
 
 def test_few():
-    gate(nees(20))
+    gate(nees(8))
 
 def test_wanted(consistency_runs):
     with pytest.raises(ConsistencyError):
@@ -102,7 +102,7 @@ def test_gates_are_summed_up_and_written(session: pytest.Pytester, workers: list
             "test_it.py::test_good *assert_consistent *passed *102 *102 *",
             "test_it.py::test_bad *fault found *",
             "    the estimator is overconfident*covariance too small by x2*",
-            "test_it.py::test_few *too few runs *20 *102 *",
+            "test_it.py::test_few *too few runs *8 *102 *",
             "test_it.py::test_wanted *fault found (expected) *",
             "4 gates, 2 failed, 1 failed as expected; chance that any fails without a fault at most 0.003",
         ]
@@ -131,7 +131,9 @@ def test_no_gates_no_table(session: pytest.Pytester) -> None:
 
 
 def test_what_is_not_finite_is_null(session: pytest.Pytester) -> None:
-    make(session, "def test_innovations():\n    assert_consistent(nis=nees(9), nis_dof=3, detect=9.0)")
+    make(
+        session, "def test_innovations():\n    assert_consistent(nis=nees(9), nis_dof=3, detect=9.0, optimal_gain=True)"
+    )
     session.runpytest("--consistency-report=gates.json").assert_outcomes(passed=1)
     (gate,) = gates_of(session.path)
     assert gate["inflation"] is None
@@ -230,7 +232,7 @@ def test_the_marker_plans_and_is_asked(session: pytest.Pytester) -> None:
         f"        assert consistency_runs == {gate_runs(3, 1.5, 1e-4, 0.95, 'conservative')}\n"
         "        gate(nees(consistency_runs, 0.3))\n"
         "        with pytest.raises(InsufficientTrials):\n"
-        "            gate(nees(consistency_runs), detect=1.2)\n",
+        "            gate(nees(9), detect=1.2)\n",
     )
     session.runpytest("--consistency-report=gates.json").assert_outcomes(passed=2)
     assert [each["false_alarm"] for each in gates_of(session.path)] == [1e-4] * 3
@@ -339,19 +341,33 @@ def test_planned_runs_suffice_for_the_budget(session: pytest.Pytester) -> None:
     session.runpytest("--consistency-false-alarm=1e-3").assert_outcomes(passed=1)
 
 
-def test_too_few_runs_can_show_at_the_end(session: pytest.Pytester) -> None:
-    """Enough for the whole budget, too few for a quarter of it."""
+def test_what_is_shown_passes_at_any_share_of_the_budget(session: pytest.Pytester) -> None:
+    """That a filter is right is shown at a rate that no budget divides: fewer runs than planned may do."""
     runs = gate_runs(3, 1.5, 1e-3, 0.95)
-    more = gate_runs(3, 1.5, 2.5e-4, 0.95)
-    make(session, f"@pytest.mark.parametrize('i', range(4))\ndef test_it(i):\n    gate(nees({more} if i else {runs}))")
+    make(session, f"@pytest.mark.parametrize('i', range(4))\ndef test_it(i):\n    gate(nees({runs} - 9 * i))")
+    session.runpytest("--consistency-false-alarm=1e-3").assert_outcomes(passed=4)
+
+
+def test_too_few_to_compare_can_show_at_the_end(session: pytest.Pytester) -> None:
+    """Enough for the whole budget, too few for a fifth of it."""
+    make(
+        session,
+        "values = np.random.default_rng(0).chisquare(3, (2, 400, 1))\n"
+        "@pytest.mark.parametrize('i', range(5))\n"
+        "def test_it(i):\n"
+        "    runs = 400 if i else FEW\n"
+        "    assert_not_worse(nees_a=values[0, :runs], nees_b=values[1, :runs], dof=3, detect=2.0)\n"
+        "FEW = next(n for n in range(8, 400) if "
+        "compare(*(summary(v[:n], 3) for v in values), 1e-3).needed_runs(2.0, 0.95) <= n)\n",
+    )
     result = session.runpytest("--consistency-false-alarm=1e-3")
-    result.assert_outcomes(passed=3, failed=1)
-    result.stdout.fnmatch_lines([f"*{runs} runs are too few to pass: {more} find *--false-alarm 0.00025 *"])
+    result.assert_outcomes(passed=4, failed=1)
+    result.stdout.fnmatch_lines(["*is not found worse, but * runs are too few to pass: *"])
 
 
-def test_too_few_for_any_share_fails_in_place(session: pytest.Pytester) -> None:
+def test_too_few_to_decide_fail_in_place(session: pytest.Pytester) -> None:
     """And asks for the number that will do."""
-    make(session, "def test_it():\n    gate(nees(20))")
+    make(session, "def test_it():\n    gate(nees(8))")
     result = session.runpytest("--consistency-false-alarm=1e-3")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines([f"E *Simulate {gate_runs(3, 1.5, in_place_rate(1e-3, 1), 0.95)} runs*"])

@@ -19,6 +19,7 @@ from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
+from consistency.diagnostics import Settings
 from consistency.cli import main
 from consistency.diagnostics import nees
 from consistency.errors import InputError
@@ -482,7 +483,11 @@ def test_nis_alone(tmp_path: Path) -> None:
     table.to_csv(tmp_path / "nis.csv", index=False)
     r = one(tmp_path / "nis.csv", None)
     assert (r.error, r.covariance, r.nees, r.dof) == (None, None, None, 0)
-    assert analyse_recordings([r])["nis"].status == "overconfident"
+    undeclared = analyse_recordings([r])["nis"]
+    assert (undeclared.status, undeclared.faults) == ("undecided", ())
+    assert "declares an optimal gain" in undeclared.reasons[0]
+    assert "reported and not judged" in undeclared.reasons[1]
+    assert analyse_recordings([r], optimal_gain=True)["nis"].status == "overconfident"
 
 
 def test_our_own_files_get_our_own_verdict(uvd: cs.Scenario, tmp_path: Path) -> None:
@@ -522,7 +527,7 @@ def test_three_kinds_of_archives_agree(tmp_path: Path) -> None:
     by_nees = one(archive(tmp_path, nees=values, dof=2), None)
     assert by_nees.error is None
     for r in (by_error, by_truth, by_nees):
-        verdict = analyse_recordings([r], confidence=1 - 1e-4)["a"]
+        verdict = analyse_recordings([r], settings=Settings(false_alarm=1e-4))["a"]
         assert verdict.status == "consistent"
         np.testing.assert_allclose(verdict.statistics["mean_anees"], values.mean())
     for bad in (gaussian(2.0), {"nees": 2 * values, "dof": 2}):

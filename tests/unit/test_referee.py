@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from referee import judge
 from scipy import stats
 from statsmodels.stats.diagnostic import acorr_ljungbox
 
@@ -25,7 +26,6 @@ from consistency.diagnostics import (
     gate_runs,
     hotelling,
     identity_statistic,
-    judge,
     mean_shape,
     mean_test,
     nis_test,
@@ -137,7 +137,10 @@ def test_the_correction_is_that_of_closed_testing(p: list[float]) -> None:
 
 
 def test_shares_of_questions_not_asked_go_to_the_others_but_not_to_the_main() -> None:
-    assert sum(SHARES.values()) == pytest.approx(1.0)
+    for all_but in ("scale in some direction", "shape"):
+        everything = answers({q: 0.5 for q in SHARES if q != all_but}, 0.05)
+        assert sum(a.share for a in everything.values()) == pytest.approx(1.0)
+        assert everything[MAIN].share == 0.5
     found = answers({MAIN: 0.5, "bias": 0.5, "outliers": 0.5, "shape": float("nan")}, 0.05)
     assert set(found) == {MAIN, "bias", "outliers"}
     assert found[MAIN].share == 0.5
@@ -204,7 +207,7 @@ def test_few_runs_or_one_step_are_judged_by_the_chi_square_of_a_step(
 
 
 def test_effective_dof_are_those_of_the_eigenvalues(fresh: np.random.Generator) -> None:
-    """First-order autoregression: the covariance over steps is Toeplitz; one standard error to the safe side."""
+    """First-order autoregression: the covariance over steps is Toeplitz; up to two standard errors to the safe side."""
     coefficient, runs = 0.9, 600
     C = coefficient ** np.abs(np.subtract.outer(np.arange(STEPS), np.arange(STEPS)))
     eigenvalues = np.repeat(np.linalg.eigvalsh(C), DOF)
@@ -212,15 +215,24 @@ def test_effective_dof_are_those_of_the_eigenvalues(fresh: np.random.Generator) 
     w = autoregression(fresh, runs, STEPS, DOF, coefficient)
     nees = np.square(w).sum(axis=-1)
     assert DOF < exact < 0.2 * DOF * STEPS
-    assert 0.85 * exact < mean_test(nees, DOF, w).effective_dof < 1.05 * exact
-    assert 0.5 * exact < mean_test(nees, DOF).effective_dof < 1.15 * exact
+    assert 0.6 * exact < mean_test(nees, DOF).effective_dof < 1.15 * exact
 
 
 def test_effective_dof_of_independent_steps_and_of_one_and_the_same(fresh: np.random.Generator) -> None:
     w = fresh.standard_normal((400, STEPS, DOF))
-    assert 0.8 * DOF * STEPS < mean_test(np.square(w).sum(axis=-1), DOF, w).effective_dof <= DOF * STEPS * 1.05
+    assert 0.55 * DOF * STEPS < mean_test(np.square(w).sum(axis=-1), DOF).effective_dof <= DOF * STEPS * 1.0001
     w = np.repeat(w[:, :1], STEPS, axis=1)
-    assert DOF <= mean_test(np.square(w).sum(axis=-1), DOF, w).effective_dof < 1.2 * DOF
+    assert DOF <= mean_test(np.square(w).sum(axis=-1), DOF).effective_dof < 1.35 * DOF
+
+
+def test_runs_that_depend_on_themselves_each_in_its_way_do_not_pass_for_many(fresh: np.random.Generator) -> None:
+    """A fifth of the runs have one error in all steps: nu of such runs is 3, not the one of an average covariance.
+
+    Y has variance 2 / 3 (0.2 + 0.8 / 40), so nu is 13.6 at most; over all steps and runs it would be 60.
+    """
+    w = fresh.standard_normal((400, STEPS, DOF))
+    w[:80] = w[:80, :1]
+    assert DOF <= mean_test(np.square(w).sum(axis=-1), DOF).effective_dof < 20.0
 
 
 def test_runs_of_different_length_do_not_pass_for_certain(fresh: np.random.Generator) -> None:
@@ -231,14 +243,15 @@ def test_runs_of_different_length_do_not_pass_for_certain(fresh: np.random.Gener
     w = fresh.standard_normal((20, 100, DOF))
     w[0, 1:] = np.nan
     w[0, 0] = 3.0
-    assert mean_test(np.square(w).sum(axis=-1), DOF, w).above > 1e-3
+    assert mean_test(np.square(w).sum(axis=-1), DOF).above > 1e-3
 
 
 def test_runs_without_a_common_step_are_not_taken_for_certain(fresh: np.random.Generator) -> None:
     w = np.full((20, 20, DOF), np.nan)
     w[np.arange(20), np.arange(20)] = fresh.standard_normal((20, DOF))
     nees = np.square(w).sum(axis=-1)
-    test = mean_test(nees, DOF, w)
+    test = mean_test(nees, DOF)
+    assert test.effective_dof == DOF  # no run has more than one step
     assert test.above == pytest.approx(stats.chi2.sf(np.nansum(nees), 60))
 
 
@@ -255,7 +268,8 @@ def test_ratio_interval_holds_the_ratio(fresh: np.random.Generator) -> None:
         hits += low <= 1.7 <= high
     assert hits >= 400 * 0.95 - 5 * np.sqrt(400 * 0.95 * 0.05) - 4
     assert hits < 400  # an interval that never misses has a probability of 1e-9
-    assert ratio_interval(np.array([2.0]))[1:] == (0.0, float("inf"))
+    one = ratio_interval(np.array([2.0]), 3)
+    assert one[1:] == pytest.approx([6.0 / stats.chi2.isf(0.025, 3), 6.0 / stats.chi2.ppf(0.025, 3)])
 
 
 def test_bonferroni_band_is_exact_in_each_step(fresh: np.random.Generator) -> None:
@@ -522,7 +536,7 @@ def verdict_of(case: Case, **options: Any) -> cs.Verdict:
     runs, steps, _ = w.shape
     error = w @ np.linalg.cholesky(P).T * case.get("units", 1.0)
     return judge(
-        "f", error, np.broadcast_to(P * case.get("units", 1.0) ** 2, (runs, steps, 3, 3)).copy(),
+        "f", error, np.broadcast_to(P * case.get("units", 1.0) ** 2, (runs, steps, 3, 3)).copy(), optimal_gain=True,
         nis=np.square(u).sum(axis=-1), nis_dof=np.full((runs, steps), 2), innovations=u,
         innovation_covariances=np.broadcast_to(np.eye(2), (runs, steps, 2, 2)), axes=AXES,
         **{"false_alarm": FALSE_ALARM, **options},
@@ -534,11 +548,15 @@ def verdict_of(case: Case, **options: Any) -> cs.Verdict:
 def test_a_clean_filter_is_left_alone(fresh: np.random.Generator, runs: int, coefficient: float) -> None:
     """At 1e-6 each, 21 of them."""
     verdict = verdict_of(clean(fresh, runs, coefficient), false_alarm=1e-6)
-    assert verdict.status == "consistent", verdict.reasons
+    assert verdict.status in ("consistent", "undecided"), verdict.reasons
     assert verdict.faults == ()
     assert (verdict.first_step, verdict.subset, verdict.statistics["since"]) == (None, None, None)
-    assert verdict.reasons[0].startswith("consistent: no fault found; ")
+    assert verdict.reasons[0].startswith(f"{verdict.status}: no fault found")
     assert 0.0 <= verdict.p_value <= 1.0
+    if runs < 9:
+        assert verdict.status == "undecided"
+    elif runs == 60 and coefficient < 0.99:
+        assert verdict.status == "consistent"
 
 
 @pytest.mark.parametrize("units", [1e-18, 1e-9, 1e9, 1e18])
@@ -554,7 +572,7 @@ def test_runs_that_end_early_are_no_fault(fresh: np.random.Generator) -> None:
     case = clean(fresh, 20, 0.0)
     for run in range(20):
         case["w"][run, 1 + 2 * run :] = np.nan
-    assert verdict_of(case).status == "consistent"
+    assert verdict_of(case).status in ("consistent", "undecided")
 
 
 # --- whole verdicts: faults ----------------------------------------------------------------------------
@@ -631,19 +649,20 @@ def axes_that_cancel(case: Case, rng: np.random.Generator) -> Case:
 
 
 OVER, UNDER, WRONG = ("overconfident",), ("conservative",), ("inconsistent",)
+BIASED, HEAVY = ("biased",), ("heavy-tailed",)
 FAULTS: list[tuple[Callable[[Case, np.random.Generator], Case], str, tuple[str, ...], str]] = [
     (too_small, "scale", OVER, "covariance too small by x"),
     (too_large, "scale", UNDER, "covariance too large by x"),
-    (biased, "bias", (*OVER, *WRONG), "biased: "),
-    (biased_for_a_moment, "bias in some step", (*OVER, *WRONG), "biased in step 10, mainly x"),
+    (biased, "bias", BIASED, "biased: x +1."),
+    (biased_for_a_moment, "bias in some step", BIASED, "biased: in step 10, mainly x"),
     (correlated, "shape", (*WRONG, *OVER, *UNDER), "x and y are correlated +0."),
     (correlated_in_a_step, "shape in some step", (*WRONG, *OVER, *UNDER), "covariance of the wrong shape"),
-    (heavy_tailed, "outliers", (*WRONG, *OVER, *UNDER), "heavy tails: run "),
+    (heavy_tailed, "outliers", HEAVY, "heavy tails: run "),
     (coloured, "innovation whiteness", WRONG, "innovations correlated over steps"),
     (large_innovations, "innovation scale", WRONG, "innovations larger than stated"),
     (wrong_half_way, "scale in some step", OVER, "overconfident since step 21: covariance too small by x"),
     (wrong_for_a_moment, "scale in some step", OVER, "too small in 1 of 40 steps, first in step 18"),
-    (one_run_lost, "outliers", (*WRONG, *OVER), "run 7 lies "),
+    (one_run_lost, "outliers", HEAVY, "run 7 lies "),
     (one_axis, "scale of an axis", OVER, "heading"),
     (axes_that_cancel, "scale of an axis", (*WRONG, *OVER), "covariance "),
 ]
@@ -719,11 +738,11 @@ def stated(shape: tuple[int, ...]) -> Array:
 @pytest.mark.parametrize("steps", [1, 2, 10])
 @pytest.mark.parametrize("n", [1, 3, 9])
 def test_any_shape_is_judged(fresh: np.random.Generator, runs: int, steps: int, n: int) -> None:
-    """54 shapes at 1e-7 each; a warning would be an error."""
+    """54 shapes at 1e-7 each; a warning would be an error. Ten runs show no ratio of 1.5, unless steps are many."""
     e = fresh.standard_normal((runs, steps, n))
     for options in ({}, {"allow": "conservative"}, {"method": "bonferroni"}):
         verdict = judge("f", e, stated(e.shape), false_alarm=1e-7, **options)
-        assert verdict.status == "consistent", verdict.reasons
+        assert verdict.status in ("consistent", "undecided"), verdict.reasons
         assert verdict.p_value <= 1.0
 
 

@@ -12,17 +12,26 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from bokeh.models.annotations import BoxAnnotation
 from scipy import stats
 
 import consistency as cs
+from consistency.diagnostics import Answer, Evidence, Interval, Settings, judge
+from consistency.diagnostics.questions import DIRECTION, STEP
+from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import short
 from consistency.findings import Finding
+from consistency.gating.report import STYLE
 from consistency.montecarlo import run_log, simulate_log
-from consistency.reporting import build, captions, diagnosis, html, pdf, wording, write_reports
+from consistency.parquet import COVARIANCE
+from consistency.reporting import build, captions, diagnosis, figures, html, pdf, wording, write_reports
 from consistency.reporting.build import build_report
 from consistency.reporting.calibration import calibration
+from consistency.reporting.diagnosis_charts import diagnosis_charts
+from consistency.reporting.model import Track
 from consistency.reporting.thin import thin
 from consistency.results import read_results
+from consistency.types import Failure
 
 ODD = {
     "ekf-xyz": "<script>alert(1)</script><img src=x onerror=alert(2)>",
@@ -58,6 +67,32 @@ def odd_results(results):
     return replace(
         results, estimates=estimates, failures=failures, manifest=results.manifest | {"filters": list(ODD.values())}
     )
+
+
+STEPS = 60  # of the small worlds
+SURE = Settings(1e-6)  # chance of a false alarm
+
+
+def drawn(seed: int, runs: int = 60, size: float = 1.0):
+    """Errors (runs, steps, 3) that are ``size`` times as large as the covariances say."""
+    error = size * np.random.default_rng(seed).standard_normal((runs, STEPS, 3))
+    return error, np.broadcast_to(np.eye(3), (runs, STEPS, 3, 3))
+
+
+def judged(track: Track, error, covariance, settings: Settings = SURE, **given) -> Track:
+    """The track with the verdict on other errors in place of its own."""
+    evidence = Evidence(track.name, error, covariance, axes=("x", "y", "heading"), **given)
+    verdict = judge(evidence, settings)
+    assert verdict.scale is not None
+    assert verdict.location is not None
+    return replace(
+        track, verdict=verdict, anees=verdict.scale.anees, band=verdict.scale.band,
+        simultaneous=verdict.location.simultaneous, own_band=False, failures=verdict.failures,
+    )  # fmt: skip
+
+
+def with_tracks(report, *tracks: Track):
+    return replace(report, studies=(replace(report.studies[0], tracks=tracks),))
 
 
 def reproduction(results, folder: Path) -> Path:
@@ -111,8 +146,9 @@ def test_the_model_is_what_analyse_says(folder):
         verdict = verdicts[track.name]
         assert track.verdict.status == verdict.status
         assert track.verdict.reasons == verdict.reasons
-        np.testing.assert_array_equal(track.anees, verdict.statistics["anees"])
-        np.testing.assert_array_equal(track.simultaneous, verdict.statistics["simultaneous"])
+        np.testing.assert_array_equal(track.anees, verdict.scale.anees)
+        np.testing.assert_array_equal(track.simultaneous, verdict.location.simultaneous)
+        assert track.expected == 3.0
         table = results.estimates[results.estimates["filter"] == track.name]
         by_step = table.groupby("step")
         np.testing.assert_allclose(track.nis_ratio, by_step["nis"].sum() / by_step["nis_dof"].sum().replace(0, np.nan))
@@ -129,26 +165,33 @@ def test_the_odometry_is_that_of_the_trial(folder, uvd):
     np.testing.assert_allclose(np.linalg.norm(study.odometry[1] - study.odometry[0]), abs(step))
 
 
-def test_verdict_cells_are_the_statistics(folder):
-    (study,) = build_report(folder).studies
-    cells, s = wording.verdict_row(study.tracks[0]), study.tracks[0].verdict.statistics
-    assert cells[2] == short(s["mean_anees"])
-    assert cells[3].startswith(f"×{short(s['ratio'])} [")
-    assert cells[3].endswith(f", {short(s['ratio_interval'][1])}]")
-    assert cells[5] == ("–" if s["since"] is None else str(s["since"]))
-    assert cells[7] == f"{np.rad2deg(s['rmse_heading']):.2f}"
-    assert cells[9] == "0 of 4"
-    assert len(cells) == len(wording.VERDICT_COLUMNS)
-    cells = wording.figure_row(study.tracks[0])
-    assert cells[3] == " / ".join(f"{100 * share:.1f}" for share in s["coverage"])
-    assert len(cells) == len(wording.FIGURE_COLUMNS)
-
-
-def test_an_interval_that_says_nothing_is_shown_as_such(folder):
+def test_verdict_cells_are_the_records(folder):
     (study,) = build_report(folder).studies
     track = study.tracks[0]
-    s = track.verdict.statistics | {"ratio": 2.5, "ratio_interval": (0.0, np.inf)}
-    assert wording.inflation(replace(track, verdict=replace(track.verdict, statistics=s))) == "×2.50 [0, ∞]"
+    v, heads = track.verdict, wording.verdict_columns(study)
+    cells = dict(zip(heads, wording.verdict_row(track), strict=True))
+    assert cells["Mean ANEES"] == short(v.scale.mean_anees)
+    assert cells["Covariance to multiply by"].startswith(f"×{short(v.inflation)} [")
+    assert cells["Covariance to multiply by"].endswith(f", {short(v.inflation_interval[1])}]")
+    assert cells["Shown inside [0.67,\u00a01.50]"] == f"no, p {v.scale.equivalence.p_value:.2g}"
+    assert cells["Since step"] == ("–" if v.location.since is None else str(v.location.since))
+    assert cells["RMSE heading (deg)"] == f"{np.rad2deg(v.accuracy.rmse_heading):.2f}"
+    assert cells["NIS / dof"] == f"({v.innovations.ratio:.3f})"
+    assert cells["Failed runs"] == "0 of 4"
+    cells = dict(zip(wording.FIGURE_COLUMNS, wording.figure_row(track), strict=True))
+    assert cells["2-sigma coverage, all steps (%)"] == " / ".join(f"{100 * c:.1f}" for c in v.accuracy.coverage)
+    assert cells["Mean ANEES accepted"] == " to ".join(short(end) for end in v.threshold)
+    assert cells["NIS / dof (95 % expected)"] == f"{v.innovations.ratio:.3f} (not judged)"
+
+
+@pytest.mark.parametrize("ends", [(0.0, np.inf), (0.0, 1e300), (0.02, 2.5)])
+def test_an_interval_that_says_nothing_is_shown_as_such(folder, ends):
+    (study,) = build_report(folder).studies
+    track = study.tracks[0]
+    scale = replace(track.verdict.scale, inflation=Interval(2.5, *ends))
+    assert wording.inflation(replace(track, verdict=replace(track.verdict, scale=scale))) == "×2.50 [unknown]"
+    scale = replace(scale, inflation=Interval(2.5, 1.5, 4.0))
+    assert wording.inflation(replace(track, verdict=replace(track.verdict, scale=scale))) == "×2.50 [1.50, 4.00]"
 
 
 def test_the_diagnosis_is_what_the_verdict_holds(folder):
@@ -156,18 +199,18 @@ def test_the_diagnosis_is_what_the_verdict_holds(folder):
     questions = {question: answers for question, _, answers in diagnosis.asked(study)}
     by_name = {part.name: dict(part.rows) for part in diagnosis.forests(study)}
     for number, track in enumerate(study.tracks):
-        s = track.verdict.statistics
-        assert {q for q, answers in questions.items() if answers[number]} == {a["question"] for a in s["answers"]}
-        for answer in s["answers"]:
-            assert questions[answer["question"]][number] is answer
-        assert by_name["ratio"]["x"][number] == pytest.approx(s["of_axes"]["x"])
-        assert by_name["ratio"][diagnosis.WHOLE][number] == pytest.approx((s["ratio"], *s["ratio_interval"]))
-        assert by_name["coverage"]["y"][number][0] == pytest.approx(100 * s["coverage_one_step"][1])
-        if "bias" in s:
-            assert by_name["bias"]["heading"][number] == pytest.approx(s["bias"]["heading"])
+        v = track.verdict
+        assert {q for q, answers in questions.items() if answers[number]} == {a.question for a in v.answers}
+        for answer in v.answers:
+            assert questions[answer.question][number] is answer
+        assert by_name["ratio"]["x"][number] == v.axes.inflation["x"]
+        assert by_name["ratio"][diagnosis.WHOLE][number] == v.scale.inflation
+        assert by_name["coverage"]["y"][number][0] == pytest.approx(100 * v.accuracy.coverage_one_step[1])
+        assert by_name["bias"]["heading"][number] == v.bias.by_axis["heading"]
         of = diagnosis.steps(track, lambda values: np.arange(len(values)))
-        np.testing.assert_array_equal(of.x[1:-1], s["pit"])
+        np.testing.assert_array_equal(of.x[1:-1], v.tails.pit)
         np.testing.assert_allclose(of.y, [0, 0.25, 0.5, 0.75, 1, 1])
+        assert diagnosis.lags(track) is None  # four runs of 60 steps have too few innovations
     text = "".join(Page(html.render_html(build_report(folder))).text)
     assert all(question in text and about in text for question, about, _ in diagnosis.asked(study))
 
@@ -176,22 +219,31 @@ def test_the_diagnosis_is_what_the_verdict_holds(folder):
     ("answer", "cell"),
     [
         (None, ("–", "")),
-        ({"adjusted": 3e-7, "found": True}, ("✗", "< 1e-6")),
-        ({"adjusted": 0.0123, "found": True}, ("✗", "0.012")),
-        ({"adjusted": 1.0, "found": False}, ("○", "1")),
+        (Answer("scale", 1e-7, 0.5, 3e-7, True), ("✗", "< 1e-6")),
+        (Answer("scale", 0.006, 0.5, 0.0123, True), ("✗", "0.012")),
+        (Answer("scale", 0.006, 0.5, 0.0123, True, tolerated=True), ("≈", "0.012")),
+        (Answer("scale", 0.9, 0.5, 1.0, False), ("○", "1")),
     ],
 )
 def test_answers_have_a_mark_and_not_colour_alone(answer, cell):
     assert wording.answer_cell(answer) == cell
+    assert cell[0] in wording.MARKS
+    assert len(set(wording.MARKS.values())) == 4
 
 
 @pytest.mark.parametrize("ends", [(0.0, np.inf), (1e-12, 1e12), (19.0, 21.0)])
 def test_windows_are_finite_and_hold_every_value(folder, ends):
     (study,) = build_report(folder).studies
     track = study.tracks[0]
-    s = track.verdict.statistics | {"of_axes": {"x": (20.0, *ends)}, "ratio": 0.5, "ratio_interval": ends}
-    s["bias"] = {"x": (-4.0, -ends[1], ends[1])}
-    study = replace(study, tracks=(replace(track, verdict=replace(track.verdict, statistics=s)),))
+    v = track.verdict
+    v = replace(
+        v,
+        axes=replace(v.axes, inflation={"x": Interval(20.0, *ends)}),
+        scale=replace(v.scale, inflation=Interval(0.5, *ends)),
+        bias=replace(v.bias, by_axis={"x": Interval(-4.0, -ends[1], ends[1])}),
+    )
+    study = replace(study, tracks=(replace(track, verdict=v),))
+    assert {part.name for part in diagnosis.forests(study)} == {"ratio", "bias", "coverage"}
     for part in diagnosis.forests(study):
         low, high = part.window
         assert np.isfinite(part.window).all()
@@ -199,31 +251,33 @@ def test_windows_are_finite_and_hold_every_value(folder, ends):
         assert low < min(values) <= max(values) < high
 
 
-@pytest.mark.parametrize("empty", [{}, {"ratio": np.nan, "pit": np.empty(0), "pit_half_width": np.nan}])
-def test_a_verdict_without_figures_is_drawn_all_the_same(folder, empty):
+EMPTY = dict.fromkeys(("scale", "axes", "bias", "shape", "tails", "innovations", "location", "accuracy"))
+
+
+@pytest.mark.parametrize("all_steps_failed", [False, True])
+def test_a_verdict_without_figures_is_drawn_all_the_same(folder, all_steps_failed):
     report = build_report(folder)
-    (study,) = report.studies
-    tracks = tuple(
-        replace(
-            t, verdict=replace(t.verdict, status="undecided", statistics=least(t.verdict.statistics) | empty),
-            anees=None, band=None, simultaneous=None,
-        )
-        for t in study.tracks
-    )  # fmt: skip
-    report = replace(report, studies=(replace(study, tracks=tracks),))
+
+    def bare(track: Track) -> Track:
+        v = replace(track.verdict, answers=(), **EMPTY)
+        if all_steps_failed:
+            v = judge(Evidence(track.name, np.full((4, STEPS, 3), np.nan), np.full((4, STEPS, 3, 3), np.nan)))
+            v = replace(v, answers=())
+            assert v.status == "failed"
+            assert np.isnan(v.scale.inflation.value)
+        return replace(track, verdict=v, anees=None, band=None, simultaneous=None)
+
+    report = with_tracks(report, *map(bare, report.studies[0].tracks))
+    assert set(wording.verdict_row(report.studies[0].tracks[0])[2:-1]) == {"–"}
+    assert set(wording.figure_row(report.studies[0].tracks[0])[1:]) == {"–"}
     assert "There was nothing to ask" in html.render_html(report)
     assert pdf.render_pdf(report).startswith(b"%PDF")
-
-
-def least(statistics):
-    """What every verdict has."""
-    return {key: statistics[key] for key in ("runs", "steps", "false_alarm", "failures")} | {"answers": []}
 
 
 def test_nees_alone_without_axes(folder):
     report = build_report(folder)
     (study,) = report.studies
-    whole = cs.diagnostics.judge("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3)
+    whole = judge(Evidence("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3))
     track = replace(study.tracks[0], verdict=whole)
     study = replace(study, tracks=(track,))
     (part,) = diagnosis.forests(study)
@@ -233,40 +287,330 @@ def test_nees_alone_without_axes(folder):
 
 def test_the_captions_state_the_rates_in_force(folder):
     report = build_report(folder)
-    s = report.studies[0].tracks[0].verdict.statistics
-    (share,) = (a["share"] for a in s["answers"] if a["question"] == "scale in some step")
-    assert f"at most {100 * share * s['false_alarm']:.2g} %" in captions.anees_caption(report.studies[0])
+    v = report.studies[0].tracks[0].verdict
+    (share,) = (a.share for a in v.answers if a.question == STEP)
+    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in captions.anees_caption(report.studies[0])
     assert "probability 5 % at most" in captions.method(report)
+    assert "two one-sided tests, each at 5 %, put the ratio of true to stated covariance between 0.67 and 1.50" in (
+        captions.method(report)
+    )
+    track = judged(report.studies[0].tracks[0], *drawn(1), Settings(1e-3, 2.0, 0.9))
+    other = with_tracks(report, track)
+    assert "probability 0.1 % at most" in captions.method(other)
+    assert "each at 10 %, put the ratio of true to stated covariance between 0.50 and 2.00" in captions.method(other)
+    assert "Shown inside [0.50,\u00a02.00]" in captions.verdict_caption(other.studies[0])
+
+
+# --- what the referee can say -----------------------------------------------------------------
+
+
+def every_status(track: Track) -> dict[str, Track]:
+    """A verdict of each status, by false-alarm rates of 1e-6 on errors as different as can be."""
+    error, P = drawn(2)
+    heavy = error * np.where(np.arange(60) == 7, 12.0, 1.0)[:, None, None]
+    linked = error.copy()
+    linked[..., 1] = 0.7 * error[..., 0] + np.sqrt(0.51) * error[..., 1]
+    broken = (Failure(track.name, 0, 9, "LinAlgError: singular"),)
+    return {
+        "consistent": judged(track, error, P),
+        "overconfident": judged(track, 2.0 * error, P),
+        "conservative": judged(track, 0.5 * error, P),
+        "biased": judged(track, error + np.array([1.0, 0.0, 0.0]), P),
+        "heavy-tailed": judged(track, heavy, P),
+        "inconsistent": judged(track, linked, P),
+        "undecided": judged(track, error[:3], P[:3]),
+        "failed": judged(track, error, P, failures=broken),
+    }
+
+
+def test_every_status_is_shown_with_its_meaning(folder):
+    report = build_report(folder)
+    tracks = every_status(report.studies[0].tracks[0])
+    assert set(tracks) == set(STATUSES)
+    assert [track.verdict.status for track in tracks.values()] == list(tracks)
+    report = with_tracks(report, *(replace(t, name=status, style=k) for k, (status, t) in enumerate(tracks.items())))
+    text = wording.answer([replace(report.studies[0], runs=60)], ())
+    assert "1 of 8 filters is shown to be honest" in text
+    assert "1 of 480 runs through a filter broke down" in text
+    for part in (f"({meaning})" for meaning in STATUSES.values()):
+        assert part in text
+    source = html.render_html(report)
+    for status in STATUSES:
+        assert f'<span class="verdict {status}">{status}</span>' in source
+
+
+def test_consistent_has_been_shown_and_undecided_says_what_would_decide(folder):
+    tracks = every_status(build_report(folder).studies[0].tracks[0])
+    assert wording.shown_inside(tracks["consistent"]).startswith("yes, p ")
+    assert wording.shown_inside(tracks["overconfident"]) == "no, p 1"
+    shown = tracks["undecided"].verdict.scale.equivalence
+    assert wording.shown_inside(tracks["undecided"]) == f"no, p {shown.p_value:.2g}"
+    sentence = tracks["undecided"].verdict.reasons[0]
+    assert f"{shown.runs} such runs would probably decide" in sentence
+    assert f"[{short(tracks['undecided'].verdict.inflation_interval[0])}, " in sentence
+
+
+def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(folder):
+    report = build_report(folder)
+    error, P = drawn(3, 300, np.sqrt(1.1))
+    track = judged(report.studies[0].tracks[0], error, P, Settings(0.05, tolerance=1.3))
+    marks = {a.question: wording.answer_cell(a)[0] for a in track.verdict.answers}
+    assert track.verdict.consistent
+    assert marks["scale"] == "≈"
+    assert set(marks.values()) == {"≈", "○"}
+    report = with_tracks(report, track)
+    assert "≈ one was found, but is shown to lie within the tolerance of ×1.3" in (
+        captions.question_caption(report.studies[0])
+    )
+    source = html.render_html(report)
+    cell = '<td class="number tolerated"><span role="img" aria-label="found, within the tolerance">≈<'
+    assert source.count(cell) == sum(mark == "≈" for mark in marks.values())
+    assert "≈" not in captions.question_caption(build_report(folder).studies[0])
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def test_where_only_too_small_is_a_fault_the_worst_direction_is_shown(folder):
+    report = build_report(folder)
+    error, P = drawn(4)
+    error[..., :2] = error[..., :2] @ np.array([[1.25, 0.95], [0.95, 1.25]])  # x and y err together
+    track = judged(report.studies[0].tracks[0], 0.7 * error, P, Settings(0.05, allow="conservative"))
+    (study,) = with_tracks(report, track).studies
+    ratios = dict(diagnosis.forests(study)[0].rows)
+    assert ratios[diagnosis.DIRECTION] == (track.verdict.axes.largest,)
+    assert DIRECTION in {question for question, _, answers in diagnosis.asked(study) if answers[0].found}
+    assert wording.verdict_columns(study)[4] == "Shown inside (0,\u00a01.50]"
+    assert "Worst direction: chosen by one half of the runs" in captions.axis_caption(study)
+    assert "a one-sided test at 5 %, put" in captions.method(replace(report, studies=(study,)))
+    assert "orst direction" not in captions.axis_caption(report.studies[0])
+
+
+# --- innovations ------------------------------------------------------------------------------
+
+
+def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(folder, linear, tmp_path):
+    (study,) = build_report(folder).studies
+    for track in study.tracks:
+        assert not track.innovations_judged
+    caption = captions.innovation_caption(study, True)
+    assert "No filter here declares one: its innovations are reported and not judged." in caption
+    assert "shaded bound" not in caption
+    assert "NIS in parentheses: reported and not judged" in captions.verdict_caption(study)
+
+    results = cs.run_trials(linear, ["kf"], runs=20, seed=1, jobs=1)
+    both = pd.concat([results.estimates, results.estimates.assign(filter="silent")], ignore_index=True)
+    manifest = results.manifest | {"filters": ["kf", "silent"]}  # only kf declares an optimal gain
+    replace(results, estimates=both, manifest=manifest).write(tmp_path / "kf")
+    report = build_report(tmp_path / "kf")
+    (study,) = report.studies
+    kf, silent = study.tracks
+    assert kf.innovations_judged
+    found = kf.verdict.innovations
+    low, high = found.interval
+    assert wording.verdict_row(kf)[9] == f"{found.ratio:.3f}"
+    assert wording.figure_row(kf)[-1] == f"{found.ratio:.3f} ({low:.3f} to {high:.3f})"
+    assert diagnosis.lags(kf).bound == found.bound
+    np.testing.assert_array_equal(diagnosis.lags(kf).values, found.autocorrelation)
+    assert diagnosis.lags(silent).bound is None
+    np.testing.assert_array_equal(diagnosis.lags(silent).values, found.autocorrelation)
+    (innovation,) = {a[0].question for _, _, a in diagnosis.asked(study) if a[1] is None and "scale" in a[0].question}
+    assert innovation == "innovation scale"
+    assert "Only kf declares one; the innovations of the others are reported" in (
+        captions.innovation_caption(study, True)
+    )
+    assert [bool(row.axes[1].patches) for row in figures.innovations(study)] == [True, False]
+    alone = replace(study, tracks=(silent,))
+    for drawn_study, bounds in ((study, [found.bound]), (alone, [])):
+        centre = diagnosis_charts(drawn_study, 0, 100)["lags"].center
+        assert [item.top for item in centre if isinstance(item, BoxAnnotation)] == bounds
+    assert html.render_html(report).count("(not judged)") == 1
+
+
+def test_without_truth_only_a_declared_optimal_gain_is_put_to_the_test(folder):
+    report = build_report(folder)
+    first, second = (replace(t, anees=None, band=None, simultaneous=None) for t in report.studies[0].tracks)
+    rng = np.random.default_rng(5)
+    nis, dof = rng.chisquare(4, (1, STEPS)), np.full((1, STEPS), 4)
+
+    def by_nis(track: Track, size: float, optimal: bool) -> Track:
+        evidence = Evidence(track.name, nis=size * nis, nis_dof=dof, optimal_gain=optimal)
+        return replace(track, verdict=judge(evidence, SURE))
+
+    def text(*tracks: Track) -> str:
+        study = replace(report.studies[0], runs=1, tracks=tracks, true_path=None)
+        return wording.answer([study], ())
+
+    good, bad, unknown = by_nis(first, 1.0, True), by_nis(second, 5.0, True), by_nis(second, 5.0, False)
+    assert "1 of 2 filters passes the test of the innovations" in text(good, bad)
+    assert "no filter can be judged: the truth is not known, and none declares an optimal gain" in text(unknown)
+    assert "test of the innovations" not in text(unknown)
+    assert unknown.verdict.status == "undecided"
+    assert wording.verdict_row(unknown)[4] == "–"
+    assert wording.shown_inside(good).startswith("yes")
+    study = replace(report.studies[0], tracks=(unknown,))
+    assert "reported and not judged" in captions.no_truth(study)
+    assert "all that can be judged" in captions.no_truth(replace(study, tracks=(good, unknown)))
+    assert "Without truth the ratio is that of the NIS" in captions.method(replace(report, studies=(study,)))
+
+
+# --- until decided ----------------------------------------------------------------------------
+
+
+def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
+    results = cs.run_trials(linear, ["kf"], runs=24, seed=1, jobs=1)
+    small = results.estimates.assign(filter="small", nees=20 * results.estimates["nees"])
+    small[list(COVARIANCE)] /= 20.0
+    plan = {"dof": 3, "detect": 1.5, "false_alarm": 0.05, "power": 0.95, "max_runs": 24}
+    manifest = results.manifest | {"filters": ["kf", "small"], "until_decided": plan}
+    estimates = pd.concat([results.estimates, small], ignore_index=True)
+    late = pd.DataFrame([("small", 20, 30, "diverged")], columns=["filter", "run", "step", "reason"])
+    replace(results, estimates=estimates, failures=late, manifest=manifest).write(tmp_path / "run")
+    report = build_report(tmp_path / "run")
+    (study,) = report.studies
+    kf, wrong = study.tracks
+    assert study.until_decided
+    assert (kf.verdict.runs, wrong.verdict.runs) == (24, 12)
+    assert wrong.verdict.status == "overconfident"
+    assert study.common_band is kf
+    assert wrong.own_band
+    assert study.failures == [("small", 20, 30, "diverged")]  # after the look that decided, and still listed
+    assert wording.verdict_row(wrong)[-1] == "0 of 12"
+    first = results.estimates[results.estimates["run"] < 12].groupby("step")
+    np.testing.assert_allclose(wrong.nis_ratio, first["nis"].sum() / first["nis_dof"].sum().replace(0, np.nan))
+    assert "kf after 24 runs and small after 12 runs" in captions.verdict_caption(study)
+    assert "Average NEES over 24 runs" in captions.anees_caption(study)
+    assert "judged by an e-process" in captions.method(report)
+    assert "they are listed below and counted in the verdicts that looked at them" in report.answer
+    assert "asks scale alone" in captions.question_caption(study)
+    html.render_html(report)
+    assert pdf.render_pdf(report).startswith(b"%PDF")
+
+
+def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
+    error, P = drawn(6, 24)
+    lost = (Failure("any", 3, 9, "singular"),)
+    late, early, whole = (
+        judge(Evidence("any", error[:runs], P[:runs], failures=failures))
+        for runs, failures in ((24, lost), (12, ()), (24, ()))
+    )
+    assert build._common({"early": early, "late": late}) is late
+    assert build._common({"late": late, "whole": whole, "early": early}) is whole
+
+
+def test_runs_of_a_fixed_number_say_nothing_of_looks(folder):
+    report = build_report(folder)
+    assert not report.studies[0].until_decided
+    for text in (captions.verdict_caption(report.studies[0]), captions.method(report), report.answer):
+        assert "look" not in text
+
+
+# --- colours ----------------------------------------------------------------------------------
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of #rrggbb (WCAG 2.2)."""
+    parts = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def contrast(a: str, b: str) -> float:
+    high, low = sorted((luminance(a), luminance(b)), reverse=True)
+    return (high + 0.05) / (low + 0.05)
+
+
+def rule(css: str, name: str) -> dict[str, str]:
+    """Declarations of the class, of all rules that begin with it."""
+    found: dict[str, str] = {}
+    for heads, body in re.findall(r"^([^{}@\n]+)\{([^{}]*)\}", css, re.MULTILINE):
+        if name in [head.strip() for head in heads.split(",")]:
+            found |= dict((part.strip() for part in item.split(":", 1)) for item in body.split(";") if item.strip())
+    return found
+
+
+def full(colour: str) -> str:
+    """#rgb as #rrggbb."""
+    return colour if len(colour) == 7 else "#" + "".join(2 * digit for digit in colour[1:])
+
+
+def test_contrast_is_that_of_the_standard():
+    assert contrast("#000000", "#ffffff") == pytest.approx(21.0)
+    assert contrast("#777777", "#ffffff") == pytest.approx(4.48, abs=0.005)  # just too little
+
+
+def template(name: str) -> str:
+    return (Path(html.__file__).parent / "templates" / name).read_text(encoding="utf-8")
+
+
+def test_every_status_reads_well_in_html_and_differs_by_more_than_colour():
+    css, looks = template("report.css"), set()
+    for status in STATUSES:
+        look = rule(css, f".{status}")
+        assert contrast(full(look["color"]), full(look.get("background", "#fff"))) > 4.5, status
+        looks.add((look["color"], look.get("border-style", "solid")))
+    assert len(looks) == len(STATUSES)
+    for name in (".questions .found", ".questions .tolerated"):
+        assert contrast(rule(css, name)["color"], rule(css, name).get("background", "#ffffff")) > 4.5
+
+
+def test_every_status_reads_well_in_print():
+    shades = dict(re.findall(r'"([a-z -]+)": rgb\("(#[0-9a-f]{6})"\)', template("report.typ")))
+    for status in STATUSES:
+        assert contrast(shades[status], "#ffffff") > 4.5, status
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_every_status_reads_well_among_the_gates(dark):
+    light, night = (dict(re.findall(r"--(\w+): (#[0-9a-f]{3,6})", part)) for part in STYLE.split("@media"))
+    shades = {name: full(colour) for name, colour in (light | (night if dark else {})).items()}
+
+    def shade(value: str) -> str:
+        return shades[value.removeprefix("var(--").removesuffix(")")]
+
+    looks = set()
+    for status in (*STATUSES, "worse", "not-worse"):
+        look = rule(STYLE, f".{status}")
+        assert contrast(shade(look["color"]), shade(look.get("background", "var(--ground)"))) > 4.5, status
+        looks.add((look["color"], look.get("border-style", "solid")))
+    assert len(looks) == len(STATUSES)
 
 
 CALIBRATION = {
-    "steps": 100, "dof": 3, "seed": 1, "power": 0.95, "wall_time_s": 1.0,
+    "steps": 100, "dof": 3, "seed": 1, "wall_time_s": 1.0,
+    "questions": {"false alarm": "a right filter is found at fault", "power": "`plan` keeps its word"},
+    "worlds": {"independent": "independent steps", "elsewhere": "steps that <depend> on each other"},
     "rows": [
-        {"world": "independent", "ratio": 1.0, "runs": 21, "false_alarm": 0.05, "power": 0.95, "gates": 200,
-         "found": 9},
-        {"world": "elsewhere", "ratio": 1.5, "runs": 61, "false_alarm": 0.05, "power": 0.95, "gates": 100,
-         "found": 100},
-        {"world": "independent", "ratio": 1.5, "runs": 73, "looks": 3, "mean_runs": 19.0, "false_alarm": 0.05,
-         "power": 0.95, "gates": 100, "found": 99},
+        {"world": "independent", "question": "power", "ratio": 1.5, "runs": 61, "looks": 1, "stated": 0.95,
+         "bound": ">=", "gates": 100, "found": 100},
+        {"world": "independent", "question": "false alarm", "ratio": 1.0, "runs": 21, "looks": 1, "stated": 0.05,
+         "bound": "<=", "gates": 200, "found": 2},
+        {"world": "elsewhere", "question": "false alarm", "ratio": 1.0, "runs": 21, "looks": 1, "stated": 0.05,
+         "bound": "<=", "gates": 200, "found": 9},
+        {"world": "elsewhere", "question": "power", "ratio": 1.5, "runs": 500, "looks": 0, "mean_runs": 19.0,
+         "late_runs": 30.0, "stated": 0.95, "bound": ">=", "gates": 100, "found": 80},
     ],
 }  # fmt: skip
 
 
-def test_the_calibration_is_a_table_of_rates_with_intervals(folder, tmp_path):
+def test_the_calibration_is_a_table_of_promises_with_the_interval_of_the_worst_world(folder, tmp_path):
     path = tmp_path / "calibration.json"
     path.write_text(json.dumps(CALIBRATION))
     found = calibration(path)
-    assert found.gates == 400
-    alarm, power, looks = wording.calibration_rows(found)
+    assert found.gates == 600
+    (first, (alarm,)), (second, (power, decided)) = wording.calibration_groups(found)
+    assert (first, second) == ("false alarm: a right filter is found at fault", "power: plan keeps its word")
     # Clopper & Pearson of 9 in 200 at 99 %
     low, high = stats.beta.ppf(0.005, 9, 192), stats.beta.ppf(0.995, 10, 191)
     interval = f"{100 * low:.1f} to {100 * high:.1f} %"
-    assert alarm == ("independent NEES values", "1, right", "21", "≤ 5 %", "200", "4.5 %", interval)
-    assert power[:6] == ("elsewhere", "1.5", "61", "≥ 95 %", "100", "100.0 %")
-    assert looks[2] == "19 of 73, 3 looks"
-    assert {len(row) for row in (alarm, power, looks)} == {len(wording.CALIBRATION_COLUMNS)}
+    assert alarm == ("1, right", "21", "≤ 5 %", "200 in 2 worlds", "1.0 to 4.5 %", "elsewhere", interval)
+    assert power[:6] == ("1.5", "61", "≥ 95 %", "100", "100.0 %", "independent")
+    assert decided[1] == "19, 500 at most"
+    assert [promise.worst.broken for promise in found.promises] == [False, False, True]
+    assert {len(row) for row in (alarm, power, decided)} == {len(wording.CALIBRATION_COLUMNS)}
     report = replace(build_report(folder), calibration=found)
-    assert "How far the referee can be trusted" in html.render_html(report)
+    page = html.render_html(report)
+    assert "How far the referee can be trusted" in page
+    assert "steps that &lt;depend&gt; on each other" in page
+    assert "plan keeps its word" in page
     assert pdf.render_pdf(report).startswith(b"%PDF")
 
 

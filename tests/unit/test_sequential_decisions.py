@@ -22,5 +22,5 @@ def test_an_early_decision_is_kept_while_another_filter_is_open() -> None:
     assert verdicts[OPEN].status in ("consistent", "undecided")
     assert both.manifest["runs"] > alone.manifest["runs"]  # it went on for the other one
     assert (kept.status, kept.inflation, kept.reasons) == (early.status, early.inflation, early.reasons)
-    later = cs.analyse(both, [FAULTY])[FAULTY]  # negative control: all runs say it in other numbers
+    later = cs.analyse(both, [FAULTY], confidence=0.95)[FAULTY]  # negative control: all runs say it in other numbers
     assert later.inflation != early.inflation

@@ -22,6 +22,7 @@ from consistency.types import Array
 
 RARE = 1e-6  # false-alarm rate of a gate here
 RUNS = gate_runs(3, 1.5, RARE, 0.95)
+OPTIMAL = {"optimal_gain": True}
 
 
 def sample(
@@ -111,40 +112,63 @@ def test_innovations_alone(rng: np.random.Generator) -> None:
     S = np.broadcast_to(np.diag([4.0, 0.25]), (40, 50, 2, 2))
     v = rng.normal(size=(40, 50, 2)) * [2.0, 0.5]
     v[:, 7] = np.nan  # no measurement in step 8
-    assert assert_consistent(innovations=v, innovation_covariances=S, false_alarm=RARE).consistent
+    assert assert_consistent(innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL).consistent
     nis, dof = np.where(np.isnan(v[..., 0]), np.nan, np.square(v / [2.0, 0.5]).sum(-1)), np.full((40, 50), 2)
     dof[:, 7] = 0
-    assert assert_consistent(nis=nis, nis_dof=dof, false_alarm=RARE).consistent
+    assert assert_consistent(nis=nis, nis_dof=dof, false_alarm=RARE, **OPTIMAL).consistent
     with pytest.raises(ConsistencyError, match="larger than stated"):
-        assert_consistent(innovations=v, innovation_covariances=S / 2.0, false_alarm=RARE)
+        assert_consistent(innovations=v, innovation_covariances=S / 2.0, false_alarm=RARE, **OPTIMAL)
     slow = np.repeat(rng.normal(size=(40, 25, 2)), 2, axis=1) * [2.0, 0.5]
     with pytest.raises(ConsistencyError, match="correlated over steps"):
-        assert_consistent(innovations=slow, innovation_covariances=S, false_alarm=RARE)
+        assert_consistent(innovations=slow, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
 
 
 def test_innovations_beside_errors(rng: np.random.Generator) -> None:
     """Right errors, innovations twice as wide as stated."""
     S, v = np.ones((RUNS, 12, 1, 1)), 2.0 * rng.normal(size=(RUNS, 12, 1))
     with pytest.raises(ConsistencyError) as caught:
-        assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE)
+        assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
     assert caught.value.verdict is not None
     assert caught.value.verdict.faults == ("innovation scale",)
+    verdict = assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE)
+    assert verdict.innovations is not None
+    assert not verdict.innovations.judged
+    assert verdict.innovations.ratio > 3.0
+
+
+def test_innovations_of_any_gain_decide_nothing(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="only with optimal_gain=True"):
+        assert_consistent(nis=rng.chisquare(2, (40, 50)), nis_dof=2)
 
 
 # --- enough runs -----------------------------------------------------------------------------------
 
 
 def test_too_few_runs_do_not_pass(rng: np.random.Generator) -> None:
-    errors, covariances = sample(rng, runs=RUNS - 1)
+    """Five runs have 15 degrees of freedom: no ratio shows that 1.5 and 1 / 1.5 are both too far off."""
+    errors, covariances = sample(rng, runs=5)
     with pytest.raises(InsufficientTrials) as caught:
         assert_consistent(errors, covariances, false_alarm=RARE)
-    assert (caught.value.needed, caught.value.runs) == (RUNS, RUNS - 1)
+    assert (caught.value.needed, caught.value.runs) == (RUNS, 5)
     assert caught.value.verdict is not None
-    assert caught.value.verdict.consistent
+    assert caught.value.verdict.status == "undecided"
     assert f"consistency plan --dof 3 --detect 1.5 --false-alarm {RARE} --power 0.95" in str(caught.value)
-    assert assert_consistent(errors, covariances, false_alarm=RARE, detect=1.6).consistent
+    assert "5 runs do not show the covariance ratio" in str(caught.value)
     with pytest.raises(InsufficientTrials, match="--allow conservative"):
-        assert_consistent(errors, covariances, false_alarm=RARE, detect=1.2, allow="conservative")
+        assert_consistent(errors, covariances, false_alarm=RARE, detect=1.01, allow="conservative")
+
+
+def test_a_small_fault_can_be_tolerated(rng: np.random.Generator) -> None:
+    """x1.2 in 4,000 runs is found beyond all doubt, and shown to be below 1.5."""
+    errors, covariances = sample(rng, runs=4000, true=1.2)
+    with pytest.raises(ConsistencyError, match=r"covariance too small by x1\.2"):
+        assert_consistent(errors, covariances, false_alarm=RARE)
+    verdict = assert_consistent(errors, covariances, false_alarm=RARE, tolerance=1.4)
+    assert "within the tolerance of x1.4" in "".join(verdict.reasons)
+    with pytest.raises(ConsistencyError):
+        assert_consistent(errors, covariances, false_alarm=RARE, tolerance=1.1)
+    with pytest.raises(ValueError, match="tolerance must be"):
+        assert_consistent(errors, covariances, tolerance=-1.0)
 
 
 def test_a_fault_is_a_fault_in_few_runs_too(rng: np.random.Generator) -> None:

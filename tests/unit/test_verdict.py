@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from referee import judge
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import anees_interval, judge
+from consistency.diagnostics import anees_interval
 from consistency.types import Array, Failure
 
 RUNS, STEPS = 50, 40
@@ -32,8 +33,9 @@ class Case:
         self, failures: tuple[Failure, ...] = (), false_alarm: float = FALSE_ALARM, **options: Any
     ) -> cs.Verdict:
         return judge(
-            "f", self.error, self.covariance, self.nees, self.nis, self.nis_dof, failures, false_alarm, **options
-        )
+            "f", self.error, self.covariance, nees=self.nees, nis=self.nis, nis_dof=self.nis_dof, failures=failures,
+            false_alarm=false_alarm, **{"optimal_gain": True, **options},
+        )  # fmt: skip
 
 
 def make(scale: float = 1.0, bias: float = 0.0, runs: int = RUNS, steps: int = STEPS) -> Case:
@@ -71,7 +73,8 @@ def test_calibrated_is_consistent() -> None:
     assert verdict.status == "consistent"
     assert verdict.consistent
     assert verdict.faults == ()
-    assert verdict.reasons[0].startswith("consistent: no fault found; 50 runs would show a covariance too small by x")
+    assert verdict.reasons[0].startswith("consistent: no fault found in 50 runs, and the covariance ratio ")
+    assert verdict.reasons[0].endswith("] is shown to be between 0.67 and 1.50")
     assert verdict.first_step is None
     assert verdict.subset is None
     assert verdict.statistics["first_outside"] is None
@@ -113,11 +116,22 @@ def test_a_covariance_too_large_may_be_allowed() -> None:
 
 
 def test_biased_is_caught() -> None:
-    """A bias of 1.5 standard deviations in x adds at least 2.25 to the NEES: errors larger than claimed."""
+    """A bias of 1.5 standard deviations in x adds at least 2.25 to the NEES; less the bias the covariance is right."""
     verdict = make(bias=1.5).verdict()
-    assert verdict.status == "overconfident"
+    assert verdict.status == "biased"
     assert {"scale", "bias"} <= set(verdict.faults)
-    assert "biased: axis 0 +1." in verdict.reasons[0]
+    assert verdict.reasons[0].startswith("biased: axis 0 +1.")
+    assert "too small" not in verdict.reasons[0]
+    assert verdict.bias is not None
+    assert verdict.bias.inflation_without is not None
+    assert 0.7 < verdict.bias.inflation_without.value < 1.4 < verdict.inflation
+
+
+def test_a_bias_does_not_hide_a_covariance_too_small() -> None:
+    verdict = make(scale=3.0, bias=1.5).verdict()
+    assert verdict.status == "overconfident"
+    assert "biased: axis 0 +" in verdict.reasons[0]
+    assert "covariance about the mean too small by x" in verdict.reasons[0]
 
 
 def test_overconfident_in_a_single_step_is_caught() -> None:
@@ -155,7 +169,7 @@ def test_statistics_of_a_calibrated_filter() -> None:
 def test_nees_is_worked_out_from_error_and_covariance() -> None:
     case = make(scale=2.0)
     alone = judge("f", case.error, case.covariance, false_alarm=FALSE_ALARM)
-    lied = judge("f", case.error, case.covariance, case.nees / 2, false_alarm=FALSE_ALARM)
+    lied = judge("f", case.error, case.covariance, nees=case.nees / 2, false_alarm=FALSE_ALARM)
     for verdict in (alone, lied):
         assert verdict.statistic == pytest.approx(case.nees.mean())
         assert verdict.status == "overconfident"
@@ -215,8 +229,10 @@ def test_false_alarms_stay_below_the_stated_rate() -> None:
     for _ in range(200):
         error = rng.normal(size=(20, 10, 3))
         nis = np.full((20, 10), np.nan)
-        verdict = judge("f", error, P, cs.nees(error, P), nis, np.zeros((20, 10), int), false_alarm=0.1)
-        alarms += not verdict.consistent
+        verdict = judge(
+            "f", error, P, nees=cs.nees(error, P), nis=nis, nis_dof=np.zeros((20, 10), int), false_alarm=0.1
+        )
+        alarms += bool(verdict.faults)
     assert 0 < alarms <= 40  # none in 200 has probability below 1e-5 if the rate is above 6 %
 
 
@@ -279,7 +295,8 @@ def test_all_runs_failed_at_once() -> None:
 
 
 def blind(case: Case, **options: Any) -> cs.Verdict:
-    return judge("f", None, case.covariance, None, case.nis, case.nis_dof, **{"false_alarm": FALSE_ALARM, **options})
+    arrays = {"nis": case.nis, "nis_dof": case.nis_dof}
+    return judge("f", None, case.covariance, **arrays, **{"optimal_gain": True, "false_alarm": FALSE_ALARM, **options})
 
 
 @pytest.mark.parametrize(("scale", "status"), [(1.0, "consistent"), (1.3, "overconfident"), (0.7, "conservative")])

@@ -1,0 +1,55 @@
+"""Is the covariance too small in any direction? What a covariance that may be too large is asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.diagnostics.blocks import by_runs
+from consistency.diagnostics.records import Interval
+from consistency.diagnostics.scale import UNKNOWN, ratio_interval, scale_test
+from consistency.diagnostics.shape import second_moments
+from consistency.types import Array
+
+
+@dataclass(frozen=True)
+class Largest:
+    """The direction in which errors are largest against the stated covariance."""
+
+    ratio: Interval  # of true to stated variance in directions that the judged runs had no part in choosing
+    direction: Array  # (n,), unit vector of whitened errors, from all runs
+    p_value: float
+
+
+def largest_direction(whitened: Array) -> Largest:
+    """Test that no direction has errors larger than stated: largest eigenvalue of the mean of w w' at most 1.
+
+    A covariance is conservative if P >= E e e' in every direction (Forsling, Julier & Hendeby 2025), so that the
+    largest eigenvalue of the whitened second moment is at most 1; the trace, which is the mean NEES, cannot tell.
+    The leading eigenvector of every other run is the direction in which the remaining runs are judged, and the other
+    way round: runs are independent, so each half knows nothing of the errors that chose its direction, and the
+    test of a single component holds (:func:`scale_test`). Both halves count, Bonferroni.
+
+    Parameters
+    ----------
+    whitened : (runs, steps, n), NaN where a run has no value. p is NaN with fewer than 2 runs or n = 1.
+    """
+    present = np.asarray(np.isfinite(whitened).all(axis=-1))
+    n, some = whitened.shape[-1], present.any(axis=1)
+    if some.sum() < 2 or n == 1:
+        return Largest(UNKNOWN, np.full(n, np.nan), float("nan"))
+    w, present = whitened[some], present[some]
+    moments = by_runs(second_moments, w, present) / present.sum(axis=1)[:, None, None]
+    steps = int(present.sum(axis=1).max())
+    halves = [np.arange(len(moments)) % 2 == k for k in (0, 1)]
+    along, p_values = np.empty(len(moments)), []
+    for chosen, judged in (halves, halves[::-1]):
+        u = _leading(moments[chosen])
+        along[judged] = np.einsum("i,rij,j->r", u, moments[judged], u)
+        p_values.append(scale_test(along[judged], 1, steps).above)
+    return Largest(ratio_interval(along), _leading(moments), min(1.0, 2.0 * min(p_values)))
+
+
+def _leading(moments: Array) -> Array:
+    return np.asarray(np.linalg.eigh(moments.mean(axis=0))[1][:, -1])

@@ -1,0 +1,76 @@
+"""Is the scale shown to be right? Absence of evidence is not it."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special, stats
+
+from consistency.diagnostics.eprocess import e_process, ever
+from consistency.diagnostics.innovations import NisTest
+from consistency.diagnostics.planning import LARGEST
+from consistency.diagnostics.questions import MAIN, SHARES
+from consistency.diagnostics.records import Equivalence, Settings
+from consistency.diagnostics.scale import FEW, MeanTest, scale_test
+from consistency.types import Array
+
+
+def equivalence(means: Array, dof: int, steps: int, settings: Settings, factor: float | None = None) -> Equivalence:
+    """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
+
+    The ratio is below ``factor`` if the test of run means Y / factor finds them too small, and above its inverse if
+    that of Y factor finds them too large; both at ``1 - power`` (Schuirmann 1987). A ratio at either end, or beyond,
+    is called equivalent with that probability at most.
+
+    Parameters
+    ----------
+    means : (runs,), mean NEES of each run over ``dof``
+    steps : of the longest run
+    factor : ``settings.factor`` where it is not given
+    """
+    factor = settings.factor if factor is None else factor
+    below, above = (
+        scale_test(means / factor, dof, steps).below,
+        scale_test(means * factor, dof, steps).above,
+    )
+    return _result(below, above, factor, settings, _deciding_runs(scale_test(means, dof, steps), factor, settings))
+
+
+def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:
+    """The same from the e-process inverted: valid whenever it is looked at, and under any dependence."""
+    factor = settings.factor
+    below = ever(e_process(means / factor, dof).down)
+    above = ever(e_process(means * factor, dof).up)
+    return _result(below, above, factor, settings, None)
+
+
+def equivalence_of_innovations(test: NisTest, settings: Settings) -> Equivalence:
+    """The same of the total NIS, whose innovations are independent over steps too."""
+    factor, total = settings.factor, test.ratio * test.dof
+    if not test.dof:
+        return Equivalence(factor, float("nan"), 1.0 - settings.power, None)
+    below, above = float(stats.chi2.cdf(total / factor, test.dof)), float(stats.chi2.sf(total * factor, test.dof))
+    return _result(below, above, factor, settings, None)
+
+
+def _result(below: float, above: float, factor: float, settings: Settings, runs: int | None) -> Equivalence:
+    p_value = below if settings.one_sided else max(below, above)
+    return Equivalence(factor, float(p_value), 1.0 - settings.power, runs)
+
+
+def _deciding_runs(test: MeanTest, factor: float, settings: Settings) -> int | None:
+    """Runs that would probably show the ratio inside, or find it at fault, if it is what it seems to be.
+
+    Fewer than 20 runs do not know their ratio: then it is taken to be right. Chi-square of k degrees of freedom
+    is judged by its logarithm, of variance 2 / k; each with probability ``power``.
+    """
+    if not test.runs or not test.ratio > 0:
+        return None
+    gap = abs(float(np.log(test.ratio))) if test.runs >= FEW else 0.0
+    tail = SHARES[MAIN] * settings.false_alarm / (1 if settings.one_sided else 2)
+    power, room = float(special.ndtri(settings.power)), float(np.log(factor)) - gap
+
+    def runs(quantile: float, distance: float) -> float:
+        return 2.0 / test.effective_dof * ((quantile + power) / distance) ** 2 if distance > 0 else float("inf")
+
+    least = min(runs(power, room), runs(float(special.ndtri(1.0 - tail)), gap))
+    return None if least > LARGEST else max(int(np.ceil(least)), FEW)

@@ -1,0 +1,155 @@
+"""A verdict for programs, terminals and notebooks: one flat dictionary, a short text, a short table."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from consistency.diagnostics.wording import p_text, plural, short
+
+if TYPE_CHECKING:
+    from consistency.diagnostics.records import Equivalence, Verdict
+
+
+def flat(v: Verdict) -> dict[str, Any]:
+    """Every number of a verdict under one name each; parts that could not be looked at are left out."""
+    s: dict[str, Any] = {
+        "runs": v.runs, "steps": v.steps, "false_alarm": v.settings.false_alarm,
+        "confidence": 1.0 - v.settings.false_alarm, "detect": v.settings.detect, "power": v.settings.power,
+        "tolerance": v.settings.tolerance, "allow": v.settings.allow,
+        "failures": [[f.run, f.step, f.reason] for f in v.failures],
+        "answers": [vars(a) for a in v.answers], "p_value": v.p_value, "left_out_steps": list(v.left_out_steps),
+    }  # fmt: skip
+    for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy):
+        s |= part(v)
+    if v.convention is not None or v.notes:
+        s |= {"convention": v.convention, "notes": list(v.notes)}
+    return s
+
+
+def _scale(v: Verdict) -> dict[str, Any]:
+    if (s := v.scale) is None:
+        return {}
+    return {
+        "dof": s.dof, "anees": s.anees, "alive": s.alive, "band": s.band, "judged_steps": s.judged_steps,
+        "mean_anees": s.mean_anees, "acceptance": s.accepted, "effective_dof": s.effective_dof,
+        "ratio": s.inflation.value, "ratio_interval": tuple(s.inflation[1:]), "detectable": s.detectable,
+        "median_run": s.median_run, "worst_run": s.worst_run, "share_inside": s.share_inside,
+        "equivalence": _equivalence(s.equivalence),
+    }  # fmt: skip
+
+
+def _equivalence(e: Equivalence | None) -> dict[str, Any] | None:
+    return None if e is None else vars(e) | {"shown": e.shown}
+
+
+def _location(v: Verdict) -> dict[str, Any]:
+    if (where := v.location) is None:
+        return {}
+    return {
+        "simultaneous": where.simultaneous, "steps_above": where.above, "steps_below": where.below,
+        "first_outside": where.first_outside, "first_step": where.first_step, "since": where.since,
+        "lasting": where.lasting, "subset": where.subset,
+    }  # fmt: skip
+
+
+def _axes(v: Verdict) -> dict[str, Any]:
+    if (a := v.axes) is None:
+        return {}
+    s: dict[str, Any] = {
+        "axes": a.names, "groups": {key: list(index) for key, index in a.groups.items()},
+        "of_axes": {key: tuple(interval) for key, interval in a.inflation.items()},
+        "impossible": [list(pair) for pair in v.impossible],
+    }  # fmt: skip
+    if a.largest is not None:
+        s |= {"largest": tuple(a.largest), "largest_direction": a.direction}
+    return s
+
+
+def _bias(v: Verdict) -> dict[str, Any]:
+    if (b := v.bias) is None:
+        return {}
+    s: dict[str, Any] = {"bias": {axis: tuple(interval) for axis, interval in b.by_axis.items()}, "bias_step": b.step}
+    if b.inflation_without is not None:
+        s |= {"ratio_without_bias": tuple(b.inflation_without), "bias_axis": b.axis}
+    return s
+
+
+def _shape(v: Verdict) -> dict[str, Any]:
+    if (s := v.shape) is None:
+        return {}
+    correlation = [*(s.pair or (None, None)), s.actual, s.stated]
+    return {"shape": s.matrix, "shape_step": s.step, "correlation": correlation}
+
+
+def _tails(v: Verdict) -> dict[str, Any]:
+    if (t := v.tails) is None:
+        return {}
+    return {
+        "outlier": {"run": t.run, "step": t.step, "distance": t.distance}, "pit": t.pit,
+        "pit_half_width": t.half_width,
+    }  # fmt: skip
+
+
+def _innovations(v: Verdict) -> dict[str, Any]:
+    if (i := v.innovations) is None:
+        return {}
+    return {
+        "nis_ratio": i.ratio, "nis_interval": list(i.interval), "nis_dof": i.dof, "nis_judged": i.judged,
+        "autocorrelation": i.autocorrelation, "autocorrelation_bound": i.bound,
+        "nis_equivalence": _equivalence(i.equivalence),
+    }  # fmt: skip
+
+
+def _accuracy(v: Verdict) -> dict[str, Any]:
+    if (a := v.accuracy) is None:
+        return {}
+    return {
+        "coverage": a.coverage, "coverage_one_step": a.coverage_one_step, "coverage_interval": a.coverage_interval,
+        "rmse": a.rmse, "rmse_position": a.rmse_position, "rmse_heading": a.rmse_heading, "nci": a.nci,
+        "inclination": a.inclination,
+    }  # fmt: skip
+
+
+# --- for people --------------------------------------------------------------------------------------
+
+
+def figures(v: Verdict) -> list[tuple[str, str]]:
+    """The numbers that matter, with their names."""
+    rows = [("evidence", f"{plural(v.runs, 'run')} of {plural(v.steps, 'step')}")]
+    if v.scale is not None and v.scale.judged_steps:
+        s, shown = v.scale, v.scale.equivalence
+        low, high = s.accepted
+        rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {short(low)} to {short(high)} accepted)"))
+        value, low, high = s.inflation
+        rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], truth over stated"))
+        ends = f"[{short(1 / shown.factor)}, {short(shown.factor)}]"
+        rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)})"))
+    if v.accuracy is not None and v.axes is not None:
+        inside = (f"{axis} {100 * c:.1f} %" for axis, c in zip(v.axes.names, v.accuracy.coverage, strict=True))
+        rows.append(("2-sigma coverage", ", ".join(inside)))
+    if v.innovations is not None and np.isfinite(v.innovations.ratio):
+        judged = "" if v.innovations.judged else ", not judged"
+        rows.append(("NIS / dof", f"{v.innovations.ratio:.3f}{judged}"))
+    rows.append(("failed runs", f"{len({f.run for f in v.failures})} of {v.runs}"))
+    found = [f"{a.question} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated]
+    rows.append(("faults", f"{', '.join(found) or 'none'} of {plural(len(v.answers), 'question')}"))
+    return rows
+
+
+def text(v: Verdict) -> str:
+    """The sentence and a short table."""
+    rows = figures(v)
+    width = max(len(name) for name, _ in rows)
+    return "\n".join([f"{v.filter} is {v.reasons[0]}", *(f"  {name:<{width}}  {value}" for name, value in rows)])
+
+
+def html(v: Verdict) -> str:
+    """The same for a notebook."""
+    rows = "".join(
+        f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
+        for name, value in figures(v)
+    )
+    return f"<div><p><strong>{escape(v.filter)}</strong> is {escape(v.reasons[0])}</p><table>{rows}</table></div>"

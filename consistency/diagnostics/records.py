@@ -1,0 +1,342 @@
+"""What the referee is given, what it is asked, and what it says: frozen records, shapes on each field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from consistency.types import Array, Failure, Indices
+
+# status -> what it means; the order is that of reports
+STATUSES = {
+    "consistent": "no fault is found, and the errors are shown to be as large as the covariance says",
+    "overconfident": "the errors are larger than the covariance says",
+    "conservative": "the errors are smaller than the covariance says",
+    "biased": "the errors have a mean; about it they are as large as the covariance says",
+    "heavy-tailed": "a few errors are far larger than a Gaussian of the stated covariance has them",
+    "inconsistent": "the errors are otherwise than the covariance says, in more than their size",
+    "undecided": "no fault is found, and it is not shown that there is none",
+    "failed": "a run broke down, or there was nothing to judge",
+}
+
+
+class Interval(NamedTuple):
+    """A value and a confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def holds(self, value: float) -> bool:
+        """Is ``value`` inside? NaN ends hold nothing."""
+        return self.low <= value <= self.high
+
+
+# --- what the referee is given -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them."""
+
+    name: str
+    error: Array | None = None  # (runs, steps, n), NaN where a run has no estimate
+    covariance: Array | None = None  # (runs, steps, n, n)
+    nees: Array | None = None  # (runs, steps), NaN where it does not count; worked out from the errors if not given
+    dof: int | None = None  # dimension of the error, where NEES stands alone
+    nis: Array | None = None  # (runs, steps), NaN where there was no innovation
+    nis_dof: Array | None = None  # (runs, steps)
+    innovations: Array | None = None  # (runs, steps, m), for their whiteness; without them the NIS has to do
+    innovation_covariances: Array | None = None  # (runs, steps, m, m)
+    optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
+    failures: tuple[Failure, ...] = ()
+    axes: Sequence[str] | None = None  # names of the n components
+    run_numbers: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a verdict is asked, and how sure it has to be.
+
+    Raises
+    ------
+    ValueError
+        A value out of its range.
+    """
+
+    false_alarm: float = 0.05  # chance to find a fault in a right filter, all questions together
+    detect: float = 1.5  # a consistent filter is shown to have a ratio of true to stated covariance inside
+    power: float = 0.95  # [1 / detect, detect]; one at either end is not called so with this probability or more
+    tolerance: float | None = None  # a ratio shown to lie in [1 / tolerance, tolerance] is no fault
+    allow: str | None = None  # "conservative": a covariance that is too large is no fault
+    method: str = "max"  # of the band over all steps: "max" or "bonferroni"
+    subsets: Mapping[str, Sequence[int]] | None = None  # further groups of components to look at, name -> indices
+
+    def __post_init__(self) -> None:
+        for name in ("false_alarm", "power"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name)}")
+        for name in ("detect", "tolerance"):
+            value = getattr(self, name)
+            if value is not None and not (0.0 < value < float("inf") and value != 1.0):
+                raise ValueError(f"{name} must be a positive ratio of true to stated covariance, not 1; got {value}")
+        if self.allow not in (None, "conservative"):
+            raise ValueError(f"allow must be 'conservative' or None, got '{self.allow}'")
+        if self.method not in ("max", "bonferroni"):
+            raise ValueError(f"method must be 'max' or 'bonferroni', got '{self.method}'")
+
+    @property
+    def factor(self) -> float:
+        """``detect`` as a factor above 1."""
+        return max(self.detect, 1.0 / self.detect)
+
+    @property
+    def tolerated(self) -> float:
+        """``tolerance`` as a factor of 1 or more; 1 where nothing is tolerated."""
+        return 1.0 if self.tolerance is None else max(self.tolerance, 1.0 / self.tolerance)
+
+    @property
+    def one_sided(self) -> bool:
+        """Only a covariance that is too small is a fault."""
+        return self.allow == "conservative"
+
+
+# --- what the referee says ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one question found."""
+
+    question: str
+    p_value: float
+    share: float  # of the false-alarm rate; all of a verdict add to 1
+    adjusted: float  # p value corrected for all questions asked
+    found: bool  # adjusted is at most the false-alarm rate of the verdict
+    tolerated: bool = False  # found, but shown to lie within the tolerance
+
+
+@dataclass(frozen=True)
+class Equivalence:
+    """Is the ratio of true to stated covariance shown to lie near 1? Two one-sided tests (Schuirmann 1987)."""
+
+    factor: float  # the interval is [1 / factor, factor]
+    p_value: float  # the larger of both; NaN where there is nothing to judge
+    level: float  # at which it is shown
+    runs: int | None  # that would probably decide, shown or found at fault; None where it is not known
+
+    @property
+    def shown(self) -> bool:
+        return self.p_value <= self.level
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Size of the errors against the stated covariance; T steps."""
+
+    dof: int
+    anees: Array  # (T,), average NEES over runs
+    alive: Indices  # (T,), runs that have a value
+    band: Array  # (T, 2), 95 % interval of the ANEES of one step by itself; not judged
+    mean_anees: float  # over whole runs
+    accepted: tuple[float, float]  # interval of mean_anees without a fault
+    effective_dof: float  # nu of one run: its mean NEES spreads as chi-square(nu) / nu
+    inflation: Interval  # ratio of true to stated covariance, 95 % interval; since the fault begins, if it begins late
+    detectable: float  # smallest ratio that the runs find with power 0.95, however steps depend on each other
+    median_run: float  # mean NEES
+    worst_run: float
+    share_inside: float  # of steps inside ``band``
+    equivalence: Equivalence
+
+    @property
+    def judged_steps(self) -> int:
+        return int((self.alive > 0).sum())
+
+
+@dataclass(frozen=True)
+class Axes:
+    """The error by component; n components."""
+
+    names: tuple[str, ...]
+    groups: Mapping[str, Sequence[int]]  # components, named groups and subsets
+    inflation: Mapping[str, Interval] = field(default_factory=dict)  # of each group, simultaneous 95 %
+    largest: Interval | None = None  # inflation in the worst direction, where one-sided
+    direction: Array | None = None  # (n,), of whitened errors
+
+
+@dataclass(frozen=True)
+class Bias:
+    """Mean of the error."""
+
+    by_axis: Mapping[str, Interval]  # in stated standard deviations
+    step: int | None  # where it is clearest, 1..T
+    axis: str | None  # the one that carries it in that step
+    inflation_without: Interval | None  # of the errors less their mean; where a bias was found
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Relative sizes and correlations of the components."""
+
+    matrix: Array  # (n, n), mean product of whitened errors over whole runs, scaled to trace n: I if right
+    step: int | None  # where it is worst, 1..T
+    pair: tuple[int, int] | None  # components that correlate least as stated
+    actual: float  # their correlation
+    stated: float
+
+
+@dataclass(frozen=True)
+class Tails:
+    """Errors that are too rare, and the whole distribution."""
+
+    run: int  # of the error farthest from the other runs; -1 if none is
+    step: int  # 1..T
+    distance: float  # in standard deviations of the other runs
+    pit: Array  # (N,), sorted distribution function of the NEES, one step a run: uniform if right
+    half_width: float  # of its simultaneous band
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """What the filter sees of its own errors."""
+
+    ratio: float  # total NIS over its degrees of freedom
+    interval: tuple[float, float]  # 95 % expected of white innovations
+    dof: int
+    judged: bool  # an optimal gain was declared
+    autocorrelation: Array  # (lags,)
+    bound: float  # that 95 % of each lag stay within, if white
+    equivalence: Equivalence | None = None  # of the NIS, where it is judged
+
+
+@dataclass(frozen=True)
+class Location:
+    """Since when, and where; T steps."""
+
+    simultaneous: Array  # (T, 2), where the ANEES of a consistent filter lies in all steps at once
+    above: int  # steps above it
+    below: int
+    first_outside: int | None  # first step outside, found at fault or not
+    first_step: int | None = None  # the same where some step was found at fault
+    since: int | None = None  # the fault begins there: it was absent before
+    lasting: bool = False  # most steps from there on are outside
+    subset: str | None = None  # axes that carry the fault, where axes differ from each other
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Size of the errors by themselves, and other people's indices."""
+
+    coverage: Array  # (n,), share of errors within 2 stated standard deviations, all steps
+    coverage_one_step: Array  # (n,), of one step of each run
+    coverage_interval: Array  # (n, 2), its exact binomial 95 % interval
+    rmse: Array  # (n,)
+    rmse_position: float
+    rmse_heading: float
+    nci: float  # noncredibility index, dB (Li & Zhao 2006)
+    inclination: float  # dB
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The referee's answer for one filter.
+
+    ``print`` shows the sentence and a short table. Every part is None where it could not be looked at.
+    """
+
+    filter: str
+    status: str  # see STATUSES
+    reasons: tuple[str, ...]  # the first is a sentence to act on
+    runs: int
+    steps: int
+    settings: Settings
+    answers: tuple[Answer, ...] = ()
+    failures: tuple[Failure, ...] = ()
+    impossible: tuple[tuple[int, int], ...] = ()  # (run, step) of what no filter may say
+    left_out_steps: tuple[int, ...] = ()  # rank-deficient covariance
+    scale: Scale | None = None
+    axes: Axes | None = None
+    bias: Bias | None = None
+    shape: Shape | None = None
+    tails: Tails | None = None
+    innovations: Innovations | None = None
+    location: Location | None = None
+    accuracy: Accuracy | None = None
+    convention: str | None = None  # of the error, where files declare one
+    notes: tuple[str, ...] = ()  # of whoever read the files
+
+    @property
+    def consistent(self) -> bool:
+        return self.status == "consistent"
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Questions in which a fault was found, those within the tolerance left out."""
+        return tuple(a.question for a in self.answers if a.found and not a.tolerated)
+
+    @property
+    def p_value(self) -> float:
+        """False-alarm rate at which some fault would just be found, all questions together; NaN without any."""
+        return min((min(1.0, a.p_value / a.share) for a in self.answers if not a.tolerated), default=float("nan"))
+
+    @property
+    def statistic(self) -> float:
+        """Mean NEES over runs and steps; without truth, NIS per degree of freedom."""
+        if self.scale is not None:
+            return self.scale.mean_anees
+        return self.innovations.ratio if self.innovations is not None else float("nan")
+
+    @property
+    def threshold(self) -> tuple[float, float]:
+        """Interval in which ``statistic`` is no fault."""
+        if self.scale is not None:
+            return self.scale.accepted
+        return self.innovations.interval if self.innovations is not None else (float("nan"), float("nan"))
+
+    @property
+    def inflation(self) -> float:
+        """Factor by which the stated covariance has to grow (below 1: shrink) to be that of the errors."""
+        return self.scale.inflation.value if self.scale is not None else float("nan")
+
+    @property
+    def inflation_interval(self) -> tuple[float, float]:
+        """95 % interval of ``inflation``, from the spread between runs."""
+        return self.scale.inflation[1:] if self.scale is not None else (float("nan"), float("nan"))
+
+    @property
+    def equivalence(self) -> Equivalence | None:
+        """What was shown of the scale: of the NEES, without truth of the NIS."""
+        if self.scale is not None:
+            return self.scale.equivalence
+        return self.innovations.equivalence if self.innovations is not None else None
+
+    @property
+    def first_step(self) -> int | None:
+        """First step in which the ANEES is outside its simultaneous band; None if in none."""
+        return self.location.first_step if self.location is not None else None
+
+    @property
+    def subset(self) -> str | None:
+        """Axes that carry the fault; None if no axis stands out."""
+        return self.location.subset if self.location is not None else None
+
+    @property
+    def statistics(self) -> dict[str, Any]:
+        """Every number as one flat dictionary, as ``--json`` has it."""
+        from consistency.diagnostics.export import flat
+
+        return flat(self)
+
+    def __str__(self) -> str:
+        from consistency.diagnostics.export import text
+
+        return text(self)
+
+    def __repr__(self) -> str:
+        return f"<Verdict {self.filter}: {self.status}, {self.runs} runs x {self.steps} steps; print() shows it>"
+
+    def _repr_html_(self) -> str:
+        from consistency.diagnostics.export import html
+
+        return html(self)

@@ -1,0 +1,51 @@
+"""The scale of a filter as a verdict reports it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consistency.diagnostics.asking import Asked
+from consistency.diagnostics.intervals import anees_interval
+from consistency.diagnostics.nees import anees
+from consistency.diagnostics.planning import detectable_ratio
+from consistency.diagnostics.questions import MAIN, SHARES
+from consistency.diagnostics.records import Equivalence, Location, Scale, Settings
+from consistency.diagnostics.sample import Sample
+from consistency.diagnostics.scale import acceptance, ratio_interval
+from consistency.types import Array, Indices
+
+INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
+NOTHING = (float("nan"), float("nan"))
+
+
+def scale_of(sample: Sample, asked: Asked, settings: Settings, location: Location, shown: Equivalence) -> Scale:
+    """Put together what is known of the scale; the inflation is that since the fault began, if it began late."""
+    dof, means = sample.dof, sample.means()
+    alive = sample.counted.sum(axis=0)
+    curve, band = anees(sample.nees), pointwise_band(alive, dof)
+    judged = alive > 0
+    some = bool(judged.any())
+    rate = SHARES[MAIN] * settings.false_alarm
+    inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
+    late = means if location.since is None else sample.means(slice(location.since - 1, None))
+    return Scale(
+        dof=dof,
+        anees=curve,
+        alive=alive,
+        band=band,
+        mean_anees=asked.main.ratio * dof,
+        accepted=acceptance(asked.main, dof, rate, settings.allow),
+        effective_dof=asked.main.effective_dof,
+        inflation=ratio_interval(late, dof, INTERVAL),
+        detectable=detectable_ratio(dof, len(means), rate, two_sided=not settings.one_sided) if some else np.nan,
+        median_run=float(np.median(means)) * dof if some else np.nan,
+        worst_run=float(means.max()) * dof if some else np.nan,
+        share_inside=float(inside[judged].mean()) if some else np.nan,
+        equivalence=shown,
+    )
+
+
+def pointwise_band(alive: Indices, dof: int) -> Array:
+    """95 % interval of the ANEES of each step by itself, (steps,) -> (steps, 2); NaN without a run."""
+    intervals = {int(m): anees_interval(dof, int(m), INTERVAL) for m in set(alive[alive > 0])}
+    return np.array([intervals.get(int(m), NOTHING) for m in alive]).reshape(-1, 2)

@@ -1,0 +1,768 @@
+"""Statuses and sentences: the right word for each fault, and none that contradicts its own figures.
+
+Draws with rates have a fixed seed that was not chosen and limits at 1e-5 or further out; single cases are so far from
+the limit of their word that they are missed less often than that.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from collections.abc import Callable, Iterator
+from html import escape
+from typing import Any
+
+import numpy as np
+import pytest
+from draws import autoregression, fully_dependent, identities, independent, verdict_on
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy import stats
+
+from consistency.diagnostics import Evidence, Interval, Settings, Verdict, judge
+from consistency.diagnostics.records import STATUSES
+from consistency.diagnostics.wording import factor, p_text, plural, short
+from consistency.storage import plain
+from consistency.types import Array, Failure
+
+SURE = 1e-5
+ALARMS = ("overconfident", "conservative", "biased", "heavy-tailed", "inconsistent")
+# --- the status ------------------------------------------------------------------------------------------
+
+
+def test_a_pure_offset_is_biased(rng: np.random.Generator) -> None:
+    """One sigma along one axis, over AR(.95) steps, and over steps that are one."""
+    for world in (autoregression, fully_dependent):
+        verdict = verdict_on(world(rng, 100, 40, 3) + np.array([1.0, 0.0, 0.0]), false_alarm=SURE)
+        assert verdict.status == "biased"
+        assert "bias" in verdict.faults
+        assert verdict.reasons[0].startswith("biased: axis 0 +")
+        assert "too small" not in verdict.reasons[0]
+        assert "without the bias the covariance ratio is" in verdict.reasons[0]
+
+
+def test_an_offset_in_some_steps_is_biased(rng: np.random.Generator) -> None:
+    error = independent(rng, 100, 30, 3)
+    error[:, 11, 1] += 2.0
+    verdict = verdict_on(error, false_alarm=SURE)
+    assert verdict.status == "biased"
+    assert "in step 12, mainly axis 1" in verdict.reasons[0]
+
+
+def test_an_offset_and_a_wrong_scale_are_both_said(rng: np.random.Generator) -> None:
+    verdict = verdict_on(2.0 * independent(rng, 100, 30, 3) + np.array([2.0, 0.0, 0.0]), false_alarm=SURE)
+    assert verdict.status == "overconfident"
+    assert {"scale", "bias"} <= set(verdict.faults)
+    assert "biased: axis 0 +" in verdict.reasons[0]
+    assert "covariance too small by x" in verdict.reasons[0]
+
+
+@pytest.mark.xfail(strict=True, reason="the side of the headline is that of the errors with their bias")
+def test_an_offset_does_not_make_a_small_error_large(rng: np.random.Generator) -> None:
+    """Errors of half the stated variance about a mean of 1.2 sigma in every axis: not 'overconfident'."""
+    verdict = verdict_on(np.sqrt(0.5) * independent(rng, 100, 30, 3) + 1.2, false_alarm=SURE)
+    assert verdict.bias is not None
+    assert verdict.bias.inflation_without is not None
+    assert verdict.bias.inflation_without.high < 0.6
+    assert verdict.status in ("biased", "conservative")
+
+
+@pytest.mark.parametrize(("ratio", "status"), [(2.0, "overconfident"), (0.5, "conservative")])
+def test_a_wrong_scale(rng: np.random.Generator, ratio: float, status: str) -> None:
+    verdict = verdict_on(np.sqrt(ratio) * autoregression(rng, 61, 40, 3), false_alarm=SURE)
+    assert verdict.status == status
+    side = "too small" if ratio > 1 else "too large"
+    assert verdict.reasons[0].startswith(f"{status}: covariance {side} by x") or "since step" in verdict.reasons[0]
+    assert verdict.reasons[0].endswith("no bias found")
+
+
+def test_a_few_large_errors_are_heavy_tails(rng: np.random.Generator) -> None:
+    """Every hundredth error eight times as large as stated, the others smaller: a right covariance, 100 runs."""
+    error = independent(rng, 100, 20, 3) * np.sqrt((1.0 - 0.01 * 64.0) / 0.99)
+    large = rng.random((100, 20)) < 0.01
+    error[large] *= 8.0 / np.sqrt((1.0 - 0.01 * 64.0) / 0.99)
+    verdict = verdict_on(error, false_alarm=SURE)
+    assert verdict.status == "heavy-tailed"
+    assert "outliers" in verdict.faults
+    assert verdict.reasons[0].startswith("heavy-tailed: heavy tails: run ")
+    assert "sigma from the other runs in step" in verdict.reasons[0]
+
+
+@pytest.mark.xfail(strict=True, reason="a step, or an axis, that is found is not asked whether a few errors make it")
+def test_heavy_tails_of_the_right_covariance_are_not_a_wrong_scale(rng: np.random.Generator) -> None:
+    """60 draws of 21 runs with Laplace errors in independent steps; at 5 % more than 12 have a probability of 1e-5."""
+    laplace = (rng.laplace(0.0, np.sqrt(0.5), (21, 60, 3)) for _ in range(60))
+    statuses = [verdict_on(error).status for error in laplace]
+    count = statuses.count("overconfident") + statuses.count("conservative")
+    assert count <= stats.binom.isf(SURE, 60, 0.05)
+
+
+def test_heavy_tails_of_many_runs_are_called_so(rng: np.random.Generator) -> None:
+    """100 runs of t5 errors in independent steps: 20 draws, with the limit of the test above."""
+    statuses = [verdict_on(np.sqrt(0.6) * rng.standard_t(5, (100, 60, 3))).status for _ in range(20)]
+    assert statuses.count("heavy-tailed") >= 14
+    assert statuses.count("overconfident") + statuses.count("conservative") <= stats.binom.isf(SURE, 20, 0.05)
+
+
+def test_a_wrong_correlation_is_inconsistent(rng: np.random.Generator) -> None:
+    error = independent(rng, 100, 30, 3)
+    error[..., 2] = 0.8 * error[..., 0] + 0.6 * error[..., 2]
+    verdict = verdict_on(error, false_alarm=SURE)
+    assert verdict.status == "inconsistent"
+    assert "axis 0 and axis 2 are correlated +0." in verdict.reasons[0]
+    assert "stated +0.00" in verdict.reasons[0]
+
+
+def test_axes_that_err_in_opposite_directions_are_inconsistent(rng: np.random.Generator) -> None:
+    verdict = verdict_on(independent(rng, 100, 30, 2) * np.sqrt([1.6, 0.4]), false_alarm=SURE)
+    assert "scale" not in verdict.faults or abs(verdict.inflation - 1.0) < 0.1
+    assert "axis 0 too small by x1." in verdict.reasons[0]
+    assert "axis 1 too large by x2." in verdict.reasons[0]
+    assert verdict.status == "inconsistent"
+
+
+def test_failures_are_failed_unless_a_fault_is_found(rng: np.random.Generator) -> None:
+    broke = (Failure("f", 3, 7, "LinAlgError: singular"),)
+    for ratio, status in ((1.0, "failed"), (4.0, "overconfident")):
+        error = np.sqrt(ratio) * independent(rng, 60, 20, 3)
+        error[3, 6:] = np.nan
+        verdict = judge(Evidence("f", error, identities(error), failures=broke), Settings(SURE))
+        assert verdict.status == status
+        assert "1 of 60 runs failed, first run 3 in step 7: LinAlgError: singular" in " ".join(verdict.reasons[:2])
+    single = independent(rng, 1, 20, 3)
+    assert judge(Evidence("f", single, identities(single), failures=broke), Settings(SURE)).status == "failed"
+
+
+def test_statuses_of_alarm_have_a_fault_and_the_others_none(rng: np.random.Generator) -> None:
+    seen = set()
+    for _ in range(60):
+        runs = int(rng.integers(1, 40))
+        error = np.exp(rng.normal(0, 0.5)) * independent(rng, runs, 6, 2) + rng.normal(0, 0.3)
+        verdict = verdict_on(error, false_alarm=0.2)
+        seen.add(verdict.status)
+        assert (verdict.status in ALARMS) == bool(verdict.faults)
+        assert verdict.reasons[0].startswith(f"{verdict.status}")
+        assert verdict.consistent == (verdict.status == "consistent")
+    assert {"consistent", "overconfident", "conservative", "undecided"} <= seen
+
+
+# --- where and since when ----------------------------------------------------------------------------------
+
+
+def named(verdict: Verdict) -> bool:
+    return verdict.subset is not None or "mainly" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize("runs", [21, 61])
+def test_a_uniform_fault_names_no_axis_and_no_beginning(rng: np.random.Generator, runs: int) -> None:
+    """x1.2 with AR(.95) in 60 draws; at 5 % more than 12 have a probability below 1e-5."""
+    verdicts = [verdict_on(np.sqrt(1.2) * autoregression(rng, runs, 100, 3)) for _ in range(60)]
+    assert sum(named(v) or " since step" in v.reasons[0] for v in verdicts) <= stats.binom.isf(SURE, 60, 0.05)
+
+
+def test_the_axis_that_is_wrong_is_named(rng: np.random.Generator) -> None:
+    """x1.5 in one of three axes with AR(.95), 61 runs; 30 draws at 90 %, less than 18 have a probability of 1e-5."""
+    count = 0
+    for _ in range(30):
+        error = autoregression(rng, 61, 100, 3)
+        error[..., 1] *= np.sqrt(1.5)
+        text = verdict_on(error).reasons[0]
+        count += "mainly axis 1" in text or "covariance of axis 1 too small" in text
+    assert count >= stats.binom.ppf(SURE, 30, 0.9)
+
+
+def test_a_fault_that_begins_is_dated(rng: np.random.Generator) -> None:
+    """x1.5 from step 51 of 100 with AR(.95), 61 runs; 30 draws at 90 %."""
+    dated = []
+    for _ in range(30):
+        error = autoregression(rng, 61, 100, 3)
+        error[:, 50:] *= np.sqrt(1.5)
+        verdict = verdict_on(error)
+        if verdict.location is not None and verdict.location.since is not None:
+            dated.append(verdict.location.since)
+            assert verdict.reasons[0].startswith(f"{verdict.status} since step {verdict.location.since}: ")
+            assert verdict.location.lasting
+            assert verdict.location.first_step == verdict.location.since
+            assert 1.15 < verdict.inflation < 1.95  # of the steps since then alone
+    assert len(dated) >= stats.binom.ppf(SURE, 30, 0.9)
+    assert 51 <= np.median(dated) <= 60
+
+
+def test_a_fault_from_the_start_has_no_date(rng: np.random.Generator) -> None:
+    verdict = verdict_on(np.sqrt(3.0) * independent(rng, 61, 30, 3), false_alarm=SURE)
+    assert "since" not in verdict.reasons[0]
+    assert "visible" not in verdict.reasons[0]
+    error = independent(rng, 30, 40, 3) * np.sqrt(np.linspace(1.3, 3.0, 40))[:, None]  # grows: visible late, not begun
+    growing = verdict_on(error, false_alarm=1e-3)
+    assert growing.location is not None
+    assert growing.location.since is None or growing.location.since > 1
+
+
+def test_the_chief_axis_has_the_name_it_was_given(rng: np.random.Generator) -> None:
+    error = independent(rng, 61, 20, 3)
+    error[..., 2] *= np.sqrt(3.0)
+    evidence = Evidence("f", error, identities(error), axes=["x", "y", "heading"])
+    verdict = judge(evidence, Settings(SURE))
+    assert verdict.subset == "heading"
+    assert "heading" in verdict.reasons[0]
+    assert judge(evidence, Settings(SURE, subsets={"all": [0, 1, 2]})).subset == "heading"
+
+
+# --- wrong words ----------------------------------------------------------------------------------------
+
+RUNS = [1, 2, 3, 5, 19, 20, 50]
+
+
+def worlds(rng: np.random.Generator, runs: int, n: int = 3, steps: int = 8) -> Iterator[Array]:
+    """Right and wrong, by little and by much."""
+    for world in (independent, fully_dependent):
+        yield world(rng, runs, steps, n)
+        for power in (-6, -3, -1, 1, 3, 6):
+            yield 10.0 ** (power / 2) * world(rng, runs, steps, n)
+    yield independent(rng, runs, steps, n) + 3.0
+    yield 1e-4 * independent(rng, runs, steps, n) + 1.0
+    one_axis = independent(rng, runs, steps, n)
+    one_axis[..., -1] *= 1e3
+    yield one_axis
+    late = independent(rng, runs, steps, n)
+    late[:, steps // 2 :] *= 30.0
+    yield late
+    tilted = independent(rng, runs, steps, n)
+    tilted[..., 0] = tilted[..., -1] + 0.01 * tilted[..., 0]
+    yield tilted
+
+
+def one_component(rng: np.random.Generator, runs: int) -> Iterator[Array]:
+    yield from worlds(rng, runs, n=1, steps=1)
+    yield from worlds(rng, runs, n=1, steps=5)
+
+
+def six_components(rng: np.random.Generator, runs: int) -> Iterator[Array]:
+    yield independent(rng, runs, 8, 6) + 3.0
+    yield independent(rng, runs, 8, 6) * np.sqrt([3.0, 0.3, 3.0, 0.3, 3.0, 0.3])
+
+
+def some_diverged(rng: np.random.Generator, runs: int, n: int = 3, steps: int = 8) -> Iterator[Array]:
+    for size in (1e2, 1e4, 1e6):
+        error = independent(rng, runs, steps, n)
+        error[0] *= size
+        yield error
+        error = independent(rng, runs, steps, n)
+        error[-1, steps // 2 :] *= size
+        yield error
+    for _ in range(4):
+        yield np.sqrt(2.1 / rng.chisquare(2.1, (runs, 1, 1))) * independent(rng, runs, steps, n)
+
+
+def without_error(rng: np.random.Generator, runs: int) -> Iterator[Array]:
+    yield np.zeros((runs, 8, 3))
+    axis = independent(rng, runs, 8, 3)
+    axis[..., 0] = 0.0
+    yield axis
+
+
+def infinite(text: str) -> bool:
+    return re.search(r"\binf\b|\bnan\b", text, re.I) is not None
+
+
+def placeholder(text: str) -> bool:
+    """A number that only keeps a division from failing."""
+    return re.search(r"e[+-](2\d\d|30\d)", text) is not None
+
+
+def zero_end(text: str) -> bool:
+    """An interval of a ratio from 0, or up to 0."""
+    return re.search(r"\[0(\.0+)?,|, 0(\.0+)?\]|ratio 0(\.0+)?\b(?!\.)", text) is not None
+
+
+def wrong_number(text: str) -> bool:
+    """Singular for plural, or plural for singular."""
+    singular = re.search(r"(?<![\d.])1 (runs|steps|questions)\b|of 1 steps", text)
+    return bool(singular or re.search(r"(?<![\d.])(0|[2-9]|\d\d+) (run|step|question)\b", text))
+
+
+def gap(text: str) -> bool:
+    """Nothing where something was to be said."""
+    return re.search(r": ?$|: ;|; ?;|; ?$|  |\bNone\b", text) is not None
+
+
+def long(text: str) -> bool:
+    return len(text) >= 300
+
+
+def same_correlations(text: str) -> bool:
+    pair = re.search(r"correlated ([+-]\d\.\d\d), stated ([+-]\d\.\d\d)", text)
+    return pair is not None and abs(float(pair[1]) - float(pair[2])) < 0.05
+
+
+def outside(text: str) -> bool:
+    """A value outside its own interval."""
+    ends = re.findall(r"(-?[\d.]+(?:e[+-]\d+)?)(?: sigma)? \[([^,\]]+), ([^\]]+)\]", text)
+    return any(not float(low) <= abs(float(v)) <= float(high) for v, low, high in ends if float(low) >= 0.0)
+
+
+def contradiction(text: str) -> bool:
+    """The headline says one side, and the covariance is only wrong to the other."""
+    if text.startswith("overconfident"):
+        return "too large" in text and "too small" not in text
+    return text.startswith("conservative") and "too small" in text and "too large" not in text
+
+
+def said_twice(text: str) -> bool:
+    return text.count("biased") > 1
+
+
+FLAWS = [
+    infinite,
+    placeholder,
+    zero_end,
+    wrong_number,
+    gap,
+    long,
+    same_correlations,
+    outside,
+    contradiction,
+    said_twice,
+]
+KINDS = [worlds, one_component, six_components, some_diverged, without_error]
+KNOWN = {
+    (worlds, zero_end): "0.00 for small ratios",
+    (one_component, zero_end): "0.00 for small ratios",
+    (one_component, placeholder): "an interval that says nothing",
+    (some_diverged, zero_end): "0.00 for small ratios, and an interval that says nothing",
+    (some_diverged, placeholder): "an interval that says nothing",
+    (some_diverged, long): "every figure of every axis",
+    (without_error, placeholder): "the inverse of a ratio of 0",
+    (without_error, zero_end): "0.00 for small ratios",
+}
+
+
+@functools.cache
+def sentences(kind: Callable[..., Iterator[Array]]) -> list[tuple[str, int]]:
+    """Sentences of verdicts with their number of runs; fixed seed."""
+    rng, texts = np.random.default_rng(61), []
+    for runs in RUNS:
+        for error in kind(rng, runs):
+            for settings in (Settings(), Settings(allow="conservative"), Settings(1e-4, tolerance=1.2)):
+                verdict = judge(Evidence("f", error, identities(error)), settings)
+                assert verdict.status in STATUSES
+                texts.append((verdict.reasons[0], runs))
+    return texts
+
+
+def pairs() -> list[Any]:
+    marks = {pair: pytest.mark.xfail(strict=True, reason=f"says {reason}") for pair, reason in KNOWN.items()}
+    return [
+        pytest.param(kind, flaw, marks=[marks[kind, flaw]] if (kind, flaw) in marks else [])
+        for kind in KINDS
+        for flaw in FLAWS
+    ]
+
+
+@pytest.mark.parametrize(("kind", "flaw"), pairs())
+def test_sentences_are_sound(kind: Callable[..., Iterator[Array]], flaw: Callable[[str], bool]) -> None:
+    assert [text for text, _ in sentences(kind) if flaw(text)] == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_one_run_does_is_not_that_of_a_few(kind: Callable[..., Iterator[Array]]) -> None:
+    assert not any("a few runs" in text for text, runs in sentences(kind) if runs == 1)
+
+
+@pytest.mark.xfail(strict=True, reason="an interval from 0 to 0 is not narrow by the rule of a few runs")
+def test_no_error_at_all_is_not_made_by_a_few_runs() -> None:
+    assert not any("a few runs" in text for text, _ in sentences(without_error))
+
+
+def test_the_flaws_are_seen() -> None:
+    """Negative control of the patterns."""
+    bad = {
+        infinite: "x2.00 [1.00, inf]",
+        placeholder: "x1.0e+300 [1, 2]",
+        zero_end: "covariance ratio 1.20 [0.00, 3.00]",
+        wrong_number: "no fault found in 1 runs, and",
+        gap: "consistent: ",
+        long: 300 * "x",
+        same_correlations: "are correlated +0.69, stated +0.68",
+        outside: "covariance ratio 1.20 [1.30, 3.00]",
+        contradiction: "overconfident: covariance of x too large by x1.2 [1.1, 1.3]",
+        said_twice: "biased: biased in step 3",
+    }
+    good = (
+        "overconfident: axis 1 -0.50 sigma [-0.60, -0.40]; 10 runs; covariance too small by x1.20 [1.10, 1.30] of 1 run"
+    )
+    for flaw in FLAWS:
+        assert flaw(bad[flaw])
+        assert not flaw(good)
+    assert not zero_end("covariance ratio 0.95 [0.87, 1.04]")
+
+
+def test_a_fault_of_one_run_is_not_that_of_a_few(rng: np.random.Generator) -> None:
+    for scale in (1e-3, 1e3, 1e8):
+        assert "a few runs" not in verdict_on(scale * independent(rng, 1, 50, 2)).reasons[0]
+
+
+def test_a_few_runs_that_make_the_mean_are_said(rng: np.random.Generator) -> None:
+    """The words that must not be said of one run are said where they are due."""
+    error = independent(rng, 30, 10, 3)
+    error[0] *= 1e3
+    assert "which a few runs make" in verdict_on(error).reasons[0]
+
+
+def test_correlations_that_look_the_same_are_not_named(rng: np.random.Generator) -> None:
+    """Stated .68 and .69 found in 400,000 errors: a fault of the shape, which no person reads off two such numbers."""
+    stated, true = (np.array([[1.0, c], [c, 1.0]]) for c in (0.68, 0.70))
+    error = independent(rng, 4000, 40, 2) @ np.linalg.cholesky(true).T
+    covariance = np.broadcast_to(stated, (4000, 40, 2, 2))
+    verdict = judge(Evidence("f", error, covariance), Settings())
+    assert "shape" in verdict.faults
+    assert "correlated" not in verdict.reasons[0]
+    error = independent(rng, 400, 40, 2) @ np.linalg.cholesky(np.array([[1.0, 0.9], [0.9, 1.0]])).T
+    far = judge(Evidence("f", error, covariance[:400]), Settings())
+    assert "correlated +0.90, stated +0.68" in far.reasons[0]
+
+
+@pytest.mark.xfail(strict=True, reason="'1 of 40 runs have an infinite error'")
+def test_one_run_that_failed_is_said_in_the_singular(rng: np.random.Generator) -> None:
+    error = independent(rng, 40, 10, 2)
+    covariance = identities(error).copy()
+    covariance[3, 4] = -np.eye(2)
+    verdict = judge(Evidence("f", error, covariance), Settings(SURE))
+    assert verdict.status == "failed"
+    assert "1 of 40 runs has " in verdict.reasons[0]
+
+
+@pytest.mark.xfail(strict=True, reason="'biased: biased in step 12'")
+def test_a_bias_in_a_step_is_said_once(rng: np.random.Generator) -> None:
+    error = independent(rng, 100, 30, 3)
+    error[:, 11, 1] += 2.0
+    text = verdict_on(error, false_alarm=SURE).reasons[0]
+    assert text.lower().count("biased") == 1
+
+
+# --- numbers in words --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.234, "1.23"), (12.34, "12.3"), (123.4, "123"), (12345.0, "1.2e+04"), (0.5, "0.50"), (1e4, "1.0e+04")],
+)
+def test_three_digits(value: float, text: str) -> None:
+    assert short(value) == text
+
+
+@pytest.mark.xfail(strict=True, reason="two decimals below 10, so 0.00")
+def test_small_numbers_keep_their_digits() -> None:
+    for value in (0.004, 1e-3, 3e-6):
+        assert float(short(value)) == pytest.approx(value, rel=0.05)
+
+
+def test_factor_is_above_one_on_either_side() -> None:
+    assert factor(Interval(2.0, 1.6, 2.5)) == "x2.00 [1.60, 2.50]"
+    assert factor(Interval(0.5, 0.4, 0.625)) == "x2.00 [1.60, 2.50]"
+
+
+def test_plural_and_p() -> None:
+    assert [plural(n, "run") for n in (0, 1, 2)] == ["0 runs", "1 run", "2 runs"]
+    assert [p_text(p) for p in (0.04567, 1e-6, 9e-7, 0.0)] == ["0.046", "1e-06", "below 1e-6", "below 1e-6"]
+
+
+# --- the whole verdict in text -------------------------------------------------------------------------------
+
+
+@pytest.mark.xfail(strict=True, reason="every axis with its interval")
+def test_a_sentence_about_many_axes_is_short(rng: np.random.Generator) -> None:
+    error = 1.5 * independent(rng, 50, 8, 6) + 1.0
+    axes = ["x", "y", "z", "roll", "pitch", "yaw"]
+    assert len(judge(Evidence("f", error, identities(error), axes=axes)).reasons[0]) < 300
+
+
+def test_print_is_short(rng: np.random.Generator) -> None:
+    verdict = verdict_on(1.5 * independent(rng, 1000, 500, 3))
+    text = str(verdict)
+    assert len(text) < 1500
+    assert text.startswith("f is overconfident: covariance too small by x2.2")
+    for row in ("1000 runs of 500 steps", "mean NEES", "covariance ratio", "2-sigma coverage", "failed runs", "faults"):
+        assert row in text
+    assert len(repr(verdict)) < 200
+    assert "overconfident" in repr(verdict)
+    assert "\n" not in repr(verdict)
+
+
+def test_html_escapes_what_others_named(rng: np.random.Generator) -> None:
+    hostile = "<script>alert('x')</script>&\""
+    error = 3.0 * independent(rng, 20, 5, 2)
+    evidence = Evidence(hostile, error, identities(error), axes=["<b>x", "y&z"],
+                        failures=(Failure("f", 1, 2, "<img src=x>"),))  # fmt: skip
+    html = judge(evidence, Settings())._repr_html_()
+    for bad in ("<script", "<b>x", "<img"):
+        assert bad not in html
+    assert escape(hostile) in html
+    assert "&lt;b&gt;x" in html
+    assert html.count("<tr>") == html.count("</tr>") >= 5
+
+
+KEYS = {
+    "acceptance", "alive", "allow", "anees", "answers", "band", "confidence", "detectable", "dof", "effective_dof",
+    "failures", "false_alarm", "first_outside", "first_step", "judged_steps", "lasting", "left_out_steps",
+    "mean_anees", "median_run", "p_value", "pit", "pit_half_width", "ratio", "ratio_interval", "runs", "share_inside",
+    "simultaneous", "since", "steps", "steps_above", "steps_below", "subset", "worst_run",
+}  # fmt: skip
+OF_ERRORS = KEYS | {
+    "axes", "bias", "bias_step", "coverage", "coverage_interval", "coverage_one_step", "groups", "impossible",
+    "inclination", "nci", "of_axes", "outlier", "rmse", "rmse_heading", "rmse_position",
+}  # fmt: skip
+OF_SHAPE = {"correlation", "shape", "shape_step"}
+OF_INNOVATIONS = {"autocorrelation", "autocorrelation_bound", "nis_dof", "nis_interval", "nis_ratio"}
+OF_ANY = {"allow", "answers", "confidence", "failures", "false_alarm", "p_value", "runs", "steps"}
+
+
+def test_statistics_have_every_key_that_files_have_had(rng: np.random.Generator) -> None:
+    """What older files and reports hold, and JSON can hold all of it."""
+    error = independent(rng, 40, 12, 3)
+    P, nees = identities(error), np.square(error).sum(axis=-1)
+    nis = {"nis": rng.chisquare(2, (40, 12)), "nis_dof": np.full((40, 12), 2)}
+    cases: list[tuple[Verdict, set[str]]] = [
+        (judge(Evidence("f", error, P)), OF_ERRORS | OF_SHAPE),
+        (judge(Evidence("f", error + 1.0, P)), OF_ERRORS | OF_SHAPE | {"ratio_without_bias", "bias_axis"}),
+        (judge(Evidence("f", error, P), Settings(allow="conservative")), OF_ERRORS),
+        (judge(Evidence("f", error, P, **nis)), OF_ERRORS | OF_SHAPE | OF_INNOVATIONS),
+        (judge(Evidence("f", nees=nees, dof=3)), KEYS),
+        (judge(Evidence("f", **nis)), OF_ANY | OF_INNOVATIONS),
+        (judge(Evidence("f", **nis, optimal_gain=True)), OF_ANY | OF_INNOVATIONS),
+    ]
+    for verdict, keys in cases:
+        s = verdict.statistics
+        assert keys <= set(s)
+        again = json.loads(json.dumps(plain(s), allow_nan=False))
+        assert set(again) == set(s)
+        answer = again["answers"][0] if again["answers"] else {}
+        assert not answer or {"question", "p_value", "share", "adjusted", "found"} <= set(answer)
+
+
+def test_statistics_of_nothing_can_be_written() -> None:
+    for error in (np.full((3, 2, 2), np.nan), np.zeros((2, 2, 2)), np.zeros((1, 1, 1))):
+        json.dumps(plain(verdict_on(error).statistics), allow_nan=False)
+
+
+def test_statistics_are_the_numbers_of_the_arrays(rng: np.random.Generator) -> None:
+    """The flat names mean what they say: nothing swapped between the parts."""
+    error = np.sqrt(1.3) * independent(rng, 40, 12, 3)
+    nees = np.square(error).sum(axis=-1)
+    v = judge(Evidence("f", error, identities(error), axes=["x", "y", "heading"]), Settings(0.01))
+    s, means = v.statistics, nees.mean(axis=1)
+    assert (s["false_alarm"], s["confidence"], s["runs"], s["steps"]) == (0.01, 0.99, 40, 12)
+    assert s["mean_anees"] == pytest.approx(nees.mean())
+    assert s["ratio"] == pytest.approx(nees.mean() / 3)
+    assert (s["median_run"], s["worst_run"]) == pytest.approx((np.median(means), means.max()))
+    assert s["ratio_interval"][0] < s["ratio"] < s["ratio_interval"][1]
+    assert s["acceptance"][0] < 3 < s["acceptance"][1]
+    assert s["of_axes"]["y"][0] == pytest.approx(np.square(error[..., 1]).mean())
+    assert s["of_axes"]["position"][0] == pytest.approx(np.square(error[..., :2]).mean())
+    assert s["groups"] == {"x": [0], "y": [1], "heading": [2], "position": [0, 1]}
+    assert s["steps_above"] == sum(s["anees"] > s["simultaneous"][:, 1])
+    assert s["steps_below"] == sum(s["anees"] < s["simultaneous"][:, 0])
+    assert s["outlier"]["run"] == v.tails.run if v.tails is not None else False
+    assert s["equivalence"]["shown"] == v.equivalence.shown if v.equivalence is not None else False
+    assert s["bias"]["x"][0] == pytest.approx(error[..., 0].mean())
+
+
+# --- tolerance -------------------------------------------------------------------------------------------
+
+
+def test_four_percent_may_be_tolerated(rng: np.random.Generator) -> None:
+    """1,000 runs of AR(.5) steps, x1.04."""
+    error = np.sqrt(1.04) * autoregression(rng, 1000, 40, 3, 0.5)
+    assert verdict_on(error, false_alarm=1e-3).status == "overconfident"
+    verdict = verdict_on(error, false_alarm=1e-3, tolerance=1.1)
+    assert verdict.status == "consistent"
+    assert verdict.faults == ()
+    assert "scale" in {a.question for a in verdict.answers if a.tolerated}
+    assert "no fault beyond the tolerance" in verdict.reasons[0]
+    assert any("within the tolerance of x1.1: scale" in line for line in verdict.reasons)
+    assert verdict_on(error, false_alarm=1e-3, tolerance=1 / 1.1).status == "consistent"
+
+
+def test_more_than_the_tolerance_is_a_fault(rng: np.random.Generator) -> None:
+    for ratio, status in ((1.2, "overconfident"), (1 / 1.2, "conservative")):
+        error = np.sqrt(ratio) * autoregression(rng, 1000, 40, 3, 0.5)
+        verdict = verdict_on(error, false_alarm=1e-3, tolerance=1.1)
+        assert verdict.status == status
+        assert not any(a.tolerated for a in verdict.answers)
+
+
+def test_a_tolerance_is_not_for_what_was_not_shown(rng: np.random.Generator) -> None:
+    """x1.5 with 21 runs is found; that it is inside 1.6 is not shown, so that it stays a fault."""
+    for _ in range(10):
+        error = np.sqrt(1.5) * independent(rng, 21, 4, 3)
+        verdict = verdict_on(error, tolerance=1.51)
+        if "scale" in {a.question for a in verdict.answers if a.found}:
+            assert verdict.status == "overconfident"
+            return
+    pytest.fail("no draw was found at fault")
+
+
+def test_a_tolerance_does_not_excuse_other_faults(rng: np.random.Generator) -> None:
+    """Bias, shape, outliers, one axis, one step: each with a mean NEES inside the tolerance."""
+    runs, steps = 400, 20
+    biased = independent(rng, runs, steps, 3) * np.sqrt(0.98) + 0.15
+    shape = independent(rng, runs, steps, 3)
+    shape[..., 1] = 0.5 * shape[..., 0] + np.sqrt(0.75) * shape[..., 1]
+    outliers = independent(rng, runs, steps, 3)
+    outliers[7, 3] = 12.0
+    axis = independent(rng, runs, steps, 3) * np.sqrt([1.3, 0.85, 0.85])
+    step = independent(rng, runs, steps, 3)
+    step[:, 9] *= np.sqrt(1.8)
+    for error, question in (
+        (biased, "bias"),
+        (shape, "shape"),
+        (outliers, "outliers"),
+        (axis, "scale of an axis"),
+        (step, "scale in some step"),
+    ):
+        verdict = verdict_on(error, false_alarm=1e-3, tolerance=1.2)
+        assert question in verdict.faults
+        assert verdict.status not in ("consistent", "undecided")
+
+
+def test_a_tolerance_wider_than_what_is_to_be_shown(rng: np.random.Generator) -> None:
+    """Consistent then means: inside the tolerance."""
+    error = np.sqrt(1.8) * independent(rng, 300, 10, 3)
+    verdict = verdict_on(error, false_alarm=1e-3, tolerance=2.0)
+    assert verdict.equivalence is not None
+    assert verdict.equivalence.factor == 2.0
+    assert verdict.status == "consistent"
+
+
+# --- innovations without a declared optimal gain --------------------------------------------------------------
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(0.01, 100.0),
+    st.integers(1, 25),
+    st.integers(1, 6),
+    st.sampled_from([0.5, 1, 3]),
+)
+def test_innovations_of_no_declared_gain_change_nothing(
+    seed: int, size: float, runs: int, steps: int, ratio: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    error = np.sqrt(ratio) * independent(rng, runs, steps, 2)
+    nis: dict[str, Any] = {"nis": size * rng.chisquare(2, (runs, steps)), "nis_dof": np.full((runs, steps), 2)}
+    alone = judge(Evidence("f", error, identities(error)))
+    beside = judge(Evidence("f", error, identities(error), **nis))
+    assert (alone.status, alone.faults, alone.answers) == (beside.status, beside.faults, beside.answers)
+    assert alone.reasons[0] == beside.reasons[0]
+    assert beside.innovations is not None
+    assert not beside.innovations.judged
+    only = judge(Evidence("f", **nis))
+    assert (only.status, only.answers) == ("undecided", ())
+
+
+def test_innovations_of_a_declared_gain_count(rng: np.random.Generator) -> None:
+    error = independent(rng, 60, 20, 2)
+    nis: dict[str, Any] = {"nis": 2.0 * rng.chisquare(2, (60, 20)), "nis_dof": np.full((60, 20), 2)}
+    verdict = judge(Evidence("f", error, identities(error), optimal_gain=True, **nis), Settings(SURE))
+    assert verdict.faults == ("innovation scale",)
+    assert verdict.status == "inconsistent"
+    assert verdict.reasons[0] == "inconsistent: innovations larger than stated"
+    only = judge(Evidence("f", optimal_gain=True, **nis), Settings(SURE))
+    assert only.status == "overconfident"
+    u = independent(rng, 60, 20, 2)
+    u[:, 1:] = 0.6 * u[:, :-1] + 0.8 * u[:, 1:]
+    correlated = judge(
+        Evidence("f", error, identities(error), innovations=u, innovation_covariances=identities(u), optimal_gain=True),
+        Settings(SURE),
+    )
+    assert "innovation whiteness" in correlated.faults
+    assert "innovations correlated over steps" in correlated.reasons[0]
+
+
+# --- anything at all ---------------------------------------------------------------------------------------
+
+
+@st.composite
+def evidence(draw: Callable[..., Any]) -> Evidence:
+    """Errors of any finite kind: gaps, ragged ends, zeros, duplicates, unlike scales."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    runs, steps, n = draw(st.integers(1, 25)), draw(st.integers(1, 6)), draw(st.integers(1, 4))
+    error = 10.0 ** draw(st.floats(-8, 8)) * rng.standard_normal((runs, steps, n))
+    root = rng.standard_normal((n, n)) if draw(st.booleans()) else np.eye(n)
+    covariance = np.broadcast_to(root @ root.T + 1e-9 * np.eye(n), (runs, steps, n, n)).copy()
+    for kind in draw(
+        st.lists(st.sampled_from(["gaps", "ends", "zeros", "axis", "copies", "runs", "late", "flat"]), unique=True)
+    ):
+        row, k = int(rng.integers(runs)), int(rng.integers(steps))
+        if kind == "gaps":
+            error[rng.random((runs, steps)) < 0.3] = np.nan
+        elif kind == "ends":
+            for run in range(runs):
+                error[run, int(rng.integers(steps + 1)) :] = np.nan
+        elif kind == "zeros":
+            error[row] = 0.0
+        elif kind == "axis":
+            error[..., -1] = 0.0
+        elif kind == "copies":
+            error[:] = error[:1] if rng.random() < 0.5 else error[:, :1]
+        elif kind == "runs":
+            error[row] *= 1e6
+        elif kind == "late":
+            error[:, k:] *= 100.0
+        elif kind == "flat":
+            covariance[:, k] = 0.0
+    nis, nis_dof = rng.chisquare(2, (runs, steps)), rng.integers(0, 3, (runs, steps))
+    given_nis = draw(st.booleans())
+    return Evidence(
+        "f", error, covariance, nis=nis if given_nis else None, nis_dof=nis_dof if given_nis else None,
+        optimal_gain=draw(st.booleans()),
+    )  # fmt: skip
+
+
+def only_one_run_errs(evidence: Evidence) -> bool:
+    """What the next test is for."""
+    assert evidence.error is not None
+    return int((np.nan_to_num(evidence.error) != 0.0).any(axis=(1, 2)).sum()) == 1
+
+
+@pytest.mark.xfail(
+    strict=True, reason="the mean of the other runs is a difference of large numbers, and comes out as 0"
+)
+@pytest.mark.parametrize("runs", [2, 25])
+@pytest.mark.parametrize("size", [1e9, 1e12])
+def test_there_is_a_verdict_on_a_run_that_diverged(rng: np.random.Generator, runs: int, size: float) -> None:
+    error = independent(rng, runs, 5, 2)
+    error[0] *= size
+    text = verdict_on(error).reasons[0]
+    assert not infinite(text)
+    assert not zero_end(text)
+
+
+@pytest.mark.xfail(strict=True, reason="the logarithm of the mean of the other runs, which is 0")
+@pytest.mark.parametrize("runs", [2, 5, 25])
+def test_there_is_a_verdict_where_only_one_run_errs(runs: int) -> None:
+    error = np.zeros((runs, 3, 2))
+    error[0, 1] = 0.1
+    assert verdict_on(error).status in STATUSES
+
+
+SETTINGS = st.sampled_from(
+    [Settings(), Settings(allow="conservative"), Settings(1e-3, 2.0, tolerance=1.1), Settings(method="bonferroni")]
+)
+
+
+@given(evidence(), SETTINGS)
+def test_there_is_a_verdict_on_anything(given_: Evidence, settings: Settings) -> None:
+    """Warnings are errors here. The status, the faults and the texts agree with each other."""
+    assume(not only_one_run_errs(given_))
+    verdict = judge(given_, settings)
+    assert verdict.status in STATUSES
+    judged = verdict.scale is not None and verdict.scale.judged_steps > 0
+    assert (verdict.status in ALARMS) == (bool(verdict.faults) and judged)
+    assert verdict.reasons[0]
+    assert str(verdict)
+    assert verdict._repr_html_()
+    json.dumps(plain(verdict.statistics), allow_nan=False)
+    only = judge(Evidence("f", nees=np.square(given_.error).sum(axis=-1), dof=given_.error.shape[-1]), settings)
+    assert only.status in STATUSES

@@ -39,7 +39,7 @@ class Contrast:
     def half_width(self, tail: float) -> float:
         """From the value to a one-sided confidence limit, missed with probability ``tail`` at most."""
         widest = self._error(abs(self.slope) * REACH * self.error)
-        return -float(special.stdtrit(self.freedom, tail)) * widest if self.variance > 0.0 else 0.0
+        return -float(special.stdtrit(self.freedom, tail)) * widest
 
     def _error(self, growth: float) -> float:
         """Standard error, to the safe side, where the log variance is larger by ``growth``."""

@@ -6,27 +6,29 @@ import numpy as np
 import pytest
 from rigs import MOTION, RIG
 
-from consistency.vision.motion import ESTIMATORS, Estimate, _estimated
+from consistency.types import Array
+from consistency.vision import triangulate, triangulation_covariance
+from consistency.vision.motion import ESTIMATORS, _estimated
 
 EQUATIONS = {"reprojection": 5, "svd": 3, "horn": 3}  # of a point: eight pixels less its position, or three coordinates
-NOISE = 0.3  # px
+NOISE = (0.2, 0.6)  # px, in the first and the second frame
 
 
-def motion(rng: np.random.Generator, estimator: str, points: int, outliers: int = 0, gate: float = 10.0) -> Estimate:
-    """From points of one distance; the first ``outliers`` are somewhere else in the second frame."""
+def matches(rng: np.random.Generator, points: int, outliers: int = 0) -> tuple[Array, Array, Array, Array]:
+    """Pixels of points at one distance, and their noise; the first ``outliers`` are elsewhere in the second frame."""
     p = rng.uniform([-1, -1, 6], [1, 1, 7], (points, 3))
     moved = MOTION.inverse().apply(p)
     moved[:outliers] += [1.0, -1.0, 2.0]
-    sigma = np.full((points, 4), NOISE)
-    uv0, uv1 = (RIG.project(q) + rng.normal(0.0, NOISE, (points, 4)) for q in (p, moved))
-    return _estimated(RIG, uv0, uv1, sigma, sigma, estimator, gate, rng)
+    sigma0, sigma1 = (np.full((points, 4), noise) for noise in NOISE)
+    uv0, uv1 = (RIG.project(q) + s * rng.normal(size=s.shape) for q, s in ((p, sigma0), (moved, sigma1)))
+    return uv0, uv1, sigma0, sigma1
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("outliers", [0, 7])
 def test_six_degrees_of_freedom_are_the_pose(rng: np.random.Generator, estimator: str, outliers: int) -> None:
     """Of the inliers' equations six are used up; an inlier is outside the gate of 10 sigma with probability 1e-21."""
-    found = motion(rng, estimator, 30, outliers)
+    found = _estimated(RIG, *matches(rng, 30, outliers), estimator, 10.0, rng)
     assert not found.inliers[:outliers].any()
     assert found.inliers.sum() > 20
     assert found.dof == EQUATIONS[estimator] * found.inliers.sum() - 6
@@ -37,7 +39,23 @@ def test_residuals_have_their_degrees_of_freedom(rng: np.random.Generator) -> No
 
     Without the six of each pose these would be 7 sigma away.
     """
-    found = [motion(rng, "reprojection", 8) for _ in range(120)]
+    found = [_estimated(RIG, *matches(rng, 8), "reprojection", 10.0, rng) for _ in range(120)]
     assert all(f.inliers.all() for f in found)
     chi2, dof = sum(f.chi2 for f in found), sum(f.dof for f in found)
     assert abs(chi2 - dof) < 4.5 * np.sqrt(2.0 * dof)
+
+
+@pytest.mark.parametrize("estimator", ["svd", "horn"])
+def test_chi2_of_a_registration_by_hand(rng: np.random.Generator, estimator: str) -> None:
+    uv0, uv1, sigma0, sigma1 = matches(rng, 20, 3)
+    found = _estimated(RIG, uv0, uv1, sigma0, sigma1, estimator, 10.0, rng)
+    chi2 = 0.0
+    for i in np.flatnonzero(found.inliers):
+        (p0,), (p1,) = (triangulate(RIG, uv[[i]]) for uv in (uv0, uv1))
+        (C0,), (C1,) = (
+            triangulation_covariance(RIG, uv[[i]], noise**2 * np.eye(4))
+            for uv, noise in zip((uv0, uv1), NOISE, strict=True)
+        )
+        e = p0 - found.pose.apply(p1[None])[0]
+        chi2 += e @ np.linalg.solve(C0 + found.pose.R @ C1 @ found.pose.R.T, e)
+    assert found.chi2 == pytest.approx(chi2)

@@ -65,7 +65,8 @@ def _deciding_runs(test: MeanTest, factor: float, settings: Settings) -> int | N
     """
     if not test.runs or not test.ratio > 0:
         return None
-    gap = abs(float(np.log(test.ratio))) if test.runs >= FEW else 0.0
+    off = float(np.log(test.ratio)) if test.runs >= FEW else 0.0
+    gap = off if settings.one_sided else abs(off)  # one-sided, a ratio below 1 is no fault and farther from the end
     tail = SHARES[MAIN] * settings.false_alarm / (1 if settings.one_sided else 2)
     power, room = float(special.ndtri(settings.power)), float(np.log(factor)) - gap
 

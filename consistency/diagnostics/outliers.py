@@ -62,4 +62,4 @@ def _distances(gap: Array, precision: Array) -> Array:
     for i in range(gap.shape[-1]):
         for j in range(gap.shape[-1]):
             d2 += gap[..., i] * precision[:, i, j] * gap[..., j]
-    return np.where(np.isfinite(d2), d2, 0.0)
+    return np.where(np.isfinite(d2), np.maximum(d2, 0.0), 0.0)  # rounding may make it negative

@@ -30,7 +30,7 @@ def chi_square_power(k: float, ratio: float, tail: float) -> float:
 )
 def test_by_hand(detect: float, allow: str | None) -> None:
     """The least N with the power, at half of the rate and the pilot's nu, times 1.15 and rounded up."""
-    means, dof, false_alarm, power = pilot(), 3, 0.04, 0.9
+    means, dof, false_alarm, power = pilot() / pilot().mean(), 3, 0.04, 0.9
     test = scale_test(means, dof, 60)
     tail = 0.02 if allow else 0.01
     runs = 1

@@ -141,12 +141,16 @@ def test_an_oblique_fault_beside_small_errors_is_overconfident() -> None:
     assert {v.status for v in verdicts} == {"overconfident"}
 
 
-def test_the_sentence_on_an_oblique_fault_names_the_direction() -> None:
-    rng = np.random.default_rng(53)
+def test_the_sentence_on_an_oblique_fault_names_what_is_too_small() -> None:
+    """x1.6 along (1, 1, 1, 1, 1, 1), the rest x0.7: every axis by itself is too large, and the direction is named."""
+    rng, u = np.random.default_rng(53), np.full(6, 6**-0.5)
     for _ in range(5):
-        text = verdict_on(oblique(independent(rng, 100, 60, 6)), allow="conservative").reasons[0]
+        w = np.sqrt(0.7) * independent(rng, 100, 60, 6)
+        w += (np.sqrt(1.6 / 0.7) - 1.0) * (w @ u)[..., None] * u
+        text = verdict_on(w, allow="conservative").reasons[0]
         assert "too large" not in text
-        assert "in the direction" in text
+        assert "covariance too small by x1." in text
+        assert "in the direction +0." in text
 
 
 def test_the_sentence_names_the_direction() -> None:

@@ -2,7 +2,7 @@
 
 ``make calibrate`` measures all rows and writes reports/reference/calibration.json, which the appendix of every report
 shows, and the table of docs/referee.md. ``make calibrate-quick`` measures fewer gates of fewer rows with fresh random
-numbers, writes nothing, and fails where a promise is broken: by chance less than once in 1,000 runs.
+numbers, writes nothing, and fails where a promise is broken: by chance less than once in 5,000 runs.
 
 Worlds are in ``calibration_worlds.py`` and promises in ``calibration_cases.py``; ``calibration_monitor.py`` and
 ``calibration_compare.py`` have those on the monitor and on comparisons.

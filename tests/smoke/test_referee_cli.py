@@ -33,6 +33,34 @@ def test_plan(tmp_path: Path) -> None:
         assert json.loads(done.stdout)["one_step"] == one_step
 
 
+def test_plan_by_a_pilot(folder: Path, tmp_path: Path) -> None:
+    """A run is worth at least what its pilot shows, and a plan never takes more runs than the worst case."""
+    consistency("run", "linear-gaussian", "--filter", "kf", "--runs", "25", "--out", "pilot", cwd=tmp_path)
+    done = consistency("plan", "--like", "pilot", "--detect", "1.2", cwd=tmp_path)
+    assert "where steps depend on each other as those of kf in 25 pilot runs" in done.stdout
+    pilot = json.loads(consistency("plan", "--like", "pilot", "--detect", "1.2", "--json", cwd=tmp_path).stdout)
+    assert pilot["runs"] == 301
+    assert 20 <= pilot["like"]["kf"]["runs"] <= 301
+    assert pilot["like"]["kf"]["effective_dof"] >= 3.0
+    done = consistency("plan", "linear-gaussian", "--filter", "kf", "--pilot-runs", "20", "--json", cwd=tmp_path)
+    assert json.loads(done.stdout)["like"]["kf"]["pilot_runs"] == 20
+    consistency("plan", "--like", str(folder / "out"), cwd=tmp_path, status=2)  # 12 runs are no pilot
+
+
+def test_what_is_shown_depends_on_what_is_asked(folder: Path) -> None:
+    """12 runs do not show a ratio of 1.01; a confidence is 1 less a false-alarm rate."""
+    verdicts = json.loads(
+        consistency("analyse", "out", "--detect", "1.01", "--false-alarm", "1e-12", "--json", cwd=folder).stdout
+    )
+    for verdict in verdicts.values():
+        assert verdict["statistics"]["equivalence"]["factor"] == 1.01
+        assert verdict["status"] != "consistent"
+    rates = (("--confidence", "0.9"), ("--false-alarm", "0.1"))
+    printed = [json.loads(consistency("analyse", "out", *rate, "--json", cwd=folder).stdout) for rate in rates]
+    accepted = [verdicts["ekf-uvd"]["statistics"]["acceptance"] for verdicts in printed]
+    assert accepted[0] == pytest.approx(accepted[1])
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -47,6 +75,19 @@ def test_plan(tmp_path: Path) -> None:
             "--false-alarm must lie between 0 and 1, got 3",
         ),
         (("compare", "nowhere"), "nowhere: cannot be read"),
+        (("plan", "linear-gaussian"), "--filter: name the filter to plan for in linear-gaussian"),
+        (("plan", "linear-gaussian", "--like", "out"), "either a SCENARIO for a pilot or --like RESULTS"),
+        (("plan", "--filter", "kf"), "--filter goes with a SCENARIO or --like RESULTS"),
+        (
+            ("plan", "linear-gaussian", "--filter", "kf", "--dof", "2"),
+            "--dof 2: results of the bench have 3",
+        ),
+        (("plan", "linear-gaussian", "--filter", "kf", "--pilot-runs", "5"), "a pilot needs at least 20 runs"),
+        (("analyse", "out", "--detect", "1"), "--detect must be a positive ratio of true to stated covariance, not 1"),
+        (("analyse", "out", "--tolerance", "-2"), "--tolerance must be a positive ratio"),
+        (("analyse", "out", "--false-alarm", "0"), "--false-alarm must lie between 0 and 1, got 0.0"),
+        (("analyse", "out", "--confidence", "0.9", "--false-alarm", "0.1"), "--confidence is 1 less --false-alarm"),
+        (("analyse", "out", "--innovations", "white"), "--innovations must be 'optimal', got 'white'"),
         (("compare", "nowhere", "--fail-on", "sun"), "--fail-on must be 'worse'"),
     ],
 )

@@ -43,9 +43,9 @@ def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equiva
     return _result(below, above, factor, settings, None)
 
 
-def equivalence_of_innovations(test: NisTest, settings: Settings) -> Equivalence:
+def equivalence_of_innovations(test: NisTest, settings: Settings, factor: float | None = None) -> Equivalence:
     """The same of the total NIS, whose innovations are independent over steps too."""
-    factor, total = settings.factor, test.ratio * test.dof
+    factor, total = settings.factor if factor is None else factor, test.ratio * test.dof
     if not test.dof:
         return Equivalence(factor, float("nan"), 1.0 - settings.power, None)
     below, above = float(stats.chi2.cdf(total / factor, test.dof)), float(stats.chi2.sf(total * factor, test.dof))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +10,12 @@ import numpy as np
 from consistency.diagnostics import wording
 from consistency.diagnostics.asking import Asked, ask
 from consistency.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
-from consistency.diagnostics.innovations import nis_test, nis_whiteness, whiteness
+from consistency.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import chi2_mean_interval
 from consistency.diagnostics.location import accuracy_of, axes_of, bias_of, location_of, shape_of, tails_of
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, INNOVATIONS, MAIN, SHARES, STEP, answers
-from consistency.diagnostics.records import Equivalence, Evidence, Innovations, Settings, Verdict
+from consistency.diagnostics.records import Answer, Equivalence, Evidence, Innovations, Settings, Verdict
 from consistency.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.diagnostics.sample import shape_of as shape_of_arrays
 from consistency.diagnostics.scale import scale_test, simultaneous_band, spreads_more, spreads_more_in_steps
@@ -62,8 +63,9 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     if look is not None:
         p_values = _at(look, p_values)
     found = answers(p_values, settings.false_alarm)
+    near = {"innovation scale"} if innovations is not None and _near(innovations, settings) else set()
     verdict = Verdict(
-        evidence.name, "failed", (), runs, steps, settings, tuple(found.values()), evidence.failures,
+        evidence.name, "failed", (), runs, steps, settings, _excused(found.values(), near), evidence.failures,
         innovations=innovations,
     )  # fmt: skip
     if sample is not None and asked is not None:
@@ -94,7 +96,7 @@ def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | 
     else:
         white = nis_whiteness(*given)
     judged = evidence.optimal_gain
-    shown = equivalence_of_innovations(test, settings) if judged else None
+    shown = equivalence_of_innovations(test, settings, max(settings.factor, settings.tolerated)) if judged else None
     record = Innovations(test.ratio, low_high, test.dof, judged, white.correlation, white.bound, shown)
     if not judged:
         return record, {}
@@ -109,10 +111,9 @@ def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | 
 def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, asked: Asked, look: Look | None) -> Verdict:
     settings = verdict.settings
     shown = _equivalence(sample, settings, look)
-    tolerated = _tolerated(sample, asked, settings) if settings.tolerance is not None else set()
-    found = tuple(replace(a, tolerated=a.found and a.question in tolerated) for a in verdict.answers)
-    verdict = replace(verdict, answers=found)
-    by_question = {a.question: a for a in found if not a.tolerated}
+    if settings.tolerance is not None:
+        verdict = replace(verdict, answers=_excused(verdict.answers, _tolerated(sample, asked, settings)))
+    by_question = {a.question: a for a in verdict.answers if not a.tolerated}
     band = asked.band
     step = by_question.get(STEP)
     if step is not None and step.found and not band.outside.any():  # found by what Holm's correction left over
@@ -143,6 +144,19 @@ def _equivalence(sample: Sample, settings: Settings, look: Look | None) -> Equiv
         return equivalence_by_betting(sample.means(), sample.dof, settings)
     factor = max(settings.factor, settings.tolerated)
     return equivalence(sample.means(), sample.dof, sample.longest, settings, factor)
+
+
+def _excused(found: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:
+    """Answers with the faults in these questions marked as tolerated."""
+    return tuple(replace(a, tolerated=True) if a.found and a.question in questions else a for a in found)
+
+
+def _near(innovations: Innovations, settings: Settings) -> bool:
+    """Is the scale of the innovations shown to lie within the tolerance?"""
+    if settings.tolerance is None or not innovations.judged:
+        return False
+    test = NisTest(innovations.ratio, innovations.dof, float("nan"), float("nan"))
+    return equivalence_of_innovations(test, settings, settings.tolerated).shown
 
 
 def _tolerated(sample: Sample, asked: Asked, settings: Settings) -> set[str]:

@@ -5,6 +5,8 @@ Seeds are fixed and were not chosen; counts have limits at 1e-5.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from draws import independent, verdict_on
@@ -227,3 +229,15 @@ def test_nothing_is_shown_by_innovations_that_are_not_judged() -> None:
     optimal = judge(Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE))
     assert optimal.status == "consistent"
     assert judge(Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE, 1.0001)).status == "undecided"
+
+
+def test_innovations_of_nearly_the_stated_size_are_tolerated() -> None:
+    """4 % too small in 40,000 innovations is found, shown to lie within 1.1 and not within 1.02; no chance in it."""
+    nis = 1.04 * stats.chi2.ppf((np.random.default_rng(0).permutation(40_000) + 0.5) / 40_000, 2).reshape(400, 100)
+    evidence = Evidence("f", nis=nis, nis_dof=np.full(nis.shape, 2), optimal_gain=True)
+    assert judge(evidence).status == "overconfident"
+    verdict = judge(evidence, Settings(tolerance=1.1))
+    assert (verdict.status, verdict.faults) == ("consistent", ())
+    assert [a.question for a in verdict.answers if a.tolerated] == ["innovation scale"]
+    assert judge(evidence, Settings(tolerance=1.02)).status == "overconfident"
+    assert not judge(replace(evidence, optimal_gain=False), Settings(tolerance=1.1)).answers

@@ -3,6 +3,7 @@
 No table, no plot and no file belongs here.
 """
 
+from consistency.diagnostics.band import Band, simultaneous_band
 from consistency.diagnostics.bias import Hotelling, hotelling, t_squared
 from consistency.diagnostics.comparison import Comparison, Difference, RunSummary, compare, summary
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
@@ -20,7 +21,7 @@ from consistency.diagnostics.outliers import Outlier, outliers
 from consistency.diagnostics.planning import PilotPlan, detectable_ratio, gate_runs, pilot_plan, power_of, required_runs
 from consistency.diagnostics.questions import answers
 from consistency.diagnostics.records import Answer, Equivalence, Evidence, Interval, Settings, Verdict
-from consistency.diagnostics.scale import Band, MeanTest, mean_test, ratio_interval, simultaneous_band
+from consistency.diagnostics.scale import MeanTest, mean_test, ratio_interval
 from consistency.diagnostics.sequential import Design, follow, look, sequential_design, speaks
 from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
 from consistency.diagnostics.verdict import judge

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from consistency.diagnostics.band import Band, simultaneous_band
 from consistency.diagnostics.bias import hotelling, t_squared
 from consistency.diagnostics.direction import Largest, largest_direction
 from consistency.diagnostics.distribution import Pit, pit
@@ -14,7 +15,7 @@ from consistency.diagnostics.outliers import Outlier, outliers
 from consistency.diagnostics.questions import AXIS, DIRECTION, MAIN, STEP, answers
 from consistency.diagnostics.records import Settings
 from consistency.diagnostics.sample import Sample
-from consistency.diagnostics.scale import Band, MeanTest, scale_test, simultaneous_band
+from consistency.diagnostics.scale import MeanTest, scale_test
 from consistency.diagnostics.shape import mean_shape, sphericity
 from consistency.diagnostics.whitening import mean_of_runs
 from consistency.types import Array

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import stats
 
 from consistency.diagnostics.asking import Asked
+from consistency.diagnostics.band import Band
 from consistency.diagnostics.bias import hotelling
 from consistency.diagnostics.blocks import blocks
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
@@ -25,7 +26,7 @@ from consistency.diagnostics.records import (
     Tails,
 )  # fmt: skip
 from consistency.diagnostics.sample import ATTITUDE, POSITION, Errors, Sample
-from consistency.diagnostics.scale import Band, ratio_interval
+from consistency.diagnostics.scale import ratio_interval
 from consistency.diagnostics.scaling import INTERVAL, pointwise_band
 from consistency.diagnostics.whitening import mean_of_runs, standardise
 from consistency.types import Array, Indices

@@ -9,6 +9,7 @@ import numpy as np
 
 from consistency.diagnostics import wording
 from consistency.diagnostics.asking import Asked, ask
+from consistency.diagnostics.band import simultaneous_band
 from consistency.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import chi2_mean_interval
@@ -18,7 +19,7 @@ from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, INNOVATIONS
 from consistency.diagnostics.records import Answer, Equivalence, Evidence, Innovations, Settings, Verdict
 from consistency.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.diagnostics.sample import shape_of as shape_of_arrays
-from consistency.diagnostics.scale import scale_test, simultaneous_band, spreads_more, spreads_more_in_steps
+from consistency.diagnostics.scale import scale_test, spreads_more, spreads_more_in_steps
 from consistency.diagnostics.scaling import INTERVAL, scale_of
 from consistency.types import Array
 

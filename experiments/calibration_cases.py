@@ -111,7 +111,7 @@ def _until_decided(worlds: Iterable[str], gates: int) -> list[Case]:
 
 def _decisions(worlds: Iterable[str], gates: int) -> list[Case]:
     claims = (
-        Claim("until decided, power", "overconfident", POWER, ">="),
+        Claim("until decided, power", "fault", POWER - 0.02, ">="),  # approximately what is not called consistent
         Claim("until decided, wrong all-clear", "consistent", 1.0 - POWER, "<="),
     )
     return [Case(world, MOST, gates, claims, DETECT, mode="until decided") for world in worlds]

@@ -132,16 +132,17 @@ def test_calibration_rows_count_false_alarms(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "experiments")
     import calibration_compare
 
-    rows = calibration_compare.rows(40, 20, 5)
-    assert [(r["runs"], r["false_alarm"], r["gates"]) for r in rows[:4]] == [
-        (8, 0.05, 40), (8, 0.01, 20), (21, 0.05, 40), (21, 0.01, 20),
-    ]  # fmt: skip
-    assert len({(r["world"], r["dof"], r["runs"], r["false_alarm"]) for r in rows}) == len(rows) == 24
-    assert json.loads(json.dumps(rows)) == rows
-    assert rows == calibration_compare.rows(40, 20, 5)
+    monkeypatch.setattr(calibration_compare, "QUICK_GATES", {0.05: 40, 0.01: 20})
+    rows = calibration_compare.rows(True, 5)
+    assert len(rows) == 2 * 2 * 3 * 2
+    assert {(r["stated"], r["gates"]) for r in rows} == {(0.05, 40), (0.01, 20)}
+    assert all(0 <= r["found"] <= r["gates"] for r in rows)
+    assert {r["world"] for r in rows} | {r["question"] for r in rows} == set(calibration_compare.ABOUT)
+    assert rows == calibration_compare.rows(True, 5)
     monkeypatch.setattr(calibration_compare, "_p_value", lambda *_: 0.03)
-    assert {r["found"] for r in calibration_compare.rows(4, 2, 5) if r["false_alarm"] == 0.05} == {4}
-    assert {r["found"] for r in calibration_compare.rows(4, 2, 5) if r["false_alarm"] == 0.01} == {0}
+    always = calibration_compare.rows(True, 5)
+    assert {r["found"] for r in always if r["stated"] == 0.05} == {40}
+    assert {r["found"] for r in always if r["stated"] == 0.01} == {0}
 
 
 def test_the_p_value_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -728,7 +728,8 @@ def test_a_run_far_from_copies_is_an_outlier_without_a_warning() -> None:
         rng = np.random.default_rng(seed)
         error = np.repeat(rng.standard_normal((1, 2, 4)), 7, axis=0)
         error[0] *= 1e6
-        assert outliers(error).p_value >= 0.0
+        p_value = outliers(error).p_value  # NaN where the other runs, all the same, have no covariance
+        assert np.isnan(p_value) or 0.0 <= p_value <= 1.0
 
 
 SETTINGS = st.sampled_from(

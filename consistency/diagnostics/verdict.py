@@ -194,11 +194,11 @@ def _status(verdict: Verdict, sample: Sample | None, asked: Asked | None) -> str
         return "consistent" if shown is not None and shown.shown else "undecided"
     if sample is None or asked is None:
         return _by_innovations(verdict, faults)
-    if faults & set(BIAS):
-        sample, asked, faults = _without_bias(verdict, sample)
-        if not faults:
-            return "biased"
-    return _by_errors(verdict.settings, faults, sample, asked)
+    if not faults & set(BIAS):
+        return _by_errors(verdict.settings, faults, sample, asked)
+    sample, asked, rest = _without_bias(verdict, sample)
+    status = _by_errors(verdict.settings, rest, sample, asked) if rest else "biased"
+    return "biased" if status == "heavy-tailed" else status  # a few errors explain less than the mean of all
 
 
 def _by_innovations(verdict: Verdict, faults: set[str]) -> str:
@@ -226,7 +226,8 @@ def _by_errors(settings: Settings, faults: set[str], sample: Sample, asked: Aske
         return "overconfident" if asked.main.ratio > 1.0 else "conservative"
     heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, asked))
     if STEP in faults and not heavy:
-        return _by_step(sample, asked)
+        opposite = AXIS in faults and _by_axis(settings, asked) == "inconsistent"
+        return "inconsistent" if opposite else _by_step(sample, asked)
     if AXIS in faults or DIRECTION in faults:
         if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, asked, settings)):
             return _by_axis(settings, asked)

@@ -288,12 +288,17 @@ def test_a_fault_scales_every_covariance_that_is_stated() -> None:
 
 def test_outcomes_are_counted_as_each_claim_says() -> None:
     outcomes = [
-        calibration.Outcome("consistent", False, False, 10), calibration.Outcome("overconfident", True, True, 20),
-        calibration.Outcome("undecided", False, False, 90), calibration.Outcome("conservative", True, False, 40),
-        calibration.Outcome("biased", True, False, 40),
-    ]  # fmt: skip
+        calibration.Outcome(status, fault, wrong_scale, located, runs)
+        for status, fault, wrong_scale, located, runs in (
+            ("consistent", False, False, False, 10),
+            ("overconfident", True, True, True, 20),
+            ("undecided", False, False, False, 90),
+            ("conservative", True, True, False, 40),
+            ("biased", True, False, False, 40),
+        )
+    ]
     counts = {
-        "fault": 3, "consistent": 1, "overconfident": 1, "conservative": 1, "scale": 2, "located": 1,
+        "fault": 3, "consistent": 1, "overconfident": 1, "conservative": 1, "scale": 2, "wrong scale": 2, "located": 1,
     }  # fmt: skip
     claims = tuple(Claim("q", counted, 0.05, "<=") for counted in counts)
     rows = calibration.rows_of_case(replace(CASE, claims=claims, mode="until decided"), outcomes)

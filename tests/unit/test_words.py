@@ -564,6 +564,13 @@ def test_four_percent_may_be_tolerated(rng: np.random.Generator) -> None:
     assert verdict_on(error, false_alarm=1e-3, tolerance=1 / 1.1).status == "consistent"
 
 
+def test_what_is_not_found_is_not_tolerated_either(rng: np.random.Generator) -> None:
+    verdict = verdict_on(independent(rng, 300, 10, 3), false_alarm=SURE, tolerance=1.3)
+    assert not any(a.tolerated for a in verdict.answers)
+    assert not any("tolerance" in line for line in verdict.reasons)
+    assert verdict.p_value == pytest.approx(min(min(1.0, a.p_value / a.share) for a in verdict.answers))
+
+
 def test_more_than_the_tolerance_is_a_fault(rng: np.random.Generator) -> None:
     for ratio, status in ((1.2, "overconfident"), (1 / 1.2, "conservative")):
         error = np.sqrt(ratio) * autoregression(rng, 1000, 40, 3, 0.5)

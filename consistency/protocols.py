@@ -1,4 +1,4 @@
-"""What can be plugged in: a motion model, a sensor, a filter."""
+"""What can be plugged in: a filter, step by step or a whole trial at once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from consistency.scenario import Belief
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.types import Array, Control, Estimates, Gaussian, Info, Observation, Trial
 
 
 @dataclass(frozen=True)
@@ -16,21 +16,6 @@ class Problem:
     belief: Belief
     start: Array  # (3,), pose at step 0, known exactly
     landmarks: Array | None = None  # (N, 3): reference of a linear world, None in any other
-
-
-class Motion(Protocol):
-    """f of eq. 9 with its Jacobians, as a textbook filter calls it."""
-
-    def move(self, pose: Array, control: Control) -> Array: ...
-    def jacobians(self, pose: Array, control: Control) -> tuple[Array, Array]: ...
-
-
-class Sensor(Protocol):
-    """h of eq. 11 with its inverse and Jacobians, as a textbook filter calls it."""
-
-    def measure(self, pose: Array, landmark: Array) -> Array: ...
-    def jacobians(self, pose: Array, landmark: Array) -> tuple[Array, Array]: ...
-    def locate(self, pose: Array, z: Array) -> tuple[Array, Array, Array]: ...
 
 
 @runtime_checkable
@@ -46,3 +31,11 @@ class Filter(Protocol):
     def predict(self, state: Any, control: Control) -> Any: ...
     def update(self, state: Any, observation: Observation) -> tuple[Any, Info | None]: ...
     def pose(self, state: Any) -> Gaussian: ...
+
+
+@runtime_checkable
+class WholeTrial(Protocol):
+    """A filter that also runs whole trials, with the numbers that its four methods give."""
+
+    def run(self, trial: Trial, belief: Belief) -> Estimates: ...
+    def is_ready(self, trial: Trial, belief: Belief) -> bool: ...

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from consistency.errors import InputError
 from consistency.geometry import rotation
-from consistency.types import Array
+from consistency.models.point import Mounting
 
 T = TypeVar("T", bound="Table")
 
@@ -72,9 +72,9 @@ class Mount(Table):
     position: Triple = (0.0, 0.0, 0.0)
     rotation: Triple = (0.0, 0.0, 0.0)  # roll, pitch, heading
 
-    def packed(self) -> Array:
-        """Position and rotation matrix by rows, shape (12,), as the models take it."""
-        return np.concatenate([self.position, rotation(*self.rotation).ravel()])
+    def packed(self) -> Mounting:
+        """Position and rotation matrix, as the models take it."""
+        return Mounting(*self.position, *(float(entry) for entry in rotation(*self.rotation).ravel()))
 
 
 # --- the world -------------------------------------------------------------------------------
@@ -272,10 +272,6 @@ class BelievedSensor(Table):
         if self.model == "uvd" and (self.f is None or self.B is None):
             raise ValueError("a uvd sensor needs f (px) and B (m)")
         return self
-
-    def packed(self) -> Array:
-        """f, B and the mount, shape (14,), as the kernels take them."""
-        return np.concatenate([[self.f or np.nan, self.B or np.nan], self.mount.packed()])
 
 
 class SigmaPoints(Table):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,9 @@ class Estimates:
     nis: Array  # (T,), NaN where no known landmark was seen
     nis_dof: Indices  # (T,)
     failure: Failure | None = None
+    error: str = "so2"  # convention of the error that ``own`` is the covariance of
+    own: Array | None = None  # (T, 3, 3), where that error is not the additive one of the world
+    landmarks: Mapping[int, Gaussian] = field(default_factory=dict)  # after the last step, by label
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,12 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from consistency.filters.textbook import (
-    ExtendedKalman,
-    PointSensor,
-    SlamState,
-    Unscented,
-    ordered_root,
-    process_noise,
-)
+from consistency.filters import plain
+from consistency.filters.methods.ukf import ordered_root
+from consistency.filters.plain import SlamState
+from consistency.protocols import Problem
 from consistency.scenario import Belief
-from consistency.types import Array, Control, Info
+from consistency.types import Array, Control, Gaussian, Info, Observation
 
 
 class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -38,54 +34,86 @@ class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x = self.f(self.x)
 
 
-class FilterpyEkf(ExtendedKalman):
+class FilterpyEkf:
     """EKF-SLAM with filterpy's predict and (Joseph form) update."""
 
+    robot = plain.Unicycle()
+
     def __init__(self, name: str, uvd: bool) -> None:
-        super().__init__(name, uvd)
+        self.name, self.uvd = name, uvd
         self.sensors = ("uvd",) if uvd else ("xyz", "uvd")
 
+    def init(self, problem: Problem) -> SlamState:
+        return plain.start(problem)
+
     def predict(self, state: SlamState, control: Control) -> SlamState:
-        ekf = _Ekf(state, lambda x: np.concatenate([self.motion.move(x[:3], control), x[3:]]))
-        F, G = self.motion.jacobians(state.x[:3], control)
+        ekf = _Ekf(state, lambda x: np.concatenate([self.robot.move(x[:3], control), x[3:]]))
+        F, G = self.robot.jacobians(state.x[:3], control)
         ekf.F = np.eye(len(state.x))
         ekf.F[:3, :3] = F
-        ekf.Q = _padded(process_noise(G, state.problem.belief), len(state.x))
+        ekf.Q = _padded(plain.process_noise(G, state.problem.belief), len(state.x))
         ekf.predict()
         return replace(state, x=ekf.x, P=ekf.P)
 
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        return plain.update_jointly(state, observation, self.uvd, self._correct, _locate(self.uvd))
+
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         ekf = _Ekf(state, lambda x: x)
-        zhat, H = self._expected(state, seen)
-        ekf.update(z.ravel(), HJacobian=lambda _: H, Hx=lambda _: zhat, R=R)
+        zhat, H = plain.expect(state, seen, self.uvd)
+        ekf.update(z.ravel(), HJacobian=lambda _: H, Hx=lambda _: zhat, R=plain.block_diagonal(R))
         return replace(state, x=ekf.x, P=ekf.P), Info(ekf.y, ekf.S, ekf.K)
 
+    def pose(self, state: SlamState) -> Gaussian:
+        return plain.pose_of(state)
 
-class FilterpyUkf(Unscented):
+    def map(self, state: SlamState) -> dict[int, Gaussian]:
+        return plain.map_of(state)
+
+
+class FilterpyUkf:
     """UKF-SLAM with filterpy's unscented transforms over the whole state."""
 
+    robot = plain.Unicycle()
+
     def __init__(self, name: str, uvd: bool) -> None:
-        super().__init__(name, uvd)
+        self.name, self.uvd = name, uvd
         self.sensors = ("uvd",) if uvd else ("xyz", "uvd")
+
+    def init(self, problem: Problem) -> SlamState:
+        return plain.start(problem)
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         def f(x: Array, dt: float) -> Array:
-            return np.concatenate([self.motion.move(x[:3], control), x[3:]])
+            return np.concatenate([self.robot.move(x[:3], control), x[3:]])
 
         ukf = _ukf(state, np.arange(3), f, lambda x: x[:3])
-        _, G = self.motion.jacobians(state.x[:3], control)
-        ukf.Q = _padded(process_noise(G, state.problem.belief), len(state.x))
+        _, G = self.robot.jacobians(state.x[:3], control)
+        ukf.Q = _padded(plain.process_noise(G, state.problem.belief), len(state.x))
         ukf.predict()
         return replace(state, x=ukf.x, P=ukf.P)
 
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        return plain.update_jointly(state, observation, self.uvd, self._correct, _locate(self.uvd))
+
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
-        sensor = PointSensor(state.problem.belief.sensor, self.uvd)
+        sensor = plain.PointSensor(state.problem.belief.sensor, self.uvd)
         involved = np.concatenate([np.arange(3), at.ravel()])
         ukf = _ukf(state, involved, lambda x, dt: x, lambda x: sensor.measure(x[:3], x[at]).ravel(), dim_z=z.size)
         ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
-        ukf.update(z.ravel(), R=R)
+        ukf.update(z.ravel(), R=plain.block_diagonal(R))
         return replace(state, x=ukf.x, P=ukf.P), Info(ukf.y, ukf.S, ukf.K)
+
+    def pose(self, state: SlamState) -> Gaussian:
+        return plain.pose_of(state)
+
+    def map(self, state: SlamState) -> dict[int, Gaussian]:
+        return plain.map_of(state)
+
+
+def _locate(uvd: bool) -> plain.Locate:
+    return lambda state, label, z: plain.locate_point(state, z, uvd)
 
 
 def _ukf(

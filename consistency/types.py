@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -108,6 +107,15 @@ class Failure:
 
 
 @dataclass(frozen=True)
+class Map:
+    """Landmarks that a filter has estimated, as points in the world, m."""
+
+    landmarks: Indices  # (K,), sorted
+    mean: Array  # (K, 3)
+    covariance: Array  # (K, 3, 3)
+
+
+@dataclass(frozen=True)
 class Estimates:
     """What a filter said in one run; rows from the step of a failure on are NaN."""
 
@@ -120,7 +128,7 @@ class Estimates:
     failure: Failure | None = None
     error: str = "so2"  # convention of the error that ``own`` is the covariance of
     own: Array | None = None  # (T, 3, 3), where that error is not the additive one of the world
-    landmarks: Mapping[int, Gaussian] = field(default_factory=dict)  # after the last step, by label
+    map: Map | None = None  # after the last step; None where the filter gives none or the run failed
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,11 @@ from consistency.filters.kernel.dispatch import fits, require_fitting
 from consistency.filters.kernel.gain import REASONS
 from consistency.filters.kernel.loop import Outcome, trial_kernel
 from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
-from consistency.filters.map import landmarks_of
 from consistency.filters.plain import sensor_noise
 from consistency.filters.upkeep.local import LOCAL_FROM, Local
 from consistency.protocols import Problem
 from consistency.scenario import Belief
-from consistency.types import Array, Control, Estimates, Failure, Gaussian, Info, Observation, Trial
+from consistency.types import Array, Control, Estimates, Failure, Gaussian, Info, Map, Observation, Trial
 
 _lock = threading.Lock()
 _inside: list[Any] = []  # the limit in force, once for every trial that is running
@@ -113,13 +112,14 @@ class Compiled:
         try:
             with one_blas_thread():
                 out: Outcome = trial_kernel(*arguments)
-                landmarks = landmarks_of(arguments[0], out.state) if out.code == 0 else {}
         except SystemError as error:  # Ctrl-C in the main thread comes out of a kernel like this
             raise KeyboardInterrupt from error
         failure = Failure(self.name, trial.run, out.step, REASONS[out.code]) if out.step else None
         own = None if self.error == "so2" else out.own
+        labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
+        map_ = Map(labels, out.points[labels], out.spread[labels]) if out.code == 0 else None
         return Estimates(
-            self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, landmarks
+            self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_
         )
 
     def _arguments(self, trial: Trial, belief: Belief) -> tuple[Slam, Data, int]:

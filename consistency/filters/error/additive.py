@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.filters.kernel.arrays import copy_matrix
 from consistency.filters.kernel.blas import add_transposed_times
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.slam import (
@@ -62,4 +63,4 @@ def retract_additive(error: Additive, slam: Slam, state: State, A: Array, y: Arr
 
 @implement(pose_covariance, Additive)
 def additive_pose_covariance(error: Additive, x: Array, P: Array, out: Array) -> None:
-    out[:] = P
+    copy_matrix(P, out)

@@ -6,6 +6,7 @@ writes P does it here, but for the block and the rows of the robot, which are wh
 
 from __future__ import annotations
 
+from consistency.filters.kernel.arrays import copy_matrix
 from consistency.filters.kernel.blas import add_gram, upper_cholesky
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.linalg import DEFICIENT
@@ -16,14 +17,15 @@ from consistency.types import Array, Indices
 @inner
 def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Array) -> None:
     """Whole rows of P: of the robot in rows 0..r-1, then of the ``m`` landmarks of ``w`` variables at ``at``."""
-    rows[:r, :n] = P[:r, :n]
+    copy_matrix(P[:r, :n], rows[:r, :n])
     for i in range(m):
         o, first = at[i], r + w * i
         for j in range(o):
             for a in range(w):
                 rows[first + a, j] = P[j, o + a]
         for a in range(w):
-            rows[first + a, o + a : n] = P[o + a, o + a : n]
+            for j in range(o + a, n):
+                rows[first + a, j] = P[o + a, j]
             for b in range(a):
                 rows[first + a, o + b] = rows[first + b, o + a]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.filters.kernel.arrays import copy_matrix
 from consistency.filters.kernel.blas import add_gram, add_product_of_transposed, add_transposed_times, solve_transposed
 from consistency.filters.kernel.covariance import definite_root, gather_rows, subtract_gram
 from consistency.filters.kernel.jit import inner
@@ -37,10 +38,10 @@ def gather(slam: Slam, state: State, m: int, local: Factors, work: Work) -> None
     r, w, n, base = robot_width(slam.motion), landmark_width(slam.landmark), state.n, state.base
     gather_rows(state.P, n, r, w, work.at, m, work.rows)
     if base > 0:
-        work.rows[:r, n : n + base] = local.Phi[:r, :base]
+        copy_matrix(local.Phi[:r, :base], work.rows[:r, n : n + base])
         for i in range(m):
             first, o = r + w * i, work.at[i]
-            work.rows[first : first + w, n : n + base] = local.Phi[o : o + w, :base]
+            copy_matrix(local.Phi[o : o + w, :base], work.rows[first : first + w, n : n + base])
 
 
 @inner

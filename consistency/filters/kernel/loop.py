@@ -6,9 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
 from consistency.filters.kernel.covariance import append_landmark
 from consistency.filters.kernel.gain import NOT_FINITE, POSE
 from consistency.filters.kernel.jit import Kernel, inner
+from consistency.filters.kernel.lending import keep, lend
 from consistency.filters.kernel.linalg import definiteness_with
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.slam import (
@@ -24,8 +26,11 @@ from consistency.filters.kernel.slam import (
     pose_covariance,
     predict,
     prepare,
+    robot_frame,
     robot_width,
     settle,
+    to_error,
+    world_point,
 )
 from consistency.filters.kernel.work import Work, make_work
 from consistency.types import Array, Indices
@@ -41,7 +46,8 @@ class Outcome(NamedTuple):
     nis_dof: Indices  # (T,)
     step: int  # of the failure, or 0
     code: int  # of REASONS, or 0
-    state: State  # after the last step
+    points: Array  # (n_landmarks, 3), landmarks in the world after the last step, NaN where none was seen
+    spread: Array  # (n_landmarks, 3, 3), and their covariances
 
 
 @inner
@@ -110,42 +116,116 @@ def _most_seen(first: Indices) -> int:
     return most
 
 
-def run_trial(slam: Slam, data: Data, size: int) -> Outcome:
+@inner
+def _map(slam: Slam, state: State, points: Array, spread: Array) -> None:
+    """Positions of the landmarks in the world, and covariances of their additive errors."""
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    pose, D, block = state.x[:r], np.empty((3, r + w)), np.empty((r + w, r + w))
+    frame = robot_frame(slam.motion, pose)
+    for label in range(len(points)):
+        o = state.offset[label]
+        if o >= 0:
+            values = state.x[o : o + w]
+            world_point(slam.landmark, frame, values, points[label], D[:, :r], D[:, r:])
+            to_error(slam.error, pose, values, D[:, :r], D[:, r:])
+            for i in range(r + w):
+                for j in range(i, r + w):
+                    p, q = i if i < r else o + i - r, j if j < r else o + j - r
+                    block[i, j] = block[j, i] = state.P[p, q]
+            for i in range(3):
+                for j in range(3):
+                    total = 0.0
+                    for a in range(r + w):
+                        for b in range(r + w):
+                            total += D[i, a] * block[a, b] * D[j, b]
+                    spread[label, i, j] = total
+
+
+class Memory(NamedTuple):
+    """All arrays of a trial."""
+
+    x: Array
+    P: Array
+    active: Indices  # (n_landmarks,) offset of each landmark in the active part, or -1
+    home: Indices  # and in the whole state
+
+
+def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     """Filter a whole trial whose state grows to at most ``size`` variables."""
+    slam, data = lend(own_slam), lend(own_data)
     T, r, w = len(data.controls), robot_width(slam.motion), landmark_width(slam.landmark)
-    pose, covariance, own = np.full((T, r), np.nan), np.full((T, r, r), np.nan), np.full((T, r, r), np.nan)
-    nis, nis_dof = np.full(T, np.nan), np.zeros(T, np.int64)
-    x, P, offset = np.zeros(size), np.zeros((size, size)), np.full(data.n_landmarks, -1)
-    work = make_work(slam, size, _most_seen(data.first))
-    local = make_local(slam.covariance, r, w, size)
-    x[:r] = data.start
-    whole = State(x, P, r, 0, np.full(data.n_landmarks, -1))
-    state = State(x, P, r, 0, offset)  # what a step works on: the whole, unless it has a base
+    own_memory = Memory(
+        np.zeros(size), np.zeros((size, size)), np.full(data.n_landmarks, -1), np.full(data.n_landmarks, -1)
+    )
+    own_work = make_work(slam, size, _most_seen(data.first))
+    own_local = make_local(slam.covariance, r, w, size)
+    out = _empty_outcome(T, r, data.n_landmarks)
+    memory, work, local, said = lend(own_memory), lend(own_work), lend(own_local), lend(out)
+    step, code = _run(slam, data, memory, local, work, said)
+    keep((own_slam, own_data, own_memory, own_work, own_local))
+    return Outcome(
+        out.pose, out.covariance, out.own, out.nis, out.nis_dof, step, code, out.points, out.spread
+    )
+
+
+@inner
+def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
+    return Outcome(
+        np.full((T, r), np.nan),
+        np.full((T, r, r), np.nan),
+        np.full((T, r, r), np.nan),
+        np.full(T, np.nan),
+        np.zeros(T, np.int64),
+        0,
+        0,
+        np.full((n_landmarks, 3), np.nan),
+        np.full((n_landmarks, 3, 3), np.nan),
+    )
+
+
+@inner
+def _run(slam: Slam, data: Data, memory: Memory, local: Factors, work: Work, out: Outcome) -> tuple[int, int]:
+    """``out`` <- all steps of a trial; step and code of a failure, or zeros."""
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    copy(data.start, memory.x[:r])
+    whole = State(memory.x, memory.P, r, 0, memory.home)
+    state = State(memory.x, memory.P, r, 0, memory.active)  # of a step: the whole, unless it has a base
     full_rank = False
-    for k in range(T):
+    for k in range(len(data.controls)):
         labels = data.landmark[data.first[k] : data.first[k + 1]]
         state = prepare(slam.covariance, slam, whole, state, labels, local)
-        state, code, m, value = _step(slam, state, data, k, local, work)
+        state, code, m, nis = _step(slam, state, data, k, local, work)
         if m > 0:
-            nis[k], nis_dof[k] = value, OBSERVED * m
+            out.nis[k], out.nis_dof[k] = nis, OBSERVED * m
         if code == 0:
-            own[k] = state.P[:r, :r]
-            pose_covariance(slam.error, state.x[:r], own[k], covariance[k])
-            rank = definiteness_with(covariance[k], work.small)
-            pose[k] = state.x[:r]
+            rank = _keep_pose(slam, state, k, out, work)
             if rank < 0 or (full_rank and rank == 0):
-                code, pose[k], covariance[k], own[k] = POSE, np.nan, np.nan, np.nan
+                code = POSE
+                fill(out.pose[k], np.nan)
+                fill_matrix(out.covariance[k], np.nan)
+                fill_matrix(out.own[k], np.nan)
             full_rank = full_rank or rank == 1
         if code > 0:
-            return Outcome(pose, covariance, own, nis, nis_dof, k + 1, code, whole)
+            return k + 1, code
         n = whole.n
         for label in labels:
-            if whole.offset[label] < 0:
-                whole.offset[label] = n
+            if memory.home[label] < 0:
+                memory.home[label] = n
                 n += w
-        whole = State(x, P, n, 0, whole.offset)
+        whole = State(memory.x, memory.P, n, 0, memory.home)
     settle(slam.covariance, slam, whole, state, local)
-    return Outcome(pose, covariance, own, nis, nis_dof, 0, 0, whole)
+    _map(slam, whole, out.points, out.spread)
+    return 0, 0
+
+
+@inner
+def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work) -> int:
+    """Estimate of step k + 1; returns the rank of its covariance as ``definiteness`` says it."""
+    r = robot_width(slam.motion)
+    copy_matrix(state.P[:r, :r], out.own[k])
+    copy(state.x[:r], out.pose[k])
+    pose_covariance(slam.error, out.pose[k], out.own[k], out.covariance[k])
+    return definiteness_with(out.covariance[k], work.small)
 
 
 trial_kernel = Kernel(run_trial)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.filters.kernel.arrays import copy, fill_matrix
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.slam import (
     Frame,
@@ -57,7 +58,7 @@ def insert_world_point(
 ) -> None:
     c, s, bx, by = frame.c, frame.s, body[0], body[1]
     values[0], values[1], values[2] = point.turned_to_world(frame.x, frame.y, c, s, bx, by, body[2])
-    Jp[:] = 0.0
+    fill_matrix(Jp, 0.0)
     Jp[0, 0] = Jp[1, 1] = 1.0
     Jp[0, 2], Jp[1, 2] = -s * bx - c * by, c * bx - s * by
     for j in range(3):
@@ -68,9 +69,9 @@ def insert_world_point(
 def world_point_itself(
     landmark: WorldPoint, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array
 ) -> None:
-    point[:] = values
-    Dp[:] = 0.0
-    Dl[:] = 0.0
+    copy(values, point)
+    fill_matrix(Dp, 0.0)
+    fill_matrix(Dl, 0.0)
     Dl[0, 0] = Dl[1, 1] = Dl[2, 2] = 1.0
 
 

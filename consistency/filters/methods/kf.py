@@ -55,7 +55,7 @@ class LinearKalman:
         def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
             known = np.concatenate([reference, *(landmarks[label] for label in slam.landmarks)])
             zhat, H = plain.expect(replace(slam, x=known), seen, uvd=False)
-            innovation = z.ravel() - zhat - H @ (slam.x - known)
+            innovation = z.ravel() - (zhat + H @ (slam.x - known))
             S, W = plain.gain(slam.P, H, plain.block_diagonal(R))
             return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.filters.kernel.arrays import copy_matrix
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.measuring import linearise_at
 from consistency.filters.kernel.slam import (
@@ -57,8 +58,8 @@ def place_about_reference(point: Reference, slam: Slam, state: State, k: int, la
     r = robot_width(slam.motion)
     z0, Hp, Hl = np.empty(3), np.empty((3, r)), np.empty((3, len(landmark)))
     linearise_at(slam, robot_frame(slam.motion, pose), landmark, z0, Hp, Hl)
-    work.Jz[:] = np.linalg.inv(Hl)
-    work.Jp[:] = -np.dot(work.Jz, Hp)
+    copy_matrix(np.linalg.inv(Hl), work.Jz)
+    copy_matrix(-np.dot(work.Jz, Hp), work.Jp)
     for i in range(len(landmark)):
         state.x[n + i] = landmark[i]
         for j in range(3):

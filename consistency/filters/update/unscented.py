@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.filters.kernel.arrays import copy, fill
 from consistency.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
 from consistency.filters.kernel.covariance import definite_root
 from consistency.filters.kernel.dispatch import implement, part
@@ -98,7 +99,7 @@ def predict_unscented(update: Unscented, slam: Slam, state: State, k: int, u: Ar
     if not semidefinite_cholesky(P[:r, :r], C):
         P[0, 0] = np.nan  # an indefinite prior is reported by the loop
         return
-    work.pose[:] = x[:r]
+    copy(x[:r], work.pose)
     move(slam.motion, work.pose, u, Y[2 * r])
     for j in range(r):
         for side in range(2):
@@ -211,14 +212,14 @@ def _project(slam: Slam, x: Array, m: int, spread: float, work: Work) -> None:
     at, U, Z, pose, landmark = work.at, work.room.U, work.room.Z, work.room.pose, work.room.landmark
     for j in range(L):
         first = 0 if j < r else r + w * ((j - r) // w)
-        U[j, first:j] = 0.0  # the lower half holds anything, and the variables of a part are moved together
+        fill(U[j, first:j], 0.0)  # the lower half holds anything, and the variables of a part are moved together
     mean = robot_frame(slam.motion, x[:r])
     for i in range(m):
         observe(slam, mean, x[at[i] : at[i] + w], Z[2 * L, OBSERVED * i : OBSERVED * i + OBSERVED])
     for k in range(2 * L):
         j, step = k // 2, spread if k % 2 == 0 else -spread
         first = 0 if j < r else (j - r) // w
-        Z[k, : OBSERVED * first] = Z[2 * L, : OBSERVED * first]
+        copy(Z[2 * L, : OBSERVED * first], Z[k, : OBSERVED * first])
         frame = mean
         if j < r:
             for a in range(r):

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
 from consistency.filters.kernel.blas import (
     add_symmetric_product,
     add_times_transposed,
@@ -76,7 +77,7 @@ def prepare_active(
         join(slam, whole, n, b, local)
         count_settling(whole.n, n, b, local)
         x, P, n, b = whole.x, whole.P, whole.n, 0
-        offset[:] = home
+        copy(home, offset)
     if b == 0 and n >= covariance.start and may_split(r, w, len(labels), local):
         n = split(r, w, whole, labels, offset, local)
         start_counting(n, local)
@@ -133,7 +134,7 @@ def split(r: int, w: int, whole: State, labels: Indices, offset: Indices, local:
     ``offset`` <- that of each landmark in the active part, or -1.
     """
     x, P, home = whole.x, whole.P, whole.offset
-    offset[:] = -1
+    fill(offset, -1)
     n = r
     for label in labels:
         if home[label] >= 0:
@@ -146,7 +147,7 @@ def split(r: int, w: int, whole: State, labels: Indices, offset: Indices, local:
         for j in range(i, n):
             local.P[i, j] = _entry(P, p, _place(r, w, j, local.base))
             local.Psi[i, j] = 0.0
-        local.Phi[i, :n] = 0.0
+        fill(local.Phi[i, :n], 0.0)
         local.theta[i] = 0.0
     _raw(x, r, 0, 0, 0, local.Phi)
     for i in range(r, n, w):
@@ -186,16 +187,16 @@ def _activate(r: int, w: int, whole: State, n: int, b: int, more: int, local: Fa
     for j in range(r, b, w):
         _relative(x0, local.base[(j - r) // w], D[:, :r], D[:, j : j + 2])
     times_symmetric(D, Psi[:b, :b], G)
-    P[:n, n : n + more] = 0.0
+    fill_matrix(P[:n, n : n + more], 0.0)
     add_times_transposed(1.0, Phi[:n, :b], D, P[:n, n : n + more])
     add_times_transposed(-1.0, G, D, P[n : n + more, n : n + more])
     for i in range(more):
         for j in range(b):
             x[n + i] += D[i, j] * local.theta[j]
             Phi[n + i, j] = -G[i, j]
-    Phi[: n + more, b : b + more] = 0.0
-    Psi[: b + more, b : b + more] = 0.0
-    local.theta[b : b + more] = 0.0
+    fill_matrix(Phi[: n + more, b : b + more], 0.0)
+    fill_matrix(Psi[: b + more, b : b + more], 0.0)
+    fill(local.theta[b : b + more], 0.0)
     for i in range(0, more, w):
         _raw(x0, w, local.base[(b + i - r) // w], n + i, b + i, Phi)
 
@@ -230,7 +231,7 @@ def _settle(r: int, w: int, whole: State, n: int, b: int, local: Factors) -> Non
         for j in range(i, n):
             q = _place(r, w, j, at)
             P[min(p, q), max(p, q)] = local.P[i, j]
-    P[:r, :r] = local.P[:r, :r]
+    copy_matrix(local.P[:r, :r], P[:r, :r])
 
 
 @inner
@@ -240,7 +241,7 @@ def _settle_rows(whole: State, width: int, i: int, p: int, across: Array, local:
         for a in range(width):
             whole.P[j, p + a] = across[i + a, j]
     for a in range(width):
-        whole.P[p + a, p + a : whole.n] = across[i + a, p + a :]
+        copy(across[i + a, p + a :], whole.P[p + a, p + a : whole.n])
         whole.x[p + a] = local.x[i + a]
 
 

@@ -187,7 +187,7 @@ class _Names(NamedTuple):
 
     def ids(self, numbers: pd.Series[int]) -> Indices:
         """Place of each number in the one list and then the other; -1 where it is in neither."""
-        return pd.Index(np.concatenate(self)).get_indexer(numbers).astype(np.int64)
+        return pd.Index(np.concatenate(self)).get_indexer(pd.Index(numbers)).astype(np.int64)
 
 
 def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | None) -> _Names:

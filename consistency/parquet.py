@@ -103,7 +103,7 @@ def _kinds(name: str, columns: Iterable[str]) -> dict[str, str]:
 
 def write_table(path: Path, name: str, table: pd.DataFrame) -> None:
     """A whole table; estimates in row groups of one filter each."""
-    kinds = _kinds(name, table)
+    kinds = _kinds(name, map(str, table))
     table = table[list(kinds)].astype(kinds)
     with Writer(path, name, kinds) as writer:
         if name != "estimates":

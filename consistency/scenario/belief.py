@@ -30,5 +30,3 @@ class Belief(Table):
     motion: BelievedMotion
     sensor: BelievedSensor
     sigma_points: SigmaPoints = SigmaPoints()
-
-

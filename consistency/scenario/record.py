@@ -91,5 +91,3 @@ def load_scenario(name: str | Path) -> Scenario:
         known = ", ".join(scenario_names())
         raise InputError(f"unknown scenario '{name}'{hint}; known: {known}; or give the path of a .toml file")
     return read_table(path, Scenario, name=path.stem)
-
-

@@ -92,6 +92,11 @@ class TrueSensor(ImageSensor):
     range: Interval  # m, distance from the sensor
     effects: tuple[SerializeAsAny[ListedEffect], ...] = ()  # in the order in which they are applied
 
+    @property
+    def rig(self) -> tuple[float, float] | None:
+        """Focal length (px) and baseline (m) of a sensor that measures disparities."""
+        return None
+
     @model_validator(mode="after")
     def _consistent_view(self) -> TrueSensor:
         if not 0 <= self.range[0] < self.range[1]:
@@ -144,6 +149,10 @@ class UvdSensor(TrueSensor, StereoSensor):
     f: Positive
     B: Positive
     disparity: tuple[Positive, Positive]
+
+    @property
+    def rig(self) -> tuple[float, float]:
+        return self.f, self.B
 
     @model_validator(mode="after")
     def _search_range(self) -> UvdSensor:

@@ -33,8 +33,6 @@ Sigmas = tuple[Positive, Positive, Positive]
 Interval = tuple[Finite, Finite]
 
 
-
-
 def _scaled(value: Any, factor: float) -> Any:
     if isinstance(value, list | tuple):
         return [_scaled(item, factor) for item in value]

@@ -123,5 +123,3 @@ class Truth(Table):
         if self.motion.model == "linear" and self.motion.noise_on != "motion":
             raise ValueError("a linear world needs motion.noise_on = 'motion'")
         return self
-
-

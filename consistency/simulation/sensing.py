@@ -43,30 +43,39 @@ class Chain:
     """
 
     def __init__(self, effects: Sequence[Effect]) -> None:
-        self.effects = list(effects)
-        self._purposes = [purpose_of(effect.label) for effect in effects]
+        self._links = [_Link(effect) for effect in effects]
 
     def leading(self) -> int:
         """How many effects come before the first that draws random numbers."""
-        return next((i for i, effect in enumerate(self.effects) if effect.draws), len(self.effects))
+        return next((i for i, link in enumerate(self._links) if link.purpose is not None), len(self._links))
 
     def shared(self, context: Context, number: int) -> Observations:
         """The ideal observations after the first ``number`` effects, which draw no random numbers."""
-        return self._apply(context.ideal(), context, range(number), 0, 0)
+        observations = context.ideal()
+        for link in self._links[:number]:
+            observations = link.apply(observations, context, 0, 0)
+        return observations
 
     def rest(self, observations: Observations, context: Context, number: int, run: int, seed: int) -> Observations:
         """``observations`` after all effects but the first ``number``, in one run."""
-        return self._apply(observations, context, range(number, len(self.effects)), run, seed)
+        for link in self._links[number:]:
+            observations = link.apply(observations, context, run, seed)
+        return observations
 
-    def _apply(
-        self, observations: Observations, context: Context, which: range, run: int, seed: int
-    ) -> Observations:
-        for i in which:
-            effect = self.effects[i]
-            rng = generator(seed, run, self._purposes[i]) if effect.draws else _no_numbers(effect)
-            observations = effect.apply(observations, rng, context)
-            if isinstance(effect, ListedEffect):
-                _require_sound(effect.label, observations, context)
+
+class _Link:
+    """An effect with the purpose of its random stream, which is None if it draws nothing."""
+
+    def __init__(self, effect: Effect) -> None:
+        self.effect, self.is_listed = effect, isinstance(effect, ListedEffect)
+        self.purpose = purpose_of(effect.label) if effect.draws else None
+        self._no_numbers = cast(np.random.Generator, _NoNumbers(effect.label))
+
+    def apply(self, observations: Observations, context: Context, run: int, seed: int) -> Observations:
+        rng = self._no_numbers if self.purpose is None else generator(seed, run, self.purpose)
+        observations = self.effect.apply(observations, rng, context)
+        if self.is_listed:
+            _require_sound(self.effect.label, observations, context)
         return observations
 
 
@@ -78,10 +87,6 @@ class _NoNumbers:
 
     def __getattr__(self, name: str) -> Any:
         raise TypeError(f"the effect '{self._label}' says draws = False and asks for random numbers")
-
-
-def _no_numbers(effect: Effect) -> np.random.Generator:
-    return cast(np.random.Generator, _NoNumbers(effect.label))
 
 
 def _require_sound(label: str, observations: Observations, context: Context) -> None:

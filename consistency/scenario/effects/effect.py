@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 from consistency.scenario.effects.observations import Context, Observations
 from consistency.scenario.tables import Table
 
-E = TypeVar("E", bound="type[ListedEffect]")
+E = TypeVar("E", bound="ListedEffect")
 
 
 class Effect(Protocol):
@@ -79,7 +79,7 @@ class ListedEffect(Table):
 EFFECTS: dict[str, type[ListedEffect]] = {}  # by kind
 
 
-def register(effect: E) -> E:
+def register(effect: type[E]) -> type[E]:
     """Decorator that makes the kind of an effect known to scenarios."""
     EFFECTS[effect.model_fields["kind"].default] = effect
     return effect

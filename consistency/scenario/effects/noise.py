@@ -21,5 +21,7 @@ class Noise:
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
         """All rows, with noise."""
-        noise = rng.standard_normal((len(observations), 3))
-        return observations.with_z(observations.z + noise * np.array(self.sigma))
+        z = rng.standard_normal((len(observations), 3))
+        z *= self.sigma
+        z += observations.z
+        return observations.with_z(z)

@@ -143,8 +143,8 @@ class Context:
         Herath et al. (2007) eq. 19 and 22, or eq. 19 to first order about the planned path.
         """
         points = self._linearised(step, landmark) if self.linear else self.points(step, landmark)
-        if self.sensor.model == "uvd":
-            points = stereo.project(*points, self.sensor.f, self.sensor.B)
+        if self.sensor.rig is not None:
+            points = stereo.project(*points, *self.sensor.rig)
         return np.stack(points, axis=-1)
 
     def points(self, step: Indices, landmark: Indices) -> tuple[Array, Array, Array]:

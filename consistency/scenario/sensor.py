@@ -15,7 +15,14 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, SerializeAsAny, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    Field,
+    SerializeAsAny,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from consistency.geometry import rotation
 from consistency.scenario.effects import BUILT_IN, ListedEffect
@@ -91,6 +98,13 @@ class TrueSensor(ImageSensor):
 
     range: Interval  # m, distance from the sensor
     effects: tuple[SerializeAsAny[ListedEffect], ...] = ()  # in the order in which they are applied
+
+    @field_validator("effects", mode="before")
+    @classmethod
+    def _is_a_list(cls, data: Any) -> Any:
+        if not isinstance(data, list | tuple):
+            raise ValueError("a list of tables, each of which begins with [[truth.sensor.effects]]")
+        return data
 
     @property
     def rig(self) -> tuple[float, float] | None:

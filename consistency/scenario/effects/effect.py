@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
-from pydantic import ModelWrapValidatorHandler, TypeAdapter, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, TypeAdapter, model_validator
 from pydantic_core import PydanticCustomError
 
 from consistency.scenario.effects.observations import Context, Observations
@@ -42,7 +42,7 @@ class ListedEffect(Table):
     before_noise: ClassVar[bool] = False  # applied before the sensor's noise, not after it
 
     kind: str
-    name: str | None = None
+    name: Annotated[str, Field(min_length=1)] | None = None
 
     @property
     def label(self) -> str:
@@ -63,7 +63,7 @@ class ListedEffect(Table):
         if cls is not ListedEffect or isinstance(data, ListedEffect):
             return handler(data)
         if not isinstance(data, dict):
-            raise ValueError("an effect is a table with a 'kind': write [[truth.sensor.effects]]")
+            raise ValueError("an effect is a table that begins with [[truth.sensor.effects]]")
         context = {"discriminator": "'kind'", "tag": data.get("kind")}
         if "kind" not in data:
             raise PydanticCustomError("union_tag_not_found", "kind is missing", context)

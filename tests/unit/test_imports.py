@@ -96,12 +96,12 @@ FORBIDDEN = [
     ("diagnostics", "import pandas as pd"),
     ("diagnostics", "from matplotlib.axes import Axes"),
     ("diagnostics", "from consistency.scenario import Belief"),
-    ("montecarlo", "from consistency.judge import analyse"),
+    ("montecarlo", "from consistency.verdicts.judge import analyse"),
     ("montecarlo", "import matplotlib.pyplot as plt"),
     ("plots", "from consistency.reporting import write_reports"),
     ("gating", "from consistency.testing import assert_consistent"),
     ("testing", "from consistency.pytest_plugin import Gates"),
-    ("results", "if TYPE_CHECKING:\n    from consistency.log import Log"),
+    ("results", "if TYPE_CHECKING:\n    from consistency.store.log import Log"),
 ]
 
 

@@ -14,10 +14,10 @@ import pandas as pd
 import tomli_w
 
 from consistency.errors import InputError
-from consistency.parquet import read_parquet
-from consistency.results import POSE, controls_table, observations_table, truth_of
 from consistency.scenario import Belief, BelievedMotion, Finite, PicturedSensor, SigmaPoints, Table, read_table
-from consistency.storage import write_folder
+from consistency.store.parquet import read_parquet
+from consistency.store.results import POSE, controls_table, observations_table, truth_of
+from consistency.store.storage import write_folder
 from consistency.types import Array, Indices, Trial
 
 View = tuple[tuple[int, int], tuple[float, float]]  # image (width, height) and principal point (column, row), px

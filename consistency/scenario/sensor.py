@@ -1,13 +1,8 @@
 """The one definition of a sensor: what its truth, a filter's belief and the file of a log say of it.
 
-Each key is declared once. ``Sensor`` has what all three share; a subclass adds what only some of them know.
-
-==================  ===========================================================
-Sensor              model, sigma, f, mount
-StereoSensor        and B: the sensor of a belief
-PicturedSensor      and image, principal_point: the sensor of a log
-TrueSensor          what is measured by: range, effects; by model also disparity
-==================  ===========================================================
+Each key is declared once. ``Sensor`` has what all of them share, ``StereoSensor`` adds the baseline and ``ImageSensor``
+the image. ``BelievedSensor`` is what a filter is told, ``PicturedSensor`` what ``sensor.toml`` of a log says,
+``TrueSensor`` what the world has: it adds how far the sensor sees, and its effects.
 """
 
 from __future__ import annotations
@@ -94,7 +89,11 @@ class PicturedSensor(BelievedSensor, ImageSensor):
 
 
 class TrueSensor(ImageSensor):
-    """A sensor as it is: how far it sees, and what it does to an ideal observation."""
+    """A sensor as it is.
+
+    Its effects are, in this order: field of view, noise, the listed ``effects``, search range (``uvd``). A listed
+    effect whose class says ``before_noise`` is applied before the noise.
+    """
 
     range: Interval  # m, distance from the sensor
     effects: tuple[SerializeAsAny[ListedEffect], ...] = ()  # in the order in which they are applied

@@ -33,19 +33,20 @@ class Effect(Protocol):
 class ListedEffect(Table):
     """An effect that a scenario lists: its fields are the keys of its table.
 
-    A subclass gives ``kind`` its value, adds keys of its own and defines :meth:`apply`. Two effects of one kind need
-    different ``name``\\ s: the random numbers of an effect depend on seed, run and name, and on nothing else.
+    A subclass gives ``kind`` a value, adds keys of its own and defines :meth:`apply`. Two effects of one kind need
+    different names, because the random numbers of an effect depend on seed, run and name, and on nothing else.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("xyz", "uvd", "linear")  # sensors that it makes sense for
-    draws: ClassVar[bool] = True
-    before_noise: ClassVar[bool] = False  # applied before the sensor's noise, not after it
+    models: ClassVar[tuple[str, ...]] = ("xyz", "uvd", "linear")  # sensors that it works on
+    draws: ClassVar[bool] = True  # whether it needs random numbers
+    before_noise: ClassVar[bool] = False  # whether it is applied before the sensor's noise or after it
 
     kind: str
     name: Annotated[str, Field(min_length=1)] | None = None
 
     @property
     def label(self) -> str:
+        """``name``, or ``kind`` where no name is given."""
         return self.name or self.kind
 
     @abstractmethod
@@ -70,7 +71,8 @@ class ListedEffect(Table):
         chosen = EFFECTS.get(str(data["kind"]))
         if chosen is None:
             known = ", ".join(f"'{kind}'" for kind in sorted(EFFECTS)) or "the known kinds: there are none yet"
-            raise PydanticCustomError("union_tag_invalid", "unknown kind", context | {"expected_tags": known})
+            context["expected_tags"] = known
+            raise PydanticCustomError("union_tag_invalid", "'{tag}' is not one of {expected_tags}", context)
         # as a tagged union would, with the kind in the location of an error
         effects = TypeAdapter[dict[str, ListedEffect]](dict[str, chosen])  # type: ignore[valid-type]
         return effects.validate_python({str(data["kind"]): data})[str(data["kind"])]

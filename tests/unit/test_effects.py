@@ -13,6 +13,7 @@ import pytest
 import tomli_w
 
 import consistency as cs
+from consistency.cli.app import app
 from consistency.filters.stepping import step_through
 from consistency.models import point, stereo
 from consistency.runs.montecarlo import run_log, simulate_log
@@ -361,6 +362,19 @@ def test_labels_go_through_a_log(small: Small, tmp_path: Path, effect: dict[str,
     pd.testing.assert_frame_equal(logged.estimates, direct.estimates, check_exact=True)
 
 
+def test_the_command_line_simulates_and_runs_such_a_log(tmp_path: Path) -> None:
+    load(tmp_path, [GHOSTS], steps=60)
+    at = [str(tmp_path / name) for name in ("mine.toml", "log", "results")]
+    for arguments in (
+        ["simulate", at[0], "--runs", "2", "--out", at[1]],
+        ["run", "--log", at[1], "--filter", "ekf-uvd", "--jobs", "1", "--out", at[2]],
+    ):
+        assert not app(arguments, standalone_mode=False)
+    direct = cs.run_trials(cs.load_scenario(tmp_path / "mine.toml"), ["ekf-uvd"], runs=2, jobs=1)
+    logged = cs.read_results(at[2])
+    pd.testing.assert_frame_equal(logged.estimates, direct.estimates, check_exact=True)
+
+
 def test_without_labels_there_is_no_column(small: Small, tmp_path: Path) -> None:
     simulate_log(with_effects(small, FIRST), runs=1, seed=0, out=tmp_path / "log")
     assert "source" not in pd.read_parquet(tmp_path / "log" / "observations.parquet")
@@ -475,9 +489,10 @@ def test_a_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> N
     assert "\n" not in str(e.value)
 
 
-def load(tmp_path: Path, effects: Any) -> cs.Scenario:
+def load(tmp_path: Path, effects: Any, **truth: Any) -> cs.Scenario:
     data = tomllib.loads((data_folder("scenarios") / "herath2007-stereo.toml").read_text(encoding="utf-8"))
     data["truth"]["sensor"]["effects"] = effects
+    data["truth"] |= truth
     (tmp_path / "mine.toml").write_text(tomli_w.dumps(data), encoding="utf-8")
     return cs.load_scenario(tmp_path / "mine.toml")
 

@@ -18,7 +18,7 @@ from consistency.filters.stepping import step_through
 from consistency.models import point, stereo
 from consistency.runs.montecarlo import run_log, simulate_log
 from consistency.scenario import data_folder
-from consistency.scenario.effects import EFFECTS, Context, ListedEffect, Observations
+from consistency.scenario.effects import EFFECTS, Context, FieldOfView, ListedEffect, Observations
 from consistency.scenario.tables import Count, Positive, Triple
 from consistency.simulation import World, draw_landmarks, planned_controls
 from consistency.simulation.sensing import purpose_of
@@ -167,7 +167,8 @@ def plainly(scenario: cs.Scenario, run: int, seed: int) -> tuple[Array, Array, A
         distance = np.linalg.norm(p, axis=0)
         u, v, d = stereo.project(*p, sensor.f, getattr(sensor, "B", 0.0))
         near = (distance >= sensor.range[0]) & (distance <= sensor.range[1]) & (p[0] > 0)
-        (width, height), (column, row) = sensor.image, sensor.centre
+        width, height = sensor.image
+        column, row = sensor.principal_point or (width / 2, height / 2)
         seen = np.flatnonzero(near & (u >= -column) & (u < width - column) & (v >= -row) & (v < height - row))
         step += [k] * len(seen)
         landmark += list(seen)
@@ -192,6 +193,18 @@ def test_field_of_view_noise_and_search_range_are_a_plain_sensor(
     assert np.array_equal(trial.landmark, landmark)
     assert np.allclose(trial.z, z, rtol=0, atol=1e-9)
     assert not np.allclose(cs.simulate(scenario, run=2, seed=4).z[:5], z[:5], rtol=0, atol=1e-9)  # negative control
+
+
+@pytest.mark.parametrize("name", ["linear-gaussian", "herath2007-xyz"])
+def test_a_linear_sensor_looks_from_the_planned_path(small: Small, name: str) -> None:
+    world, rng = World(small(name).truth), np.random.default_rng(0)
+    aside = world.reference + [0.0, 0.0, 0.5]
+
+    def seen(path: Array) -> Array:
+        context = world.context(path)
+        return FieldOfView().apply(context.ideal(), rng, context).landmark
+
+    assert np.array_equal(seen(aside), seen(world.reference)) == (name == "linear-gaussian")
 
 
 def test_an_empty_list_is_no_list(small: Small) -> None:

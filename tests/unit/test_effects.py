@@ -198,7 +198,7 @@ def test_field_of_view_noise_and_search_range_are_a_plain_sensor(
 @pytest.mark.parametrize("name", ["linear-gaussian", "herath2007-xyz"])
 def test_a_linear_sensor_looks_from_the_planned_path(small: Small, name: str) -> None:
     world, rng = World(small(name).truth), np.random.default_rng(0)
-    aside = world.reference + [0.0, 0.0, 0.5]
+    aside = world.reference + np.array([0.0, 0.0, 0.5])
 
     def seen(path: Array) -> Array:
         context = world.context(path)
@@ -215,6 +215,7 @@ def test_an_empty_list_is_no_list(small: Small) -> None:
     assert base.hash == "0e4adbb398026474"  # results folders hold it
     shifted = base.variant("shifted", truth__sensor__effects=[{"kind": "shift", "by": (0.0, 0.0, 1.0)}])
     assert shifted.hash != base.hash
+    assert base.variant("object", truth__sensor__effects=[Shift(by=(0.0, 0.0, 1.0))]).hash == shifted.hash
     assert cs.Scenario.model_validate(shifted.model_dump(mode="json")).hash == shifted.hash
     assert shifted.variant("back", truth__sensor__effects=()).hash == base.hash
 

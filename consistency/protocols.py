@@ -25,6 +25,13 @@ class Filter(Protocol):
     ``update`` may return None in the place of Info: then there is no NIS. An attribute ``innovations = "optimal"``
     declares that the gain is optimal and no measurement is gated away, so that innovations are white if the
     filter is right; they are then judged, and otherwise only reported.
+
+    Two more methods are optional: ``map(state)``, the landmarks by label as points (3,) in the world with their
+    covariance (3, 3), for the NEES of the map; and ``joint(state)``, robot and landmarks as one Gaussian.
+
+    ``pose`` gives the covariance of the additive error in the world. A filter whose own error is another declares
+    it in an attribute ``error`` (a convention of :mod:`consistency.recording.conventions`) and gives the covariance
+    of that error by ``own_covariance(state)``, (3, 3).
     """
 
     def init(self, problem: Problem) -> Any: ...
@@ -35,7 +42,12 @@ class Filter(Protocol):
 
 @runtime_checkable
 class WholeTrial(Protocol):
-    """A filter that also runs whole trials, with the numbers that its four methods give."""
+    """A filter that also runs whole trials, with the numbers that its four methods give.
+
+    ``run`` may be called from several threads at once. ``is_ready`` says whether it starts at once; if not,
+    ``compile`` does what takes seconds.
+    """
 
     def run(self, trial: Trial, belief: Belief) -> Estimates: ...
     def is_ready(self, trial: Trial, belief: Belief) -> bool: ...
+    def compile(self, trial: Trial, belief: Belief) -> None: ...

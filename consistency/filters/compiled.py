@@ -100,6 +100,10 @@ class Compiled:
         """Whether ``run`` starts at once on this trial, or spends seconds on compiling first."""
         return trial_kernel.is_ready(*self._arguments(trial, belief))
 
+    def compile(self, trial: Trial, belief: Belief) -> None:
+        """Compile what ``run`` needs on this trial, or load it from disk."""
+        trial_kernel.compile(*self._arguments(trial, belief))
+
     def run(self, trial: Trial, belief: Belief) -> Estimates:
         """Estimates of all steps of ``trial``.
 
@@ -130,13 +134,14 @@ class Compiled:
         controls, z, R, start = (np.array(a, float, order="C") for a in (trial.controls, z, R, trial.start))
         first, landmark = (np.array(a, np.int64, order="C") for a in (trial.first, trial.landmark))
         data = Data(controls, first, landmark, z, R, start, trial.n_landmarks)
-        seen = len(np.unique(landmark))
-        size = robot_width(slam.motion) + landmark_width(slam.landmark) * seen
-        return self._with_upkeep(slam, size), data, size
+        r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+        slam = self._with_upkeep(slam, r + w * trial.n_landmarks)
+        return slam, data, r + w * len(np.unique(landmark))
 
-    def _with_upkeep(self, slam: Slam, size: int) -> Slam:
+    def _with_upkeep(self, slam: Slam, most: int) -> Slam:
+        """Local updating, which takes longer to compile, only in a world in which the state may grow so large."""
         local = slam._replace(covariance=Local(self.local_from))
-        slam = local if size >= self.local_from and fits(local) else slam
+        slam = local if most >= self.local_from and fits(local) else slam
         require_fitting(slam)
         return slam
 

@@ -11,19 +11,19 @@ import pandas as pd
 
 from consistency.diagnostics import Verdict
 from consistency.errors import InputError
-from consistency.findings import read_findings
-from consistency.judge import Curves, analyse, curves, design_of
 from consistency.models.motion import dead_reckoning
 from consistency.reporting.calibration import calibration
 from consistency.reporting.distributions import distributions
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.stereo import front_end
 from consistency.reporting.wording import answer, number
-from consistency.results import read_results
+from consistency.runs.findings import read_findings
 from consistency.scenario import Scenario
 from consistency.simulation import simulate
-from consistency.storage import read_manifest
+from consistency.store.results import read_results
+from consistency.store.storage import read_manifest
 from consistency.types import Array
+from consistency.verdicts.judge import Curves, analyse, curves, design_of
 
 DECADE = 10.0  # values that span more are drawn on a log axis
 DEGREES = np.array([1.0, 1.0, 180.0 / np.pi])

@@ -9,8 +9,8 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d
 from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
-from consistency.plots import AXES, BAND, COLOURS, DASHES, ODOMETRY, TRUTH, style
 from consistency.reporting.model import Distribution, Study, Track
+from consistency.reporting.plots import AXES, BAND, COLOURS, DASHES, ODOMETRY, TRUTH, style
 from consistency.reporting.thin import LIMIT, thin
 from consistency.types import Array
 

@@ -10,8 +10,8 @@ import numpy as np
 from consistency.diagnostics import Answer, Verdict
 from consistency.diagnostics.coverage import TWO_SIGMA
 from consistency.diagnostics.questions import ABOUT
-from consistency.plots import Interval
 from consistency.reporting.model import Study, Track
+from consistency.reporting.plots import Interval
 from consistency.types import Array
 
 WHOLE, DIRECTION = "all axes", "worst direction"

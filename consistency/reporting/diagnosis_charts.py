@@ -8,10 +8,10 @@ import numpy as np
 from bokeh.models import BasicTickFormatter, ColumnDataSource, DataRange1d, FixedTicker, Range1d
 from bokeh.models.annotations import BoxAnnotation, Span
 
-from consistency.plots import BAND, LEAST_CORRELATION, Interval, dodge, style
 from consistency.reporting.charts import MARKERS, add_hover, add_line, base_figure, columns, pixels, tag
 from consistency.reporting.diagnosis import Forest, forests, lags, steps
 from consistency.reporting.model import Study, Track
+from consistency.reporting.plots import BAND, LEAST_CORRELATION, Interval, dodge, style
 from consistency.reporting.thin import thin
 
 

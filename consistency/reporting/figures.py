@@ -1,4 +1,4 @@
-"""The figures of the PDF: model records onto Matplotlib figures by way of ``consistency.plots``."""
+"""The figures of the PDF: model records onto Matplotlib figures by way of ``consistency.reporting.plots``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from consistency import plots
-from consistency.reporting import diagnosis
+from consistency.reporting import diagnosis, plots
 from consistency.reporting.model import Distribution, FirstOrder, Scenes, Shares, Study
 from consistency.reporting.thin import thin
 

@@ -8,7 +8,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from consistency import plots
+from consistency.reporting import plots
 from consistency.reporting.figures import RC, WIDTH
 from consistency.types import Array
 

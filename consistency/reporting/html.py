@@ -9,8 +9,7 @@ from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from consistency import plots
-from consistency.reporting import captions, diagnosis, wording
+from consistency.reporting import captions, diagnosis, plots, wording
 from consistency.reporting.charts import MARKERS, distribution_charts, study_charts
 from consistency.reporting.diagnosis_charts import diagnosis_charts
 from consistency.reporting.model import Report

@@ -10,11 +10,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from consistency import plots
-from consistency.monitoring import Watched
+from consistency.reporting import plots
 from consistency.reporting.figures import RC, WIDTH
 from consistency.reporting.thin import thin
 from consistency.types import Array
+from consistency.verdicts.monitoring import Watched
 
 HEIGHT = 3.6  # inches
 POINTS = 600  # at most, of the NIS: few enough to see a change among them

@@ -8,9 +8,9 @@ import numpy as np
 from bokeh.models import BasicTickFormatter, ColumnDataSource, FixedTicker, HoverTool, Range1d
 from bokeh.models.annotations import BoxAnnotation, Span
 
-from consistency.plots import ACCEPTED, BAND, COLOURS, PERCENT, REJECTED
 from consistency.reporting.charts import MARKERS, base_figure, columns
 from consistency.reporting.model import Cells, FirstOrder, FrontEnd, Scenes, Shares
+from consistency.reporting.plots import ACCEPTED, BAND, COLOURS, PERCENT, REJECTED
 
 DECADES = range(-6, 13)
 WIDE = 200.0  # a log axis that spans more has room for powers of ten only

@@ -20,17 +20,17 @@ from consistency.diagnostics import Answer, Evidence, Interval, Settings, judge
 from consistency.diagnostics.questions import DIRECTION, STEP
 from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import short
-from consistency.findings import Finding
 from consistency.gating.report import STYLE
-from consistency.montecarlo import run_log, simulate_log
-from consistency.parquet import COVARIANCE
 from consistency.reporting import build, captions, diagnosis, figures, html, pdf, wording, write_reports
 from consistency.reporting.build import build_report
 from consistency.reporting.calibration import calibration
 from consistency.reporting.diagnosis_charts import diagnosis_charts
 from consistency.reporting.model import Track
 from consistency.reporting.thin import thin
-from consistency.results import read_results
+from consistency.runs.findings import Finding
+from consistency.runs.montecarlo import run_log, simulate_log
+from consistency.store.parquet import COVARIANCE
+from consistency.store.results import read_results
 from consistency.types import Failure
 
 ODD = {
@@ -913,7 +913,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     simulate_log(uvd, 1, 0, tmp_path / "log")
     for name in ("truth", "landmarks"):
         (tmp_path / "log" / f"{name}.parquet").unlink()
-    from consistency.log import read_log
+    from consistency.store.log import read_log
 
     run_log(read_log(tmp_path / "log"), ["ekf-uvd"], jobs=1).write(tmp_path / "run")
     report = build_report(tmp_path / "run")

@@ -45,13 +45,18 @@ class Kernel:
         self._entries: dict[tuple[Path, ...], tuple[Any, Path]] = {}
 
     def __call__(self, *args: Any) -> Any:
+        return self.compile(*args)(*args)
+
+    def compile(self, *args: Any) -> Callable[..., Any]:
+        """The entry, compiled for these arguments or loaded from disk."""
         entry, folder = self._entry()
         signature = _signature(args)
         if signature not in entry.overloads:
             with _one_at_a_time(folder):
                 entry.compile(signature)
                 _mark(folder, signature)
-        return entry(*args)
+        compiled: Callable[..., Any] = entry
+        return compiled
 
     def is_ready(self, *args: Any) -> bool:
         """Whether a call with these arguments starts at once, or spends seconds on compiling first."""

@@ -1,0 +1,65 @@
+"""The worked example "Add a sensor effect" of docs/extending.md, followed in a copy of the package."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import consistency
+
+PACKAGE = Path(consistency.__file__).parent
+DOCUMENT = PACKAGE.parent / "docs" / "extending.md"
+EFFECTS = Path("consistency/scenario/effects")
+
+
+def blocks(heading: str) -> list[str]:
+    """Code blocks of one part of the document."""
+    text = DOCUMENT.read_text(encoding="utf-8")
+    part = re.split(r"^## ", text.split(f"\n## {heading}\n")[1], flags=re.MULTILINE)[0]
+    return re.findall(r"^```\w+\n(.*?)^```", part, flags=re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    ignore = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
+    for name in ("consistency", "scenarios"):
+        shutil.copytree(PACKAGE.parent / name, tmp_path / name, ignore=ignore)
+    return tmp_path
+
+
+def python(folder: Path, code: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(folder)}
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True, timeout=120
+    )
+
+
+def test_the_bias_of_the_document_works(copy: Path) -> None:
+    """One new file, one line elsewhere, a key in a scenario; and the document's own test passes."""
+    effect, line, key, test = blocks("Add a sensor effect")
+    assert line.count("\n") == 1
+    (copy / EFFECTS / "bias.py").write_text(effect, encoding="utf-8")
+    names = copy / EFFECTS / "__init__.py"
+    first = "from consistency.scenario.effects.effect"
+    assert names.read_text(encoding="utf-8").count(first) == 1
+    names.write_text(names.read_text(encoding="utf-8").replace(first, line + first), encoding="utf-8")
+    scenario = (copy / "scenarios" / "herath2007-stereo.toml").read_text(encoding="utf-8")
+    (copy / "mine.toml").write_text(f"{scenario}\n{key}", encoding="utf-8")
+    (copy / "test_bias.py").write_text(test, encoding="utf-8")
+    code = (
+        "import consistency as cs, test_bias\n"
+        "test_bias.test_a_bias_shifts_every_disparity()\n"
+        "print(cs.__file__, cs.load_scenario('mine.toml').truth.sensor.effects)"
+    )
+    done = python(copy, code)
+    assert done.returncode == 0, done.stderr
+    assert str(copy) in done.stdout
+    assert "Bias(kind='bias', name=None, bias=(0.0, 0.0, 1.0))" in done.stdout
+    names.write_text(names.read_text(encoding="utf-8").replace(line, ""), encoding="utf-8")
+    assert "'bias' is not one of" in python(copy, code).stderr  # negative control

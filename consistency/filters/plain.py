@@ -130,7 +130,7 @@ def predict_extended(state: SlamState, control: Control) -> SlamState:
 class Correct(Protocol):
     """The update with landmarks already in the state: their labels, z (m, 3), R (m, 3, 3)."""
 
-    def __call__(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]: ...
+    def __call__(self, state: SlamState, seen: list[int], z: Array, R: Array, /) -> tuple[SlamState, Info]: ...
 
 
 Locate = Callable[[SlamState, int, Array], tuple[Array, Array, Array]]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters.stepping import step_through
 from consistency.filters.kernel.loop import trial_kernel
+from consistency.filters.stepping import step_through
 from consistency.scenario import Belief
 from consistency.simulation import planned_path
 from consistency.types import Array, Estimates, Trial

@@ -34,7 +34,7 @@ class Additive(NamedTuple):
 
 @implement(propagate, Additive)
 def propagate_additive(
-    error: Additive, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work
+    error: Additive, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     pose = state.x[: robot_width(slam.motion)]
     at = motion_point(slam.point, pose, k)
@@ -57,7 +57,7 @@ def additive_insert(error: Additive, pose: Array, values: Array, Jp: Array) -> N
 
 
 @implement(retract, Additive)
-def retract_additive(error: Additive, slam: Slam, state: State, A: Array, y: Array, work: Work) -> None:
+def retract_additive(error: Additive, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
     add_transposed_times(A, y, state.x[: state.n])
 
 

@@ -23,6 +23,7 @@ from numba.extending import overload
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 PACKAGE = Path(__file__).parents[2]
 
+_overload: Callable[..., Any] = overload
 Function = TypeVar("Function", bound=Callable[..., Any])
 Part = TypeVar("Part", bound=type)
 Bodies = dict[tuple[type, ...], Callable[..., Any]]
@@ -53,7 +54,9 @@ def part(**needs: str) -> Callable[[Part], Part]:
             raise TypeError(f"part '{cls.__qualname__}' must be a NamedTuple at module level")
         if cls.__name__ in _parts:
             other = _parts[cls.__name__].__module__
-            raise TypeError(f"a part named '{cls.__name__}' is there already, in {other}; two would share compiled code")
+            raise TypeError(
+                f"a part named '{cls.__name__}' is there already, in {other}; two would share compiled code"
+            )
         _parts[cls.__name__] = cls
         _needs[cls] = {role: frozenset(names.split()) for role, names in needs.items()}
         _remember_file(cls)
@@ -79,10 +82,10 @@ def generic(deciding: int = 1) -> Callable[[Function], Function]:
             classes = tuple(getattr(a, "instance_class", None) for a in args[:deciding])
             return _body(stub, bodies, classes)
 
-        overload(call, strict=False, jit_options=OPTIONS)(choose)
+        _overload(call, strict=False, jit_options=OPTIONS)(choose)
         _bodies[call] = bodies
         chosen: Any = call
-        return chosen  # type: ignore[no-any-return]
+        return chosen
 
     return declare
 
@@ -98,7 +101,7 @@ def implement(function: Callable[..., Any], *classes: type) -> Callable[[Functio
 
     def register(body: Function) -> Function:
         name = f"{body.__module__}.{body.__qualname__}"
-        if "<locals>" in name or _names.intersection({name}) and body not in _bodies[function].values():
+        if "<locals>" in name or (_names.intersection({name}) and body not in _bodies[function].values()):
             raise TypeError(f"kernel function '{name}' must stand at module level under a name of its own")
         if classes in _bodies[function]:
             raise TypeError(f"'{function.__name__}' has a body for {_named(classes)} already")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from consistency.filters.kernel.arrays import copy_matrix
@@ -33,7 +35,7 @@ REASONS = {
 
 
 @inner
-def gather(slam: Slam, state: State, m: int, local: Factors, work: Work) -> None:
+def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
     """``work.rows`` <- rows of P of the robot and the seen landmarks; behind them those of Phi, treated alike."""
     r, w, n, base = robot_width(slam.motion), landmark_width(slam.landmark), state.n, state.base
     gather_rows(state.P, n, r, w, work.at, m, work.rows)
@@ -45,7 +47,7 @@ def gather(slam: Slam, state: State, m: int, local: Factors, work: Work) -> None
 
 
 @inner
-def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work) -> None:
+def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTuple]) -> None:
     """zhat, Hp, Hl <- of the seen landmarks, with respect to the error of the filter."""
     pose, w = state.x[: robot_width(slam.motion)], landmark_width(slam.landmark)
     for i in range(m):
@@ -56,7 +58,7 @@ def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work) -> None
 
 
 @inner
-def combine_seen(slam: Slam, state: State, m: int, work: Work) -> None:
+def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> None:
     """A <- H P of the gathered rows, and the upper half of S <- H P H'."""
     r, w, width = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base
     A, S, Hp, Hl = work.A, work.S, work.Hp, work.Hl
@@ -78,7 +80,7 @@ def combine_seen(slam: Slam, state: State, m: int, work: Work) -> None:
 
 
 @inner
-def innovate(state: State, data: Data, m: int, work: Work) -> Array:
+def innovate(state: State, data: Data, m: int, work: Work[NamedTuple]) -> Array:
     """Innovation of the ``m`` landmarks, in the last column of A."""
     y = work.A[: OBSERVED * m, state.n + state.base]
     for i in range(m):
@@ -88,7 +90,7 @@ def innovate(state: State, data: Data, m: int, work: Work) -> Array:
 
 
 @inner
-def whiten(state: State, data: Data, m: int, work: Work) -> tuple[int, float]:
+def whiten(state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float]:
     """S <- the root of S + R, and A and the innovation <- divided by it; a code of REASONS or 0, and the NIS."""
     rows, width = OBSERVED * m, state.n + state.base
     S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
@@ -111,7 +113,7 @@ def whiten(state: State, data: Data, m: int, work: Work) -> tuple[int, float]:
 
 
 @inner
-def apply(slam: Slam, state: State, m: int, local: Factors, work: Work) -> None:
+def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
     """x <- moved by W' S^-1/2 innovation and P <- P - W' W; with the columns of Phi as ``local`` says."""
     rows, n, base = OBSERVED * m, state.n, state.base
     A, y = work.A[:rows, :n], work.A[:rows, n + base]

@@ -12,9 +12,13 @@ from typing import Any
 import numba
 from filelock import FileLock
 
-from consistency.filters.kernel.dispatch import OPTIONS, PACKAGE, outside_files
+from consistency.filters.kernel.dispatch import OPTIONS, PACKAGE, Function, outside_files
 
-inner: Callable[[Any], Any] = numba.njit(**OPTIONS)
+
+def inner(function: Function) -> Function:
+    """Decorator of a function that other kernels call."""
+    compiled: Any = numba.njit(**OPTIONS)(function)
+    return compiled
 
 
 def _digest(outside: Iterable[Path]) -> str:
@@ -89,7 +93,8 @@ def _cached(function: Any, folder: Path) -> Any:
 
 
 def _signature(args: tuple[Any, ...]) -> tuple[Any, ...]:
-    return tuple(numba.typeof(arg) for arg in args)
+    typeof: Callable[[Any], Any] = numba.typeof
+    return tuple(typeof(arg) for arg in args)
 
 
 def _marker(folder: Path, signature: tuple[Any, ...]) -> Path:

@@ -22,7 +22,7 @@ _intrinsic: Callable[[Any], Any] = intrinsic
 _llvm: Any = cgutils  # untyped
 
 
-class Lent(types.Type):  # type: ignore[misc]
+class Lent(types.Type):
     """Pointer to a NamedTuple."""
 
     def __init__(self, record: Any) -> None:
@@ -31,21 +31,21 @@ class Lent(types.Type):  # type: ignore[misc]
 
 
 @register_model(Lent)
-class _LentModel(models.PrimitiveModel):  # type: ignore[misc]
+class _LentModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, ir.IntType(8).as_pointer())
+        super().__init__(dmm, fe_type, ir.IntType(8).as_pointer())  # type: ignore[no-untyped-call]
 
 
 @infer_getattr
-class _LentFields(AttributeTemplate):  # type: ignore[misc]
+class _LentFields(AttributeTemplate):
     key = Lent
 
-    def generic_resolve(self, lent: Any, field: str) -> Any:
+    def generic_resolve(self, lent: Any, field: str) -> Any:  # type: ignore[override]
         fields = lent.record.fields
         return lent.record.types[fields.index(field)] if field in fields else None
 
 
-@lower_getattr_generic(Lent)  # type: ignore[untyped-decorator]
+@lower_getattr_generic(Lent)  # type: ignore[no-untyped-call, untyped-decorator]
 def _lent_field(context: Any, builder: Any, lent: Any, pointer: Any, field: str) -> Any:
     kind = context.get_value_type(lent.record).as_pointer()
     return builder.load(_llvm.gep_inbounds(builder, builder.bitcast(pointer, kind), 0, lent.record.fields.index(field)))
@@ -59,8 +59,11 @@ def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
         array.parent = _llvm.get_null_value(array.parent.type)
         return array._getvalue()
     if isinstance(kind, types.BaseTuple):
-        for i, each in enumerate(kind.types):
-            value = builder.insert_value(value, _without_owner(context, builder, each, builder.extract_value(value, i)), i)
+        members: Any = kind
+        for i, each in enumerate(members.types):
+            value = builder.insert_value(
+                value, _without_owner(context, builder, each, builder.extract_value(value, i)), i
+            )
     return value
 
 

@@ -51,7 +51,7 @@ class Outcome(NamedTuple):
 
 
 @inner
-def _find_known(data: Data, k: int, offset: Indices, work: Work) -> int:
+def _find_known(data: Data, k: int, offset: Indices, work: Work[NamedTuple]) -> int:
     """Observations of step k + 1 whose landmark is in the state, their offsets, and how many they are."""
     m = 0
     for i in range(data.first[k], data.first[k + 1]):
@@ -63,7 +63,7 @@ def _find_known(data: Data, k: int, offset: Indices, work: Work) -> int:
 
 
 @inner
-def _insert_new(slam: Slam, state: State, data: Data, k: int, local: Factors, work: Work) -> State:
+def _insert_new(slam: Slam, state: State, data: Data, k: int, local: Factors, work: Work[NamedTuple]) -> State:
     """The state with the landmarks that step k + 1 sees for the first time."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     x, P, n, base, offset = state.x, state.P, state.n, state.base, state.offset
@@ -95,9 +95,9 @@ def _append_factors(label: int, r: int, w: int, n: int, base: int, Jp: Array, lo
 
 @inner
 def _step(
-    slam: Slam, state: State, data: Data, k: int, local: Factors, work: Work
+    slam: Slam, state: State, data: Data, k: int, local: Factors, work: Work[NamedTuple]
 ) -> tuple[State, int, int, float]:
-    """Step k + 1: predict, update, insert what is new; the state, a code of REASONS or 0, landmarks in the update, NIS."""
+    """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, and the NIS."""
     predict(slam.update, slam, state, k, data.controls[k], local.Phi, work)
     m, nis = _find_known(data, k, state.offset, work), np.nan
     if m > 0:
@@ -163,9 +163,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     memory, work, local, said = lend(own_memory), lend(own_work), lend(own_local), lend(out)
     step, code = _run(slam, data, memory, local, work, said)
     keep((own_slam, own_data, own_memory, own_work, own_local))
-    return Outcome(
-        out.pose, out.covariance, out.own, out.nis, out.nis_dof, step, code, out.points, out.spread
-    )
+    return Outcome(out.pose, out.covariance, out.own, out.nis, out.nis_dof, step, code, out.points, out.spread)
 
 
 @inner
@@ -184,7 +182,9 @@ def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
 
 
 @inner
-def _run(slam: Slam, data: Data, memory: Memory, local: Factors, work: Work, out: Outcome) -> tuple[int, int]:
+def _run(
+    slam: Slam, data: Data, memory: Memory, local: Factors, work: Work[NamedTuple], out: Outcome
+) -> tuple[int, int]:
     """``out`` <- all steps of a trial; step and code of a failure, or zeros."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     copy(data.start, memory.x[:r])
@@ -219,7 +219,7 @@ def _run(slam: Slam, data: Data, memory: Memory, local: Factors, work: Work, out
 
 
 @inner
-def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work) -> int:
+def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedTuple]) -> int:
     """Estimate of step k + 1; returns the rank of its covariance as ``definiteness`` says it."""
     r = robot_width(slam.motion)
     copy_matrix(state.P[:r, :r], out.own[k])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import (
     OBSERVED,
@@ -52,9 +54,7 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
 
 
 @inner
-def linearise(
-    slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array
-) -> None:
+def linearise(slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array) -> None:
     """z (3,) <- h expected of (pose, values) in step k + 1; Hp (3, r), Hl (3, w) <- Jacobians at the chosen point."""
     at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label)
     linearise_at(slam, robot_frame(slam.motion, at), landmark, z, Hp, Hl)
@@ -65,7 +65,7 @@ def linearise(
 
 
 @inner
-def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work) -> None:
+def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[NamedTuple]) -> None:
     """values (w,), ``work.Jp``, ``work.Jz`` <- the inverse of h at ``pose``, and its Jacobians."""
     mount, Jb = slam.sensor.mount, work.Jb
     cx, cy, cz = locate(slam.sensor, z[0], z[1], z[2])

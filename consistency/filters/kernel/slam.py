@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 from consistency.filters.kernel.dispatch import generic
+from consistency.filters.kernel.local_state import Factors
 from consistency.models.point import Mounting
 from consistency.types import Array, Indices
 
@@ -282,7 +283,7 @@ def predict(update: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi:
 
 @generic()
 def correct(
-    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
+    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: NamedTuple
 ) -> tuple[int, float]:
     """x, P <- the joint update with the ``m`` landmarks in ``work``; returns a code of REASONS or 0, and the NIS."""
     raise NotImplementedError
@@ -292,20 +293,18 @@ def correct(
 
 
 @generic()
-def make_local(covariance: NamedTuple, r: int, w: int, n: int) -> NamedTuple:
+def make_local(covariance: NamedTuple, r: int, w: int, n: int) -> Factors:
     """Factors for a state of up to ``n`` variables; empty where updating is dense."""
     raise NotImplementedError
 
 
 @generic()
-def prepare(
-    covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: NamedTuple
-) -> State:
+def prepare(covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
     """The variables that a step works on in which ``labels`` are seen."""
     raise NotImplementedError
 
 
 @generic()
-def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: NamedTuple) -> None:
+def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: Factors) -> None:
     """``whole`` <- what is known of all variables."""
     raise NotImplementedError

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -10,8 +10,10 @@ from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import OBSERVED, Slam, landmark_width, make_room, robot_width
 from consistency.types import Array, Indices
 
+Room = TypeVar("Room", covariant=True)
 
-class Work(NamedTuple):
+
+class Work(NamedTuple, Generic[Room]):
     """``m`` is the most landmarks seen in a step, ``n`` the final size of the state, ``L`` = r + w m."""
 
     known: Indices  # (m,) rows of the observations whose landmark is in the state
@@ -30,11 +32,11 @@ class Work(NamedTuple):
     Jb: Array  # (3, 3) of its position in the robot frame
     pose: Array  # (r,)
     small: Array  # (r, r)
-    room: NamedTuple  # what the update alone needs
+    room: Room  # what the update alone needs
 
 
 @inner
-def make_work(slam: Slam, n: int, m: int) -> Work:
+def make_work(slam: Slam, n: int, m: int) -> Work[NamedTuple]:
     """Arrays for a state of up to ``n`` variables and up to ``m`` landmarks in a step."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     rows = OBSERVED * m

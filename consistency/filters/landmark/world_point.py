@@ -66,9 +66,7 @@ def insert_world_point(
 
 
 @implement(world_point, WorldPoint)
-def world_point_itself(
-    landmark: WorldPoint, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array
-) -> None:
+def world_point_itself(landmark: WorldPoint, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array) -> None:
     copy(values, point)
     fill_matrix(Dp, 0.0)
     fill_matrix(Dl, 0.0)

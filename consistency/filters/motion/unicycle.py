@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import (
@@ -19,8 +21,6 @@ from consistency.filters.kernel.slam import (
 )
 from consistency.models.motion import unicycle, unicycle_jacobian, unicycle_noise
 from consistency.types import Array
-
-import numpy as np
 
 
 @part()

@@ -47,6 +47,6 @@ def landmark_at_estimate(point: AtEstimate, values: Array, label: int) -> Array:
 
 @implement(place, AtEstimate)
 def place_at_estimate(
-    point: AtEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work
+    point: AtEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
     place_observed(slam, state.x[: robot_width(slam.motion)], z, state.x[state.n :], work)

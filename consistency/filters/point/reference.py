@@ -53,7 +53,9 @@ def landmark_at_reference(point: Reference, values: Array, label: int) -> Array:
 
 
 @implement(place, Reference)
-def place_about_reference(point: Reference, slam: Slam, state: State, k: int, label: int, z: Array, work: Work) -> None:
+def place_about_reference(
+    point: Reference, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+) -> None:
     pose, landmark, n = point.path[k + 1], point.landmarks[label], state.n
     r = robot_width(slam.motion)
     z0, Hp, Hl = np.empty(3), np.empty((3, r)), np.empty((3, len(landmark)))

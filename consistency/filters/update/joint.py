@@ -27,13 +27,13 @@ def joint_room(update: Joint, r: int, w: int, m: int) -> NoRoom:
 
 
 @implement(predict, Joint)
-def predict_joint(update: Joint, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work) -> None:
+def predict_joint(update: Joint, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NoRoom]) -> None:
     propagate(slam.error, slam, state, k, u, Phi, work)
 
 
 @implement(correct, Joint)
 def correct_joint(
-    update: Joint, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work
+    update: Joint, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NoRoom]
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)

@@ -92,7 +92,9 @@ def _weights(L: int, points: Unscented) -> tuple[float, float, float, float]:
 
 
 @implement(predict, Unscented)
-def predict_unscented(update: Unscented, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work) -> None:
+def predict_unscented(
+    update: Unscented, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[SigmaRoom]
+) -> None:
     x, P, r = state.x, state.P, robot_width(slam.motion)
     spread, w0m, w0c, w = _weights(r, update)
     C, F, Y = work.small, work.room.F, work.room.moved
@@ -126,7 +128,7 @@ def predict_unscented(update: Unscented, slam: Slam, state: State, k: int, u: Ar
 
 @implement(correct, Unscented)
 def correct_unscented(
-    update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work
+    update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
     if not _innovate(update, slam, state, m, work):
@@ -139,7 +141,7 @@ def correct_unscented(
 
 
 @inner
-def _innovate(update: Unscented, slam: Slam, state: State, m: int, work: Work) -> bool:
+def _innovate(update: Unscented, slam: Slam, state: State, m: int, work: Work[SigmaRoom]) -> bool:
     """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite."""
     r, w, width, rows = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base, OBSERVED * m
     L = r + w * m
@@ -178,7 +180,7 @@ def _variable(r: int, w: int, a: int, at: Indices) -> int:
 
 
 @inner
-def _root(r: int, w: int, L: int, work: Work) -> bool:
+def _root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
     """Upper root U = C' of the prior over the variables involved; False if it is indefinite."""
     rows, at, U = work.rows, work.at, work.room.U[:L, :L]
     for b in range(L):
@@ -189,7 +191,7 @@ def _root(r: int, w: int, L: int, work: Work) -> bool:
 
 
 @inner
-def _singular_root(r: int, w: int, L: int, work: Work) -> bool:
+def _singular_root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
     """The root of a semidefinite prior: a zero pivot has a zero row."""
     rows, at, U, block = work.rows, work.at, work.room.U[:L, :L], work.room.block[:L, :L]
     for b in range(L):
@@ -205,7 +207,7 @@ def _singular_root(r: int, w: int, L: int, work: Work) -> bool:
 
 
 @inner
-def _project(slam: Slam, x: Array, m: int, spread: float, work: Work) -> None:
+def _project(slam: Slam, x: Array, m: int, spread: float, work: Work[SigmaRoom]) -> None:
     """Z <- h of the sigma points, in pairs along the rows of U; the last row is h of the mean."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     L = r + w * m

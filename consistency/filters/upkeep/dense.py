@@ -21,9 +21,7 @@ def make_no_factors(covariance: Dense, r: int, w: int, n: int) -> Factors:
 
 
 @implement(prepare, Dense)
-def prepare_all(
-    covariance: Dense, slam: Slam, whole: State, state: State, labels: Indices, local: Factors
-) -> State:
+def prepare_all(covariance: Dense, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
     return state
 
 

@@ -68,9 +68,7 @@ def make_local_factors(covariance: Local, r: int, w: int, n: int) -> Factors:
 
 
 @implement(prepare, Local)
-def prepare_active(
-    covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors
-) -> State:
+def prepare_active(covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
     r, w, home, offset = robot_width(slam.motion), landmark_width(slam.landmark), whole.offset, state.offset
     x, P, n, b = state.x, state.P, state.n, state.base
     if b > 0 and is_due(whole.n, n, b, w * len(labels), local):

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis as TickAxis
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -43,6 +44,7 @@ BESIDE = 0.66  # of the figure's width is left of a legend that stands beside th
 NARROWEST = 0.15  # span of one axis of a map over that of the other, at least: room for the tick labels
 WIDE = 200.0  # a log axis that spans more has room for powers of ten only
 BOUND = 0.9  # points, width of the lines at plus and minus a bound
+POINTS = 72  # in an inch, the resolution of an SVG
 RC: Any = {
     "font.family": "DejaVu Sans", "font.size": 7.5, "axes.titlesize": 8, "axes.labelsize": 7.5, "legend.fontsize": 7.5,
     "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6, "svg.hashsalt": "consistency",
@@ -53,7 +55,14 @@ RC: Any = {
 def svg(sheet: Sheet) -> bytes:
     """One sheet as SVG; the same sheet gives the same bytes."""
     with mpl.rc_context(RC):
-        return picture(draw(sheet), "svg")
+        figure = draw(sheet)
+        # laid out here and not by savefig, which draws everything once more for that
+        figure.set_dpi(POINTS)
+        FigureCanvasSVG(figure)
+        engine: Any = figure.get_layout_engine()
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+        return picture(figure, "svg")
 
 
 def picture(figure: Figure, kind: str, resolution: int = 200) -> bytes:

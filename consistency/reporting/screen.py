@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from bokeh.models import BasicTickFormatter, ColumnDataSource, DataRange1d, FixedTicker, HoverTool, Range1d
+from bokeh.models import BasicTickFormatter, ColumnDataSource, DataRange1d, FixedTicker, HoverTool, Range1d, glyphs
 from bokeh.models.annotations import BoxAnnotation
 from bokeh.models.annotations import Span as Across
 from bokeh.plotting import figure
@@ -27,7 +27,7 @@ from consistency.reporting.drawing import (
     Stems,
     kept,
 )
-from consistency.reporting.looks import Look
+from consistency.reporting.looks import Look, solid
 from consistency.types import Array
 
 # Bokeh's names of the marker shapes in looks.MARKERS
@@ -166,17 +166,16 @@ def _owned(owner: Owner | None, *glyphs: Any) -> None:
 def _line(chart: Any, mark: Line, _: Panel, limit: int) -> Any:
     rows = kept(mark, limit)
     columns = {"x": mark.x[rows], "y": mark.y[rows]} | _chosen(mark.columns, rows)
-    edges = []
     if mark.bound is not None:
         columns |= {"bound": mark.bound[rows], "below": -mark.bound[rows]}
     source = _source(**columns)
+    edges = []
     if mark.bound is not None:
-        thin = {"line_color": mark.look.colour, "line_width": 0.9, "line_dash": [5, 4], "line_alpha": 0.7}
-        edges = [chart.line("x", edge, source=source, **thin) for edge in ("bound", "below")]
-    if mark.steps:
-        line = chart.step("x", "y", source=source, mode="after", **_stroke(mark.look))
-    else:
-        line = chart.line("x", "y", source=source, **_stroke(mark.look))
+        edge = {"line_color": mark.look.colour, "line_width": 0.9, "line_dash": [5, 4], "line_alpha": 0.7}
+        edges = [chart.add_glyph(source, glyphs.Line(x="x", y=side, **edge)) for side in ("bound", "below")]
+    stroke = _stroke(mark.look)
+    curve = glyphs.Step(x="x", y="y", mode="after", **stroke) if mark.steps else glyphs.Line(x="x", y="y", **stroke)
+    line = chart.add_glyph(source, curve)
     _owned(mark.owner, line, *edges)
     return line
 
@@ -184,15 +183,15 @@ def _line(chart: Any, mark: Line, _: Panel, limit: int) -> Any:
 def _points(chart: Any, mark: Points, _: Panel, limit: int) -> Any:
     rows = kept(mark, limit)
     source = _source(x=mark.x[rows], y=mark.y[rows], **_chosen(mark.columns, rows))
-    dots = chart.scatter("x", "y", source=source, **_dots(mark.look))
+    dots = chart.add_glyph(source, glyphs.Scatter(x="x", y="y", **_dots(mark.look)))
     _owned(mark.owner, dots)
     return dots
 
 
 def _stems(chart: Any, mark: Stems, _: Panel, __: int) -> Any:
     source = _source(x=mark.x, y=mark.y, **mark.columns)
-    stems = chart.segment("x", 0, "x", "y", source=source, **_stroke(Look(mark.look.colour, width=mark.look.width)))
-    dots = chart.scatter("x", "y", source=source, **_dots(mark.look))
+    stems = chart.add_glyph(source, glyphs.Segment(x0="x", y0=0, x1="x", y1="y", **_stroke(solid(mark.look))))
+    dots = chart.add_glyph(source, glyphs.Scatter(x="x", y="y", **_dots(mark.look)))
     _owned(mark.owner, stems, dots)
     return dots
 
@@ -202,14 +201,15 @@ def _intervals(chart: Any, mark: Intervals, panel: Panel, _: int) -> Any:
     start, end = panel.x.window
     low, high = np.clip(mark.low, start, end), np.clip(mark.high, start, end)
     source = _source(x=mark.x, y=mark.y, low=low, high=high, **mark.columns)
-    solid = Look(mark.look.colour, width=mark.look.width)
-    glyphs = [chart.segment("low", "y", "high", "y", source=source, **_stroke(solid))]
-    for beyond, edge, angle in ((mark.low < start, start, 90), (mark.high > end, end, -90)):
+    bars = glyphs.Segment(x0="low", y0="y", x1="high", y1="y", **_stroke(solid(mark.look)))
+    drawn = [chart.add_glyph(source, bars)]
+    for beyond, edge, angle in ((mark.low < start, start, np.pi / 2), (mark.high > end, end, -np.pi / 2)):
         if beyond.any():
-            arrows = {"marker": "triangle", "angle": angle, "angle_units": "deg", "size": 9, "color": mark.look.colour}
-            glyphs.append(chart.scatter([edge] * int(beyond.sum()), mark.y[beyond], **arrows))
-    dots = chart.scatter("x", "y", source=source, **_dots(mark.look))
-    _owned(mark.owner, *glyphs, dots)
+            colour = {"fill_color": mark.look.colour, "line_color": mark.look.colour}
+            arrows = glyphs.Scatter(x=edge, y="y", marker="triangle", angle=angle, size=9, **colour)
+            drawn.append(chart.add_glyph(_source(y=mark.y[beyond]), arrows))
+    dots = chart.add_glyph(source, glyphs.Scatter(x="x", y="y", **_dots(mark.look)))
+    _owned(mark.owner, *drawn, dots)
     return dots
 
 
@@ -217,17 +217,17 @@ def _band(chart: Any, mark: Band, _: Panel, limit: int) -> None:
     rows = kept(mark, limit)
     source = _source(x=mark.x[rows], low=mark.low[rows], high=mark.high[rows])
     if mark.outline:
-        edges = [chart.line("x", edge, source=source, **_stroke(mark.look)) for edge in ("low", "high")]
+        edges = [chart.add_glyph(source, glyphs.Line(x="x", y=side, **_stroke(mark.look))) for side in ("low", "high")]
         _owned(mark.owner, *edges)
     else:
-        chart.varea("x", "low", "high", source=source, fill_color=mark.look.colour, fill_alpha=0.8)
+        shade = {"fill_color": mark.look.colour, "fill_alpha": 0.8}
+        chart.add_glyph(source, glyphs.VArea(x="x", y1="low", y2="high", **shade))
 
 
 def _bars(chart: Any, mark: Bars, _: Panel, __: int) -> Any:
     source = _source(left=mark.edges[:-1], right=mark.edges[1:], height=mark.height)
-    return chart.quad(
-        left="left", right="right", top="height", bottom=0, source=source, fill_color=mark.look.colour, line_color=None
-    )
+    bars = {"left": "left", "right": "right", "top": "height", "bottom": 0}
+    return chart.add_glyph(source, glyphs.Quad(**bars, fill_color=mark.look.colour, line_color=None))
 
 
 def _rule(chart: Any, mark: Rule, _: Panel, __: int) -> None:

@@ -59,13 +59,14 @@ def figures(distribution: Distribution) -> tuple[Figure, ...]:
     return (Figure("Distribution of the NEES", caption(), (_panel(study, filters),), (sheet,), keys, level=4),)
 
 
-def _panel(study: Study, filters: tuple[Steps, ...], line: Callable[[Look], Look] = lambda look: look) -> Panel:
+def _panel(study: Study, filters: tuple[Steps, ...], alone: bool = False) -> Panel:
     same = len({of.half_width for of in filters}) == 1
     bands = [_band(of, same) for of in (filters[:1] if same else filters)]
     diagonal = Line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), EXPECTED)
     tips = (("chi-square cdf", "@x{0.000}"), ("share of runs", "@y{0.000}"))
+    looks = [replace(solid(of.track.look) if alone else of.track.look, width=1.3) for of in filters]
     curves = [
-        Line(of.x, of.y, replace(of.track.look, width=1.3), of.track.owner, tips, steps=True) for of in filters
+        Line(of.x, of.y, look, of.track.owner, tips, steps=True) for of, look in zip(filters, looks, strict=True)
     ]
     return Panel(
         Axis("chi-square cdf of the NEES", "chi-square cdf", window=WINDOW), Axis("share of runs", window=WINDOW),
@@ -82,7 +83,7 @@ def _band(of: Steps, shaded: bool) -> Mark:
 
 
 def _small(study: Study, of: Steps, number: int) -> Panel:
-    panel, ticks = _panel(study, (of,), solid), (0.0, 0.5, 1.0)
+    panel, ticks = _panel(study, (of,), alone=True), (0.0, 0.5, 1.0)
     label = "share of runs" if number % PANELS == 0 else ""
     return replace(
         panel, x=replace(panel.x, ticks=ticks), y=Axis(label, window=WINDOW, ticks=ticks), title=of.track.name

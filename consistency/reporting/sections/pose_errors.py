@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.reporting.drawing import Axis, Figure, Key, Line, Panel, Rule, Sheet
-from consistency.reporting.looks import Look
+from consistency.reporting.looks import Look, solid
 from consistency.reporting.model import Study, Track
 from consistency.reporting.section import STUDY, Section
 from consistency.types import Array
@@ -65,26 +65,26 @@ def figures(errors: PoseErrors) -> tuple[Figure, ...]:
     return (Figure(title, caption(errors), panels, sheets, (BOUND, *study.keys()), stacked=True),)
 
 
-def _panel(study: Study, filters: tuple[PoseError, ...], component: int) -> Panel:
+def _panel(study: Study, filters: tuple[PoseError, ...], component: int, alone: bool = False) -> Panel:
     name, unit = COMPONENTS[component]
     x = Axis("step", window=(0.0, float(len(study.steps))), share="step")
     y = Axis(f"{name} error ({unit})", f"{name} error\n({unit})")
-    marks = (_line(study, of, component) for of in filters)
+    marks = (_line(study, of, component, alone) for of in filters)
     alt = f"{name} error of {study.name} over steps with 2-sigma bounds"
     return Panel(x, y, (*marks, Rule("y", 0.0, ZERO)), alt, height=240)
 
 
-def _line(study: Study, of: PoseError, component: int) -> Line:
+def _line(study: Study, of: PoseError, component: int, alone: bool) -> Line:
     unit = COMPONENTS[component][1]
     tips = (("step", "@x"), ("error", f"@y{{0.0000}} {unit}"), ("2 sigma", f"@bound{{0.0000}} {unit}"))
-    look = replace(of.track.look, width=0.9)
+    look = replace(solid(of.track.look) if alone else of.track.look, width=1.0)
     return Line(
         study.steps, of.error[:, component], look, of.track.owner, tips, bound=SIGMAS * of.sigma[:, component]
     )
 
 
 def _sheet(study: Study, of: PoseError) -> Sheet:
-    panels = [_panel(study, (of,), component) for component in range(3)]
+    panels = [_panel(study, (of,), component, alone=True) for component in range(3)]
     panels[1] = replace(panels[1], empty="no estimate in this run")
     return Sheet(tuple(panels), 1.4, title=of.track.name)
 

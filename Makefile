@@ -18,14 +18,14 @@ test-all: .venv/.done
 	$(BIN)/python -m pytest -n 2
 
 calibrate: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python experiments/calibration.py \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py \
 		--out reports/reference/calibration.json --docs docs/referee.md
 
 calibrate-quick: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python experiments/calibration.py --quick
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --quick
 
 bench: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python experiments/bench.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/bench.py
 
 lint: .venv/.done
 	$(BIN)/ruff check .

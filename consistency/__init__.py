@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     from consistency.diagnostics.records import Verdict
     from consistency.errors import InputError
     from consistency.filters import filter_names, get_filter
-    from consistency.findings import Study
-    from consistency.judge import analyse
-    from consistency.montecarlo import run_trials
-    from consistency.results import Results, read_results
+    from consistency.runs.findings import Study
+    from consistency.runs.montecarlo import run_trials
     from consistency.scenario import Scenario, load_scenario, scenario_names
     from consistency.simulation import simulate
+    from consistency.store.results import Results, read_results
     from consistency.types import Control, Finding, Gaussian, Info, Observation, Trial
+    from consistency.verdicts.judge import analyse
 
 _HOME = {
     "InputError": "errors",
@@ -26,17 +26,17 @@ _HOME = {
     "simulate": "simulation",
     "filter_names": "filters",
     "get_filter": "filters",
-    "run_trials": "montecarlo",
-    "Results": "results",
-    "read_results": "results",
+    "run_trials": "runs.montecarlo",
+    "Results": "store.results",
+    "read_results": "store.results",
     "nees": "diagnostics",
     "anees": "diagnostics",
     "anees_interval": "diagnostics",
     "Alarm": "diagnostics",
     "Monitor": "diagnostics",
-    "analyse": "judge",
+    "analyse": "verdicts.judge",
     "Finding": "types",
-    "Study": "findings",
+    "Study": "runs.findings",
     "Control": "types",
     "Gaussian": "types",
     "Info": "types",

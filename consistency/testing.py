@@ -18,8 +18,8 @@ from consistency.gating.watch import Entry, Terms, current, terms
 from consistency.gating.wording import fault_text, few_to_compare, undecided_text
 
 if TYPE_CHECKING:
-    from consistency.comparison import Baseline
-    from consistency.results import Results
+    from consistency.store.results import Results
+    from consistency.verdicts.comparison import Baseline
 
 
 class ConsistencyError(AssertionError):

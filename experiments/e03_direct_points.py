@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import consistency as cs
 from consistency.diagnostics import detectable_ratio, simultaneous_band
-from consistency.findings import script
+from consistency.runs.findings import script
 
 FINDINGS = ("fig11a",)
 

@@ -8,8 +8,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import Normality, normality
-from consistency.findings import script
 from consistency.models.stereo import project, triangulate, triangulate_jacobian
+from consistency.runs.findings import script
 
 FINDINGS = ("fig12a", "fig12b")
 

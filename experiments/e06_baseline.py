@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import consistency as cs
-from consistency.findings import script
-from consistency.judge import run_means
+from consistency.runs.findings import script
+from consistency.verdicts.judge import run_means
 
 FINDINGS = ("baseline-reduces-nonlinearity",)
 

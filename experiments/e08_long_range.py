@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import consistency as cs
-from consistency.findings import script
-from consistency.judge import run_means, wins
+from consistency.runs.findings import script
+from consistency.verdicts.judge import run_means, wins
 
 FINDINGS = ("long-range",)
 

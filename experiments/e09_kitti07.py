@@ -24,16 +24,16 @@ import pandas as pd
 
 import consistency as cs
 from consistency.diagnostics import anees_interval, chi2_mean_interval, coverage
-from consistency.findings import command_line, sibling
-from consistency.judge import curves
-from consistency.log import Log, write_log
 from consistency.models import point, stereo
 from consistency.models.motion import dead_reckoning
-from consistency.montecarlo import run_log
-from consistency.results import Results, joined
-from consistency.storage import manifest_of, require_free
-from consistency.table import print_findings
+from consistency.runs.findings import command_line, sibling
+from consistency.runs.montecarlo import run_log
+from consistency.store.log import Log, write_log
+from consistency.store.results import Results, joined
+from consistency.store.storage import manifest_of, require_free
+from consistency.terminal.table import print_findings
 from consistency.types import Array, Trial
+from consistency.verdicts.judge import curves
 
 if TYPE_CHECKING:
     import kitti07_log as conversion

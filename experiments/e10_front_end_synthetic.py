@@ -14,7 +14,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import chi2_mean_interval
-from consistency.findings import OURS, script
+from consistency.runs.findings import OURS, script
 from consistency.types import Array
 from consistency.vision import (
     register_svd,

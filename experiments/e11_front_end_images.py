@@ -21,12 +21,12 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.atomic import write_whole
 from consistency.diagnostics import Evidence, Verdict, judge, nees
-from consistency.findings import OURS, command_line, sibling
 from consistency.reporting.front_end import matches_png, samples_png
-from consistency.storage import require_free
-from consistency.table import print_findings
+from consistency.runs.findings import OURS, command_line, sibling
+from consistency.store.atomic import write_whole
+from consistency.store.storage import require_free
+from consistency.terminal.table import print_findings
 from consistency.types import Array
 from consistency.vision import (
     RelativePose,

@@ -15,7 +15,7 @@ import pandas as pd
 import consistency as cs
 from consistency.diagnostics import Evidence, Settings, detectable_ratio, judge
 from consistency.errors import InputError
-from consistency.findings import OURS, script
+from consistency.runs.findings import OURS, script
 from consistency.types import Array, Failure
 from consistency.vision import (
     RelativePose,

@@ -12,8 +12,8 @@ from consistency.errors import InputError
 from consistency.frontend.planar_log import MIN_LIFE, log_of
 from consistency.frontend.truth import find_truth, read_truth
 from consistency.frontend.tum import covariance_text, trajectory_text
-from consistency.log import write_log
-from consistency.storage import manifest_of, require_free
+from consistency.store.log import write_log
+from consistency.store.storage import manifest_of, require_free
 from consistency.types import Array
 from consistency.vision.features import opencv
 from consistency.vision.matching import is_rectified

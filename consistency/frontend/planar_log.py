@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
+from consistency.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.models import point, stereo
 from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.types import Array, Trial
 from consistency.vision.motion import RelativeMotion
-from consistency.vision.planar import in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.vision.pose import RelativePose, angular
 from consistency.vision.rig import StereoRig
 from consistency.vision.sequence import Sequence

@@ -14,7 +14,7 @@ from consistency.gating.watch import Terms
 from consistency.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
-    from consistency.results import Results
+    from consistency.store.results import Results
 
 ASYMMETRY = 1e-8  # of a covariance, relative to its largest entry
 SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix; below, its inverse is rounding error
@@ -116,8 +116,8 @@ def of_results(
     ValueError
         No results, no such filter, or more than one to choose from.
     """
-    from consistency.judge import curves, evidence_of
-    from consistency.results import POSE, Results
+    from consistency.store.results import POSE, Results
+    from consistency.verdicts.judge import curves, evidence_of
 
     if not isinstance(results, Results):
         raise ValueError("filter names one in the results of consistency.run_trials; give those in place of errors")

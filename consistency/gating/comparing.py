@@ -14,8 +14,8 @@ from consistency.diagnostics import Comparison, RunSummary, compare, summary, wh
 from consistency.gating.checks import Candidate, evidence, of_results
 
 if TYPE_CHECKING:
-    from consistency.comparison import Baseline
-    from consistency.results import Results
+    from consistency.store.results import Results
+    from consistency.verdicts.comparison import Baseline
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,8 @@ def of_filters(
     ValueError
         No such filter, nothing to compare with, or a baseline that cannot be read.
     """
-    from consistency.comparison import Baseline, baseline_of, read_baseline
-    from consistency.results import POSE
+    from consistency.store.results import POSE
+    from consistency.verdicts.comparison import Baseline, baseline_of, read_baseline
 
     if reference is None and than is None:
         raise ValueError("than: name the filter to compare with, or give other results as reference")

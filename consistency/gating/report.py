@@ -8,9 +8,9 @@ import tempfile
 from html import escape
 from pathlib import Path
 
-from consistency.atomic import write_whole
 from consistency.gating.session import Ledger, ending, interval, named, number, outcome
 from consistency.gating.watch import Entry
+from consistency.store.atomic import write_whole
 
 SUFFIXES = (".json", ".html")
 

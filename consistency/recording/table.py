@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.parquet import COVARIANCE
 from consistency.recording.conventions import PLANAR, planar_error
 from consistency.recording.record import (
     DEFAULT_DT,
@@ -25,6 +24,7 @@ from consistency.recording.record import (
     symmetric,
 )
 from consistency.recording.sheet import Sheet, read_sheet
+from consistency.store.parquet import COVARIANCE
 from consistency.types import Array, Indices
 
 POSE = ("x", "y", "heading")

@@ -1,8 +1,8 @@
 """Results as one offline HTML file and as a PDF; both show the same document.
 
-``build`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each figure
-described once. ``html`` and ``pdf`` show the blocks; ``screen`` and ``paper`` draw the figures. No statistic is computed
-here that the diagnostics do not already have.
+``build`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each of which
+is described once. ``html`` and ``pdf`` show the blocks; ``screen`` and ``paper`` draw the figures. No statistic is
+computed here that the diagnostics do not already have.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from consistency.atomic import write_whole
 from consistency.errors import InputError
+from consistency.store.atomic import write_whole
 
 if TYPE_CHECKING:
-    from consistency.monitoring import Watched
+    from consistency.verdicts.monitoring import Watched
 
 __all__ = ["require_plot", "write_monitor_plot", "write_reports"]
 
@@ -43,7 +43,7 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     targets = [path for path in (html, pdf) if path is not None]
     if html is not None and pdf is not None and html.absolute() == pdf.absolute():
         raise InputError(f"{html}: is named for both HTML and PDF; name two files")
-    from consistency.storage import read_manifest
+    from consistency.store.storage import read_manifest
 
     read_manifest(Path(folder))
     for path in targets:

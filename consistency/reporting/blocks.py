@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias
 from consistency.reporting.drawing import Figure, Key
 from consistency.reporting.looks import Look
 
+
 @dataclass(frozen=True)
 class Heading:
     """Title of what follows."""
@@ -15,6 +16,7 @@ class Heading:
     text: str
     level: int = 3
     paper: str = ""  # text on paper; empty: no heading there
+
 
 @dataclass(frozen=True)
 class Text:

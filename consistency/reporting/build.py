@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.findings import read_findings
-from consistency.judge import analyse, curves, design_of
 from consistency.reporting.answer import answer
 from consistency.reporting.blocks import Chapter, Document
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.section import STUDY, Section
 from consistency.reporting.sections import SECTIONS
-from consistency.results import read_results
-from consistency.storage import read_manifest
+from consistency.runs.findings import read_findings
+from consistency.store.results import read_results
+from consistency.store.storage import read_manifest
+from consistency.verdicts.judge import analyse, curves, design_of
 
 
 def build_report(folder: Path) -> Report:

@@ -54,6 +54,7 @@ class Points:
     owner: Owner | None = None
     tips: Tips = ()
     columns: Columns = field(default_factory=dict)
+    whole: bool = False  # every point is drawn, however many
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,7 @@ class Axis:
     log: bool = False
     window: tuple[float, float] | None = None  # drawn range; None: what the marks need
     start: float | None = None  # least value drawn
+    most: float | None = None  # on paper: greatest value drawn, at most
     least: float = 0.0  # of the drawn range, at least
     follows: bool = False  # on a screen the range is that of the filters that are shown
     share: str = ""  # axes of one name move together
@@ -202,6 +204,11 @@ class Figure:
     paper: str = ""  # another caption on paper
 
 
+def xy(points: Array) -> tuple[Array, Array]:
+    """Columns of points (N, 2)."""
+    return points[:, 0], points[:, 1]
+
+
 def dodge(slot: int, slots: int) -> float:
     """Place of a filter beside the others, from -0.5 to 0.5 around a common mark."""
     return 0.76 * ((slot + 0.5) / slots - 0.5)
@@ -211,6 +218,8 @@ def kept(mark: Line | Points | Band, limit: int) -> Indices:
     """Rows of a mark that are drawn, about ``limit``, its extremes kept."""
     if isinstance(mark, Band):
         return thin(mark.high, limit=limit)
+    if isinstance(mark, Points) and mark.whole:
+        return np.arange(len(mark.y))
     lines = [mark.y]
     if isinstance(mark, Line):
         lines += [mark.x] if mark.path else []

@@ -34,7 +34,6 @@ class Look:
     edge: str = ""  # colour of a marker's outline; empty: none
 
 
-
 EXPECTED = Look("#555555", width=0.8)
 LIMIT = Look("#333333", (4.0, 3.0), width=0.9)
 SHADE = Look(BAND)

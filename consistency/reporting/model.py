@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from consistency.diagnostics import Verdict
-from consistency.judge import Curves
 from consistency.reporting.drawing import Key, Owner
 from consistency.reporting.looks import Look, style
-from consistency.results import Results
+from consistency.store.results import Results
 from consistency.types import Array, Failure, Indices
+from consistency.verdicts.judge import Curves
 
 SINGLE_RUN = 1
 DECADE = 10.0  # values that span more are drawn on a log axis

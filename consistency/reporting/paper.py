@@ -52,17 +52,18 @@ RC: Any = {
 }  # fmt: skip
 
 
-def svg(sheet: Sheet) -> bytes:
-    """One sheet as SVG; the same sheet gives the same bytes."""
+def render(sheet: Sheet, kind: str = "svg", resolution: int = 200) -> bytes:
+    """One sheet as PNG, PDF or SVG; the same sheet gives the same bytes."""
     with mpl.rc_context(RC):
         figure = draw(sheet)
-        # laid out here and not by savefig, which draws everything once more for that
-        figure.set_dpi(POINTS)
-        FigureCanvasSVG(figure)
-        engine: Any = figure.get_layout_engine()
-        engine.execute(figure)
-        figure.set_layout_engine(None)
-        return picture(figure, "svg")
+        if kind == "svg":
+            # laid out here and not by savefig, which draws everything once more for that
+            figure.set_dpi(POINTS)
+            FigureCanvasSVG(figure)
+            engine: Any = figure.get_layout_engine()
+            engine.execute(figure)
+            figure.set_layout_engine(None)
+        return picture(figure, kind, resolution)
 
 
 def picture(figure: Figure, kind: str, resolution: int = 200) -> bytes:
@@ -82,7 +83,8 @@ def draw(sheet: Sheet) -> Figure:
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(WIDTH, sheet.height), layout="constrained")
     shared = {f"share{side}": _same([getattr(panel, side) for panel in panels]) for side in "xy"}
-    grid = figure.subplots(rows, columns, squeeze=False, width_ratios=sheet.widths or None, **shared)
+    options: dict[str, Any] = {"squeeze": False, "width_ratios": sheet.widths or None} | shared
+    grid = figure.subplots(rows, columns, **options)
     for panel, axes in zip(panels, grid.flat, strict=False):
         draw_panel(axes, panel)
     for axes in grid.flat[len(panels) :]:
@@ -148,6 +150,8 @@ def _axis(axes: Axes, side: str, axis: Axis) -> None:
         axes.set(**{f"{side}lim": axis.window})
     if axis.start is not None:
         axes.set(**{f"{side}lim": (axis.start, None)})
+    if axis.most is not None:
+        axes.set(**{f"{side}lim": (None, min(getattr(axes, f"get_{side}lim")()[1], axis.most))})
     if axis.ticks:
         axes.set(**{f"{side}ticks": axis.ticks})
     if axis.whole:
@@ -189,7 +193,8 @@ def _dots(look: Look) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _line(axes: Axes, mark: Line, order: float, _: Panel) -> None:
+def draw_line(axes: Axes, mark: Line, order: float, _: Panel | None = None) -> None:
+    """A curve, with shading and dashed lines where it has bounds; ``order``: greater is in front."""
     rows = kept(mark, LIMIT)
     x = mark.x[rows]
     if mark.bound is not None:
@@ -220,7 +225,7 @@ def _intervals(axes: Axes, mark: Intervals, order: float, panel: Panel) -> None:
     for edge, beyond, arrow in ((low, mark.low < start, "<"), (high, mark.high > end, ">")):
         for rows, marker, size in ((~beyond, "|", 4.0), (beyond, arrow, 4.5)):
             if rows.any():
-                ends = {"color": mark.look.colour, "markersize": size, "clip_on": False, "zorder": order}
+                ends: dict[str, Any] = {"color": mark.look.colour, "markersize": size, "clip_on": False, "zorder": order}
                 axes.plot(edge[rows], mark.y[rows], marker, **ends)
     axes.plot(mark.x, mark.y, zorder=order, **_dots(mark.look))
 
@@ -249,7 +254,7 @@ def _span(axes: Axes, mark: Span, _: float, __: Panel) -> None:
 
 
 PAINT: dict[type[Mark], Callable[[Axes, Any, float, Panel], None]] = {
-    Line: _line, Points: _points, Stems: _stems, Intervals: _intervals, Band: _band, Bars: _bars, Rule: _rule,
+    Line: draw_line, Points: _points, Stems: _stems, Intervals: _intervals, Band: _band, Bars: _bars, Rule: _rule,
     Span: _span,
 }  # fmt: skip
 

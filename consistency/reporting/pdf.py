@@ -71,7 +71,7 @@ def _figure(figure: Figure, name: str, folder: Path) -> dict[str, Any]:
     images = []
     for number, sheet in enumerate(figure.sheets):
         path = folder / f"{name}-{number}.svg"
-        path.write_bytes(paper.svg(sheet))
+        path.write_bytes(paper.render(sheet))
         images.append(path.name)
     return {"images": images, "caption": soft(figure.paper or figure.caption), "stacked": figure.stacked}
 

@@ -68,8 +68,8 @@ class Screen:
             if glyph is not None and mark.tips:  # type: ignore[union-attr]
                 named = (("filter", "$name"),) if getattr(mark, "owner", None) else ()
                 tips.setdefault((*named, *mark.tips), []).append(glyph)  # type: ignore[union-attr]
-        for words, glyphs in tips.items():
-            chart.add_tools(HoverTool(renderers=glyphs, tooltips=list(words)))
+        for words, drawn in tips.items():
+            chart.add_tools(HoverTool(renderers=drawn, tooltips=list(words)))
         return chart
 
     def _range(self, axis: Axis, arrows: bool = False) -> Any:
@@ -171,7 +171,12 @@ def _line(chart: Any, mark: Line, _: Panel, limit: int) -> Any:
     source = _source(**columns)
     edges = []
     if mark.bound is not None:
-        edge = {"line_color": mark.look.colour, "line_width": 0.9, "line_dash": [5, 4], "line_alpha": 0.7}
+        edge: dict[str, Any] = {
+            "line_color": mark.look.colour,
+            "line_width": 0.9,
+            "line_dash": [5, 4],
+            "line_alpha": 0.7,
+        }
         edges = [chart.add_glyph(source, glyphs.Line(x="x", y=side, **edge)) for side in ("bound", "below")]
     stroke = _stroke(mark.look)
     curve = glyphs.Step(x="x", y="y", mode="after", **stroke) if mark.steps else glyphs.Line(x="x", y="y", **stroke)
@@ -205,7 +210,7 @@ def _intervals(chart: Any, mark: Intervals, panel: Panel, _: int) -> Any:
     drawn = [chart.add_glyph(source, bars)]
     for beyond, edge, angle in ((mark.low < start, start, np.pi / 2), (mark.high > end, end, -np.pi / 2)):
         if beyond.any():
-            colour = {"fill_color": mark.look.colour, "line_color": mark.look.colour}
+            colour: dict[str, Any] = {"fill_color": mark.look.colour, "line_color": mark.look.colour}
             arrows = glyphs.Scatter(x=edge, y="y", marker="triangle", angle=angle, size=9, **colour)
             drawn.append(chart.add_glyph(_source(y=mark.y[beyond]), arrows))
     dots = chart.add_glyph(source, glyphs.Scatter(x="x", y="y", **_dots(mark.look)))
@@ -220,24 +225,28 @@ def _band(chart: Any, mark: Band, _: Panel, limit: int) -> None:
         edges = [chart.add_glyph(source, glyphs.Line(x="x", y=side, **_stroke(mark.look))) for side in ("low", "high")]
         _owned(mark.owner, *edges)
     else:
-        shade = {"fill_color": mark.look.colour, "fill_alpha": 0.8}
+        shade: dict[str, Any] = {"fill_color": mark.look.colour, "fill_alpha": 0.8}
         chart.add_glyph(source, glyphs.VArea(x="x", y1="low", y2="high", **shade))
 
 
 def _bars(chart: Any, mark: Bars, _: Panel, __: int) -> Any:
     source = _source(left=mark.edges[:-1], right=mark.edges[1:], height=mark.height)
-    bars = {"left": "left", "right": "right", "top": "height", "bottom": 0}
+    bars: dict[str, Any] = {"left": "left", "right": "right", "top": "height", "bottom": 0}
     return chart.add_glyph(source, glyphs.Quad(**bars, fill_color=mark.look.colour, line_color=None))
 
 
 def _rule(chart: Any, mark: Rule, _: Panel, __: int) -> None:
     dimension = "width" if mark.side == "y" else "height"
-    chart.add_layout(Across(location=mark.at, dimension=dimension, **_stroke(mark.look)))
+    chart.add_layout(Across(location=mark.at, **({"dimension": dimension} | _stroke(mark.look))))
 
 
 def _span(chart: Any, mark: Span, _: Panel, __: int) -> None:
-    ends = {"bottom": mark.low, "top": mark.high} if mark.side == "y" else {"left": mark.low, "right": mark.high}
-    chart.add_layout(BoxAnnotation(fill_color=mark.look.colour, fill_alpha=0.8 * mark.look.alpha, level="image", **ends))
+    ends: dict[str, Any] = (
+        {"bottom": mark.low, "top": mark.high} if mark.side == "y" else {"left": mark.low, "right": mark.high}
+    )
+    chart.add_layout(
+        BoxAnnotation(fill_color=mark.look.colour, fill_alpha=0.8 * mark.look.alpha, level="image", **ends)
+    )
 
 
 PAINT: dict[type[Mark], Callable[[Any, Any, Panel, int], Any]] = {

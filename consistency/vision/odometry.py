@@ -6,7 +6,7 @@ from collections.abc import Sequence as Ordered
 
 import numpy as np
 
-from consistency.progress import progress
+from consistency.terminal.progress import progress
 from consistency.types import Array
 from consistency.vision.motion import RelativeMotion, Settings, motion_between, stereo_features
 from consistency.vision.pose import angular, cross_matrix

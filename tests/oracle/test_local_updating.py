@@ -15,7 +15,7 @@ from consistency.filters.stepping import step_through
 from consistency.scenario import Belief
 from consistency.types import Estimates, Trial
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from bench_trials import growing, grown
 
 NEVER = 10**9

@@ -215,7 +215,7 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, name: str) -> None:
     """Interrupted after the first runs, then resumed: the bytes of an uninterrupted run."""
     code = f"""
 import signal, sys
-import consistency.montecarlo as mc
+import consistency.runs.montecarlo as mc
 from consistency.cli import main
 one, count = mc._one, []
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell runs in the background

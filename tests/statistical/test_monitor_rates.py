@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import calibration_monitor as calibration
 
 pytestmark = pytest.mark.slow

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.findings import reproduce
-from consistency.judge import curves
+from consistency.runs.findings import reproduce
+from consistency.verdicts.judge import curves
 
 REFERENCE = Path(__file__).parents[2] / "reports" / "reference"
 

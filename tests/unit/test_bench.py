@@ -15,13 +15,14 @@ from threadpoolctl import threadpool_limits
 import consistency as cs
 from consistency.simulation import World
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import bench
 import bench_whole as whole
-from bench_peers import WARM, FilterpyEkf, FilterpyUkf, stone_soup
+from bench_models import WARM
+from bench_peers import FilterpyEkf, FilterpyUkf, stone_soup
 from bench_trials import Case, Unequal, growing, grown, interleaved, require_equal, steady
 
-EXPERIMENTS = Path(bench.__file__).parent
+BENCHMARKS = Path(bench.__file__).parent
 TINY = bench.Effort(
     repeats=1,
     steps=12,
@@ -175,7 +176,7 @@ def test_memory_lies_on_a_line() -> None:
 def test_peak_memory_is_the_childs_own() -> None:
     """Not the parent's, which the bench has made large before."""
     large = np.ones(100_000_000)  # 800 MB
-    code = f"import sys; sys.path.insert(0, {str(EXPERIMENTS)!r}); import bench_whole; print(bench_whole.peak_mib())"
+    code = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import bench_whole; print(bench_whole.peak_mib())"
     assert float(whole._process(["-c", code])) < 700.0 < large.nbytes / 2**20
     assert whole.peak_mib() > 700.0
 

@@ -15,7 +15,7 @@ from scipy import stats
 from consistency.diagnostics import nees, nis_of
 from consistency.recording import planar_error, read_recordings
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import calibration
 import calibration_cases
 import calibration_rows

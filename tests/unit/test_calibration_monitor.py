@@ -11,7 +11,7 @@ from scipy import stats
 
 import consistency as cs
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import calibration_monitor as calibration
 from calibration_rows import Row
 

@@ -13,13 +13,20 @@ import pytest
 from scipy import optimize, special, stats
 
 import consistency as cs
-from consistency.comparison import Compared, baseline_of, compare_filters, compare_with, read_baseline, write_baseline
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.diagnostics.contrast import Contrast, contrast, margin
 from consistency.gating.session import needed_at
 from consistency.gating.watch import Watch, watching
 from consistency.testing import InsufficientTrials, assert_not_worse
 from consistency.types import Array
+from consistency.verdicts.comparison import (
+    Compared,
+    baseline_of,
+    compare_filters,
+    compare_with,
+    read_baseline,
+    write_baseline,
+)
 
 RATE = 1e-5  # false-failure rate of each statistical assertion below
 
@@ -129,7 +136,7 @@ def test_no_more_false_alarms_than_stated_on_the_same_trials(rng: np.random.Gene
 
 
 def test_calibration_rows_count_false_alarms(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "experiments")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
     import calibration_compare
 
     monkeypatch.setattr(calibration_compare, "QUICK_GATES", {0.05: 40, 0.01: 20})

@@ -10,7 +10,7 @@ import pytest
 
 import consistency as cs
 from consistency.filters.stepping import optimal_gain
-from consistency.results import joined
+from consistency.store.results import joined
 
 
 class Declares:

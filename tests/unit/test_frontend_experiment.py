@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import consistency as cs
-from consistency import plots
+from consistency.reporting import plots
 from consistency.reporting.front_end import matches_png, samples_png
 from consistency.vision import RelativePose
 

@@ -14,16 +14,16 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.frontend import Options, write_frontend_log
+from consistency.frontend.planar import OPTICAL, in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.frontend.planar_log import relative
 from consistency.frontend.truth import read_truth
-from consistency.log import read_log
 from consistency.recording import read_recordings, spatial_error
-from consistency.storage import read_manifest
+from consistency.store.log import read_log
+from consistency.store.storage import read_manifest
 from consistency.types import Array
 from consistency.vision import ConsensusError, RelativePose, relative_motion
 from consistency.vision.motion import ESTIMATORS, RelativeMotion, Settings
 from consistency.vision.odometry import trajectory, visual_odometry
-from consistency.vision.planar import OPTICAL, in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.vision.sequence import read_sequence
 from consistency.vision.tracks import linked
 

@@ -18,11 +18,12 @@ import pyarrow.parquet as pq
 import pytest
 
 import consistency as cs
-from consistency import gather, montecarlo, parquet
-from consistency.montecarlo import Interrupted
-from consistency.results import Outcome, StoredResults, open_results, outcome_of
+from consistency.runs import gather, montecarlo
+from consistency.runs.montecarlo import Interrupted
 from consistency.simulation import World
-from consistency.table import verdicts_json
+from consistency.store import parquet
+from consistency.store.results import Outcome, StoredResults, open_results, outcome_of
+from consistency.terminal.table import verdicts_json
 from consistency.types import Trial
 
 TABLES = ("estimates", "failures", "truth", "landmarks")

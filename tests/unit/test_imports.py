@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence, Set
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -13,28 +14,30 @@ import pytest
 import consistency
 
 PACKAGE = Path(consistency.__file__).parent
-EXPERIMENTS = PACKAGE.parent / "experiments"
+SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((PACKAGE.parent / folder).glob("*.py"))]
 
-# a room may import rooms of lower rank and itself; rooms of equal rank do not know each other
+# A room may import rooms of lower rank and itself; rooms of equal rank do not know each other. Rooms whose modules have
+# ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
-    "types": 0, "errors": 0, "progress": 0, "atomic": 0,
+    "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0,
     "geometry": 1,
     "models": 2,
     "scenario": 3,
     "protocols": 4,
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
-    "parquet": 4, "storage": 5, "results": 6, "gather": 7,
-    "log": 7, "recording": 7,
-    "montecarlo": 8, "judge": 8, "frontend": 8, "monitoring": 8,
-    "sequential": 9, "comparison": 9,
-    "plots": 10, "table": 10,
-    "findings": 11,
+    "store.parquet": 4, "store.storage": 5, "store.results": 6, "store.log": 7,
+    "recording": 7,
+    "runs.gather": 7, "runs.montecarlo": 8, "frontend": 8,
+    "verdicts.judge": 8, "verdicts.monitoring": 8, "verdicts.comparison": 9,
+    "runs.sequential": 9,
+    "reporting.plots": 10, "terminal.table": 10,
+    "runs.findings": 11,
     "reporting": 12, "gating": 12,
     "cli": 13, "testing": 13, "pytest_plugin": 13,
     "__main__": 14,
 }  # fmt: skip
 DIAGNOSTICS = {"types", "geometry", "errors", "diagnostics"}
-DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}  # only plots and reporting draw
+DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}  # only reporting draws
 IN_EXPERIMENTS = {"consistency", "numpy", "pandas", "scipy"}
 PEERS = {"bench_peers": {"filterpy"}, "bench_stonesoup": {"stonesoup"}}  # what the bench sets beside ours
 
@@ -47,38 +50,65 @@ def imported(source: str) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative imports hide the room"
             assert node.module is not None
-            if node.module == "consistency":
-                yield from (f"consistency.{alias.name}" for alias in node.names)
-            else:
-                yield node.module
+            room = node.module.split(".")[0] == "consistency" and node.module.count(".") < 2  # or a module in one
+            yield from {f"{node.module}.{alias.name}" if room else node.module for alias in node.names}
+
+
+def place(parts: Sequence[str]) -> str:
+    """Key of :data:`RANK`: the room, or room and module where modules have ranks."""
+    inside = ".".join(parts[:2])
+    return inside if inside in RANK else parts[0]
 
 
 def complaints(room: str, source: str) -> list[str]:
     """What a module of ``room`` imports and may not."""
-    found = []
+    found = set()
     for name in imported(source):
         top, *rest = name.split(".")
         if top == "consistency":
-            other = rest[0] if rest else "__init__"
-            allowed = other == room or RANK.get(other, 99) < RANK[room]
+            other = place(rest) if rest else "__init__"
+            allowed = other == room or RANK.get(other, 99) < RANK.get(room, -1)
             if room == "diagnostics":
                 allowed = other in DIAGNOSTICS
             if not allowed:
-                found.append(f"{room} imports consistency.{other}")
+                found.add(f"{room} imports consistency.{other}")
         elif room == "diagnostics" and top not in {"numpy", "scipy"} | sys.stdlib_module_names:
-            found.append(f"diagnostics imports {top}")
-        elif top in DRAWING and room not in {"plots", "reporting"}:
-            found.append(f"{room} imports {top}")
-    return found
+            found.add(f"diagnostics imports {top}")
+        elif top in DRAWING and room not in {"reporting.plots", "reporting"}:
+            found.add(f"{room} imports {top}")
+    return sorted(found)
 
 
 def modules() -> list[tuple[str, Path]]:
     paths = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
-    return [(path.relative_to(PACKAGE).parts[0].removesuffix(".py"), path) for path in sorted(paths)]
+    return [(place(path.relative_to(PACKAGE).with_suffix("").parts), path) for path in sorted(paths)]
+
+
+def acyclic(graph: Mapping[str, set[str]]) -> bool:
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError:
+        return False
+    return True
 
 
 def test_every_room_has_a_rank() -> None:
-    assert {room for room, _ in modules()} <= set(RANK)
+    inside = {room.split(".")[0] for room in RANK}  # their __init__.py has no rank and may import nothing of ours
+    assert {room for room, path in modules() if path.name != "__init__.py" or room not in inside} <= set(RANK)
+
+
+def test_the_root_is_small() -> None:
+    assert len(list(PACKAGE.glob("*.py"))) <= 9
+
+
+def test_no_two_rooms_import_each_other() -> None:
+    graph: dict[str, set[str]] = {}
+    for room, path in modules():
+        names = [name.split(".") for name in imported(path.read_text(encoding="utf-8"))]
+        others = {parts[1] for parts in names if parts[0] == "consistency" and len(parts) > 1}
+        graph.setdefault(room.split(".")[0], set()).update(others - {room.split(".")[0]})
+    assert acyclic(graph)
+    assert not acyclic(graph | {"store": {"runs"}})  # negative control
 
 
 @pytest.mark.parametrize(("room", "path"), modules(), ids=lambda value: getattr(value, "stem", value))
@@ -96,12 +126,17 @@ FORBIDDEN = [
     ("diagnostics", "import pandas as pd"),
     ("diagnostics", "from matplotlib.axes import Axes"),
     ("diagnostics", "from consistency.scenario import Belief"),
-    ("montecarlo", "from consistency.judge import analyse"),
-    ("montecarlo", "import matplotlib.pyplot as plt"),
-    ("plots", "from consistency.reporting import write_reports"),
+    ("runs.montecarlo", "from consistency.verdicts.judge import analyse"),
+    ("runs.montecarlo", "import matplotlib.pyplot as plt"),
+    ("reporting.plots", "from consistency.reporting import write_reports"),
     ("gating", "from consistency.testing import assert_consistent"),
     ("testing", "from consistency.pytest_plugin import Gates"),
-    ("results", "if TYPE_CHECKING:\n    from consistency.log import Log"),
+    ("store.results", "if TYPE_CHECKING:\n    from consistency.store.log import Log"),
+    ("store.parquet", "from consistency.store import storage"),
+    ("store", "from consistency.store.atomic import write_whole"),
+    ("verdicts.judge", "import consistency.store"),
+    ("verdicts.judge", "from consistency.verdicts.comparison import Compared"),
+    ("vision", "from consistency.terminal.table import print_findings"),
 ]
 
 
@@ -110,18 +145,36 @@ def test_a_forbidden_import_is_caught(room: str, source: str) -> None:
     assert len(complaints(room, source)) == 1
 
 
-# --- experiments -----------------------------------------------------------------------------
+# --- experiments and benchmarks ----------------------------------------------------------------
 
 
-def strangers(source: str) -> set[str]:
-    """What an experiment imports beside the package, arrays, tables, the standard library and its siblings."""
-    siblings = {path.stem for path in EXPERIMENTS.glob("*.py")}
-    return {name.split(".")[0] for name in imported(source)} - IN_EXPERIMENTS - siblings - set(sys.stdlib_module_names)
+def siblings(path: Path) -> set[str]:
+    return {other.stem for other in path.parent.glob("*.py")}
 
 
-@pytest.mark.parametrize("path", sorted(EXPERIMENTS.glob("*.py")), ids=lambda path: path.stem)
-def test_an_experiment_only_uses_the_package(path: Path) -> None:
-    assert strangers(path.read_text(encoding="utf-8")) == PEERS.get(path.stem, set())
+def strangers(source: str, known: Set[str] = frozenset()) -> set[str]:
+    """What a script imports beside the package, arrays, tables, the standard library and its ``known`` siblings."""
+    return {name.split(".")[0] for name in imported(source)} - IN_EXPERIMENTS - known - set(sys.stdlib_module_names)
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_a_script_only_uses_the_package(path: Path) -> None:
+    assert strangers(path.read_text(encoding="utf-8"), siblings(path)) == PEERS.get(path.stem, set())
+
+
+def mentioned(path: Path) -> set[str]:
+    """Siblings that a script imports, by a statement or, where a part is loaded later, by its name as text."""
+    source = path.read_text(encoding="utf-8")
+    texts = {str(node.value) for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant)}
+    parts = {text for text in texts if "_" in text}
+    return siblings(path) & ({*imported(source)} | parts) - {path.stem}
+
+
+def test_scripts_do_not_import_each_other_in_a_circle() -> None:
+    graph = {path.stem: mentioned(path) for path in SCRIPTS}
+    assert {"bench_models", "bench_stonesoup"} <= graph["bench_peers"]
+    assert acyclic(graph)
+    assert not acyclic(graph | {"bench_models": {"bench_stonesoup"}})  # negative control
 
 
 def test_a_stranger_in_an_experiment_is_caught() -> None:

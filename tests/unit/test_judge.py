@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from consistency.judge import Curves, run_means, wins
 from consistency.types import Array, Failure
+from consistency.verdicts.judge import Curves, run_means, wins
 
 
 def curves(nees: Array, failed: tuple[int, ...] = (), first: int = 0) -> Curves:

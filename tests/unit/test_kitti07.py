@@ -14,9 +14,9 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.log import read_log, write_log
 from consistency.models.stereo import project
-from consistency.storage import manifest_of
+from consistency.store.log import read_log, write_log
+from consistency.store.storage import manifest_of
 from consistency.types import Array, Trial
 
 ROOT = Path(__file__).parents[2]

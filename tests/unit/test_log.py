@@ -13,8 +13,8 @@ import pytest
 import tomli_w
 
 import consistency as cs
-from consistency.log import read_log
-from consistency.montecarlo import run_log, simulate_log
+from consistency.runs.montecarlo import run_log, simulate_log
+from consistency.store.log import read_log
 
 Edit = Callable[[pd.DataFrame], pd.DataFrame]
 Small = Callable[..., cs.Scenario]
@@ -258,7 +258,7 @@ def test_an_error_while_writing_leaves_nothing(
     def full(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("consistency.log._write_text", full)
+    monkeypatch.setattr("consistency.store.log._write_text", full)
     with pytest.raises((OSError, cs.InputError), match="No space left"):
         simulate_log(uvd, runs=1, seed=0, out=tmp_path / "log")
     assert list(tmp_path.iterdir()) == []

@@ -16,13 +16,12 @@ from matplotlib import image
 from matplotlib.figure import Figure
 
 import consistency as cs
-from consistency import plots
 from consistency.errors import InputError
-from consistency.monitoring import Watched, make_monitor, read_innovations, watch, watch_lines
 from consistency.recording.nis import NisLog
-from consistency.reporting import require_plot, write_monitor_plot
+from consistency.reporting import plots, require_plot, write_monitor_plot
 from consistency.reporting.monitor import POINTS, averaged, monitor_plot
-from consistency.table import print_watched, watched_json
+from consistency.terminal.table import print_watched, watched_json
+from consistency.verdicts.monitoring import Watched, make_monitor, read_innovations, watch, watch_lines
 
 NIS = [1.0, 2.5, math.nan, 0.25, 7.0]
 DOF = [2, 2, 0, 1, 3]

@@ -13,9 +13,9 @@ import pytest
 
 import consistency as cs
 from consistency.filters.stepping import run_filter
-from consistency.montecarlo import Interrupted
-from consistency.results import joined
+from consistency.runs.montecarlo import Interrupted
 from consistency.simulation import World
+from consistency.store.results import joined
 from consistency.types import Control, Gaussian, Observation, Trial
 
 Small = Callable[..., cs.Scenario]

@@ -10,7 +10,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from consistency import plots
+from consistency.reporting import plots
 
 ODD = ("$x^2$ and \\frac", "_hidden", "<script>", "#*@", "$$y$$")
 STEPS = np.arange(1, 6)

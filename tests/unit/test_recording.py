@@ -22,7 +22,6 @@ import consistency as cs
 from consistency.cli import main
 from consistency.diagnostics import Settings, nees
 from consistency.errors import InputError
-from consistency.judge import analyse_recordings
 from consistency.recording import (
     planar_error,
     read_recordings,
@@ -32,6 +31,7 @@ from consistency.recording import (
 )
 from consistency.recording.record import associate, common_times, smallest_correlation
 from consistency.types import Array
+from consistency.verdicts.judge import analyse_recordings
 
 ROOT = Path(__file__).parents[2]
 POSE_COLUMNS = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]

@@ -15,11 +15,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import consistency as cs
-from consistency.judge import curves
-from consistency.montecarlo import simulate_log
-from consistency.parquet import COLUMNS
-from consistency.storage import require_free
+from consistency.runs.montecarlo import simulate_log
+from consistency.store.parquet import COLUMNS
+from consistency.store.storage import require_free
 from consistency.types import Control, Gaussian, Observation
+from consistency.verdicts.judge import curves
 
 TABLES = ("estimates", "failures", "truth", "landmarks")
 

@@ -12,8 +12,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import Design, Evidence, follow, look, sequential_design
-from consistency.montecarlo import Interrupted
-from consistency.sequential import run_until_decided
+from consistency.runs.montecarlo import Interrupted
+from consistency.runs.sequential import run_until_decided
 from consistency.types import Array
 
 SHORT = {"truth__steps": 60}
@@ -113,7 +113,7 @@ def test_runs_are_those_of_a_plain_run_and_the_plan_is_kept() -> None:
 
 
 def test_an_interrupted_plan_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    from consistency import montecarlo
+    from consistency.runs import montecarlo
 
     scenario = cs.load_scenario("linear-gaussian").variant("short", **SHORT)
     one, calls = montecarlo._one, []

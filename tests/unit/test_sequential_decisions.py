@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import consistency as cs
-from consistency.sequential import run_until_decided
+from consistency.runs.sequential import run_until_decided
 
 FAULTY, OPEN = "ekf-xyz", "ekf-uvd"  # points from stereo as Gaussian: a gross fault; pixels: none that few runs show
 PLAN = {"false_alarm": 1e-6, "max_runs": 40, "seed": 11}

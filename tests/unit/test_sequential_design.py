@@ -14,7 +14,6 @@ import pytest
 from draws import fully_dependent, identities, independent
 from scipy import stats
 
-from consistency import sequential
 from consistency.diagnostics import (
     Design,
     Evidence,
@@ -28,6 +27,7 @@ from consistency.diagnostics import (
 )
 from consistency.diagnostics.equivalence import equivalence_by_betting
 from consistency.diagnostics.verdict import Look
+from consistency.runs import sequential
 from consistency.types import Array, Failure
 
 SURE = 1e-5

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.diagnostics import Verdict
 from consistency.diagnostics.questions import STEP
-from consistency.reporting.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Rule, Sheet
+from consistency.reporting.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Rule, Sheet, xy
 from consistency.reporting.looks import EXPECTED, LIMIT, SHADE
 from consistency.reporting.model import Study, Track, wide
 from consistency.reporting.section import STUDY, Section
@@ -102,9 +102,9 @@ def _bands(anees: Anees) -> list[Mark]:
     marks: list[Mark] = []
     steps, shared = anees.study.steps, anees.common
     if shared is not None:
-        marks.append(Band(steps, *shared.band.T, SHADE))
+        marks.append(Band(steps, *xy(shared.band), SHADE))
         if shared.simultaneous is not None:
-            marks.append(Band(steps, *shared.simultaneous.T, LIMIT, outline=True))
+            marks.append(Band(steps, *xy(shared.simultaneous), LIMIT, outline=True))
         marks.append(Rule("y", shared.expected, EXPECTED))
     for curve in anees.curves:
         if curve.own_band:
@@ -117,9 +117,9 @@ def _own_bands(curve: Curve, steps: Indices) -> list[Mark]:
     look, owner = curve.track.look, curve.track.owner
     if curve.simultaneous is not None:
         dashed = replace(look, dash=LIMIT.dash, width=0.9)
-        marks.append(Band(steps, *curve.simultaneous.T, dashed, owner, outline=True))
+        marks.append(Band(steps, *xy(curve.simultaneous), dashed, owner, outline=True))
     dotted = replace(look, dash=(1.0, 2.0), width=0.7)
-    return [*marks, Band(steps, *curve.band.T, dotted, owner, outline=True)]
+    return [*marks, Band(steps, *xy(curve.band), dotted, owner, outline=True)]
 
 
 def _line(curve: Curve, study: Study) -> Line:

@@ -72,9 +72,7 @@ def read(report: Report) -> FirstOrder | None:
             raise InputError(f"{path}: column '{column}', row {row}: not above zero ({table[column].iloc[row]:g})")
     same = table.iloc[0]
     estimators = (
-        Cells(
-            str(name), part["ratio"].to_numpy(), part["nees_ratio"].to_numpy(), (part["status"] == SHOWN).to_numpy()
-        )
+        Cells(str(name), part["ratio"].to_numpy(), part["nees_ratio"].to_numpy(), (part["status"] == SHOWN).to_numpy())
         for name, part in table.groupby("estimator", sort=False)
     )
     return FirstOrder(

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.judge import Curves
 from consistency.reporting.drawing import Axis, Band, Figure, Key, Mark, Panel, Points, Rule, Sheet, Span, Stems, dodge
 from consistency.reporting.looks import EXPECTED, SHADE, Look
 from consistency.reporting.model import Study, Track, wide
 from consistency.reporting.section import STUDY, Section
 from consistency.reporting.wording import listed
 from consistency.types import Array
+from consistency.verdicts.judge import Curves
 
 LEAST = 0.1  # correlation drawn on either side of zero, so that noise does not look large
 ONE = Look("#333333", width=0.8)

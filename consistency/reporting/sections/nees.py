@@ -65,9 +65,7 @@ def _panel(study: Study, filters: tuple[Steps, ...], alone: bool = False) -> Pan
     diagonal = Line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), EXPECTED)
     tips = (("chi-square cdf", "@x{0.000}"), ("share of runs", "@y{0.000}"))
     looks = [replace(solid(of.track.look) if alone else of.track.look, width=1.3) for of in filters]
-    curves = [
-        Line(of.x, of.y, look, of.track.owner, tips, steps=True) for of, look in zip(filters, looks, strict=True)
-    ]
+    curves = [Line(of.x, of.y, look, of.track.owner, tips, steps=True) for of, look in zip(filters, looks, strict=True)]
     return Panel(
         Axis("chi-square cdf of the NEES", "chi-square cdf", window=WINDOW), Axis("share of runs", window=WINDOW),
         (*bands, diagonal, *curves), f"Distribution of the NEES of {study.name}", height=340, shape="square",

@@ -78,9 +78,7 @@ def _line(study: Study, of: PoseError, component: int, alone: bool) -> Line:
     unit = COMPONENTS[component][1]
     tips = (("step", "@x"), ("error", f"@y{{0.0000}} {unit}"), ("2 sigma", f"@bound{{0.0000}} {unit}"))
     look = replace(solid(of.track.look) if alone else of.track.look, width=1.0)
-    return Line(
-        study.steps, of.error[:, component], look, of.track.owner, tips, bound=SIGMAS * of.sigma[:, component]
-    )
+    return Line(study.steps, of.error[:, component], look, of.track.owner, tips, bound=SIGMAS * of.sigma[:, component])
 
 
 def _sheet(study: Study, of: PoseError) -> Sheet:

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy import stats
 
 from consistency.models.stereo import project, triangulate_jacobian
-from consistency.reporting.drawing import Axis, Bars, Figure, Key, Line, Panel, Points, Sheet
+from consistency.reporting.drawing import Axis, Bars, Figure, Key, Line, Panel, Points, Sheet, xy
 from consistency.reporting.looks import Look, style
 from consistency.reporting.model import Report
 from consistency.reporting.section import Part, Section
@@ -127,8 +127,8 @@ def _figure(d: Distribution) -> Figure:
     x = Axis("x (m)", window=d.window[0], share=name)
     cloud = Panel(
         x, Axis("y (m)", window=d.window[1]),
-        (Points(*d.points.T, DOTS), Line(*d.linear_ellipse.T, LINEAR, path=True),
-         Line(*d.fitted_ellipse.T, FITTED, path=True)),
+        (Points(*xy(d.points), DOTS, whole=True), Line(*xy(d.linear_ellipse), LINEAR, path=True),
+         Line(*xy(d.fitted_ellipse), FITTED, path=True)),
         f"Samples in x and y, {name}", height=320,
     )  # fmt: skip
     tips = (("x", "@left{0.00} to @right{0.00} m"), ("density", "@height{0.0000}"))

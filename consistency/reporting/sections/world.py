@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.models.motion import dead_reckoning
-from consistency.reporting.blocks import Block
-from consistency.reporting.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet
+from consistency.reporting.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, xy
 from consistency.reporting.looks import ODOMETRY, TRUTH, Look
 from consistency.reporting.model import Study, Track
 from consistency.reporting.section import STUDY, Section
@@ -84,22 +83,22 @@ def figures(world: World) -> tuple[Figure, ...]:
 def _surroundings(world: World) -> list[Mark]:
     marks: list[Mark] = []
     if world.landmarks is not None:
-        marks.append(Points(*world.landmarks.T, LANDMARK))
+        marks.append(Points(*xy(world.landmarks), LANDMARK))
     if world.odometry is not None:
-        marks.append(Line(*world.odometry.T, ALONE, path=True))
+        marks.append(Line(*xy(world.odometry), ALONE, path=True))
     if world.truth is not None:
-        marks.append(Line(*world.truth.T, TRUE, path=True))
+        marks.append(Line(*xy(world.truth), TRUE, path=True))
     return marks
 
 
 def _start(world: World) -> list[Mark]:
-    return [] if world.truth is None else [Points(*world.truth[:1].T, START)]
+    return [] if world.truth is None else [Points(*xy(world.truth[:1]), START)]
 
 
 def _estimates(world: World) -> list[Mark]:
     tips = (("step", "@step"), ("x", "@x{0.00} m"), ("y", "@y{0.00} m"))
     return [
-        Line(*path.T, track.look, track.owner, tips, {"step": world.study.steps}, path=True)
+        Line(*xy(path), track.look, track.owner, tips, {"step": world.study.steps}, path=True)
         for track, path in world.paths
     ]
 
@@ -127,8 +126,6 @@ def caption(world: World) -> str:
     parts.append("estimates in the filters' colours")
     note = "" if world.odometry is not None else " The odometry path is left out: results of a log hold no controls."
     return f"{world.study.name} from above, run {world.study.shown_run}: {', '.join(parts)}.{note}"
-
-
 
 
 SECTION = Section(STUDY, read, figures)

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
-from consistency.parquet import COLUMNS, write_table
+from consistency.store.parquet import COLUMNS, write_table
 
 SCHEMA_VERSION = 1
 PACKAGES = (
@@ -68,7 +68,7 @@ def _git_commit() -> str | None:
 
     Asked once a process, as its modules are read once.
     """
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     if not (root / ".git").exists():  # installed, perhaps inside somebody else's repository
         return None
     command = ["git", "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]

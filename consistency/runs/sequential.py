@@ -9,11 +9,11 @@ from typing import Any
 
 from consistency.diagnostics import Design, Verdict, look, sequential_design, speaks
 from consistency.errors import InputError
-from consistency.judge import curves, evidence_of, refused
-from consistency.montecarlo import Interrupted, run_trials
 from consistency.protocols import Filter
-from consistency.results import POSE, Results, Tables
+from consistency.runs.montecarlo import Interrupted, run_trials
 from consistency.scenario import Scenario
+from consistency.store.results import POSE, Results, Tables
+from consistency.verdicts.judge import curves, evidence_of, refused
 
 
 def run_until_decided(

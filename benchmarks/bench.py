@@ -23,7 +23,8 @@ from typing import Any
 import bench_vision as front_end
 import bench_whole as whole
 import numpy as np
-from bench_peers import WARM, FilterpyEkf, FilterpyUkf, Peer, stone_soup
+from bench_models import WARM, Peer
+from bench_peers import FilterpyEkf, FilterpyUkf, stone_soup
 from bench_trials import LANDMARKS, SEEN, Case, Work, growing, grown, interleaved, require_equal, steady
 from scipy.linalg import blas, lapack
 

@@ -16,8 +16,8 @@ import pandas as pd
 import pyarrow as pa
 
 from consistency.errors import InputError
-from consistency.parquet import COLUMNS, Columns, Writer, write_table
-from consistency.results import (
+from consistency.store.parquet import COLUMNS, Columns, Writer, write_table
+from consistency.store.results import (
     NUMBERS,
     Outcome,
     Results,
@@ -27,7 +27,7 @@ from consistency.results import (
     failures_table,
     truth_table,
 )
-from consistency.storage import NewFolder, undisturbed
+from consistency.store.storage import NewFolder, undisturbed
 from consistency.types import Failure
 
 

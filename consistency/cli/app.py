@@ -50,7 +50,7 @@ def _main(
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
     """Scenarios, filters and experiments."""
     from consistency.filters import filter_names
-    from consistency.findings import experiment_summaries
+    from consistency.runs.findings import experiment_summaries
     from consistency.scenario import load_scenario, scenario_names
 
     scenarios = {name: load_scenario(name).summary for name in scenario_names()}
@@ -76,7 +76,7 @@ def simulate(
     overwrite: Overwrite = False,
 ) -> None:
     """Write truth, controls and observations of a scenario: a log for any filter, ours or not."""
-    from consistency.montecarlo import simulate_log
+    from consistency.runs.montecarlo import simulate_log
     from consistency.scenario import load_scenario
 
     simulate_log(load_scenario(scenario), runs, seed, out, overwrite)
@@ -158,14 +158,14 @@ def run(
     overwrite: Overwrite = False,
 ) -> None:
     """Put simulated trials, or a recorded log, through filters."""
-    from consistency.judge import analyse
-    from consistency.log import read_log
-    from consistency.montecarlo import Interrupted, resolve_filters, run_log, run_trials
-    from consistency.results import Results, StoredResults, open_results
+    from consistency.runs.montecarlo import Interrupted, resolve_filters, run_log, run_trials
+    from consistency.runs.sequential import run_until_decided
     from consistency.scenario import load_scenario
-    from consistency.sequential import run_until_decided
-    from consistency.storage import require_free
-    from consistency.table import print_verdicts
+    from consistency.store.log import read_log
+    from consistency.store.results import Results, StoredResults, open_results
+    from consistency.store.storage import require_free
+    from consistency.terminal.table import print_verdicts
+    from consistency.verdicts.judge import analyse
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
@@ -265,11 +265,11 @@ def analyse(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
 ) -> None:
     """Judge results, or files of another estimator: consistent, overconfident, conservative, undecided ..., and why."""
-    from consistency.judge import analyse as judge_results
-    from consistency.judge import analyse_recordings, settings_of
     from consistency.recording import is_recording, read_recordings
-    from consistency.results import open_results
-    from consistency.table import print_verdicts, verdicts_json
+    from consistency.store.results import open_results
+    from consistency.terminal.table import print_verdicts, verdicts_json
+    from consistency.verdicts.judge import analyse as judge_results
+    from consistency.verdicts.judge import analyse_recordings, settings_of
 
     if fail_on not in (None, "inconsistent"):
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
@@ -329,12 +329,12 @@ def plan(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
-    from consistency.judge import pilots_of
-    from consistency.judge import plan as plan_runs
-    from consistency.montecarlo import run_trials
-    from consistency.results import open_results
+    from consistency.runs.montecarlo import run_trials
     from consistency.scenario import load_scenario
-    from consistency.table import print_plan
+    from consistency.store.results import open_results
+    from consistency.terminal.table import print_plan
+    from consistency.verdicts.judge import pilots_of
+    from consistency.verdicts.judge import plan as plan_runs
 
     if scenario is not None and like is not None:
         raise InputError("give either a SCENARIO for a pilot or --like RESULTS")
@@ -370,8 +370,8 @@ def compare(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
-    from consistency.comparison import compare_filters, compare_with, read_baseline
-    from consistency.table import comparisons_json, print_comparisons
+    from consistency.terminal.table import comparisons_json, print_comparisons
+    from consistency.verdicts.comparison import compare_filters, compare_with, read_baseline
 
     if fail_on not in (None, "worse"):
         raise InputError(f"--fail-on must be 'worse', got '{fail_on}'")
@@ -397,8 +397,8 @@ def baseline(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Keep what a later 'compare' needs of results, one row a run."""
-    from consistency.comparison import write_baseline
-    from consistency.results import read_results
+    from consistency.store.results import read_results
+    from consistency.verdicts.comparison import write_baseline
 
     write_baseline(read_results(folder), out, overwrite)
     print(f"baseline in {out}; next: consistency compare NEW {out}")
@@ -432,10 +432,10 @@ def reproduce(
     overwrite: Overwrite = False,
 ) -> None:
     """Set each published finding beside what is measured here; exit 1 if a published one is not reproduced."""
-    from consistency.findings import OURS
-    from consistency.findings import reproduce as reproduce_findings
     from consistency.reporting import write_reports
-    from consistency.table import print_findings
+    from consistency.runs.findings import OURS
+    from consistency.runs.findings import reproduce as reproduce_findings
+    from consistency.terminal.table import print_findings
 
     findings = reproduce_findings(only, runs, seed, jobs, out, overwrite)
     print_findings(findings)
@@ -480,9 +480,9 @@ def monitor(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
-    from consistency.monitoring import make_monitor, read_innovations, watch, watch_lines
     from consistency.reporting import require_plot, write_monitor_plot
-    from consistency.table import print_watched, watched_json
+    from consistency.terminal.table import print_watched, watched_json
+    from consistency.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
 
     if fail_on not in (None, "alarm"):
         raise InputError(f"--fail-on must be 'alarm', got '{fail_on}'")

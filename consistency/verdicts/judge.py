@@ -25,9 +25,9 @@ from consistency.diagnostics import (
 from consistency.diagnostics.scale import FEW
 from consistency.errors import InputError
 from consistency.geometry import pose_error
-from consistency.parquet import COLUMNS, COVARIANCE
 from consistency.recording import Recording
-from consistency.results import NUMBERS, POSE, Tables
+from consistency.store.parquet import COLUMNS, COVARIANCE
+from consistency.store.results import NUMBERS, POSE, Tables
 from consistency.types import Array, Failure, Indices
 
 OPTION = {

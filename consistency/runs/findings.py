@@ -16,13 +16,13 @@ import pandas as pd
 
 from consistency.diagnostics import Verdict
 from consistency.errors import InputError
-from consistency.judge import Curves, analyse, curves
-from consistency.montecarlo import run_trials
-from consistency.results import Results, joined
+from consistency.runs.montecarlo import run_trials
 from consistency.scenario import Scenario, data_folder, load_scenario
-from consistency.storage import manifest_of, require_free, write_folder
-from consistency.table import print_findings
+from consistency.store.results import Results, joined
+from consistency.store.storage import manifest_of, require_free, write_folder
+from consistency.terminal.table import print_findings
 from consistency.types import Finding
+from consistency.verdicts.judge import Curves, analyse, curves
 
 OURS = "this project"  # how the source of a question begins that no paper asks
 REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"

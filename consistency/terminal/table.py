@@ -13,13 +13,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from consistency.comparison import Compared
 from consistency.diagnostics import Interval, Verdict
 from consistency.diagnostics.monitor import CAVEAT, accepted_scales
 from consistency.diagnostics.wording import short
-from consistency.monitoring import Watched
-from consistency.storage import plain
+from consistency.store.storage import plain
 from consistency.types import Finding
+from consistency.verdicts.comparison import Compared
+from consistency.verdicts.monitoring import Watched
 
 COLOURS = {
     "consistent": "green", "overconfident": "red", "conservative": "yellow", "biased": "red", "heavy-tailed": "red",

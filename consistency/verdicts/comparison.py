@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from consistency.atomic import write_whole
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.errors import InputError
-from consistency.judge import curves
-from consistency.results import POSE, Results, read_results
-from consistency.storage import SCHEMA_VERSION, manifest_of, plain
+from consistency.store.atomic import write_whole
+from consistency.store.results import POSE, Results, read_results
+from consistency.store.storage import SCHEMA_VERSION, manifest_of, plain
+from consistency.verdicts.judge import curves
 
 DETECT = 1.5  # ratio that a sentence speaks of
 

@@ -17,9 +17,9 @@ from consistency.diagnostics.whitening import whiten
 from consistency.errors import InputError
 from consistency.filters.linalg import definiteness
 from consistency.geometry import pose_error
-from consistency.parquet import COLUMNS, COVARIANCE, Columns, read_batches, read_parquet, require_table
 from consistency.scenario import Scenario, explain
-from consistency.storage import read_manifest, write_folder
+from consistency.store.parquet import COLUMNS, COVARIANCE, Columns, read_batches, read_parquet, require_table
+from consistency.store.storage import read_manifest, write_folder
 from consistency.types import Array, Estimates, Failure, Indices, Trial
 
 POSE = ["x", "y", "heading"]

@@ -15,8 +15,6 @@ import tomli_w
 from pydantic import ValidationError
 
 from consistency.errors import InputError
-from consistency.parquet import read_parquet
-from consistency.results import POSE, controls_table, observations_table, truth_of
 from consistency.scenario import (
     Belief,
     BelievedMotion,
@@ -30,7 +28,9 @@ from consistency.scenario import (
     explain,
     read_table,
 )
-from consistency.storage import write_folder
+from consistency.store.parquet import read_parquet
+from consistency.store.results import POSE, controls_table, observations_table, truth_of
+from consistency.store.storage import write_folder
 from consistency.types import Array, Trial
 
 View = tuple[tuple[int, int], tuple[float, float]]  # image (width, height) and principal point (column, row), px

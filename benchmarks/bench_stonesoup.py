@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from bench_peers import Models, Peer, Said
+from bench_models import Models, Peer, Said
 from stonesoup.models.measurement.base import MeasurementModel
 from stonesoup.models.transition.base import TransitionModel
 from stonesoup.predictor.kalman import ExtendedKalmanPredictor, UnscentedKalmanPredictor

@@ -18,14 +18,14 @@ from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter
 from consistency.filters.compiled import Compiled, one_blas_thread
 from consistency.filters.stepping import name_of, optimal_gain, run_filter
-from consistency.gather import Gathered
-from consistency.log import Log, write_log
-from consistency.progress import progress
 from consistency.protocols import Filter
-from consistency.results import Outcome, Results, StoredResults, Tables, outcome_of
+from consistency.runs.gather import Gathered
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import draw_landmarks, require_landmarks_in_view
-from consistency.storage import NewFolder, manifest_of, require_free
+from consistency.store.log import Log, write_log
+from consistency.store.results import Outcome, Results, StoredResults, Tables, outcome_of
+from consistency.store.storage import NewFolder, manifest_of, require_free
+from consistency.terminal.progress import progress
 from consistency.types import Trial
 
 Outcomes = Generator[Outcome, None, None]

@@ -13,7 +13,7 @@ import numpy as np
 from consistency.diagnostics import Alarm, Monitor
 from consistency.errors import InputError
 from consistency.recording.nis import NisLog, checked_dof, choose, read_nis, stream_nis
-from consistency.results import open_results
+from consistency.store.results import open_results
 from consistency.types import Array
 
 OPTIMAL = "optimal"

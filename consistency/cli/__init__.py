@@ -1,0 +1,5 @@
+"""The command line: parses, calls, prints; no logic. Every command imports what it needs when it is called."""
+
+from consistency.cli.app import main
+
+__all__ = ["main"]

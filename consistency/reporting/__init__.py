@@ -8,6 +8,7 @@ computed here that the diagnostics do not already have.
 from __future__ import annotations
 
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,14 +51,15 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
         _require_writable(path, overwrite)
     from consistency.reporting.build import build_report, compose
     from consistency.reporting.html import render_html
-    from consistency.reporting.pdf import render_pdf
+    from consistency.reporting.pdf import pdf_beside
 
     document = compose(build_report(Path(folder)))
     contents: list[tuple[Path, bytes]] = []
-    if html is not None:
-        contents.append((html, render_html(document).encode("utf-8")))
-    if pdf is not None:
-        contents.append((pdf, render_pdf(document)))
+    with pdf_beside(document) if pdf is not None else nullcontext(bytes) as finished:
+        if html is not None:
+            contents.append((html, render_html(document).encode("utf-8")))
+        if pdf is not None:
+            contents.append((pdf, finished()))
     for path, content in contents:
         _write(path, content)
     return targets

@@ -108,11 +108,10 @@ def _outer(grid: Any, panels: int, sharex: bool, sharey: bool) -> None:
         if sharey and number % columns:
             axes.set_ylabel("")
             axes.tick_params(labelleft=False)
-        if sharex and number + grid.size - panels < grid.size - columns:
+        if sharex:
+            axes.tick_params(labelbottom=number + columns >= panels)
+        if sharex and number < grid.size - columns:
             axes.set_xlabel("")
-            axes.tick_params(labelbottom=False)
-        elif sharex:
-            axes.tick_params(labelbottom=True)
 
 
 # --- one panel --------------------------------------------------------------------------------
@@ -163,7 +162,7 @@ def _rows(axes: Axes, labels: Sequence[str]) -> None:
     for row in range(1, len(labels), 2):
         axes.axhspan(row - 0.5, row + 0.5, color="#f5f5f5", linewidth=0, zorder=0)
     axes.set(ylim=(len(labels) - 0.5, -0.5), yticks=range(len(labels)))
-    axes.set_yticklabels([wrapped(label, 16) for label in labels], parse_math=False)
+    axes.set_yticklabels([wrapped(label, 20) for label in labels], parse_math=False)
     axes.tick_params(axis="y", length=0, pad=7)
 
 
@@ -225,7 +224,12 @@ def _intervals(axes: Axes, mark: Intervals, order: float, panel: Panel) -> None:
     for edge, beyond, arrow in ((low, mark.low < start, "<"), (high, mark.high > end, ">")):
         for rows, marker, size in ((~beyond, "|", 4.0), (beyond, arrow, 4.5)):
             if rows.any():
-                ends: dict[str, Any] = {"color": mark.look.colour, "markersize": size, "clip_on": False, "zorder": order}
+                ends: dict[str, Any] = {
+                    "color": mark.look.colour,
+                    "markersize": size,
+                    "clip_on": False,
+                    "zorder": order,
+                }
                 axes.plot(edge[rows], mark.y[rows], marker, **ends)
     axes.plot(mark.x, mark.y, zorder=order, **_dots(mark.look))
 

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import pickle
 import re
+import subprocess
+import sys
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import resources
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+import joblib
 import typst
 
 from consistency.reporting import blocks, paper
 from consistency.reporting.drawing import Figure
 
 TEMPLATE = "report.typ"
+MANY = 24  # sheets that take longer to draw than a process to start
 LONG_WORD = re.compile(r"[^\s\u200b]{1,13}-(?=[^\W\d])|[^\s\u200b]{14}")  # at a hyphen within reach, else anywhere
 
 
@@ -33,6 +41,27 @@ def render_pdf(document: blocks.Document) -> bytes:
         (folder / TEMPLATE).write_text(template.read_text(encoding="utf-8"), encoding="utf-8")
         pdf: bytes = typst.compile(str(folder / TEMPLATE), root=str(folder), ignore_system_fonts=True)
         return pdf
+
+
+@contextmanager
+def pdf_beside(document: blocks.Document) -> Iterator[Callable[[], bytes]]:
+    """Set a long document in a process of its own, while this one does something else.
+
+    Gives a function that waits for the PDF; a short document is set when that is called.
+    """
+    if sum(len(figure.sheets) for figure in document.figures) < MANY or joblib.cpu_count() < 2:
+        yield lambda: render_pdf(document)
+        return
+    with tempfile.TemporaryDirectory(prefix="consistency-report-") as name:
+        source, target = Path(name) / "document", Path(name) / "pdf"
+        source.write_bytes(pickle.dumps(document))
+        process = subprocess.Popen([sys.executable, "-m", __name__, source, target], stderr=subprocess.DEVNULL)
+        try:
+            # what goes wrong there goes wrong here, where it is reported
+            yield lambda: target.read_bytes() if process.wait() == 0 else render_pdf(document)
+        finally:
+            process.kill()
+            process.wait()
 
 
 def _chapter(chapter: blocks.Chapter, folder: Path) -> dict[str, Any]:
@@ -126,3 +155,8 @@ def _pairs(value: Any, path: str) -> list[tuple[str, str]]:
     if isinstance(value, dict):
         return [pair for key, item in value.items() for pair in _pairs(item, f"{path}.{key}")]
     return [] if value is None else [(path, json.dumps(value, ensure_ascii=False))]
+
+
+if __name__ == "__main__":
+    gc.disable()  # the process ends soon, and looking for garbage takes a tenth of its time
+    Path(sys.argv[2]).write_bytes(render_pdf(pickle.loads(Path(sys.argv[1]).read_bytes())))

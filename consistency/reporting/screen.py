@@ -38,6 +38,7 @@ MARKERS = {
 TOOLS = "pan,box_zoom,wheel_zoom,reset,save"
 STROKE = 1.5  # pixels of a line for a point of its width on paper
 DASH = 1.6
+STROKES = "PX"  # markers that Bokeh draws with lines alone
 DECADES = range(-6, 13)
 ROOM = 0.03  # of a window is left beyond its ends for arrows
 
@@ -154,6 +155,7 @@ def _dots(look: Look) -> dict[str, Any]:
     return {
         "marker": MARKERS[look.marker], "size": round(2.6 + 1.1 * look.size, 1), "fill_color": look.colour,
         "line_color": look.edge or look.colour, "fill_alpha": look.alpha, "line_alpha": look.alpha,
+        "line_width": 2.0 if look.marker in STROKES else 1.0,
     }  # fmt: skip
 
 

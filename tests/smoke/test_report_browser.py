@@ -118,7 +118,7 @@ def test_the_diagnosis_is_drawn_for_every_filter(browser):
     drawn = dict(marks)
     for label in ("covariance ratio (truth / stated)", "within 2 sigma (%)", "lag (steps)"):
         assert drawn[label] == ["0:0", "0:1"], label
-    cells = browser.find_elements("css selector", "table.questions td")
+    cells = browser.find_elements("css selector", "table.marks td")
     assert len(cells) >= 2 * 6
     assert all(cell.text[0] in MARKS for cell in cells)
     spoken = {cell.find_element("css selector", "span").get_attribute("aria-label") for cell in cells}

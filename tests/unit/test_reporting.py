@@ -1000,6 +1000,20 @@ def test_a_filter_looks_the_same_in_every_study(results, tmp_path):
     assert looks[0] == looks[1]
 
 
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_long_document_is_set_in_a_process_of_its_own(folder, monkeypatch, broken):
+    document = compose(build_report(folder))
+    expected = pdf.render_pdf(document)
+    monkeypatch.setattr(pdf, "MANY", 1)
+    monkeypatch.setattr(pdf.joblib, "cpu_count", lambda: 2)
+    if broken:  # then it is set here
+        monkeypatch.setattr(pdf.sys, "executable", "false")
+    else:
+        monkeypatch.setattr(pdf, "render_pdf", lambda _: pytest.fail("was set here"))
+    with pdf.pdf_beside(document) as finished:
+        assert finished() == expected
+
+
 def test_reports_are_deterministic(folder):
     assert printed(build_report(folder)) == printed(build_report(folder))
     ids = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f-]{22}|p\d{4,}")

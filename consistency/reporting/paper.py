@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 import warnings
 from collections.abc import Callable, Sequence
 from io import BytesIO
@@ -10,21 +9,17 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis as TickAxis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from consistency.reporting.drawing import (
     Axis,
     Band,
     Bars,
     Intervals,
-    Key,
     Line,
     Mark,
     Panel,
@@ -35,14 +30,11 @@ from consistency.reporting.drawing import (
     Stems,
     kept,
 )
-from consistency.reporting.looks import Look
+from consistency.reporting.frames import dots, frame, legend, plain_numbers, stroke, title, wrapped
 from consistency.reporting.thin import LIMIT
 
 WIDTH = 6.7  # inches, the text width of the page
-LINE = 0.16  # inches, a line of a legend
-BESIDE = 0.66  # of the figure's width is left of a legend that stands beside the axes
 NARROWEST = 0.15  # span of one axis of a map over that of the other, at least: room for the tick labels
-WIDE = 200.0  # a log axis that spans more has room for powers of ten only
 BOUND = 0.9  # points, width of the lines at plus and minus a bound
 POINTS = 72  # in an inch, the resolution of an SVG
 RC: Any = {
@@ -93,7 +85,7 @@ def draw(sheet: Sheet) -> Figure:
     if sheet.title:
         title(grid[0, 0], wrapped(sheet.title, 90))
     if sheet.keys:
-        _legend(figure, sheet)
+        legend(figure, sheet)
     return figure
 
 
@@ -177,21 +169,6 @@ def _widen(axes: Axes) -> None:
 # --- marks ------------------------------------------------------------------------------------
 
 
-def _dashed(look: Look) -> Any:
-    return (0.0, look.dash) if look.dash else "-"
-
-
-def _stroke(look: Look) -> dict[str, Any]:
-    return {"color": look.colour, "linestyle": _dashed(look), "linewidth": look.width}
-
-
-def _dots(look: Look) -> dict[str, Any]:
-    return {
-        "linestyle": "", "marker": look.marker, "color": look.colour, "markersize": look.size, "alpha": look.alpha,
-        "markeredgecolor": look.edge or look.colour, "markeredgewidth": 1.0 if look.edge else 0.0,
-    }  # fmt: skip
-
-
 def draw_line(axes: Axes, mark: Line, order: float, _: Panel | None = None) -> None:
     """A curve, with shading and dashed lines where it has bounds; ``order``: greater is in front."""
     rows = kept(mark, LIMIT)
@@ -202,17 +179,17 @@ def draw_line(axes: Axes, mark: Line, order: float, _: Panel | None = None) -> N
         for sign in (-1.0, 1.0):
             axes.plot(x, sign * bound, color=mark.look.colour, linewidth=BOUND, linestyle="--", zorder=order)
     style = "steps-post" if mark.steps else "default"
-    axes.plot(x, mark.y[rows], drawstyle=style, zorder=order, **_stroke(mark.look))
+    axes.plot(x, mark.y[rows], drawstyle=style, zorder=order, **stroke(mark.look))
 
 
 def _points(axes: Axes, mark: Points, order: float, _: Panel) -> None:
     rows = kept(mark, LIMIT)
-    axes.plot(mark.x[rows], mark.y[rows], zorder=order, **_dots(mark.look))
+    axes.plot(mark.x[rows], mark.y[rows], zorder=order, **dots(mark.look))
 
 
 def _stems(axes: Axes, mark: Stems, order: float, _: Panel) -> None:
     axes.vlines(mark.x, 0.0, mark.y, color=mark.look.colour, linewidth=mark.look.width, zorder=order)
-    axes.plot(mark.x, mark.y, zorder=order, **_dots(mark.look))
+    axes.plot(mark.x, mark.y, zorder=order, **dots(mark.look))
 
 
 def _intervals(axes: Axes, mark: Intervals, order: float, panel: Panel) -> None:
@@ -231,7 +208,7 @@ def _intervals(axes: Axes, mark: Intervals, order: float, panel: Panel) -> None:
                     "zorder": order,
                 }
                 axes.plot(edge[rows], mark.y[rows], marker, **ends)
-    axes.plot(mark.x, mark.y, zorder=order, **_dots(mark.look))
+    axes.plot(mark.x, mark.y, zorder=order, **dots(mark.look))
 
 
 def _band(axes: Axes, mark: Band, order: float, _: Panel) -> None:
@@ -239,7 +216,7 @@ def _band(axes: Axes, mark: Band, order: float, _: Panel) -> None:
     x, low, high = mark.x[rows], mark.low[rows], mark.high[rows]
     if mark.outline:
         for edge in (low, high):
-            axes.plot(x, edge, zorder=order, **_stroke(mark.look))
+            axes.plot(x, edge, zorder=order, **stroke(mark.look))
     else:
         axes.fill_between(x, low, high, color=mark.look.colour, linewidth=0, zorder=0)
 
@@ -249,7 +226,7 @@ def _bars(axes: Axes, mark: Bars, order: float, _: Panel) -> None:
 
 
 def _rule(axes: Axes, mark: Rule, order: float, _: Panel) -> None:
-    (axes.axhline if mark.side == "y" else axes.axvline)(mark.at, zorder=order, **_stroke(mark.look))
+    (axes.axhline if mark.side == "y" else axes.axvline)(mark.at, zorder=order, **stroke(mark.look))
 
 
 def _span(axes: Axes, mark: Span, _: float, __: Panel) -> None:
@@ -261,66 +238,3 @@ PAINT: dict[type[Mark], Callable[[Axes, Any, float, Panel], None]] = {
     Line: draw_line, Points: _points, Stems: _stems, Intervals: _intervals, Band: _band, Bars: _bars, Rule: _rule,
     Span: _span,
 }  # fmt: skip
-
-
-# --- words and frames -------------------------------------------------------------------------
-
-
-def title(axes: Axes, text: str) -> None:
-    """Title shown literally, dollar signs included."""
-    axes.set_title(text, loc="left", parse_math=False)
-
-
-def wrapped(label: str, width: int = 26) -> str:
-    """The label in lines of at most ``width`` characters."""
-    return "\n".join(textwrap.wrap(label, width)) or label
-
-
-def plain_numbers(axis: TickAxis, low: float, high: float) -> None:
-    """Labels of a log axis without powers of ten, as many as there is room for."""
-    axis.set_major_locator(LogLocator(subs=(1.0,) if high > WIDE * low else (1.0, 2.0, 5.0)))
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(NullFormatter())
-
-
-def frame(axes: Axes) -> None:
-    """Grid behind the marks, and no lines at the top and the right."""
-    axes.grid(visible=True, color="#ececec", linewidth=0.6, zorder=0)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _legend(figure: Figure, sheet: Sheet) -> None:
-    """Legend in room that the layout leaves above the axes, or to their right."""
-    labels = [wrapped(key.text) for key in sheet.keys]
-    longest = max(len(line) for label in labels for line in label.split("\n"))
-    columns = 1 if sheet.beside else max(1, min(len(labels), 5, int(118 / (longest + 9))))
-    tall = [label.count("\n") + 1 for label in labels]
-    lines = sum(tall) if sheet.beside else -(-len(labels) // columns) * max(tall)
-    room, height = LINE * lines + 0.06, figure.get_figheight()
-    # the axes keep their size: a long legend makes the figure taller
-    height = max(height, room) if sheet.beside else height + room - LINE
-    figure.set_figheight(height)
-    engine: Any = figure.get_layout_engine()
-    engine.set(rect=(0, 0, BESIDE, 1) if sheet.beside else (0, 0, 1, 1 - room / height))
-    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.0)}
-    if sheet.beside:
-        place = {"loc": "center left", "bbox_to_anchor": (BESIDE, 0.5)}
-    legend = figure.legend(
-        [_handle(key) for key in sheet.keys], [str(i) for i in range(len(labels))], ncols=columns, frameon=False,
-        handlelength=2.6, columnspacing=1.4, borderaxespad=0.1, **place,
-    )  # fmt: skip
-    for text, label in zip(legend.get_texts(), labels, strict=True):
-        text.set_parse_math(False)
-        text.set_text(label)
-
-
-def _handle(key: Key) -> Artist:
-    if key.kind == "band":
-        return Patch(color=key.look.colour)
-    if key.kind == "points":
-        return Line2D([], [], **_dots(key.look))
-    options = _stroke(key.look)
-    if key.marked:
-        options |= {"marker": key.look.marker, "markersize": key.look.size}
-    return Line2D([], [], **options)

@@ -259,6 +259,8 @@ def test_a_long_mark_is_thinned_and_keeps_its_peak():
     mark = Line(np.arange(9000), y, style(0))
     assert len(kept(mark, 100)) <= 100
     assert 4321 in kept(mark, 100)
+    assert 4321 in kept(replace(mark, x=y, y=np.zeros(9000), path=True), 100)
+    assert 4321 in kept(replace(mark, y=np.zeros(9000), bound=y), 100)
     assert 4321 in kept(Band(mark.x, -y, y, SHADE), 100)
     assert len(kept(Points(mark.x, y, style(0), whole=True), 100)) == 9000
     assert len(glyphs(shown(mark))[0].data_source.data["x"]) <= 100

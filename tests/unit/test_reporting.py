@@ -24,7 +24,7 @@ from consistency.reporting import html, pdf, write_reports
 from consistency.reporting.answer import answer
 from consistency.reporting.blocks import Document
 from consistency.reporting.build import build_report, compose
-from consistency.reporting.drawing import Figure, Span
+from consistency.reporting.drawing import Figure, Intervals, Line, Points, Span
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.sections import (
     anees,
@@ -902,6 +902,58 @@ def test_the_front_end_is_what_its_tables_hold(results, tmp_path):
     assert "probability 0.1 % at most" in text
     assert "$x$ <b>: 0 of 1 accepted" in text
     assert printed(report).startswith(b"%PDF")
+
+
+def marks(section, report, kind: type, panel: int = 0) -> list:
+    """Marks of one kind in a panel of the first figure of a section."""
+    figure, *_ = section.figures(section.read(report))
+    return [mark for mark in figure.panels[panel].marks if isinstance(mark, kind)]
+
+
+def test_the_figures_of_the_front_end_draw_the_tables(results, tmp_path):
+    folder = reproduction(results, tmp_path / "all")
+    front_end_tables(folder)
+    report = build_report(folder)
+    (curve,), (accepted,) = marks(shares, report, Line), marks(shares, report, Span)
+    np.testing.assert_allclose(curve.y, [95.0, 80.0])
+    np.testing.assert_allclose([accepted.low, accepted.high], [90.0, 98.5])
+    (intervals,) = marks(scenes, report, Intervals)
+    np.testing.assert_array_equal([intervals.low, intervals.x, intervals.high], [[0.97, 1.1], [1.01, 1.2], [1.05, 1.3]])
+    good, bad = marks(first_order, report, Points)
+    np.testing.assert_allclose([*good.x, *good.y, *bad.x, *bad.y], [1.0, 1.02, 30.0, 7.0])
+    narrow, *_ = stereo_noise.read(report)
+    linear, fitted = marks(stereo_noise, report, Line)
+    np.testing.assert_array_equal(np.stack([linear.x, linear.y], axis=1), narrow.linear_ellipse)
+    np.testing.assert_array_equal(np.stack([fitted.x, fitted.y], axis=1), narrow.fitted_ellipse)
+    linear, fitted = marks(stereo_noise, report, Line, 1)
+    np.testing.assert_array_equal([linear.y, fitted.y], [narrow.linear_density, narrow.fitted_density])
+
+
+def test_the_forest_has_the_interval_of_each_axis_in_its_row(folder):
+    (study,) = build_report(folder).studies
+    ratios = axes.read(study).forests[0]
+    for number, mark in enumerate(marks(axes, study, Intervals)):
+        for (label, row), y, x in zip(ratios.rows, mark.y, mark.x, strict=True):
+            assert ratios.labels[round(y)] == label
+            assert row[number][0] == x
+
+
+def test_checkboxes_of_one_study_leave_the_others_alone(results, tmp_path):
+    folder = reproduction(results, tmp_path / "all")
+    results.write(folder / "other")
+    manifest = json.loads((folder / "manifest.json").read_text()) | {"studies": ["small", "other"]}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    tags = [{track.tag for track in study.tracks} for study in build_report(folder).studies]
+    assert tags == [{"0:0", "0:1"}, {"1:0", "1:1"}]
+
+
+def test_captions_name_the_place_of_panels_on_paper_and_screen(linear, tmp_path):
+    cs.run_trials(linear, ["kf"], runs=12, seed=1, jobs=1).write(tmp_path / "kf")
+    (study,) = build_report(tmp_path / "kf").studies
+    (drawn_twice,) = innovations.figures(innovations.read(study))
+    assert " Below: autocorrelation" in drawn_twice.caption
+    assert " Right: autocorrelation" in drawn_twice.paper
+    assert " Right: autocorrelation" in pdf._figure(drawn_twice, "i", tmp_path)["caption"].replace("\u200b", "")
 
 
 @pytest.mark.parametrize("alone", ["frontend_fig22", "frontend_fig23", "first_order"])

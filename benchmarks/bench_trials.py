@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import consistency as cs
-from consistency.filters.stepping import problem_of
+from consistency.filters.compiled import problem_of
 from consistency.models import point, stereo
 from consistency.models.motion import dead_reckoning
 from consistency.scenario import Belief

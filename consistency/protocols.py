@@ -1,4 +1,4 @@
-"""What can be plugged in: a motion model, a sensor, a filter."""
+"""What can be plugged in: a filter, step by step or a whole trial at once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from consistency.scenario import Belief
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.types import Array, Control, Estimates, Gaussian, Info, Observation, Trial
 
 
 @dataclass(frozen=True)
@@ -18,21 +18,6 @@ class Problem:
     landmarks: Array | None = None  # (N, 3): reference of a linear world, None in any other
 
 
-class Motion(Protocol):
-    """f of eq. 9 with its Jacobians, as a textbook filter calls it."""
-
-    def move(self, pose: Array, control: Control) -> Array: ...
-    def jacobians(self, pose: Array, control: Control) -> tuple[Array, Array]: ...
-
-
-class Sensor(Protocol):
-    """h of eq. 11 with its inverse and Jacobians, as a textbook filter calls it."""
-
-    def measure(self, pose: Array, landmark: Array) -> Array: ...
-    def jacobians(self, pose: Array, landmark: Array) -> tuple[Array, Array]: ...
-    def locate(self, pose: Array, z: Array) -> tuple[Array, Array, Array]: ...
-
-
 @runtime_checkable
 class Filter(Protocol):
     """Any object with these four; ``name`` is optional and defaults to the class name.
@@ -40,9 +25,29 @@ class Filter(Protocol):
     ``update`` may return None in the place of Info: then there is no NIS. An attribute ``innovations = "optimal"``
     declares that the gain is optimal and no measurement is gated away, so that innovations are white if the
     filter is right; they are then judged, and otherwise only reported.
+
+    Two more methods are optional: ``map(state)``, the landmarks by label as points (3,) in the world with their
+    covariance (3, 3), for the NEES of the map; and ``joint(state)``, robot and landmarks as one Gaussian.
+
+    ``pose`` gives the covariance of the additive error in the world. A filter whose own error is another declares
+    it in an attribute ``error`` (a convention of :mod:`consistency.recording.conventions`) and gives the covariance
+    of that error by ``own_covariance(state)``, (3, 3).
     """
 
     def init(self, problem: Problem) -> Any: ...
     def predict(self, state: Any, control: Control) -> Any: ...
     def update(self, state: Any, observation: Observation) -> tuple[Any, Info | None]: ...
     def pose(self, state: Any) -> Gaussian: ...
+
+
+@runtime_checkable
+class WholeTrial(Protocol):
+    """A filter that also runs whole trials, with the numbers that its four methods give.
+
+    ``run`` may be called from several threads at once. ``is_ready`` says whether it starts at once; if not,
+    ``compile`` does what takes seconds.
+    """
+
+    def run(self, trial: Trial, belief: Belief) -> Estimates: ...
+    def is_ready(self, trial: Trial, belief: Belief) -> bool: ...
+    def compile(self, trial: Trial, belief: Belief) -> None: ...

@@ -57,17 +57,22 @@ class Trial:
 
     Step k = 1..T moves the robot from k-1 to k, then observes. The observations of step k are the
     rows ``first[k-1]:first[k]``.
+
+    A filter is told the ids in ``landmark``. Row i of ``landmarks`` is where landmark i is; ids from N on are things
+    that are no landmark and look like one. ``source`` is for scoring alone: the landmark that a row is really of, -1
+    if it is of none. Where it is None each row is of its ``landmark``.
     """
 
     run: int
     start: Array  # (3,), pose at step 0, known exactly
     controls: Array  # (T, 3): dt, v, omega
     first: Indices  # (T + 1,)
-    landmark: Indices  # (M,), index into 0..n_landmarks-1
+    landmark: Indices  # (M,), id in 0..n_landmarks-1
     z: Array  # (M, 3)
-    n_landmarks: int
+    n_landmarks: int  # number of ids, those of things that are no landmark included: at least N
     truth: Array | None = None  # (T + 1, 3): x, y, heading (not wrapped)
     landmarks: Array | None = None  # (N, 3), true positions in the world
+    source: Indices | None = None  # (M,), in 0..N-1 or -1
 
     def __post_init__(self) -> None:
         # read-only views: one filter cannot change what the next one is given
@@ -85,6 +90,18 @@ class Trial:
     def t(self) -> Array:
         """Time of steps 0..T in seconds, shape (T + 1,)."""
         return np.concatenate([[0.0], np.cumsum(self.controls[:, 0])])
+
+    @property
+    def spurious(self) -> Array:
+        """Whether a row is not of the landmark that it says, shape (M,)."""
+        return np.zeros(len(self.landmark), bool) if self.source is None else self.source != self.landmark
+
+    @property
+    def things(self) -> Indices:
+        """Ids that are no landmark in any of their rows, sorted: what a score of the map leaves out."""
+        if self.source is None:
+            return np.zeros(0, np.int64)
+        return np.setdiff1d(self.landmark, self.source)
 
     def control(self, step: int) -> Control:
         """Control of step 1..T."""
@@ -107,6 +124,15 @@ class Failure:
 
 
 @dataclass(frozen=True)
+class Map:
+    """Landmarks that a filter has estimated, as points in the world, m."""
+
+    landmarks: Indices  # (K,), sorted
+    mean: Array  # (K, 3)
+    covariance: Array  # (K, 3, 3)
+
+
+@dataclass(frozen=True)
 class Estimates:
     """What a filter said in one run; rows from the step of a failure on are NaN."""
 
@@ -117,6 +143,9 @@ class Estimates:
     nis: Array  # (T,), NaN where no known landmark was seen
     nis_dof: Indices  # (T,)
     failure: Failure | None = None
+    error: str = "so2"  # convention of the error that ``own`` is the covariance of
+    own: Array | None = None  # (T, 3, 3), where that error is not the additive one of the world
+    map: Map | None = None  # after the last step; None where the filter gives none or the run failed
 
 
 @dataclass(frozen=True)

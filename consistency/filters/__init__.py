@@ -1,7 +1,7 @@
 """What the filter believes: SLAM filters by name.
 
-One file a filter; rules, observation models and the loop over a trial are shared. Nothing here knows
-the simulation.
+A method is one file in ``methods``: the parts that its kernel is made of, and its plain twin. Parts that several
+methods use have a folder for each role; ``kernel`` is what all share. Nothing here knows the simulation.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from consistency.errors import InputError
 
 # name -> module of this folder and the attribute in it; imported when asked for
 MODULES = {
-    "kf": ("kf", "FILTER"),
-    "ekf-xyz": ("ekf_xyz", "FILTER"),
-    "ekf-uvd": ("ekf_uvd", "FILTER"),
-    "ukf-xyz": ("ukf_xyz", "FILTER"),
-    "ukf-uvd": ("ukf_uvd", "FILTER"),
-    "filterpy-ekf-xyz": ("filterpy_adapters", "EKF_XYZ"),
-    "filterpy-ekf-uvd": ("filterpy_adapters", "EKF_UVD"),
-    "filterpy-ukf-xyz": ("filterpy_adapters", "UKF_XYZ"),
-    "filterpy-ukf-uvd": ("filterpy_adapters", "UKF_UVD"),
+    "kf": ("methods.kf", "FILTER"),
+    "ekf-xyz": ("methods.ekf", "XYZ"),
+    "ekf-uvd": ("methods.ekf", "UVD"),
+    "ukf-xyz": ("methods.ukf", "XYZ"),
+    "ukf-uvd": ("methods.ukf", "UVD"),
+    "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ"),
+    "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD"),
+    "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ"),
+    "filterpy-ukf-uvd": ("external.filterpy", "UKF_UVD"),
 }
 
 

@@ -1,9 +1,9 @@
-"""A textbook filter joined with its compiled twin: the same numbers, a whole trial at once."""
+"""A textbook filter joined with its compiled kernels: the same numbers, a whole trial at once."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from consistency.errors import InputError
-from consistency.filters.jit import is_compiled
-from consistency.filters.local import LOCAL_FROM
-from consistency.filters.textbook import ExtendedKalman, sensor_noise
-from consistency.filters.trial import REASONS, run_trial
-from consistency.models.motion import dead_reckoning
+from consistency.filters.kernel.dispatch import fits, require_fitting
+from consistency.filters.kernel.gain import REASONS
+from consistency.filters.kernel.loop import Outcome, trial_kernel
+from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
+from consistency.filters.plain import sensor_noise
+from consistency.filters.upkeep.local import LOCAL_FROM, Local
 from consistency.protocols import Problem
 from consistency.scenario import Belief
-from consistency.types import Control, Estimates, Failure, Gaussian, Info, Observation, Trial
+from consistency.types import Array, Control, Estimates, Failure, Gaussian, Info, Map, Observation, Trial
 
 _lock = threading.Lock()
 _inside: list[Any] = []  # the limit in force, once for every trial that is running
@@ -45,20 +45,38 @@ def one_blas_thread() -> Iterator[None]:
 
 
 class Compiled:
-    """``init``, ``predict``, ``update``, ``pose`` of the twin, and ``run`` of the kernel.
+    """``init``, ``predict``, ``update``, ``pose`` of the twin, and ``run`` of the kernels.
 
-    ``local_from``: variables in the state from which the kernel updates locally; the numbers are the same.
-    ``innovations``: "optimal" where they are white if the belief is right, see :class:`consistency.protocols.Filter`.
+    Parameters
+    ----------
+    twin : the filter in plain NumPy, with ``name`` and the optional ``map``
+    parts : gives the parts of the filter for a problem and the controls (T, 3) of a trial
+    sensors : models of sensors whose data it takes
+    uvd : whether it works on (u, v, d); if not, such data are turned into points by eq. 21
+    innovations : "optimal" where they are white if the belief is right, see
+        :class:`consistency.protocols.Filter`
+    error : convention of the error in which its covariance is meant, see
+        :mod:`consistency.recording.conventions`
+
+    ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
+    allow it; the numbers are the same.
     """
 
     local_from = LOCAL_FROM
 
     def __init__(
-        self, twin: ExtendedKalman, rule: int, model: int, sensors: tuple[str, ...], innovations: str | None = None
+        self,
+        twin: Any,
+        parts: Callable[[Problem, Array], Slam],
+        *,
+        sensors: tuple[str, ...],
+        uvd: bool,
+        innovations: str | None = None,
+        error: str = "so2",
     ) -> None:
-        self.twin, self.rule, self.model, self.sensors = twin, rule, model, sensors
-        self.innovations = innovations
-        self.name = twin.name
+        self.twin, self.parts, self.sensors, self.uvd = twin, parts, sensors, uvd
+        self.innovations, self.error = innovations, error
+        self.name: str = twin.name
 
     def init(self, problem: Problem) -> Any:
         return self.twin.init(problem)
@@ -66,38 +84,68 @@ class Compiled:
     def predict(self, state: Any, control: Control) -> Any:
         return self.twin.predict(state, control)
 
-    def update(self, state: Any, observation: Observation) -> tuple[Any, Info]:
-        return self.twin.update(state, observation)
+    def update(self, state: Any, observation: Observation) -> tuple[Any, Info | None]:
+        updated: tuple[Any, Info | None] = self.twin.update(state, observation)
+        return updated
 
     def pose(self, state: Any) -> Gaussian:
-        return self.twin.pose(state)
+        pose: Gaussian = self.twin.pose(state)
+        return pose
 
-    @property
-    def is_compiled(self) -> bool:
-        """Whether ``run`` starts at once, or spends seconds on compiling first."""
-        return is_compiled(run_trial)
+    def map(self, state: Any) -> dict[int, Gaussian]:
+        landmarks: dict[int, Gaussian] = self.twin.map(state)
+        return landmarks
+
+    def is_ready(self, trial: Trial, belief: Belief) -> bool:
+        """Whether ``run`` starts at once on this trial, or spends seconds on compiling first."""
+        return trial_kernel.is_ready(*self._arguments(trial, belief))
+
+    def compile(self, trial: Trial, belief: Belief) -> None:
+        """Compile what ``run`` needs on this trial, or load it from disk."""
+        trial_kernel.compile(*self._arguments(trial, belief))
 
     def run(self, trial: Trial, belief: Belief) -> Estimates:
-        """Estimates of all steps of ``trial``."""
-        sensor, points = belief.sensor, belief.sigma_points
-        z, R = sensor_noise(trial.z, sensor, converted=sensor.model == "uvd" and not self.twin.uvd)
-        linear = sensor.model == "linear"
-        if linear and trial.landmarks is None:
-            raise InputError(f"filter '{self.name}' needs the landmarks that its world is linearised about")
-        landmarks0 = trial.landmarks if linear else np.zeros((trial.n_landmarks, 3))
-        arrays = (
-            (trial.controls, float), (trial.first, np.int64), (trial.landmark, np.int64), (z, float), (R, float),
-            (trial.start, float), (dead_reckoning(trial.start, trial.controls), float), (landmarks0, float),
-            ([belief.motion.sigma_v, belief.motion.sigma_omega], float), (sensor.packed(), float),
-            ([points.alpha, points.beta, points.kappa], float),
-        )  # fmt: skip
-        # copies: writable and C-contiguous, so that one compiled signature serves every caller
-        copies = [np.array(a, dtype=kind, order="C") for a, kind in arrays]
+        """Estimates of all steps of ``trial``.
+
+        Raises
+        ------
+        InputError
+            The trial lacks what the filter needs.
+        """
+        arguments = self._arguments(trial, belief)
         try:
             with one_blas_thread():
-                out = run_trial(self.rule, self.model, trial.n_landmarks, *copies, self.local_from)
+                out: Outcome = trial_kernel(*arguments)
         except SystemError as error:  # Ctrl-C in the main thread comes out of a kernel like this
             raise KeyboardInterrupt from error
-        pose, covariance, nis, nis_dof, step, code = out
-        failure = Failure(self.name, trial.run, step, REASONS[code]) if step else None
-        return Estimates(self.name, trial.run, pose, covariance, nis, nis_dof, failure)
+        failure = Failure(self.name, trial.run, out.step, REASONS[out.code]) if out.step else None
+        own = None if self.error == "so2" else out.own
+        labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
+        map_ = Map(labels, out.points[labels], out.spread[labels]) if out.code == 0 else None
+        return Estimates(
+            self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_
+        )
+
+    def _arguments(self, trial: Trial, belief: Belief) -> tuple[Slam, Data, int]:
+        problem = problem_of(trial, belief)
+        slam = self.parts(problem, np.array(trial.controls, float))
+        z, R = sensor_noise(trial.z, belief.sensor, converted=belief.sensor.model == "uvd" and not self.uvd)
+        # copies: writable and C-contiguous, so that one compiled signature serves every caller
+        controls, z, R, start = (np.array(a, float, order="C") for a in (trial.controls, z, R, trial.start))
+        first, landmark = (np.array(a, np.int64, order="C") for a in (trial.first, trial.landmark))
+        data = Data(controls, first, landmark, z, R, start, trial.n_landmarks)
+        r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+        slam = self._with_upkeep(slam, r + w * trial.n_landmarks)
+        return slam, data, r + w * len(np.unique(landmark))
+
+    def _with_upkeep(self, slam: Slam, most: int) -> Slam:
+        """Local updating, which takes longer to compile, only in a world in which the state may grow so large."""
+        local = slam._replace(covariance=Local(self.local_from))
+        slam = local if most >= self.local_from and fits(local) else slam
+        require_fitting(slam)
+        return slam
+
+
+def problem_of(trial: Trial, belief: Belief) -> Problem:
+    """What a filter is told before step 1 of ``trial``."""
+    return Problem(belief, trial.start, trial.landmarks if belief.sensor.model == "linear" else None)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from consistency.filters.compiled import Compiled
-from consistency.filters.linalg import definiteness
-from consistency.protocols import Filter, Problem
+from consistency.filters.compiled import problem_of
+from consistency.filters.kernel.linalg import definiteness
+from consistency.protocols import Filter, WholeTrial
 from consistency.scenario import Belief
 from consistency.types import Array, Estimates, Failure, Trial
 
@@ -27,24 +27,19 @@ def name_of(filter_: Filter) -> str:
     return str(getattr(filter_, "name", type(filter_).__name__))
 
 
-def problem_of(trial: Trial, belief: Belief) -> Problem:
-    """What a filter is told before step 1 of ``trial``."""
-    return Problem(belief, trial.start, trial.landmarks if belief.sensor.model == "linear" else None)
-
-
 def run_filter(filter_: Filter, trial: Trial, belief: Belief, timeout: float | None = None) -> Estimates:
     """A whole trial through a filter, compiled where it can be.
 
     An exception, a time-out (``timeout`` seconds a trial), an estimate that is not finite or a pose
     covariance that is not positive definite ends the run as a :class:`Failure` of that step.
     """
-    if isinstance(filter_, Compiled):
+    if isinstance(filter_, WholeTrial):
         return filter_.run(trial, belief)
     return step_through(filter_, trial, belief, timeout)
 
 
 def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float | None = None) -> Estimates:
-    """The same, always by ``init``, ``predict``, ``update`` and ``pose``."""
+    """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``."""
     T = trial.steps
     pose, covariance = np.full((T, 3), np.nan), np.full((T, 3, 3), np.nan)
     nis, dof = np.full(T, np.nan), np.zeros(T, np.int64)

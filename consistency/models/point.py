@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from consistency.models.jitable import jitable
+
+
+class Mounting(NamedTuple):
+    """Pose of a sensor in the robot frame: position in m, and the rotation whose columns are the sensor's axes."""
+
+    x: float
+    y: float
+    z: float
+    xx: float
+    xy: float
+    xz: float
+    yx: float
+    yy: float
+    yz: float
+    zx: float
+    zy: float
+    zz: float
 
 
 @jitable
@@ -25,26 +42,31 @@ def turned_to_robot(px: Any, py: Any, c: Any, s: Any, lx: Any, ly: Any, lz: Any)
 @jitable
 def to_world(px: Any, py: Any, heading: Any, bx: Any, by: Any, bz: Any) -> tuple[Any, Any, Any]:
     """Inverse of :func:`to_robot`."""
-    c, s = np.cos(heading), np.sin(heading)
+    return turned_to_world(px, py, np.cos(heading), np.sin(heading), bx, by, bz)
+
+
+@jitable
+def turned_to_world(px: Any, py: Any, c: Any, s: Any, bx: Any, by: Any, bz: Any) -> tuple[Any, Any, Any]:
+    """Inverse of :func:`turned_to_robot`."""
     return px + c * bx - s * by, py + s * bx + c * by, bz
 
 
 @jitable
-def to_sensor(bx: Any, by: Any, bz: Any, mount: Any) -> tuple[Any, Any, Any]:
-    """Robot frame to the frame of a sensor at ``mount``: 12 numbers, position and rotation by rows."""
-    dx, dy, dz = bx - mount[0], by - mount[1], bz - mount[2]
+def to_sensor(bx: Any, by: Any, bz: Any, mount: Mounting) -> tuple[Any, Any, Any]:
+    """Robot frame to the frame of a mounted sensor."""
+    dx, dy, dz = bx - mount.x, by - mount.y, bz - mount.z
     return (
-        mount[3] * dx + mount[6] * dy + mount[9] * dz,
-        mount[4] * dx + mount[7] * dy + mount[10] * dz,
-        mount[5] * dx + mount[8] * dy + mount[11] * dz,
+        mount.xx * dx + mount.yx * dy + mount.zx * dz,
+        mount.xy * dx + mount.yy * dy + mount.zy * dz,
+        mount.xz * dx + mount.yz * dy + mount.zz * dz,
     )
 
 
 @jitable
-def from_sensor(cx: Any, cy: Any, cz: Any, mount: Any) -> tuple[Any, Any, Any]:
+def from_sensor(cx: Any, cy: Any, cz: Any, mount: Mounting) -> tuple[Any, Any, Any]:
     """Inverse of :func:`to_sensor`."""
     return (
-        mount[0] + mount[3] * cx + mount[4] * cy + mount[5] * cz,
-        mount[1] + mount[6] * cx + mount[7] * cy + mount[8] * cz,
-        mount[2] + mount[9] * cx + mount[10] * cy + mount[11] * cz,
+        mount.x + mount.xx * cx + mount.xy * cy + mount.xz * cz,
+        mount.y + mount.yx * cx + mount.yy * cy + mount.yz * cz,
+        mount.z + mount.zx * cx + mount.zy * cy + mount.zz * cz,
     )

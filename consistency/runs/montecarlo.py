@@ -16,9 +16,9 @@ import pandas as pd
 
 from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter
-from consistency.filters.compiled import Compiled, one_blas_thread
+from consistency.filters.compiled import one_blas_thread
 from consistency.filters.stepping import name_of, optimal_gain, run_filter
-from consistency.protocols import Filter
+from consistency.protocols import Filter, WholeTrial
 from consistency.runs.gather import Gathered
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import draw_landmarks, require_landmarks_in_view
@@ -132,7 +132,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
     for filter_ in chosen:
         sensors = getattr(filter_, "sensors", None)
         if sensors is not None and model not in sensors:
-            fitting = [name for name in filter_names() if model in get_filter(name).sensors]
+            fitting = [name for name in filter_names() if model in getattr(get_filter(name), "sensors", (model,))]
             raise InputError(
                 f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
                 f"filters that fit: {', '.join(fitting)}"
@@ -163,11 +163,12 @@ class _Work:
         return _one(self.make_trial(run), self.filters, self.belief, self.timeout)
 
     def compile(self, run: int) -> None:
-        """Compile what is not yet compiled, on the first steps of a run, and say so."""
+        """Compile what a run needs and is not yet compiled, and say so."""
+        trial = self.make_trial(run)
         for filter_ in self.filters:
-            if isinstance(filter_, Compiled) and not filter_.is_compiled:
+            if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, self.belief):
                 with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
-                    filter_.run(_head(self.make_trial(run)), self.belief)
+                    filter_.compile(trial, self.belief)
                     advance(1)
 
     def outcomes(self, runs: list[int]) -> Outcomes:
@@ -175,7 +176,7 @@ class _Work:
         workers = min(self.jobs if self.jobs > 0 else joblib.cpu_count(), len(runs))
         if workers <= 1:
             return (self(run) for run in runs)
-        if all(isinstance(f, Compiled) for f in self.filters):  # kernels release the GIL; Python needs processes
+        if all(isinstance(f, WholeTrial) for f in self.filters):  # kernels release the GIL; Python needs processes
             return self._in_threads(runs, workers)
         return self._in_processes(runs, workers)
 
@@ -231,15 +232,6 @@ def _place(out: Path | None, overwrite: bool, previous: Tables | None) -> Iterat
     same = isinstance(previous, StoredResults) and previous.folder.resolve() == out.resolve()
     with NewFolder(out, "results", overwrite or same, keep_others=same) as new:
         yield new
-
-
-def _head(trial: Trial) -> Trial:
-    """The first two steps of a trial: enough to compile on."""
-    last = trial.first[min(2, trial.steps)]
-    return Trial(
-        trial.run, trial.start, trial.controls[:2], trial.first[:3], trial.landmark[:last], trial.z[:last],
-        trial.n_landmarks, None, trial.landmarks,
-    )  # fmt: skip
 
 
 def _same_study(previous: Tables, scenario: Scenario, names: list[str], seed: int) -> Tables:

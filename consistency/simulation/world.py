@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.models import motion, point, stereo
+from consistency.models import motion
 from consistency.scenario import ListedLandmarks, Scenario, Truth, UvdSensor
+from consistency.scenario.effects import Context, FieldOfView, Observations
 from consistency.simulation.path import planned_controls, start_pose
+from consistency.simulation.sensing import MOTION_NOISE, Chain, effects_of, generator
 from consistency.types import Array, Indices, Trial
-
-MOTION_NOISE, OBSERVATION_NOISE = 0, 1  # purposes in the spawn key of the seed
-BLOCK = 8192  # numbers in each array of a search for what is in view: they stay in the processor's cache
 
 SOME = 50  # steps of the planned path that are searched at a time for a landmark
 
@@ -28,30 +27,32 @@ class World:
         self.linear = truth.sensor.model == "linear"
         # noise on the odometry leaves the path as planned, and a linear world looks from it
         self.undisturbed = not self.linear and truth.motion.noise_on != "motion"
-        always = self.linear or self.undisturbed
-        self._in_view = _in_view(truth, self.reference, self.landmarks) if always else None
-        self._z = self._noise_free(self.reference, *self._in_view) if self._in_view and self.undisturbed else None
+        self._chain = Chain(effects_of(truth.sensor))
+        self._number = 1 if self.linear else self._chain.leading() if self.undisturbed else 0
+        self._shared = self._chain.shared(self.context(self.reference), self._number) if self._number else None
+        if self._shared is not None and self.undisturbed:
+            _ = self._shared.z  # now, and not in several threads at once
+        self._ends = np.arange(1, truth.steps + 2)
+
+    def context(self, path: Array) -> Context:
+        """What an effect may know of a trial along ``path`` (T + 1, 3)."""
+        return Context(self.truth.sensor, self.landmarks, path, self.reference)
 
     def trial(self, run: int, seed: int) -> Trial:
         """Truth, controls and observations of run ``run``, as :func:`simulate`."""
-        truth, landmarks = self.truth, self.landmarks
         true_path, told = self._drive(generator(seed, run, MOTION_NOISE))
-        step, landmark = self._in_view or _in_view(truth, true_path, landmarks)
-        noise = generator(seed, run, OBSERVATION_NOISE).standard_normal((len(step), 3))
-        z = self._noise_free(true_path, step, landmark) if self._z is None else self._z
-        z = z + noise * np.array(truth.sensor.sigma)
-        if isinstance(truth.sensor, UvdSensor):
-            low, high = truth.sensor.disparity
-            found = (z[:, 2] >= low) & (z[:, 2] <= high)
-            step, landmark, z = step[found], landmark[found], z[found]
-        first = np.searchsorted(step, np.arange(truth.steps + 1))
-        return Trial(run, self.start, told, first, landmark, z, len(landmarks), true_path, landmarks)
+        context = self.context(true_path)
+        seen = self._chain.rest(self._begin(context), context, self._number, run, seed)
+        first = np.searchsorted(seen.step, self._ends)
+        return Trial(
+            run, self.start, told, first, seen.landmark, seen.z, seen.ids, true_path, self.landmarks, _source(seen)
+        )
 
-    def _noise_free(self, path: Array, step: Indices, landmark: Indices) -> Array:
-        """Observations (M, 3) of landmarks in steps (from 0)."""
-        if self.linear:
-            return _linear(self.truth, path[step + 1], self.reference[step + 1], self.landmarks[landmark])
-        return _measure(self.truth, path[step + 1], self.landmarks[landmark])
+    def _begin(self, context: Context) -> Observations:
+        """The observations of a run after the effects that are the same in every run."""
+        if self._shared is None:
+            return context.ideal()
+        return context.at(self._shared.step, self._shared.landmark) if self.linear else self._shared
 
     def _drive(self, rng: np.random.Generator) -> tuple[Array, Array]:
         """True poses (T + 1, 3) and the controls (T, 3) that the filter is told."""
@@ -76,9 +77,9 @@ def simulate(scenario: Scenario, run: int = 0, seed: int = 0) -> Trial:
     return World(scenario.truth).trial(run, seed)
 
 
-def generator(seed: int, run: int, purpose: int) -> np.random.Generator:
-    """The random stream of one purpose in one run: independent of every other run and purpose."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run, purpose)))
+def _source(seen: Observations) -> Indices | None:
+    """What the observations are really of, where that is not what they say."""
+    return None if seen.source is None or np.array_equal(seen.source, seen.landmark) else seen.source
 
 
 def draw_landmarks(truth: Truth) -> Array:
@@ -92,17 +93,18 @@ def draw_landmarks(truth: Truth) -> Array:
 
 def require_landmarks_in_view(scenario: Scenario) -> World:
     """The scenario's world; raises :class:`InputError` if no landmark comes into view on the planned path."""
-    truth = scenario.truth
+    truth, sensor = scenario.truth, scenario.truth.sensor
     world = World(truth)
     for k in range(0, truth.steps, SOME):
-        path = world.reference[k : k + SOME + 1]
-        step, landmark = _in_view(truth, path, world.landmarks)
-        if isinstance(truth.sensor, UvdSensor):
-            d = _measure(truth, path[step + 1], world.landmarks[landmark])[:, 2]
-            low, high = truth.sensor.disparity
-            slack = 6.0 * truth.sensor.sigma[2]
-            step = step[(d > low - slack) & (d < high + slack)]
-        if len(step):
+        here = slice(k, k + SOME + 1)
+        context = Context(sensor, world.landmarks, world.reference[here], world.reference[here])
+        seen = Chain([FieldOfView()]).shared(context, 1)
+        # effects that are listed may bring any disparity into the search range
+        if isinstance(sensor, UvdSensor) and not sensor.effects:
+            low, high = sensor.disparity
+            slack = 6.0 * sensor.sigma[2]
+            seen = seen.keep((seen.z[:, 2] > low - slack) & (seen.z[:, 2] < high + slack))
+        if len(seen):
             return world
     raise InputError(
         f"scenario '{scenario.name}': no landmark comes into view in {truth.steps} steps; "
@@ -123,49 +125,3 @@ def _drive_linear(reference: Array, planned: Array, noise: Array) -> Array:
         path[1:, axis] += np.cumsum(np.column_stack([slope * before, along * share]))[1::2]
     path[1:, 2] += turned
     return path
-
-
-def _in_view(truth: Truth, path: Array, landmarks: Array) -> tuple[Indices, Indices]:
-    """Steps (from 0) and landmarks whose true position is in range and in the image in steps 1..T, by step."""
-    x, y, heading = path[1:].T[..., None]
-    c, s = np.cos(heading), np.sin(heading)
-    rows = max(BLOCK // len(landmarks), 1)
-    seen = np.empty((len(path) - 1, len(landmarks)), bool)
-    for k in range(0, len(seen), rows):
-        here = slice(k, k + rows)
-        body = point.turned_to_robot(x[here], y[here], c[here], s[here], *landmarks.T)
-        seen[here] = _visible(truth, *point.to_sensor(*body, truth.sensor.mount.packed()))
-    step, landmark = np.nonzero(seen)
-    return step, landmark
-
-
-def _visible(truth: Truth, x: Array, y: Array, z: Array) -> Array:
-    """Which of the points in the sensor frame are in range and in the image."""
-    sensor = truth.sensor
-    distance = np.sqrt(x * x + y * y + z * z)
-    seen: Array = (distance >= sensor.range[0]) & (distance <= sensor.range[1])
-    if sensor.image is None:
-        return seen
-    assert sensor.f is not None
-    (width, height), (column, row) = sensor.image, sensor.centre
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v, _ = stereo.project(x, y, z, sensor.f, 0.0)
-    inside = (u >= -column) & (u < width - column) & (v >= -row) & (v < height - row)
-    return np.asarray(seen & (x > 0) & inside)
-
-
-def _measure(truth: Truth, poses: Array, landmarks: Array) -> Array:
-    """Landmarks (M, 3) as the sensor at the poses (M, 3) gives them, without noise."""
-    p = point.to_sensor(*point.to_robot(*poses.T, *landmarks.T), truth.sensor.mount.packed())
-    if isinstance(truth.sensor, UvdSensor):
-        p = stereo.project(*p, truth.sensor.f, truth.sensor.B)
-    return np.stack(p, axis=-1)
-
-
-def _linear(truth: Truth, pose: Array, reference: Array, landmark: Array) -> Array:
-    """Eq. 19 to first order in the pose about ``reference``, shapes (M, 3)."""
-    x, y, z = point.to_robot(*reference.T, *landmark.T)
-    c, s = np.cos(reference[:, 2]), np.sin(reference[:, 2])
-    dx, dy, dh = (pose - reference).T
-    body = x - c * dx - s * dy + y * dh, y + s * dx - c * dy - x * dh, z
-    return np.column_stack(point.to_sensor(*body, truth.sensor.mount.packed()))

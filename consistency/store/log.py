@@ -7,31 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import tomli_w
-from pydantic import ValidationError
 
 from consistency.errors import InputError
-from consistency.scenario import (
-    Belief,
-    BelievedMotion,
-    BelievedSensor,
-    Finite,
-    Mount,
-    Positive,
-    SigmaPoints,
-    Sigmas,
-    Table,
-    explain,
-    read_table,
-)
+from consistency.scenario import Belief, BelievedMotion, Finite, PicturedSensor, SigmaPoints, Table, read_table
 from consistency.store.parquet import read_parquet
 from consistency.store.results import POSE, controls_table, observations_table, truth_of
 from consistency.store.storage import write_folder
-from consistency.types import Array, Trial
+from consistency.types import Array, Indices, Trial
 
 View = tuple[tuple[int, int], tuple[float, float]]  # image (width, height) and principal point (column, row), px
 
@@ -44,25 +31,12 @@ class Start(Table):
     heading: Finite
 
 
-class SensorFile(Table):
+class SensorFile(PicturedSensor):
     """``sensor.toml``: the sensor, its mount and noise, and the noise of the odometry, as believed."""
 
-    model: Literal["xyz", "uvd", "linear"]
-    sigma: Sigmas
-    f: Positive | None = None
-    B: Positive | None = None
-    image: tuple[int, int] | None = None
-    principal_point: tuple[Finite, Finite] | None = None
-    mount: Mount = Mount()
     motion: BelievedMotion
     start: Start | None = None
     sigma_points: SigmaPoints = SigmaPoints()
-
-    def belief(self) -> Belief:
-        sensor = BelievedSensor.model_validate(
-            {"model": self.model, "sigma": self.sigma, "f": self.f, "B": self.B, "mount": self.mount.model_dump()}
-        )
-        return Belief(motion=self.motion, sensor=sensor, sigma_points=self.sigma_points)
 
 
 @dataclass(frozen=True)
@@ -96,10 +70,7 @@ def read_log(folder: str | Path) -> Log:
             f"{path}: missing; 'consistency frontend' makes a log of images, 'consistency simulate' one of a scenario"
         )
     sensor = read_table(path, SensorFile)
-    try:
-        belief = sensor.belief()
-    except ValidationError as error:
-        raise InputError(f"{path}: {explain(error, BelievedSensor)}") from None
+    belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points)
     controls, observations = read_parquet(folder, "controls"), read_parquet(folder, "observations")
     tables = {
         name: read_parquet(folder, name) if (folder / f"{name}.parquet").exists() else None
@@ -108,10 +79,11 @@ def read_log(folder: str | Path) -> Log:
     _check(folder, controls, observations, belief)
     _check_pixels(folder, observations, sensor)
     start = np.array([sensor.start.x, sensor.start.y, sensor.start.heading]) if sensor.start else None
-    labels = np.unique(observations["landmark"])
-    positions = _positions(folder, tables["landmarks"], labels, belief)
+    names = _names(folder, observations, tables["landmarks"])
+    _require_landmarks_only(folder, names, belief)
+    positions = _positions(folder, tables["landmarks"], names.landmarks, belief)
     trials = [
-        _trial(folder, run, controls[controls["run"] == run], observations, labels, tables["truth"], start, positions)
+        _trial(folder, run, controls[controls["run"] == run], observations, names, tables["truth"], start, positions)
         for run in sorted({int(run) for run in controls["run"]})
     ]
     files = [path, *sorted(folder.glob("*.parquet"))]
@@ -195,8 +167,7 @@ def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) 
     """Pixels must be relative to the principal point: with it they must fall into the image."""
     if sensor.model != "uvd" or sensor.image is None:
         return
-    centre = sensor.principal_point or (sensor.image[0] / 2, sensor.image[1] / 2)
-    for column, middle, size, sigma in zip(("z0", "z1"), centre, sensor.image, sensor.sigma, strict=False):
+    for column, middle, size, sigma in zip(("z0", "z1"), sensor.centre, sensor.image, sensor.sigma, strict=False):
         pixel = observations[column].to_numpy() + middle
         outside = (pixel < -6 * sigma) | (pixel > size + 6 * sigma)
         if outside.any():
@@ -206,6 +177,43 @@ def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) 
                 f"{folder / 'observations.parquet'}: column '{column}', row {row}: {value:.1f} px "
                 "is outside the image of sensor.toml; u and v must be relative to the principal point"
             )
+
+
+class _Names(NamedTuple):
+    """Numbers in the files: those of landmarks, sorted, and those of things that are no landmark, sorted."""
+
+    landmarks: Indices
+    things: Indices
+
+    def ids(self, numbers: pd.Series[int]) -> Indices:
+        """Place of each number in the one list and then the other; -1 where it is in neither."""
+        return pd.Index(np.concatenate(self)).get_indexer(pd.Index(numbers)).astype(np.int64)
+
+
+def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | None) -> _Names:
+    """Which of the numbers in ``observations.parquet`` are landmarks, by ``source`` and ``landmarks.parquet``."""
+    labels = np.unique(observations["landmark"])
+    if "source" not in observations:
+        return _Names(labels, labels[:0])
+    wrong = (observations["source"] < -1) | (observations["landmark"] < 0)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"{folder / 'observations.parquet'}: row {row}: beside a column 'source' landmarks are numbered from 0, "
+            "and a source is one of them or -1"
+        )
+    source = np.unique(observations["source"])
+    known = source[source >= 0] if landmarks is None else np.concatenate([source[source >= 0], landmarks["landmark"]])
+    real = np.union1d(source[source >= 0], np.intersect1d(labels, known))
+    return _Names(real, np.setdiff1d(labels, real))
+
+
+def _require_landmarks_only(folder: Path, names: _Names, belief: Belief) -> None:
+    if belief.sensor.model == "linear" and len(names.things):
+        raise InputError(
+            f"{folder / 'observations.parquet'}: column 'landmark': {names.things[0]} is no landmark, and a linear "
+            "world needs one that it is linearised about"
+        )
 
 
 def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, belief: Belief) -> Array | None:
@@ -227,7 +235,7 @@ def _trial(
     run: int,
     controls: pd.DataFrame,
     observations: pd.DataFrame,
-    labels: Array,
+    names: _Names,
     truth: pd.DataFrame | None,
     start: Array | None,
     positions: Array | None,
@@ -248,9 +256,10 @@ def _trial(
         start,
         controls[["dt", "v", "omega"]].to_numpy(float),
         np.searchsorted(seen["step"], np.arange(1, steps + 2)),
-        np.searchsorted(labels, seen["landmark"]),
+        names.ids(seen["landmark"]),
         seen[["z0", "z1", "z2"]].to_numpy(float),
-        len(labels),
+        len(names.landmarks) + len(names.things),
         path,
         positions,
+        names.ids(seen["source"]) if "source" in seen else None,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ COLUMNS: dict[str, dict[str, str]] = {
     },
     "failures": {"filter": "str", "run": "int64", "step": "int64", "reason": "str"},
 }  # fmt: skip
+OPTIONAL = {"observations": {"source": "int64"}}  # columns of a table that may be missing
 NULLABLE = {"nees", "nis"}
 REPEATED = {"t", "dt"}  # floating-point columns of few different values
 ROWS = 65_536  # of a row group, and of a batch that is read
@@ -43,10 +44,13 @@ Columns = dict[str, Array]  # columns of a table by name, equally long
 
 
 class Writer:
-    """A Parquet file of the table ``name``, in row groups of ``ROWS`` rows however many are added at a time."""
+    """A Parquet file of the table ``name``, in row groups of ``ROWS`` rows however many are added at a time.
 
-    def __init__(self, path: Path, name: str) -> None:
-        kinds = COLUMNS[name]
+    ``columns`` are those of the rows to come, where an optional one may be among them.
+    """
+
+    def __init__(self, path: Path, name: str, columns: Iterable[str] = ()) -> None:
+        kinds = _kinds(name, columns)
         self.schema = pa.schema([(column, TYPES[kind]) for column, kind in kinds.items()])
         # the bytes of similar numbers are alike: apart from each other they take less room, and nothing is lost
         split = [column for column, kind in kinds.items() if kind == "float64" and column not in REPEATED]
@@ -91,10 +95,17 @@ class Writer:
         self._rows -= rows
 
 
+def _kinds(name: str, columns: Iterable[str]) -> dict[str, str]:
+    """Types of the columns of a table, with those of the optional ones that are among ``columns``."""
+    present = set(columns)
+    return COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in present}
+
+
 def write_table(path: Path, name: str, table: pd.DataFrame) -> None:
     """A whole table; estimates in row groups of one filter each."""
-    table = table[list(COLUMNS[name])].astype(COLUMNS[name])
-    with Writer(path, name) as writer:
+    kinds = _kinds(name, map(str, table))
+    table = table[list(kinds)].astype(kinds)
+    with Writer(path, name, kinds) as writer:
         if name != "estimates":
             writer.add({str(column): table[column].to_numpy() for column in table})
         else:
@@ -116,9 +127,11 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
     InputError
         The file is missing, damaged, lacks a column or holds what the column may not.
     """
-    path, wanted = folder / f"{name}.parquet", COLUMNS[name]
+    path = folder / f"{name}.parquet"
     with _refusals(path):
-        read = require_table(folder, name).read(list(wanted))
+        file = require_table(folder, name)
+        wanted = _kinds(name, file.schema_arrow.names)
+        read = file.read(list(wanted))
         table = read.to_pandas()
     for column, kind in wanted.items():
         if kind == "str":

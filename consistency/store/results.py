@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from consistency.diagnostics.whitening import whiten
 from consistency.errors import InputError
-from consistency.filters.linalg import definiteness
+from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry import pose_error
 from consistency.scenario import Scenario, explain
 from consistency.store.parquet import COLUMNS, COVARIANCE, Columns, read_batches, read_parquet, require_table
@@ -244,7 +244,8 @@ def controls_table(trials: Sequence[Trial]) -> pd.DataFrame:
 
 
 def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
-    """``observations.parquet``."""
+    """``observations.parquet``; with a column ``source`` if a row is not of the landmark that it says."""
+    labelled = any(t.source is not None for t in trials)
     return pd.concat(
         [
             pd.DataFrame(
@@ -253,6 +254,7 @@ def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
                     "step": np.repeat(np.arange(1, t.steps + 1), np.diff(t.first)),
                     "landmark": t.landmark,
                     **dict(zip(["z0", "z1", "z2"], t.z.T, strict=True)),
+                    **({"source": t.landmark if t.source is None else t.source} if labelled else {}),
                 }
             )
             for t in trials

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters.linalg import ROUNDING
+from consistency.filters.kernel.linalg import ROUNDING
 from consistency.filters.stepping import step_through
 from consistency.types import Estimates
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import consistency as cs
+from consistency.filters.kernel.loop import trial_kernel
 from consistency.filters.stepping import step_through
-from consistency.filters.trial import run_trial
 from consistency.scenario import Belief
 from consistency.simulation import planned_path
 from consistency.types import Array, Estimates, Trial
@@ -101,12 +101,12 @@ def test_one_compiled_signature_serves_every_caller(uvd: cs.Scenario) -> None:
     """Arrays from a table are often column-major; a second signature would cost half a minute to compile."""
     trial = cs.simulate(uvd)
     ours = compiled("ekf-uvd", trial, uvd.belief)
-    signatures = len(run_trial.signatures)
+    signatures = len(trial_kernel.signatures)
     turned = replace(trial, controls=np.asfortranarray(trial.controls), z=np.asfortranarray(trial.z))
     turned.controls.flags.writeable = False
     again = compiled("ekf-uvd", turned, uvd.belief)
     assert np.array_equal(again.pose, ours.pose)
-    assert len(run_trial.signatures) == signatures
+    assert len(trial_kernel.signatures) == signatures
 
 
 def test_sigma_points_matter(small: Small) -> None:

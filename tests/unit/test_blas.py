@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from consistency.filters import blas
-from consistency.filters.covariance import gather_rows, subtract_gram
+from consistency.filters.kernel import blas
+from consistency.filters.kernel.covariance import gather_rows, subtract_gram
 from consistency.types import Array
 
 SIZES = [(1, 1), (3, 7), (36, 174), (50, 9)]
@@ -76,10 +76,10 @@ def test_rows_of_half_a_covariance(rng: np.random.Generator) -> None:
     P = upper(A @ A.T)
     P[:3, :3] = (A @ A.T)[:3, :3]
     rows = np.full((12, 20), np.nan)
-    gather_rows(P, 18, np.array([9, 3, 15]), 3, rows)
+    gather_rows(P, 18, 3, 3, np.array([9, 3, 15]), 3, rows)
     assert np.array_equal(rows[:, :18], (A @ A.T)[np.r_[0:3, 9:12, 3:6, 15:18]])
     W = rng.normal(size=(4, 18))
-    subtract_gram(P, 18, W)
+    subtract_gram(P, 18, 3, W)
     after = A @ A.T - W.T @ W
     assert np.allclose(np.triu(P), np.triu(after), rtol=1e-12, atol=1e-12)
     assert np.array_equal(P[:3, :3], P[:3, :3].T)
@@ -87,16 +87,17 @@ def test_rows_of_half_a_covariance(rng: np.random.Generator) -> None:
 
 KERNEL = """
 import numpy as np
-from consistency.filters import blas
-from consistency.filters.jit import kernel
+from consistency.filters.kernel import blas
+from consistency.filters.kernel.jit import Kernel
 
-@kernel
-def root(A):
+def root_of(A):
     return blas.upper_cholesky(A)
+
+root = Kernel(root_of)
 
 A = 4.0 * np.eye(3)
 assert root(A) and A[2, 2] == 2.0
-print(sum(root.stats.cache_hits.values()))
+print(sum(root.compile(A).stats.cache_hits.values()))
 """
 
 

@@ -118,7 +118,7 @@ def test_a_room_imports_only_rooms_below_it(room: str, path: Path) -> None:
 
 FORBIDDEN = [
     ("filters", "from consistency.simulation import simulate"),
-    ("simulation", "import consistency.filters.textbook"),
+    ("simulation", "import consistency.filters.plain"),
     ("simulation", "def f():\n    from consistency import filters"),
     ("models", "from consistency.scenario import Truth"),
     ("scenario", "import consistency as cs"),

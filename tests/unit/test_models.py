@@ -9,10 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from consistency.filters.observation import LINEAR, UVD, XYZ, linearise, place, predict_observation
-from consistency.filters.textbook import PointSensor, Unicycle, sensor_noise
+from consistency.filters.error.additive import Additive
+from consistency.filters.kernel.measuring import linearise, linearise_at, observe, place_observed
+from consistency.filters.kernel.slam import Slam, State, robot_frame
+from consistency.filters.kernel.work import make_work
+from consistency.filters.landmark.world_point import WorldPoint
+from consistency.filters.motion import unicycle
+from consistency.filters.parts import sensor_of
+from consistency.filters.plain import PointSensor, Unicycle, sensor_noise
+from consistency.filters.point.at_estimate import AtEstimate
+from consistency.filters.point.reference import Reference, place_about_reference
+from consistency.filters.update.joint import Joint
+from consistency.filters.upkeep.dense import Dense
 from consistency.models import motion, point, stereo
-from consistency.scenario import BelievedSensor, Mount
+from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.types import Array, Control
 
 F, B = 150.0, 0.09
@@ -166,43 +176,51 @@ def test_textbook_sensor_jacobians(pose: Array, landmark: Array, uvd: bool, tilt
     assert close(Hp + Hl @ Jp, np.zeros((3, 3)), 1e-11)
 
 
+def _slam(sensor: BelievedSensor, uvd: bool) -> Slam:
+    belief = Belief(motion=BelievedMotion(sigma_v=0.1, sigma_omega=0.1), sensor=sensor)
+    part = sensor_of(belief, uvd)
+    return Slam(unicycle.Unicycle(0.1, 0.1), part, WorldPoint(), Additive(), AtEstimate(), Joint(), Dense())
+
+
 @pytest.mark.parametrize(("pose", "landmark"), CASES)
 @pytest.mark.parametrize("uvd", [False, True])
 def test_kernels_equal_the_textbook_sensor(
     pose: Array, landmark: Array, uvd: bool, tilted: dict[str, list[float]]
 ) -> None:
     belief = _sensor(tilted)
-    sensor, model, rig = PointSensor(belief, uvd), UVD if uvd else XYZ, belief.packed()
-    expected = sensor.measure(pose, landmark)
-    z, Hp, Hl, zero = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
-    predict_observation(model, pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), landmark, rig, z)
+    sensor, slam = PointSensor(belief, uvd), _slam(belief, uvd)
+    frame, expected = robot_frame(slam.motion, pose), sensor.measure(pose, landmark)
+    z, Hp, Hl = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    observe(slam, frame, landmark, z)
     assert close(z, expected)
-    linearise(model, pose, landmark, zero, zero, rig, z, Hp, Hl)
+    linearise_at(slam, frame, landmark, z, Hp, Hl)
     assert close(z, expected)
     for kernel, textbook in zip((Hp, Hl), sensor.jacobians(pose, landmark), strict=True):
         assert close(kernel, textbook)
-    where, Jp, Jz = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    place(model, pose, expected, zero, zero, rig, where, Jp, Jz)
-    for kernel, textbook in zip((where, Jp, Jz), sensor.locate(pose, expected), strict=True):
+    where, work = np.empty(3), make_work(slam, 6, 1)
+    place_observed(slam, pose, expected, where, work)
+    for kernel, textbook in zip((where, work.Jp, work.Jz), sensor.locate(pose, expected), strict=True):
         assert close(kernel, textbook)
 
 
 def test_linear_kernel_is_the_first_order_expansion(tilted: dict[str, list[float]]) -> None:
     belief = _sensor(tilted)
-    sensor, rig = PointSensor(belief, uvd=False), belief.packed()
+    sensor = PointSensor(belief, uvd=False)
     pose0, landmark0 = CASES[0]
+    reference = Reference(np.array([pose0, pose0]), np.array([landmark0]))
+    slam = _slam(belief, uvd=False)._replace(point=reference)
     Hp0, Hl0 = sensor.jacobians(pose0, landmark0)
     step, move = np.array([0.4, -0.3, 0.5]), np.array([0.2, 0.6, -0.1])
     z, Hp, Hl = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    linearise(LINEAR, pose0 + step, landmark0 + move, pose0, landmark0, rig, z, Hp, Hl)
+    linearise(slam, pose0 + step, landmark0 + move, 0, 0, z, Hp, Hl)
     assert close(Hp, Hp0)
     assert close(Hl, Hl0)
     assert close(z, sensor.measure(pose0, landmark0) + Hp0 @ step + Hl0 @ move)
-    where, Jp, Jz = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    place(LINEAR, pose0 + step, z, pose0, landmark0, rig, where, Jp, Jz)
-    assert close(where, landmark0 + move)
-    assert close(Hl0 @ Jz, np.eye(3))
-    assert close(Hp0 + Hl0 @ Jp, np.zeros((3, 3)))
+    x, work = np.concatenate([pose0 + step, np.empty(3)]), make_work(slam, 6, 1)
+    place_about_reference(reference, slam, State(x, np.zeros((6, 6)), 3, 0, np.zeros(1, int)), 0, 0, z, work)
+    assert close(x[3:], landmark0 + move)
+    assert close(Hl0 @ work.Jz, np.eye(3))
+    assert close(Hp0 + Hl0 @ work.Jp, np.zeros((3, 3)))
     # negative control: so large a step is not linear
     assert not close(z, sensor.measure(pose0 + step, landmark0 + move), 1e-3)
 

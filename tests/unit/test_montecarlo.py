@@ -369,7 +369,7 @@ def test_resuming_fills_gaps(uvd: cs.Scenario, ten: cs.Results) -> None:
 def test_resuming_what_is_complete_needs_no_compiler(
     uvd: cs.Scenario, ten: cs.Results, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("consistency.filters.compiled.is_compiled", lambda entry: False)
+    monkeypatch.setattr("consistency.filters.compiled.Compiled.is_ready", lambda *_: False)
     assert equal(cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1, previous=ten), ten)
 
 
@@ -462,6 +462,6 @@ def test_ctrl_c_inside_a_kernel_is_ctrl_c(xyz: cs.Scenario, monkeypatch: pytest.
     def kernel(*_: Any) -> Any:
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
 
-    monkeypatch.setattr("consistency.filters.compiled.run_trial", kernel)
+    monkeypatch.setattr("consistency.filters.compiled.trial_kernel", kernel)
     with pytest.raises(KeyboardInterrupt):
         cs.get_filter("ekf-xyz").run(cs.simulate(xyz), xyz.belief)

@@ -1,0 +1,66 @@
+"""Truth minus estimate, variable by variable: the error of the textbook EKF, in world coordinates."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.filters.kernel.arrays import copy_matrix
+from consistency.filters.kernel.blas import add_transposed_times
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.slam import (
+    Slam,
+    State,
+    add_motion_noise,
+    carry,
+    expands,
+    insert_error,
+    motion_point,
+    move,
+    move_about,
+    pose_covariance,
+    propagate,
+    retract,
+    robot_width,
+    to_error,
+)
+from consistency.filters.kernel.work import Work
+from consistency.types import Array
+
+
+@part()
+class Additive(NamedTuple):
+    """No parameters."""
+
+
+@implement(propagate, Additive)
+def propagate_additive(
+    error: Additive, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    pose = state.x[: robot_width(slam.motion)]
+    at = motion_point(slam.point, pose, k)
+    carry(slam.motion, at, u, state.P, state.n, Phi, state.base)
+    add_motion_noise(slam.motion, at, u, state.P)
+    if expands(slam.point):
+        move_about(slam.motion, at, u, pose)
+    else:
+        move(slam.motion, pose, u, pose)
+
+
+@implement(to_error, Additive)
+def additive_as_it_is(error: Additive, pose: Array, values: Array, Hp: Array, Hl: Array) -> None:
+    pass
+
+
+@implement(insert_error, Additive)
+def additive_insert(error: Additive, pose: Array, values: Array, Jp: Array) -> None:
+    pass
+
+
+@implement(retract, Additive)
+def retract_additive(error: Additive, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
+    add_transposed_times(A, y, state.x[: state.n])
+
+
+@implement(pose_covariance, Additive)
+def additive_pose_covariance(error: Additive, x: Array, P: Array, out: Array) -> None:
+    copy_matrix(P, out)

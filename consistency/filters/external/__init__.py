@@ -1,0 +1,1 @@
+"""Other libraries' filters behind the four methods of :class:`consistency.protocols.Filter`."""

@@ -1,0 +1,78 @@
+"""The state covariance of the kernels: row-major, its upper half valid, the block of the robot full.
+
+A symmetric update of half of P costs half, and BLAS leaves the other half alone. Everything that reads or
+writes P does it here, but for the block and the rows of the robot, which are whole.
+"""
+
+from __future__ import annotations
+
+from consistency.filters.kernel.arrays import copy_matrix
+from consistency.filters.kernel.blas import add_gram, upper_cholesky
+from consistency.filters.kernel.jit import inner
+from consistency.filters.kernel.linalg import DEFICIENT
+from consistency.filters.kernel.slam import OBSERVED
+from consistency.types import Array, Indices
+
+
+@inner
+def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Array) -> None:
+    """Whole rows of P: of the robot in rows 0..r-1, then of the ``m`` landmarks of ``w`` variables at ``at``."""
+    copy_matrix(P[:r, :n], rows[:r, :n])
+    for i in range(m):
+        o, first = at[i], r + w * i
+        for j in range(o):
+            for a in range(w):
+                rows[first + a, j] = P[j, o + a]
+        for a in range(w):
+            for j in range(o + a, n):
+                rows[first + a, j] = P[o + a, j]
+            for b in range(a):
+                rows[first + a, o + b] = rows[first + b, o + a]
+
+
+@inner
+def definite_root(A: Array, scale: Array) -> bool:
+    """Upper half of A <- its root; False if it has none or a pivot is lost to rounding. ``scale`` <- its diagonal."""
+    for i in range(len(A)):
+        scale[i] = A[i, i]
+    definite = upper_cholesky(A)
+    for i in range(len(A)):
+        definite = definite and A[i, i] * A[i, i] > DEFICIENT * scale[i]
+    return definite
+
+
+@inner
+def subtract_gram(P: Array, n: int, r: int, W: Array) -> None:
+    """P <- P - W' W."""
+    add_gram(-1.0, W, P[:n, :n])
+    for a in range(r):
+        for b in range(a):
+            P[a, b] = P[b, a]
+
+
+@inner
+def append_landmark(P: Array, n: int, Jp: Array, Jz: Array, R: Array) -> None:
+    """Covariance of a landmark put at n: its own and the one with everything before it."""
+    w, r = Jp.shape
+    for j in range(n):
+        for a in range(w):
+            total = 0.0
+            for c in range(r):
+                total += Jp[a, c] * P[c, j]
+            P[j, n + a] = total
+    for a in range(w):
+        for b in range(a, w):
+            P[n + a, n + b] = 0.5 * (_own(P, n, Jp, Jz, R, a, b) + _own(P, n, Jp, Jz, R, b, a))
+
+
+@inner
+def _own(P: Array, n: int, Jp: Array, Jz: Array, R: Array, a: int, b: int) -> float:
+    """Entry (a, b) of Jp P_pose Jp' + Jz R Jz'."""
+    r, total = Jp.shape[1], 0.0
+    for c in range(max(r, OBSERVED)):
+        if c < r:
+            total += P[c, n + a] * Jp[b, c]
+        if c < OBSERVED:
+            for d in range(OBSERVED):
+                total += Jz[a, c] * R[c, d] * Jz[b, d]
+    return total

@@ -1,0 +1,167 @@
+"""Kernel functions chosen at compile time by the types of the parts they are given.
+
+A part is a small NamedTuple: a motion, a sensor, an update ... Its type chooses the code and its fields carry its
+parameters. ``generic`` declares a function, ``implement`` gives it a body for some types of parts. A kernel that
+calls a generic function is compiled with the one body that fits, so that a filter compiles what it uses and
+nothing is decided at run time.
+
+Bodies and parts stand at module level. Numba names a closure by a counter of the process, and kernels that
+different processes have cached would be linked to each other's functions; two parts of one name would share code
+in the same way, so ``part`` refuses the second.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+from numba.extending import overload
+
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+PACKAGE = Path(__file__).parents[2]
+
+_overload: Callable[..., Any] = overload
+Function = TypeVar("Function", bound=Callable[..., Any])
+Part = TypeVar("Part", bound=type)
+Bodies = dict[tuple[type, ...], Callable[..., Any]]
+
+_parts: dict[str, type] = {}
+_needs: dict[type, dict[str, frozenset[str]]] = {}
+_bodies: dict[Any, Bodies] = {}
+_names: set[str] = set()
+_files: set[Path] = set()  # of parts and bodies outside the package, which the cache must know too
+
+
+def part(**needs: str) -> Callable[[Part], Part]:
+    """Decorator of a part: a NamedTuple at module level, with a name that no other part has.
+
+    Parameters
+    ----------
+    needs : names of the parts that it can be combined with, by role and separated by blanks, as in
+        ``landmark="WorldPoint"``; any where a role is left out.
+
+    Raises
+    ------
+    TypeError
+        Not a NamedTuple at module level, or the name is taken.
+    """
+
+    def register(cls: Part) -> Part:
+        if not (issubclass(cls, tuple) and hasattr(cls, "_fields")) or "<locals>" in cls.__qualname__:
+            raise TypeError(f"part '{cls.__qualname__}' must be a NamedTuple at module level")
+        if cls.__name__ in _parts:
+            other = _parts[cls.__name__].__module__
+            raise TypeError(
+                f"a part named '{cls.__name__}' is there already, in {other}; two would share compiled code"
+            )
+        _parts[cls.__name__] = cls
+        _needs[cls] = {role: frozenset(names.split()) for role, names in needs.items()}
+        _remember_file(cls)
+        return cls
+
+    return register
+
+
+def generic(deciding: int = 1) -> Callable[[Function], Function]:
+    """Decorator of a function whose body is chosen by the types of its first ``deciding`` arguments.
+
+    The decorated body is never run: its signature and docstring say what every implementation does.
+    """
+
+    def declare(stub: Function) -> Function:
+        bodies: Bodies = {}
+
+        @wraps(stub)
+        def call(*args: Any) -> Any:
+            return _body(stub, bodies, tuple(type(a) for a in args[:deciding]))(*args)
+
+        def choose(*args: Any) -> Any:
+            classes = tuple(getattr(a, "instance_class", None) for a in args[:deciding])
+            return _body(stub, bodies, classes)
+
+        _overload(call, strict=False, jit_options=OPTIONS)(choose)
+        _bodies[call] = bodies
+        chosen: Any = call
+        return chosen
+
+    return declare
+
+
+def implement(function: Callable[..., Any], *classes: type) -> Callable[[Function], Function]:
+    """Decorator of the body of a generic ``function`` for parts of these types.
+
+    Raises
+    ------
+    TypeError
+        The body is a closure, its name is taken, or there is a body for these types.
+    """
+
+    def register(body: Function) -> Function:
+        name = f"{body.__module__}.{body.__qualname__}"
+        if "<locals>" in name or (_names.intersection({name}) and body not in _bodies[function].values()):
+            raise TypeError(f"kernel function '{name}' must stand at module level under a name of its own")
+        if classes in _bodies[function]:
+            raise TypeError(f"'{function.__name__}' has a body for {_named(classes)} already")
+        _names.add(name)
+        _bodies[function][classes] = body
+        _remember_file(body)
+        return body
+
+    return register
+
+
+def require_fitting(parts: Any) -> None:
+    """Refuse a combination of ``parts``, a NamedTuple by role, that means nothing.
+
+    Raises
+    ------
+    TypeError
+        An unknown part, or two that do not go together.
+    """
+    for role, value in zip(parts._fields, parts, strict=True):
+        cls = type(value)
+        if _parts.get(cls.__name__) is not cls:
+            raise TypeError(f"{role}: '{cls.__name__}' is no registered part")
+        for other, names in _needs[cls].items():
+            chosen = type(getattr(parts, other)).__name__
+            if chosen not in names:
+                raise TypeError(
+                    f"{role} '{cls.__name__}' does not go with {other} '{chosen}', only with {', '.join(sorted(names))}"
+                )
+
+
+def fits(parts: Any) -> bool:
+    """Whether :func:`require_fitting` lets ``parts`` pass."""
+    try:
+        require_fitting(parts)
+    except TypeError:
+        return False
+    return True
+
+
+def outside_files() -> list[Path]:
+    """Sources of parts and bodies that lie outside the package, sorted."""
+    return sorted(_files)
+
+
+def _body(stub: Any, bodies: Bodies, classes: tuple[Any, ...]) -> Callable[..., Any]:
+    if classes not in bodies:
+        raise TypeError(f"'{stub.__name__}' has no body for {_named(classes)}; there are {_known(bodies)}")
+    return bodies[classes]
+
+
+def _named(classes: tuple[Any, ...]) -> str:
+    return " and ".join(getattr(cls, "__name__", str(cls)) for cls in classes)
+
+
+def _known(bodies: Bodies) -> str:
+    return ", ".join(sorted(_named(classes) for classes in bodies)) or "none"
+
+
+def _remember_file(thing: Any) -> None:
+    path = Path(inspect.getfile(thing)).resolve()
+    if not path.is_relative_to(PACKAGE):
+        _files.add(path)

@@ -1,0 +1,231 @@
+"""The one loop over a trial that all compiled filters share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
+from consistency.filters.kernel.covariance import append_landmark
+from consistency.filters.kernel.gain import NOT_FINITE, POSE
+from consistency.filters.kernel.jit import Kernel, inner
+from consistency.filters.kernel.lending import keep, lend
+from consistency.filters.kernel.linalg import definiteness_with
+from consistency.filters.kernel.local_state import Factors
+from consistency.filters.kernel.slam import (
+    OBSERVED,
+    Data,
+    Slam,
+    State,
+    correct,
+    insert_error,
+    landmark_width,
+    make_local,
+    place,
+    pose_covariance,
+    predict,
+    prepare,
+    robot_frame,
+    robot_width,
+    settle,
+    to_error,
+    world_point,
+)
+from consistency.filters.kernel.work import Work, make_work
+from consistency.types import Array, Indices
+
+
+class Outcome(NamedTuple):
+    """What a filter said of a trial of T steps; NaN from the step of a failure on."""
+
+    pose: Array  # (T, r)
+    covariance: Array  # (T, r, r), of the additive error
+    own: Array  # (T, r, r), of the filter's own error
+    nis: Array  # (T,)
+    nis_dof: Indices  # (T,)
+    step: int  # of the failure, or 0
+    code: int  # of REASONS, or 0
+    points: Array  # (n_landmarks, 3), landmarks in the world after the last step, NaN where none was seen
+    spread: Array  # (n_landmarks, 3, 3), and their covariances
+
+
+@inner
+def _find_known(data: Data, k: int, offset: Indices, work: Work[NamedTuple]) -> int:
+    """Observations of step k + 1 whose landmark is in the state, their offsets, and how many they are."""
+    m = 0
+    for i in range(data.first[k], data.first[k + 1]):
+        label = data.landmark[i]
+        if offset[label] >= 0:
+            work.known[m], work.label[m], work.at[m] = i, label, offset[label]
+            m += 1
+    return m
+
+
+@inner
+def _insert_new(slam: Slam, state: State, data: Data, k: int, local: Factors, work: Work[NamedTuple]) -> State:
+    """The state with the landmarks that step k + 1 sees for the first time."""
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    x, P, n, base, offset = state.x, state.P, state.n, state.base, state.offset
+    for i in range(data.first[k], data.first[k + 1]):
+        label = data.landmark[i]
+        if offset[label] < 0:
+            offset[label] = n
+            place(slam.point, slam, State(x, P, n, base, offset), k, label, data.z[i], work)
+            insert_error(slam.error, x[:r], x[n : n + w], work.Jp)
+            append_landmark(P, n, work.Jp, work.Jz, data.R[i])
+            if base > 0:
+                _append_factors(label, r, w, n, base, work.Jp, local)
+            n += w
+    return State(x, P, n, base, offset)
+
+
+@inner
+def _append_factors(label: int, r: int, w: int, n: int, base: int, Jp: Array, local: Factors) -> None:
+    """A new landmark at ``n`` of the active part."""
+    Phi = local.Phi
+    for a in range(w):
+        for j in range(base):
+            total = 0.0
+            for c in range(r):
+                total += Jp[a, c] * Phi[c, j]
+            Phi[n + a, j] = total
+    local.label[(n - r) // w] = label
+
+
+@inner
+def _step(
+    slam: Slam, state: State, data: Data, k: int, local: Factors, work: Work[NamedTuple]
+) -> tuple[State, int, int, float]:
+    """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, and the NIS."""
+    predict(slam.update, slam, state, k, data.controls[k], local.Phi, work)
+    m, nis = _find_known(data, k, state.offset, work), np.nan
+    if m > 0:
+        code, nis = correct(slam.update, slam, state, data, k, m, local, work)
+        if code > 0:
+            return state, code, 0, nis
+    state = _insert_new(slam, state, data, k, local, work)
+    return state, 0 if np.isfinite(state.x[: state.n].sum()) else NOT_FINITE, m, nis
+
+
+@inner
+def _most_seen(first: Indices) -> int:
+    most = 0
+    for k in range(len(first) - 1):
+        most = max(most, first[k + 1] - first[k])
+    return most
+
+
+@inner
+def _map(slam: Slam, state: State, points: Array, spread: Array) -> None:
+    """Positions of the landmarks in the world, and covariances of their additive errors."""
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    pose, D, block = state.x[:r], np.empty((3, r + w)), np.empty((r + w, r + w))
+    frame = robot_frame(slam.motion, pose)
+    for label in range(len(points)):
+        o = state.offset[label]
+        if o >= 0:
+            values = state.x[o : o + w]
+            world_point(slam.landmark, frame, values, points[label], D[:, :r], D[:, r:])
+            to_error(slam.error, pose, values, D[:, :r], D[:, r:])
+            for i in range(r + w):
+                for j in range(i, r + w):
+                    p, q = i if i < r else o + i - r, j if j < r else o + j - r
+                    block[i, j] = block[j, i] = state.P[p, q]
+            for i in range(3):
+                for j in range(3):
+                    total = 0.0
+                    for a in range(r + w):
+                        for b in range(r + w):
+                            total += D[i, a] * block[a, b] * D[j, b]
+                    spread[label, i, j] = total
+
+
+class Memory(NamedTuple):
+    """All arrays of a trial."""
+
+    x: Array
+    P: Array
+    active: Indices  # (n_landmarks,) offset of each landmark in the active part, or -1
+    home: Indices  # and in the whole state
+
+
+def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
+    """Filter a whole trial whose state grows to at most ``size`` variables."""
+    slam, data = lend(own_slam), lend(own_data)
+    T, r, w = len(data.controls), robot_width(slam.motion), landmark_width(slam.landmark)
+    own_memory = Memory(
+        np.zeros(size), np.zeros((size, size)), np.full(data.n_landmarks, -1), np.full(data.n_landmarks, -1)
+    )
+    own_work = make_work(slam, size, _most_seen(data.first))
+    own_local = make_local(slam.covariance, r, w, size)
+    out = _empty_outcome(T, r, data.n_landmarks)
+    memory, work, local, said = lend(own_memory), lend(own_work), lend(own_local), lend(out)
+    step, code = _run(slam, data, memory, local, work, said)
+    keep((own_slam, own_data, own_memory, own_work, own_local))
+    return Outcome(out.pose, out.covariance, out.own, out.nis, out.nis_dof, step, code, out.points, out.spread)
+
+
+@inner
+def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
+    return Outcome(
+        np.full((T, r), np.nan),
+        np.full((T, r, r), np.nan),
+        np.full((T, r, r), np.nan),
+        np.full(T, np.nan),
+        np.zeros(T, np.int64),
+        0,
+        0,
+        np.full((n_landmarks, 3), np.nan),
+        np.full((n_landmarks, 3, 3), np.nan),
+    )
+
+
+@inner
+def _run(
+    slam: Slam, data: Data, memory: Memory, local: Factors, work: Work[NamedTuple], out: Outcome
+) -> tuple[int, int]:
+    """``out`` <- all steps of a trial; step and code of a failure, or zeros."""
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    copy(data.start, memory.x[:r])
+    whole = State(memory.x, memory.P, r, 0, memory.home)
+    state = State(memory.x, memory.P, r, 0, memory.active)  # of a step: the whole, unless it has a base
+    full_rank = False
+    for k in range(len(data.controls)):
+        labels = data.landmark[data.first[k] : data.first[k + 1]]
+        state = prepare(slam.covariance, slam, whole, state, labels, local)
+        state, code, m, nis = _step(slam, state, data, k, local, work)
+        if m > 0:
+            out.nis[k], out.nis_dof[k] = nis, OBSERVED * m
+        if code == 0:
+            rank = _keep_pose(slam, state, k, out, work)
+            if rank < 0 or (full_rank and rank == 0):
+                code = POSE
+                fill(out.pose[k], np.nan)
+                fill_matrix(out.covariance[k], np.nan)
+                fill_matrix(out.own[k], np.nan)
+            full_rank = full_rank or rank == 1
+        if code > 0:
+            return k + 1, code
+        n = whole.n
+        for label in labels:
+            if memory.home[label] < 0:
+                memory.home[label] = n
+                n += w
+        whole = State(memory.x, memory.P, n, 0, memory.home)
+    settle(slam.covariance, slam, whole, state, local)
+    _map(slam, whole, out.points, out.spread)
+    return 0, 0
+
+
+@inner
+def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedTuple]) -> int:
+    """Estimate of step k + 1; returns the rank of its covariance as ``definiteness`` says it."""
+    r = robot_width(slam.motion)
+    copy_matrix(state.P[:r, :r], out.own[k])
+    copy(state.x[:r], out.pose[k])
+    pose_covariance(slam.error, out.pose[k], out.own[k], out.covariance[k])
+    return definiteness_with(out.covariance[k], work.small)
+
+
+trial_kernel = Kernel(run_trial)

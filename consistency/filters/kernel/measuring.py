@@ -1,0 +1,78 @@
+"""From pose and landmark through the mounted sensor to the observation, and back: what all filters do alike."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.filters.kernel.jit import inner
+from consistency.filters.kernel.slam import (
+    OBSERVED,
+    Frame,
+    Slam,
+    Triple,
+    expands,
+    insert,
+    landmark_point,
+    locate,
+    locate_jacobian,
+    look,
+    measure,
+    measure_jacobian,
+    observation_point,
+    pull_back,
+    robot_frame,
+)
+from consistency.filters.kernel.work import Work
+from consistency.models import point
+from consistency.types import Array
+
+
+@inner
+def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
+    """z (3,) <- h."""
+    bx, by, bz = look(slam.landmark, frame, values)
+    cx, cy, cz = point.to_sensor(bx, by, bz, slam.sensor.mount)
+    z[0], z[1], z[2] = measure(slam.sensor, cx, cy, cz)
+
+
+@inner
+def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, Hl: Array) -> None:
+    """z (3,), Hp (3, r), Hl (3, w) <- h and its Jacobians with respect to the variables of robot and landmark."""
+    body = look(slam.landmark, frame, values)
+    mount = slam.sensor.mount
+    cx, cy, cz = point.to_sensor(body[0], body[1], body[2], mount)
+    z[0], z[1], z[2] = measure(slam.sensor, cx, cy, cz)
+    J = measure_jacobian(slam.sensor, cx, cy, cz)
+    for i in range(OBSERVED):
+        j0, j1, j2 = J[3 * i], J[3 * i + 1], J[3 * i + 2]
+        row: Triple = (
+            j0 * mount.xx + j1 * mount.xy + j2 * mount.xz,
+            j0 * mount.yx + j1 * mount.yy + j2 * mount.yz,
+            j0 * mount.zx + j1 * mount.zy + j2 * mount.zz,
+        )
+        pull_back(slam.landmark, frame, values, body, row, Hp[i], Hl[i])
+
+
+@inner
+def linearise(slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array) -> None:
+    """z (3,) <- h expected of (pose, values) in step k + 1; Hp (3, r), Hl (3, w) <- Jacobians at the chosen point."""
+    at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label)
+    linearise_at(slam, robot_frame(slam.motion, at), landmark, z, Hp, Hl)
+    if expands(slam.point):
+        for i in range(OBSERVED):
+            for j in range(len(pose)):
+                z[i] += Hp[i, j] * (pose[j] - at[j]) + Hl[i, j] * (values[j] - landmark[j])
+
+
+@inner
+def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[NamedTuple]) -> None:
+    """values (w,), ``work.Jp``, ``work.Jz`` <- the inverse of h at ``pose``, and its Jacobians."""
+    mount, Jb = slam.sensor.mount, work.Jb
+    cx, cy, cz = locate(slam.sensor, z[0], z[1], z[2])
+    body = point.from_sensor(cx, cy, cz, mount)
+    J = locate_jacobian(slam.sensor, z[0], z[1], z[2])
+    for j in range(OBSERVED):
+        Jb[0, j] = mount.xx * J[j] + mount.xy * J[3 + j] + mount.xz * J[6 + j]
+        Jb[1, j] = mount.yx * J[j] + mount.yy * J[3 + j] + mount.yz * J[6 + j]
+        Jb[2, j] = mount.zx * J[j] + mount.zy * J[3 + j] + mount.zz * J[6 + j]
+    insert(slam.landmark, robot_frame(slam.motion, pose), body, Jb, mount, values, work.Jp, work.Jz)

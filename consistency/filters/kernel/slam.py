@@ -1,0 +1,310 @@
+"""What a filter is made of, and the functions that its parts must provide.
+
+The loop and the shared steps call nothing but these. ``generic(n)`` is decided by the types of the first n
+arguments; pose, landmark and covariance arrays are written in place where a docstring says ``<-``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from consistency.filters.kernel.dispatch import generic
+from consistency.filters.kernel.local_state import Factors
+from consistency.models.point import Mounting
+from consistency.types import Array, Indices
+
+OBSERVED = 3  # numbers of an observation, as in the columns z0, z1, z2 of every file
+
+Triple = tuple[float, float, float]
+Nine = tuple[float, float, float, float, float, float, float, float, float]
+
+
+class Sensor(Protocol):
+    """A part that measures points in its own frame."""
+
+    @property
+    def mount(self) -> Mounting: ...
+
+
+class Slam(NamedTuple):
+    """The parts of a filter; the type of each chooses its code."""
+
+    motion: NamedTuple
+    sensor: Sensor
+    landmark: NamedTuple
+    error: NamedTuple
+    point: NamedTuple
+    update: NamedTuple
+    covariance: NamedTuple
+
+
+class Data(NamedTuple):
+    """A trial as kernels take it: T steps, M observations."""
+
+    controls: Array  # (T, 3): dt, v, omega
+    first: Indices  # (T + 1,)
+    landmark: Indices  # (M,)
+    z: Array  # (M, 3)
+    R: Array  # (M, 3, 3), noise of each observation
+    start: Array  # (r,), known exactly
+    n_landmarks: int
+
+
+class State(NamedTuple):
+    """The variables that a step works on: all of them, or the active part under local updating.
+
+    The robot comes first, then landmarks in the order in which they came. One half of P is valid, and the block of
+    the robot (``covariance``).
+    """
+
+    x: Array  # (>= n,)
+    P: Array  # (>= n, >= n)
+    n: int
+    base: int  # variables of the base, 0 unless updating is local
+    offset: Indices  # (n_landmarks,) of each landmark in x, or -1
+
+
+class Frame(NamedTuple):
+    """A planar robot: its position in m, cosine and sine of its heading."""
+
+    x: float
+    y: float
+    c: float
+    s: float
+
+
+# --- motion ----------------------------------------------------------------------------------------
+
+
+@generic()
+def robot_width(motion: NamedTuple) -> int:
+    """Number r of variables of the robot; a constant."""
+    raise NotImplementedError
+
+
+@generic()
+def move(motion: NamedTuple, pose: Array, u: Array, out: Array) -> None:
+    """``out`` (r,) <- f of ``pose`` (r,) under the control ``u`` (dt, v, omega), without noise."""
+    raise NotImplementedError
+
+
+@generic()
+def move_about(motion: NamedTuple, at: Array, u: Array, pose: Array) -> None:
+    """``pose`` (r,) <- f(at) + F (pose - at), f to first order about ``at`` (r,)."""
+    raise NotImplementedError
+
+
+@generic()
+def carry(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
+    """P <- F P F' and Phi <- F Phi with F the Jacobian of f at ``at``; of P the rows of the robot and its block."""
+    raise NotImplementedError
+
+
+@generic()
+def add_motion_noise(motion: NamedTuple, at: Array, u: Array, P: Array) -> None:
+    """Block of the robot in P += G Q G' at ``at``."""
+    raise NotImplementedError
+
+
+@generic()
+def noise_columns(motion: NamedTuple, at: Array, u: Array, G: Array) -> int:
+    """Columns of ``G`` (r, >= q) <- G Q^(1/2) at ``at``; returns q."""
+    raise NotImplementedError
+
+
+@generic()
+def robot_frame(motion: NamedTuple, pose: Array) -> Frame:
+    """What landmarks need to know of a pose (r,)."""
+    raise NotImplementedError
+
+
+@generic()
+def carry_root(motion: NamedTuple, P: Array, first: int, last: int, C: Array, F: Array) -> None:
+    """Columns first..last-1 of the robot's rows: P <- F C^-1 P for a lower root C (r, r); a zero pivot carries 0."""
+    raise NotImplementedError
+
+
+# --- sensor ----------------------------------------------------------------------------------------
+
+
+@generic()
+def measure(sensor: Sensor, x: float, y: float, z: float) -> Triple:
+    """Observation of a point in the frame of the sensor, in m."""
+    raise NotImplementedError
+
+
+@generic()
+def measure_jacobian(sensor: Sensor, x: float, y: float, z: float) -> Nine:
+    """Jacobian of :func:`measure` by rows."""
+    raise NotImplementedError
+
+
+@generic()
+def locate(sensor: Sensor, z0: float, z1: float, z2: float) -> Triple:
+    """Inverse of :func:`measure`."""
+    raise NotImplementedError
+
+
+@generic()
+def locate_jacobian(sensor: Sensor, z0: float, z1: float, z2: float) -> Nine:
+    """Jacobian of :func:`locate` by rows."""
+    raise NotImplementedError
+
+
+# --- landmark --------------------------------------------------------------------------------------
+
+
+@generic()
+def landmark_width(landmark: NamedTuple) -> int:
+    """Number w of variables of a landmark; a constant."""
+    raise NotImplementedError
+
+
+@generic()
+def look(landmark: NamedTuple, frame: Frame, values: Array) -> Triple:
+    """The landmark ``values`` (w,) in the frame of the robot, in m."""
+    raise NotImplementedError
+
+
+@generic()
+def pull_back(
+    landmark: NamedTuple, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
+) -> None:
+    """Rows ``Hp`` (r,) and ``Hl`` (w,) <- a ``row`` d / d(point in the robot frame) through :func:`look`.
+
+    ``body`` is what :func:`look` gave.
+    """
+    raise NotImplementedError
+
+
+@generic()
+def insert(
+    landmark: NamedTuple, frame: Frame, body: Triple, Jb: Array, mount: Mounting, values: Array, Jp: Array, Jz: Array
+) -> None:
+    """``values`` (w,) <- a new landmark seen at ``body`` in the robot frame; Jacobians (w, r) and (w, 3).
+
+    ``Jb`` (3, 3) is d body / d observation; ``mount`` tells from where it was seen.
+    """
+    raise NotImplementedError
+
+
+@generic()
+def world_point(landmark: NamedTuple, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array) -> None:
+    """``point`` (3,) <- position in the world, m, with Jacobians (3, r) and (3, w)."""
+    raise NotImplementedError
+
+
+@generic()
+def combine(landmark: NamedTuple, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
+    """``out`` (3, width) <- H P of the i-th seen landmark, from ``rows`` (r + w m, width) of P."""
+    raise NotImplementedError
+
+
+# --- error -----------------------------------------------------------------------------------------
+
+
+@generic()
+def propagate(error: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
+    """x, P, Phi <- one step of motion; the Jacobians are those that the linearisation point asks for."""
+    raise NotImplementedError
+
+
+@generic()
+def to_error(error: NamedTuple, pose: Array, values: Array, Hp: Array, Hl: Array) -> None:
+    """Jacobians with respect to variables -> with respect to this error, in place: rows of ``Hp`` and ``Hl``."""
+    raise NotImplementedError
+
+
+@generic()
+def insert_error(error: NamedTuple, pose: Array, values: Array, Jp: Array) -> None:
+    """Jacobian (w, r) of a new landmark's variables by those of the robot -> between their errors, in place."""
+    raise NotImplementedError
+
+
+@generic()
+def retract(error: NamedTuple, slam: Slam, state: State, A: Array, y: Array, work: NamedTuple) -> None:
+    """x <- x moved by the error A' y, A (k, n) and y (k,)."""
+    raise NotImplementedError
+
+
+@generic()
+def pose_covariance(error: NamedTuple, x: Array, P: Array, out: Array) -> None:
+    """``out`` (r, r) <- covariance of the additive error of the robot from that of this error, P (r, r)."""
+    raise NotImplementedError
+
+
+# --- linearisation point -----------------------------------------------------------------------------
+
+
+@generic()
+def expands(point: NamedTuple) -> bool:
+    """Whether f and h are replaced by their first-order expansion about the point; a constant."""
+    raise NotImplementedError
+
+
+@generic()
+def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
+    """Pose (r,) at which f of step k + 1 is linearised."""
+    raise NotImplementedError
+
+
+@generic()
+def observation_point(point: NamedTuple, pose: Array, k: int) -> Array:
+    """Pose (r,) at which h of step k + 1 is linearised."""
+    raise NotImplementedError
+
+
+@generic()
+def landmark_point(point: NamedTuple, values: Array, label: int) -> Array:
+    """Landmark (w,) at which h is linearised."""
+    raise NotImplementedError
+
+
+@generic()
+def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Array, work: NamedTuple) -> None:
+    """x[n:n + w], ``work.Jp`` and ``work.Jz`` <- the inverse of h for a new landmark, and its Jacobians."""
+    raise NotImplementedError
+
+
+# --- update ----------------------------------------------------------------------------------------
+
+
+@generic()
+def make_room(update: NamedTuple, r: int, w: int, m: int) -> NamedTuple:
+    """Arrays of this update for up to ``m`` landmarks in a step."""
+    raise NotImplementedError
+
+
+@generic()
+def predict(update: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
+    """x, P, Phi <- one step of motion."""
+    raise NotImplementedError
+
+
+@generic()
+def correct(
+    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: NamedTuple
+) -> tuple[int, float]:
+    """x, P <- the joint update with the ``m`` landmarks in ``work``; returns a code of REASONS or 0, and the NIS."""
+    raise NotImplementedError
+
+
+# --- upkeep of the covariance --------------------------------------------------------------------------
+
+
+@generic()
+def make_local(covariance: NamedTuple, r: int, w: int, n: int) -> Factors:
+    """Factors for a state of up to ``n`` variables; empty where updating is dense."""
+    raise NotImplementedError
+
+
+@generic()
+def prepare(covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+    """The variables that a step works on in which ``labels`` are seen."""
+    raise NotImplementedError
+
+
+@generic()
+def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: Factors) -> None:
+    """``whole`` <- what is known of all variables."""
+    raise NotImplementedError

@@ -1,0 +1,84 @@
+"""A point in world coordinates, x, y, z in m, seen from a planar robot: Herath et al. (2007) eq. 19."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.filters.kernel.arrays import copy, fill_matrix
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.slam import (
+    Frame,
+    Triple,
+    combine,
+    insert,
+    landmark_width,
+    look,
+    pull_back,
+    world_point,
+)
+from consistency.models import point
+from consistency.models.point import Mounting
+from consistency.types import Array
+
+
+@part()
+class WorldPoint(NamedTuple):
+    """No parameters."""
+
+
+@implement(landmark_width, WorldPoint)
+def world_point_width(landmark: WorldPoint) -> int:
+    return 3
+
+
+@implement(look, WorldPoint)
+def look_at_world_point(landmark: WorldPoint, frame: Frame, values: Array) -> Triple:
+    return point.turned_to_robot(frame.x, frame.y, frame.c, frame.s, values[0], values[1], values[2])
+
+
+@implement(pull_back, WorldPoint)
+def pull_back_to_world_point(
+    landmark: WorldPoint, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
+) -> None:
+    c, s, d0, d1, d2 = frame.c, frame.s, row[0], row[1], row[2]
+    Hl[0], Hl[1], Hl[2] = c * d0 - s * d1, s * d0 + c * d1, d2
+    Hp[0], Hp[1], Hp[2] = -Hl[0], -Hl[1], d0 * body[1] - d1 * body[0]
+
+
+@implement(insert, WorldPoint)
+def insert_world_point(
+    landmark: WorldPoint,
+    frame: Frame,
+    body: Triple,
+    Jb: Array,
+    mount: Mounting,
+    values: Array,
+    Jp: Array,
+    Jz: Array,
+) -> None:
+    c, s, bx, by = frame.c, frame.s, body[0], body[1]
+    values[0], values[1], values[2] = point.turned_to_world(frame.x, frame.y, c, s, bx, by, body[2])
+    fill_matrix(Jp, 0.0)
+    Jp[0, 0] = Jp[1, 1] = 1.0
+    Jp[0, 2], Jp[1, 2] = -s * bx - c * by, c * bx - s * by
+    for j in range(3):
+        Jz[0, j], Jz[1, j], Jz[2, j] = c * Jb[0, j] - s * Jb[1, j], s * Jb[0, j] + c * Jb[1, j], Jb[2, j]
+
+
+@implement(world_point, WorldPoint)
+def world_point_itself(landmark: WorldPoint, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array) -> None:
+    copy(values, point)
+    fill_matrix(Dp, 0.0)
+    fill_matrix(Dl, 0.0)
+    Dl[0, 0] = Dl[1, 1] = Dl[2, 2] = 1.0
+
+
+@implement(combine, WorldPoint)
+def combine_world_point(landmark: WorldPoint, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
+    p0, p1, p2 = rows[0], rows[1], rows[2]
+    l0, l1, l2 = rows[3 * i + 3], rows[3 * i + 4], rows[3 * i + 5]
+    for a in range(3):
+        row = out[a]
+        g0, g1, g2, h0, h1, h2 = Hp[a, 0], Hp[a, 1], Hp[a, 2], Hl[a, 0], Hl[a, 1], Hl[a, 2]
+        for j in range(len(row)):
+            row[j] = g0 * p0[j] + g1 * p1[j] + g2 * p2[j] + h0 * l0[j] + h1 * l1[j] + h2 * l2[j]

@@ -1,0 +1,1 @@
+"""How the robot moves: f, its Jacobian and its noise, one file for each motion model."""

@@ -1,0 +1,115 @@
+"""Differential drive, Herath, Kodagoda & Dissanayake (2007) eq. 18: pose (x, y, heading), noise on v and omega."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.jit import inner
+from consistency.filters.kernel.slam import (
+    Frame,
+    add_motion_noise,
+    carry,
+    carry_root,
+    move,
+    move_about,
+    noise_columns,
+    robot_frame,
+    robot_width,
+)
+from consistency.models.motion import unicycle, unicycle_jacobian, unicycle_noise
+from consistency.types import Array
+
+
+@part()
+class Unicycle(NamedTuple):
+    """Standard deviations of v (m/s) and omega (rad/s), as the filter believes them."""
+
+    sigma_v: float
+    sigma_omega: float
+
+
+@implement(robot_width, Unicycle)
+def unicycle_width(motion: Unicycle) -> int:
+    return 3
+
+
+@implement(move, Unicycle)
+def move_unicycle(motion: Unicycle, pose: Array, u: Array, out: Array) -> None:
+    out[0], out[1], out[2] = unicycle(pose[0], pose[1], pose[2], u[0], u[1], u[2])
+
+
+@implement(move_about, Unicycle)
+def move_unicycle_about(motion: Unicycle, at: Array, u: Array, pose: Array) -> None:
+    fx, fy = unicycle_jacobian(at[2], u[0], u[1])
+    x, y, heading = unicycle(at[0], at[1], at[2], u[0], u[1], u[2])
+    turn = pose[2] - at[2]
+    pose[0] = x + (pose[0] - at[0]) + fx * turn
+    pose[1] = y + (pose[1] - at[1]) + fy * turn
+    pose[2] = heading + turn
+
+
+@implement(carry, Unicycle)
+def carry_unicycle(motion: Unicycle, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
+    fx, fy = unicycle_jacobian(at[2], u[0], u[1])
+    _move_rows(P, n, fx, fy)
+    for i in range(3):
+        P[i, 0] += fx * P[i, 2]
+        P[i, 1] += fy * P[i, 2]
+    _move_rows(Phi, base, fx, fy)
+
+
+@inner
+def _move_rows(P: Array, n: int, fx: float, fy: float) -> None:
+    """P <- F P where F is the identity but for F[0, 2] = fx and F[1, 2] = fy."""
+    p0, p1, p2 = P[0], P[1], P[2]
+    for j in range(n):
+        p0[j] += fx * p2[j]
+        p1[j] += fy * p2[j]
+
+
+@implement(add_motion_noise, Unicycle)
+def add_unicycle_noise(motion: Unicycle, at: Array, u: Array, P: Array) -> None:
+    xx, xy, yy, hh = unicycle_noise(at[2], u[0], motion.sigma_v, motion.sigma_omega)
+    P[0, 0] += xx
+    P[0, 1] += xy
+    P[1, 0] += xy
+    P[1, 1] += yy
+    P[2, 2] += hh
+
+
+@implement(noise_columns, Unicycle)
+def unicycle_noise_columns(motion: Unicycle, at: Array, u: Array, G: Array) -> int:
+    along, turn = u[0] * motion.sigma_v, u[0] * motion.sigma_omega
+    G[0, 0], G[1, 0], G[2, 0] = along * np.cos(at[2]), along * np.sin(at[2]), 0.0
+    G[0, 1], G[1, 1], G[2, 1] = 0.0, 0.0, turn
+    return 2
+
+
+@implement(robot_frame, Unicycle)
+def unicycle_frame(motion: Unicycle, pose: Array) -> Frame:
+    return Frame(pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]))
+
+
+@implement(carry_root, Unicycle)
+def carry_unicycle_root(motion: Unicycle, P: Array, first: int, last: int, C: Array, F: Array) -> None:
+    i0, i1, i2 = _reciprocal(C[0, 0]), _reciprocal(C[1, 1]), _reciprocal(C[2, 2])
+    c10, c20, c21 = C[1, 0], C[2, 0], C[2, 1]
+    f00, f01, f02 = F[0, 0], F[0, 1], F[0, 2]
+    f10, f11, f12 = F[1, 0], F[1, 1], F[1, 2]
+    f20, f21, f22 = F[2, 0], F[2, 1], F[2, 2]
+    p0, p1, p2 = P[0], P[1], P[2]
+    for j in range(first, last):
+        g0 = p0[j] * i0
+        g1 = (p1[j] - c10 * g0) * i1
+        g2 = (p2[j] - c20 * g0 - c21 * g1) * i2
+        p0[j] = f00 * g0 + f01 * g1 + f02 * g2
+        p1[j] = f10 * g0 + f11 * g1 + f12 * g2
+        p2[j] = f20 * g0 + f21 * g1 + f22 * g2
+
+
+@inner
+def _reciprocal(pivot: float) -> float:
+    return 0.0 if pivot == 0.0 else 1.0 / pivot

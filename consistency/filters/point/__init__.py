@@ -1,0 +1,1 @@
+"""Where f and h are linearised."""

@@ -1,0 +1,68 @@
+"""f and h to first order about a known reference: the Kalman filter of a linear world, Herath et al. (2007) eq. 1-8."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.filters.kernel.arrays import copy_matrix
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.measuring import linearise_at
+from consistency.filters.kernel.slam import (
+    Slam,
+    State,
+    expands,
+    landmark_point,
+    motion_point,
+    observation_point,
+    place,
+    robot_frame,
+    robot_width,
+)
+from consistency.filters.kernel.work import Work
+from consistency.types import Array
+
+
+@part(sensor="Xyz", landmark="WorldPoint", error="Additive", update="Joint")
+class Reference(NamedTuple):
+    """Where the world is linearised."""
+
+    path: Array  # (T + 1, r)
+    landmarks: Array  # (n_landmarks, w)
+
+
+@implement(expands, Reference)
+def reference_is_expanded(point: Reference) -> bool:
+    return True
+
+
+@implement(motion_point, Reference)
+def motion_at_reference(point: Reference, pose: Array, k: int) -> Array:
+    return point.path[k]
+
+
+@implement(observation_point, Reference)
+def observation_at_reference(point: Reference, pose: Array, k: int) -> Array:
+    return point.path[k + 1]
+
+
+@implement(landmark_point, Reference)
+def landmark_at_reference(point: Reference, values: Array, label: int) -> Array:
+    return point.landmarks[label]
+
+
+@implement(place, Reference)
+def place_about_reference(
+    point: Reference, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+) -> None:
+    pose, landmark, n = point.path[k + 1], point.landmarks[label], state.n
+    r = robot_width(slam.motion)
+    z0, Hp, Hl = np.empty(3), np.empty((3, r)), np.empty((3, len(landmark)))
+    linearise_at(slam, robot_frame(slam.motion, pose), landmark, z0, Hp, Hl)
+    copy_matrix(np.linalg.inv(Hl), work.Jz)
+    copy_matrix(-np.dot(work.Jz, Hp), work.Jp)
+    for i in range(len(landmark)):
+        state.x[n + i] = landmark[i]
+        for j in range(3):
+            state.x[n + i] += work.Jz[i, j] * (z[j] - z0[j]) + work.Jp[i, j] * (state.x[j] - pose[j])

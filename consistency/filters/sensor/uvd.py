@@ -1,0 +1,39 @@
+"""Rectified stereo (u, v, disparity) in px, Herath et al. (2007) eq. 21 and 22."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.slam import Nine, Triple, locate, locate_jacobian, measure, measure_jacobian
+from consistency.models import stereo
+from consistency.models.point import Mounting
+
+
+@part()
+class Uvd(NamedTuple):
+    """Focal length in px, baseline in m, and where the sensor is mounted."""
+
+    f: float
+    B: float
+    mount: Mounting
+
+
+@implement(measure, Uvd)
+def measure_uvd(sensor: Uvd, x: float, y: float, z: float) -> Triple:
+    return stereo.project(x, y, z, sensor.f, sensor.B)
+
+
+@implement(measure_jacobian, Uvd)
+def measure_uvd_jacobian(sensor: Uvd, x: float, y: float, z: float) -> Nine:
+    return stereo.project_jacobian(x, y, z, sensor.f, sensor.B)
+
+
+@implement(locate, Uvd)
+def locate_uvd(sensor: Uvd, z0: float, z1: float, z2: float) -> Triple:
+    return stereo.triangulate(z0, z1, z2, sensor.f, sensor.B)
+
+
+@implement(locate_jacobian, Uvd)
+def locate_uvd_jacobian(sensor: Uvd, z0: float, z1: float, z2: float) -> Nine:
+    return stereo.triangulate_jacobian(z0, z1, z2, sensor.f, sensor.B)

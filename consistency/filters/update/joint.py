@@ -1,0 +1,45 @@
+"""One joint update with all landmarks seen in a step, Herath et al. (2007) eq. 9-13."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, whiten
+from consistency.filters.kernel.local_state import Factors
+from consistency.filters.kernel.slam import Data, Slam, State, correct, make_room, predict, propagate
+from consistency.filters.kernel.work import Work
+from consistency.types import Array
+
+
+@part()
+class Joint(NamedTuple):
+    """No parameters."""
+
+
+class NoRoom(NamedTuple):
+    """No arrays."""
+
+
+@implement(make_room, Joint)
+def joint_room(update: Joint, r: int, w: int, m: int) -> NoRoom:
+    return NoRoom()
+
+
+@implement(predict, Joint)
+def predict_joint(update: Joint, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NoRoom]) -> None:
+    propagate(slam.error, slam, state, k, u, Phi, work)
+
+
+@implement(correct, Joint)
+def correct_joint(
+    update: Joint, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NoRoom]
+) -> tuple[int, float]:
+    gather(slam, state, m, local, work)
+    linearise_seen(slam, state, k, m, work)
+    combine_seen(slam, state, m, work)
+    innovate(state, data, m, work)
+    code, nis = whiten(state, data, m, work)
+    if code == 0:
+        apply(slam, state, m, local, work)
+    return code, nis

@@ -1,0 +1,30 @@
+"""Every step works on the whole state."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.local_state import Factors, make_factors
+from consistency.filters.kernel.slam import Slam, State, make_local, prepare, settle
+from consistency.types import Indices
+
+
+@part()
+class Dense(NamedTuple):
+    """No parameters."""
+
+
+@implement(make_local, Dense)
+def make_no_factors(covariance: Dense, r: int, w: int, n: int) -> Factors:
+    return make_factors(r, r, 1)
+
+
+@implement(prepare, Dense)
+def prepare_all(covariance: Dense, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+    return state
+
+
+@implement(settle, Dense)
+def settle_nothing(covariance: Dense, slam: Slam, whole: State, state: State, local: Factors) -> None:
+    pass

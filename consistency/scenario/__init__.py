@@ -1,0 +1,79 @@
+"""Scenarios: a TOML file becomes a frozen record of what is true and what the filter believes.
+
+``tables`` reads files, ``sensor`` has the one definition of a sensor, ``truth`` and ``belief`` the two halves of a
+scenario, ``record`` puts them together. ``effects`` holds what a sensor does to an ideal observation, one effect a
+file: its keys and its ``apply``. Nothing here draws a trial; that is the simulation's.
+"""
+
+from consistency.scenario.belief import Belief, BelievedMotion, SigmaPoints
+from consistency.scenario.record import Scenario, data_folder, load_scenario, scenario_names
+from consistency.scenario.sensor import (
+    BelievedSensor,
+    LinearSensor,
+    Mount,
+    PicturedSensor,
+    TrueSensor,
+    UvdSensor,
+    XyzSensor,
+)
+from consistency.scenario.tables import (
+    Count,
+    Finite,
+    Interval,
+    NonNegative,
+    Positive,
+    Sigmas,
+    Table,
+    Triple,
+    explain,
+    read_table,
+)
+from consistency.scenario.truth import (
+    Circle,
+    Corridor,
+    FigureOfEight,
+    ListedLandmarks,
+    Path_,
+    RoundedRectangle,
+    TrueMotion,
+    Truth,
+    UniformLandmarks,
+    Waypoints,
+)
+
+__all__ = [
+    "Belief",
+    "BelievedMotion",
+    "BelievedSensor",
+    "Circle",
+    "Corridor",
+    "Count",
+    "FigureOfEight",
+    "Finite",
+    "Interval",
+    "LinearSensor",
+    "ListedLandmarks",
+    "Mount",
+    "NonNegative",
+    "Path_",
+    "PicturedSensor",
+    "Positive",
+    "RoundedRectangle",
+    "Scenario",
+    "SigmaPoints",
+    "Sigmas",
+    "Table",
+    "Triple",
+    "TrueMotion",
+    "TrueSensor",
+    "Truth",
+    "UniformLandmarks",
+    "UvdSensor",
+    "Waypoints",
+    "XyzSensor",
+    "data_folder",
+    "explain",
+    "load_scenario",
+    "read_table",
+    "scenario_names",
+]

@@ -1,0 +1,27 @@
+"""The noise of a sensor: Gaussian, independent, of one standard deviation for each value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from consistency.scenario.effects.observations import Context, Observations
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Adds ``sigma`` times a standard normal number to each value."""
+
+    label: ClassVar[str] = "noise"
+    draws: ClassVar[bool] = True
+
+    sigma: tuple[float, float, float]  # px for uvd, m otherwise
+
+    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+        """All rows, with noise."""
+        z = rng.standard_normal((len(observations), 3))
+        z *= self.sigma
+        z += observations.z
+        return observations.with_z(z)

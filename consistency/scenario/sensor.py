@@ -1,0 +1,172 @@
+"""The one definition of a sensor: what its truth, a filter's belief and the file of a log say of it.
+
+Each key is declared once. ``Sensor`` has what all of them share, ``StereoSensor`` adds the baseline and ``ImageSensor``
+the image. ``BelievedSensor`` is what a filter is told, ``PicturedSensor`` what ``sensor.toml`` of a log says,
+``TrueSensor`` what the world has: it adds how far the sensor sees, and its effects.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    Field,
+    SerializeAsAny,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+
+from consistency.geometry import rotation
+from consistency.models.point import Mounting
+from consistency.scenario.effects import BUILT_IN, ListedEffect
+from consistency.scenario.tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
+
+
+class Mount(Table):
+    """Pose of the sensor in the robot frame; zero is the robot's origin, looking along +x."""
+
+    position: Triple = (0.0, 0.0, 0.0)
+    rotation: Triple = (0.0, 0.0, 0.0)  # roll, pitch, heading
+
+    def packed(self) -> Mounting:
+        """Position and rotation matrix, as the models take it."""
+        return Mounting(*self.position, *(float(entry) for entry in rotation(*self.rotation).ravel()))
+
+
+class Sensor(Table):
+    """What is measured, with which noise and focal length, and from where on the robot."""
+
+    model: Literal["xyz", "uvd", "linear"]
+    sigma: Sigmas  # px for uvd, m otherwise
+    f: Positive | None = None  # px
+    mount: Mount = Mount()
+
+
+class StereoSensor(Sensor):
+    """A sensor that may have a baseline."""
+
+    B: Positive | None = None  # m
+
+
+class ImageSensor(Sensor):
+    """A sensor that may have an image."""
+
+    image: tuple[Count, Count] | None = None  # width, height in px
+    principal_point: tuple[Finite, Finite] | None = None  # column, row in px; the image centre if left out
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Principal point in image columns and rows."""
+        if self.principal_point is not None:
+            return self.principal_point
+        assert self.image is not None
+        return self.image[0] / 2.0, self.image[1] / 2.0
+
+
+class BelievedSensor(StereoSensor):
+    """Noise and calibration as the filter has them; f and B are needed for ``uvd``."""
+
+    @model_validator(mode="after")
+    def _rig(self) -> BelievedSensor:
+        if self.model == "uvd" and (self.f is None or self.B is None):
+            raise ValueError("a uvd sensor needs f (px) and B (m)")
+        return self
+
+
+class PicturedSensor(BelievedSensor, ImageSensor):
+    """A believed sensor with the image that its observations come from, as a log says it."""
+
+    def belief(self) -> BelievedSensor:
+        """What a filter believes of this sensor."""
+        return BelievedSensor.model_validate(self.model_dump(include=set(BelievedSensor.model_fields)))
+
+
+class TrueSensor(ImageSensor):
+    """A sensor as it is.
+
+    Its effects are, in this order: field of view, noise, the listed ``effects``, search range (``uvd``). A listed
+    effect whose class says ``before_noise`` is applied before the noise.
+    """
+
+    range: Interval  # m, distance from the sensor
+    effects: tuple[SerializeAsAny[ListedEffect], ...] = ()  # in the order in which they are applied
+
+    @field_validator("effects", mode="before")
+    @classmethod
+    def _is_a_list(cls, data: Any) -> Any:
+        if not isinstance(data, list | tuple):
+            raise ValueError("a list of tables, each of which begins with [[truth.sensor.effects]]")
+        return data
+
+    @property
+    def rig(self) -> tuple[float, float] | None:
+        """Focal length (px) and baseline (m) of a sensor that measures disparities."""
+        return None
+
+    @model_validator(mode="after")
+    def _consistent_view(self) -> TrueSensor:
+        if not 0 <= self.range[0] < self.range[1]:
+            raise ValueError("range must be [low, high] with 0 <= low < high")
+        if self.image is not None and self.f is None:
+            raise ValueError("image needs f, the focal length in pixels")
+        return self
+
+    @model_validator(mode="after")
+    def _effects_fit(self) -> TrueSensor:
+        taken = set(BUILT_IN)
+        for effect in self.effects:
+            if self.model not in effect.models:
+                raise ValueError(
+                    f"the effect '{effect.kind}' works on a sensor {' or '.join(effect.models)}, not '{self.model}'"
+                )
+            if effect.label in taken:
+                raise ValueError(
+                    f"the name '{effect.label}' of an effect is taken; give each a 'name' of its own, "
+                    "on which its random numbers depend"
+                )
+            taken.add(effect.label)
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_an_empty_list(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A sensor without listed effects has the content, and so the hash, of one that knows of none."""
+        content: dict[str, Any] = handler(self)
+        if not self.effects:
+            content.pop("effects", None)
+        return content
+
+
+class XyzSensor(TrueSensor):
+    """Eq. 19: a point in the sensor frame with Gaussian noise in m."""
+
+    model: Literal["xyz"]
+
+
+class LinearSensor(TrueSensor):
+    """Eq. 19 to first order about the planned path; what is seen is decided on the planned path."""
+
+    model: Literal["linear"]
+
+
+class UvdSensor(TrueSensor, StereoSensor):
+    """Eq. 20-22: stereo with Gaussian noise in px and a disparity search range."""
+
+    model: Literal["uvd"]
+    f: Positive
+    B: Positive
+    disparity: tuple[Positive, Positive]
+
+    @property
+    def rig(self) -> tuple[float, float]:
+        return self.f, self.B
+
+    @model_validator(mode="after")
+    def _search_range(self) -> UvdSensor:
+        if self.disparity[0] >= self.disparity[1]:
+            raise ValueError("disparity must be [low, high] with low < high")
+        return self
+
+
+TrueSensor_ = Annotated[XyzSensor | LinearSensor | UvdSensor, Field(discriminator="model")]

@@ -1,0 +1,125 @@
+"""What is the case: path, landmarks, motion and sensor of a world."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from consistency.scenario.sensor import TrueSensor_
+from consistency.scenario.tables import Count, Finite, Interval, NonNegative, Positive, Table, Triple
+
+
+class _Path(Table):
+    """Where the robot drives: it starts at ``start`` and repeats the shape until the steps are done."""
+
+    start: tuple[Finite, Finite]
+    heading: Finite
+    speed: Positive
+
+
+class Circle(_Path):
+    shape: Literal["circle"]
+    radius: Positive
+
+
+class RoundedRectangle(_Path):
+    shape: Literal["rounded-rectangle"]
+    length: Positive
+    width: Positive
+    corner_radius: Positive
+
+    @model_validator(mode="after")
+    def _fits(self) -> RoundedRectangle:
+        if 2 * self.corner_radius > min(self.length, self.width):
+            raise ValueError("corner_radius must be at most half of length and of width")
+        return self
+
+
+class FigureOfEight(_Path):
+    shape: Literal["figure-of-eight"]
+    radius: Positive
+
+
+class Corridor(_Path):
+    """Out along a straight line, a half turn of ``turn_radius``, and back."""
+
+    shape: Literal["corridor"]
+    length: Positive
+    turn_radius: Positive
+
+
+class Waypoints(_Path):
+    """Straight lines between points, turning on the spot; the last point leads back to ``start``."""
+
+    shape: Literal["waypoints"]
+    points: Annotated[list[tuple[Finite, Finite]], Field(min_length=1)]
+    turn_rate: Positive
+
+    @model_validator(mode="after")
+    def _leads_somewhere(self) -> Waypoints:
+        if all(point == self.start for point in self.points):
+            raise ValueError("points must hold a point other than start")
+        return self
+
+
+Path_ = Annotated[Circle | RoundedRectangle | FigureOfEight | Corridor | Waypoints, Field(discriminator="shape")]
+
+
+class UniformLandmarks(Table):
+    """``count`` landmarks drawn once, uniformly in a box, from ``seed``."""
+
+    layout: Literal["uniform"]
+    count: Count
+    seed: Annotated[int, Field(ge=0, strict=True)]
+    x: Interval
+    y: Interval
+    z: Interval
+
+    @model_validator(mode="after")
+    def _ordered(self) -> UniformLandmarks:
+        for key in ("x", "y", "z"):
+            low, high = getattr(self, key)
+            if low > high:
+                raise ValueError(f"{key} must be [low, high] with low <= high")
+        return self
+
+
+class ListedLandmarks(Table):
+    layout: Literal["listed"]
+    points: Annotated[list[Triple], Field(min_length=1)]
+
+
+Landmarks_ = Annotated[UniformLandmarks | ListedLandmarks, Field(discriminator="layout")]
+
+
+class TrueMotion(Table):
+    """Eq. 18 with Gaussian noise on v and omega, or its first-order expansion (``linear``).
+
+    ``noise_on = "odometry"``: the robot drives the path and is told noisy velocities.
+    ``noise_on = "motion"``: it is told the planned velocities and drives noisy ones.
+    """
+
+    model: Literal["unicycle", "linear"]
+    sigma_v: NonNegative
+    sigma_omega: NonNegative
+    noise_on: Literal["odometry", "motion"]
+
+
+class Truth(Table):
+    """What is the case."""
+
+    dt: Positive
+    steps: Count
+    path: Path_
+    landmarks: Landmarks_
+    motion: TrueMotion
+    sensor: TrueSensor_
+
+    @model_validator(mode="after")
+    def _one_linear_world(self) -> Truth:
+        if (self.motion.model == "linear") != (self.sensor.model == "linear"):
+            raise ValueError("motion.model and sensor.model must be 'linear' together")
+        if self.motion.model == "linear" and self.motion.noise_on != "motion":
+            raise ValueError("a linear world needs motion.noise_on = 'motion'")
+        return self

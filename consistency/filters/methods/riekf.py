@@ -80,9 +80,7 @@ def insert_right(error: RightInvariant, pose: Array, values: Array, Jp: Array) -
 
 
 @implement(retract, RightInvariant)
-def retract_right(
-    error: RightInvariant, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]
-) -> None:
+def retract_right(error: RightInvariant, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
     x, delta = state.x, work.delta[: state.n]
     fill(delta, 0.0)
     add_transposed_times(A, y, delta)

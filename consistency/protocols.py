@@ -30,7 +30,7 @@ class Filter(Protocol):
     covariance (3, 3), for the NEES of the map; and ``joint(state)``, robot and landmarks as one Gaussian.
 
     ``pose`` gives the covariance of the additive error in the world. A filter whose own error is another declares
-    it in an attribute ``error`` (a convention of :mod:`consistency.recording.conventions`) and gives the covariance
+    it in an attribute ``error`` (a convention of :mod:`consistency.geometry.conventions`) and gives the covariance
     of that error by ``own_covariance(state)``, (3, 3).
     """
 

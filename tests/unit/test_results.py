@@ -21,7 +21,7 @@ from consistency.store.storage import require_free
 from consistency.types import Control, Gaussian, Observation
 from consistency.verdicts.judge import curves
 
-TABLES = ("estimates", "failures", "truth", "landmarks")
+TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 
 
 class Sleepy:

@@ -13,7 +13,7 @@ from consistency.reporting.drawing import Key, Owner
 from consistency.reporting.looks import Look, style
 from consistency.store.results import Results
 from consistency.types import Array, Failure, Indices
-from consistency.verdicts.judge import Curves
+from consistency.verdicts.curves import Curves
 
 SINGLE_RUN = 1
 DECADE = 10.0  # values that span more are drawn on a log axis

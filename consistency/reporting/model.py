@@ -84,6 +84,11 @@ class Study:
         return [track.name for track in self.tracks if track.innovations_judged]
 
     @property
+    def own_errors(self) -> list[str]:
+        """Filters that are judged in an error of their own, with its convention."""
+        return [f"{t.name} ({t.verdict.convention})" for t in self.tracks if t.verdict.world is not None]
+
+    @property
     def failures(self) -> list[tuple[str, int, int, str]]:
         """Filter, run, step and reason of every failed run."""
         return [

@@ -32,7 +32,7 @@ from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
 import consistency as cs
 from consistency.diagnostics import Evidence, Settings, Verdict, e_process, follow, judge, nees, sequential_design
 from consistency.types import Array
-from consistency.verdicts.judge import curves
+from consistency.verdicts.curves import curves
 
 BATCH = 25  # gates handed to a worker at once
 CHUNK = 2000  # runs of the Kalman filter in memory at once

@@ -26,12 +26,13 @@ class Filter(Protocol):
     declares that the gain is optimal and no measurement is gated away, so that innovations are white if the
     filter is right; they are then judged, and otherwise only reported.
 
-    Two more methods are optional: ``map(state)``, the landmarks by label as points (3,) in the world with their
-    covariance (3, 3), for the NEES of the map; and ``joint(state)``, robot and landmarks as one Gaussian.
-
     ``pose`` gives the covariance of the additive error in the world. A filter whose own error is another declares
-    it in an attribute ``error`` (a convention of :mod:`consistency.recording.conventions`) and gives the covariance
-    of that error by ``own_covariance(state)``, (3, 3).
+    it in an attribute ``error``, one of ``PLANAR`` in :mod:`consistency.geometry.conventions`, and gives the
+    covariance of that error by ``own_covariance(state)``, (3, 3). It is then judged in its own error.
+
+    Two more methods are optional. ``map(state)`` gives the landmarks in the state by label, as points (3,) in the
+    world with their covariance (3, 3); it is asked after the last step, for the NEES of the map. ``joint(state)``
+    gives robot and landmarks as one Gaussian; no verdict asks for it.
     """
 
     def init(self, problem: Problem) -> Any: ...

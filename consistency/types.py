@@ -73,6 +73,7 @@ class Trial:
     truth: Array | None = None  # (T + 1, 3): x, y, heading (not wrapped)
     landmarks: Array | None = None  # (N, 3), true positions in the world
     source: Indices | None = None  # (M,), in 0..N-1 or -1
+    labels: Indices | None = None  # (n_landmarks,), numbers in the files; the ids themselves where None
 
     def __post_init__(self) -> None:
         # read-only views: one filter cannot change what the next one is given

@@ -8,7 +8,7 @@ from scipy import stats
 import consistency as cs
 from consistency.diagnostics.coverage import TWO_SIGMA
 from consistency.runs.findings import script
-from consistency.verdicts.judge import Curves
+from consistency.verdicts.curves import Curves
 
 FINDINGS = ("fig2b", "fig2c")
 

@@ -6,7 +6,7 @@ import numpy as np
 
 import consistency as cs
 from consistency.runs.findings import script
-from consistency.verdicts.judge import Curves, run_means, wins
+from consistency.verdicts.curves import Curves, run_means, wins
 
 FINDINGS = ("fig11b", "fig13a", "fig13b")
 

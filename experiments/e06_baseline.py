@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import consistency as cs
 from consistency.runs.findings import script
-from consistency.verdicts.judge import run_means
+from consistency.verdicts.curves import run_means
 
 FINDINGS = ("baseline-reduces-nonlinearity",)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 import consistency as cs
 from consistency.runs.findings import script
-from consistency.verdicts.judge import run_means, wins
+from consistency.verdicts.curves import run_means, wins
 
 FINDINGS = ("long-range",)
 

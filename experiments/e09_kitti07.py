@@ -33,7 +33,7 @@ from consistency.store.results import Results, joined
 from consistency.store.storage import manifest_of, require_free
 from consistency.terminal.table import print_findings
 from consistency.types import Array, Trial
-from consistency.verdicts.judge import curves
+from consistency.verdicts.curves import curves
 
 if TYPE_CHECKING:
     import kitti07_log as conversion

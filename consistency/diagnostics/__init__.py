@@ -14,13 +14,14 @@ from consistency.diagnostics.eprocess import EProcess, e_process, ever
 from consistency.diagnostics.equivalence import equivalence
 from consistency.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.diagnostics.landmarks import map_score
 from consistency.diagnostics.monitor import Alarm, Monitor
 from consistency.diagnostics.nees import anees, nees
 from consistency.diagnostics.normality import Normality, normality
 from consistency.diagnostics.outliers import Outlier, outliers
 from consistency.diagnostics.planning import PilotPlan, detectable_ratio, gate_runs, pilot_plan, power_of, required_runs
 from consistency.diagnostics.questions import answers
-from consistency.diagnostics.records import Answer, Equivalence, Evidence, Interval, Settings, Verdict
+from consistency.diagnostics.records import Answer, Equivalence, Evidence, Interval, MapScore, Settings, Verdict
 from consistency.diagnostics.scale import MeanTest, mean_test, ratio_interval
 from consistency.diagnostics.sequential import Design, follow, look, sequential_design, speaks
 from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
@@ -40,6 +41,7 @@ __all__ = [
     "Hotelling",
     "Interval",
     "Largest",
+    "MapScore",
     "MeanTest",
     "Monitor",
     "NisTest",
@@ -69,6 +71,7 @@ __all__ = [
     "judge",
     "largest_direction",
     "look",
+    "map_score",
     "mean_shape",
     "mean_test",
     "nees",

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from consistency.diagnostics.wording import p_text, plural, short
+from consistency.geometry.conventions import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
-    from consistency.diagnostics.records import Equivalence, Verdict
+    from consistency.diagnostics.records import Equivalence, MapScore, Verdict
 
 
 def flat(v: Verdict) -> dict[str, Any]:
@@ -22,10 +23,12 @@ def flat(v: Verdict) -> dict[str, Any]:
         "failures": [[f.run, f.step, f.reason] for f in v.failures],
         "answers": [vars(a) for a in v.answers], "p_value": v.p_value, "left_out_steps": list(v.left_out_steps),
     }  # fmt: skip
-    for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy):
+    for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy, _map):
         s |= part(v)
     if v.convention is not None or v.notes:
         s |= {"convention": v.convention, "notes": list(v.notes)}
+    if v.world is not None:
+        s["world"] = {"status": v.world.status, "reasons": v.world.reasons, "statistics": flat(v.world)}
     return s
 
 
@@ -113,6 +116,15 @@ def _accuracy(v: Verdict) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _map(v: Verdict) -> dict[str, Any]:
+    if (m := v.map) is None:
+        return {}
+    return {
+        "map_ratio": m.ratio.value, "map_ratio_interval": tuple(m.ratio[1:]), "map_runs": m.runs,
+        "map_landmarks": m.landmarks, "map_left_out": m.left_out,
+    }  # fmt: skip
+
+
 # --- for people --------------------------------------------------------------------------------------
 
 
@@ -133,10 +145,29 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
     if v.innovations is not None and np.isfinite(v.innovations.ratio):
         judged = "" if v.innovations.judged else ", not judged"
         rows.append(("NIS / dof", f"{v.innovations.ratio:.3f}{judged}"))
+    if v.world is not None:
+        rows.insert(0, ("error", f"{v.convention}: {PLANAR[v.convention or ADDITIVE]}"))
+        rows.append(("in the world", _in_world(v.world)))
+    if v.map is not None:
+        rows.append(("map NEES / 3", f"{map_text(v.map)}, after the last step; not judged"))
     rows.append(("failed runs", f"{len({f.run for f in v.failures})} of {v.runs}"))
     found = [f"{a.question} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated]
     rows.append(("faults", f"{', '.join(found) or 'none'} of {plural(len(v.answers), 'question')}"))
     return rows
+
+
+def _in_world(v: Verdict) -> str:
+    mean = f", mean NEES {short(v.scale.mean_anees)}" if v.scale is not None and v.scale.judged_steps else ""
+    return f"{v.status}{mean} (additive error, '{ADDITIVE}')"
+
+
+def map_text(m: MapScore) -> str:
+    """Mean NEES over 3 of the landmarks in maps, with its interval."""
+    left_out = f" ({m.left_out} of {m.left_out + m.landmarks} landmarks left out)" if m.left_out else ""
+    if not m.landmarks:
+        return f"-{left_out}"
+    value, low, high = m.ratio
+    return f"{short(value)} [{short(low)}, {short(high)}]{left_out}"
 
 
 def text(v: Verdict) -> str:

@@ -225,6 +225,16 @@ class Location:
 
 
 @dataclass(frozen=True)
+class MapScore:
+    """Landmarks in the map after the last step, each with 3 degrees of freedom. It is shown and not judged."""
+
+    ratio: Interval  # mean over runs of the mean NEES over 3, with its 95 % interval from the spread between runs
+    runs: int  # with a landmark that has a NEES
+    landmarks: int  # that have one, of all runs
+    left_out: int  # that have none: no landmark of the world, not known where, or covariance not positive definite
+
+
+@dataclass(frozen=True)
 class Accuracy:
     """Size of the errors by themselves, and other people's indices."""
 
@@ -263,8 +273,15 @@ class Verdict:
     innovations: Innovations | None = None
     location: Location | None = None
     accuracy: Accuracy | None = None
-    convention: str | None = None  # of the error, where files declare one
+    convention: str | None = None  # of the error that is judged, where files or the filter declare one
     notes: tuple[str, ...] = ()  # of whoever read the files
+    world: Verdict | None = None  # the same runs in the additive error of the world, where the filter has another
+    map: MapScore | None = None
+
+    @property
+    def in_world(self) -> Verdict:
+        """The verdict whose errors are those of the pose in the world: ``world``, or this one."""
+        return self if self.world is None else self.world
 
     @property
     def consistent(self) -> bool:

@@ -56,7 +56,7 @@ class Compiled:
     innovations : "optimal" where they are white if the belief is right, see
         :class:`consistency.protocols.Filter`
     error : convention of the error in which its covariance is meant, see
-        :mod:`consistency.recording.conventions`
+        :mod:`consistency.geometry.conventions`
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
     allow it; the numbers are the same.

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from consistency.errors import InputError
 from consistency.filters.compiled import problem_of
 from consistency.filters.kernel.linalg import definiteness
+from consistency.geometry.conventions import ADDITIVE, PLANAR
 from consistency.protocols import Filter, WholeTrial
 from consistency.scenario import Belief
-from consistency.types import Array, Estimates, Failure, Trial
+from consistency.types import Array, Estimates, Failure, Gaussian, Info, Map, Trial
 
 SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
 
@@ -27,23 +30,62 @@ def name_of(filter_: Filter) -> str:
     return str(getattr(filter_, "name", type(filter_).__name__))
 
 
+def error_of(filter_: Filter) -> str:
+    """Convention of the filter's own error, "so2" where it declares none.
+
+    Raises
+    ------
+    InputError
+        No such convention, or nothing that gives the covariance of that error.
+    """
+    error = getattr(filter_, "error", ADDITIVE)
+    if not isinstance(error, str) or error not in PLANAR:
+        raise InputError(f"filter '{name_of(filter_)}': its error must be one of {', '.join(PLANAR)}, got {error!r}")
+    if error != ADDITIVE and not isinstance(filter_, WholeTrial) and not hasattr(filter_, "own_covariance"):
+        raise InputError(f"filter '{name_of(filter_)}': with the error '{error}' it needs own_covariance(state)")
+    return error
+
+
 def run_filter(filter_: Filter, trial: Trial, belief: Belief, timeout: float | None = None) -> Estimates:
     """A whole trial through a filter, compiled where it can be.
 
     An exception, a time-out (``timeout`` seconds a trial), an estimate that is not finite or a pose
     covariance that is not positive definite ends the run as a :class:`Failure` of that step.
+
+    Raises
+    ------
+    InputError
+        The filter's error is no convention, nothing gives its covariance, or estimates of a whole trial have another.
     """
     if isinstance(filter_, WholeTrial):
-        return filter_.run(trial, belief)
+        estimates, error = filter_.run(trial, belief), error_of(filter_)
+        if estimates.error != error or (estimates.own is None) != (error == ADDITIVE):
+            raise InputError(f"filter '{name_of(filter_)}': its estimates must be of the error '{error}' and carry it")
+        return estimates
     return step_through(filter_, trial, belief, timeout)
 
 
+class _Unusable(Exception):
+    """What a filter gave cannot be used; the message is the whole reason."""
+
+
 def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float | None = None) -> Estimates:
-    """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``."""
-    T = trial.steps
+    """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``.
+
+    ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``map`` after the last
+    step.
+
+    Raises
+    ------
+    InputError
+        The filter's error is no convention, or nothing gives its covariance.
+    """
+    T, name, error = trial.steps, name_of(filter_), error_of(filter_)
     pose, covariance = np.full((T, 3), np.nan), np.full((T, 3, 3), np.nan)
+    own = None if error == ADDITIVE else covariance.copy()
     nis, dof = np.full(T, np.nan), np.zeros(T, np.int64)
-    reason, step, full_rank = "", 0, False
+    ranks = [_Rank("the pose covariance"), _Rank(f"the covariance of the error '{error}'")]
+    reason, step, map_ = "", 0, None
     started = time.monotonic()
     state: Any = None
     for step in range(1, T + 1):
@@ -51,42 +93,110 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
             if step == 1:
                 state = filter_.init(problem_of(trial, belief))
             state = filter_.predict(state, trial.control(step))
-            updated = filter_.update(state, trial.observation(step))
-            if not isinstance(updated, tuple) or len(updated) != 2:
-                raise TypeError("update must return (state, info)")
-            state, info = updated
-            estimate = filter_.pose(state)
-            mean, P = _shaped(estimate.mean, (3,)), _shaped(estimate.covariance, (3, 3))
+            state, info = _updated(filter_.update(state, trial.observation(step)))
+            mean, given = _given(filter_, state, error)
             if info is not None and len(info.innovation):
                 np.linalg.cholesky(info.S)
                 nis[step - 1], dof[step - 1] = info.nis, len(info.innovation)
-        except np.linalg.LinAlgError:
-            reason = "the innovation covariance is not positive definite"
+            _require_finite(mean, *given)
+            for rank, P in zip(ranks, given, strict=False):
+                rank.require(P)
+            if timeout is not None and time.monotonic() - started > timeout:
+                raise _Unusable(f"time-out after {timeout:g} s")
+            map_ = _map(filter_, state, trial) if step == T else None
+        except Exception as exception:  # whatever a user's filter throws is a result
+            reason = _reason(exception)
+            nis[step - 1], dof[step - 1] = np.nan, 0
             break
-        except Exception as error:  # whatever a user's filter throws is a result
-            reason = f"{type(error).__name__}: {error}".encode(errors="backslashreplace").decode()
-            break
+        pose[step - 1], covariance[step - 1] = mean, given[0]
+        if own is not None:
+            own[step - 1] = given[1]
+    failure = Failure(name, trial.run, step, reason) if reason else None
+    return Estimates(name, trial.run, pose, covariance, nis, dof, failure, error, own, map_)
+
+
+def _reason(exception: Exception) -> str:
+    if isinstance(exception, _Unusable):
+        return str(exception)
+    if isinstance(exception, np.linalg.LinAlgError):
+        return "the innovation covariance is not positive definite"
+    return f"{type(exception).__name__}: {exception}".encode(errors="backslashreplace").decode()
+
+
+def _given(filter_: Filter, state: Any, error: str) -> tuple[Array, list[Array]]:
+    """Mean (3,) of the pose and its covariance (3, 3), with that of the filter's own error where it has one."""
+    estimate = filter_.pose(state)
+    mean, P = _shaped(estimate.mean, (3,)), _shaped(estimate.covariance, (3, 3))
+    if error == ADDITIVE:
+        return mean, [P]
+    return mean, [P, _shaped(_asked(filter_, "own_covariance", state), (3, 3), "own_covariance")]
+
+
+def _asked(filter_: Filter, method: str, state: Any) -> Any:
+    try:
+        return getattr(filter_, method)(state)
+    except np.linalg.LinAlgError as error:
+        raise _Unusable(f"LinAlgError: {error}") from error
+
+
+class _Rank:
+    """Demands a covariance that is symmetric and, from the first one of full rank on, positive definite."""
+
+    def __init__(self, what: str) -> None:
+        self.what, self.full = what, False
+
+    def require(self, P: Array) -> None:
+        """Raise for what it must not be."""
         rank = definiteness(P)
-        if not (np.isfinite(mean).all() and np.isfinite(P).all()):
-            reason = "the estimate is not finite"
-        elif np.abs(P - P.T).max() > SYMMETRY * np.abs(P).max():
-            reason = "the pose covariance is not symmetric"
-        elif rank < 0 or (full_rank and rank == 0):
-            reason = "the pose covariance is not positive definite"
-        elif timeout is not None and time.monotonic() - started > timeout:
-            reason = f"time-out after {timeout:g} s"
-        if reason:
-            break
-        full_rank = full_rank or rank == 1
-        pose[step - 1], covariance[step - 1] = mean, P
-    if reason:
-        nis[step - 1], dof[step - 1] = np.nan, 0
-    failure = Failure(name_of(filter_), trial.run, step, reason) if reason else None
-    return Estimates(name_of(filter_), trial.run, pose, covariance, nis, dof, failure)
+        if _asymmetric(P):
+            raise _Unusable(f"{self.what} is not symmetric")
+        if rank < 0 or (self.full and rank == 0):
+            raise _Unusable(f"{self.what} is not positive definite")
+        self.full = self.full or rank == 1
 
 
-def _shaped(value: Any, shape: tuple[int, ...]) -> Array:
+def _asymmetric(P: Array) -> bool:
+    return bool(np.abs(P - P.T).max() > SYMMETRY * np.abs(P).max())
+
+
+def _require_finite(*arrays: Array) -> None:
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise _Unusable("the estimate is not finite")
+
+
+def _updated(value: Any) -> tuple[Any, Info | None]:
+    if not isinstance(value, tuple) or len(value) != 2:
+        raise TypeError("update must return (state, info)")
+    return value
+
+
+def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:
+    """What ``map`` of the filter gives, sorted by label; None without that method."""
+    if not callable(getattr(filter_, "map", None)):
+        return None
+    landmarks = _asked(filter_, "map", state)
+    if not isinstance(landmarks, Mapping):
+        raise TypeError("map must return a dictionary of landmarks by label")
+    if unknown := [label for label in landmarks if label not in range(trial.n_landmarks)]:
+        raise ValueError(f"map() has a landmark {unknown[0]!r}; they are numbered 0 to {trial.n_landmarks - 1}")
+    labels = sorted(int(label) for label in landmarks)
+    mean, covariance = np.empty((len(labels), 3)), np.empty((len(labels), 3, 3))
+    for i, label in enumerate(labels):
+        mean[i], covariance[i] = _landmark(label, landmarks[label])
+    return Map(np.array(labels, np.int64), mean, covariance)
+
+
+def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:
+    mean, P = _shaped(estimate.mean, (3,), "map"), _shaped(estimate.covariance, (3, 3), "map")
+    if not (np.isfinite(mean).all() and np.isfinite(P).all()):
+        raise _Unusable(f"landmark {label} in the map is not finite")
+    if _asymmetric(P):
+        raise _Unusable(f"the covariance of landmark {label} in the map is not symmetric")
+    return mean, P
+
+
+def _shaped(value: Any, shape: tuple[int, ...], method: str = "pose") -> Array:
     array = np.array(value, dtype=float)
     if array.shape != shape:
-        raise ValueError(f"pose() gave an array of shape {array.shape}, not {shape}")
+        raise ValueError(f"{method}() gave an array of shape {array.shape}, not {shape}")
     return array

@@ -117,7 +117,8 @@ def of_results(
         No results, no such filter, or more than one to choose from.
     """
     from consistency.store.results import POSE, Results
-    from consistency.verdicts.judge import curves, evidence_of
+    from consistency.verdicts.curves import curves
+    from consistency.verdicts.judge import evidence_of
 
     if not isinstance(results, Results):
         raise ValueError("filter names one in the results of consistency.run_trials; give those in place of errors")

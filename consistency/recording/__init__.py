@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from consistency.errors import InputError
+from consistency.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
 from consistency.recording.archive import read_archive
-from consistency.recording.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
 from consistency.recording.record import Recording
 from consistency.recording.table import read_tables
 from consistency.recording.tum import ORDERS, SUFFIXES, read_tum, trajectory_files

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.recording.conventions import PLANAR, planar_error
+from consistency.geometry.conventions import PLANAR, planar_error
 from consistency.recording.record import Recording, Track, assemble, symmetric
 from consistency.types import Array, Failure
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.recording.conventions import PLANAR, planar_error
+from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
 from consistency.recording.record import (
     DEFAULT_DT,
     Recording,
@@ -24,7 +24,7 @@ from consistency.recording.record import (
     symmetric,
 )
 from consistency.recording.sheet import Sheet, read_sheet
-from consistency.store.parquet import COVARIANCE
+from consistency.store.parquet import COVARIANCE, OWN_COVARIANCE
 from consistency.types import Array, Indices
 
 POSE = ("x", "y", "heading")
@@ -106,12 +106,15 @@ def _recording(
         broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *_present(sheet, axes)])).all(axis=1)
         error = None if not broken.any() else np.where(broken, np.nan, 0.0)[:, None]
     else:
-        covariance = _covariance(sheet, axes)
+        own = convention != ADDITIVE and axes == POSE and _has_own(sheet)
+        covariance = _covariance(sheet, axes, own)
         keep, true, notes = _matched(name, sheet, truth, runs, keys, key, axes, max_dt)
         estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
         error = planar_error(true, estimate, convention) if axes == POSE else true - estimate
         notes.append(f"error convention {convention}: {PLANAR[convention]}")
+        if own:
+            notes.append(f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error")
         if key == "step":
             keep &= ~_exact_start(keys, covariance)
     nis, dof = _nis(sheet)
@@ -234,9 +237,19 @@ def _exact_start(steps: Array, covariance: Array) -> Array:
     return start
 
 
-def _covariance(sheet: Sheet, axes: tuple[str, ...]) -> Array:
-    """(N, n, n) from the upper triangle; a lower triangle beside it must agree."""
+def _has_own(sheet: Sheet) -> bool:
+    """Whether the rows are of a filter of the bench that states the covariance of an error of its own."""
+    return all(name in sheet and bool(sheet.data[name].notna().any()) for name in OWN_COVARIANCE)
+
+
+def _covariance(sheet: Sheet, axes: tuple[str, ...], own: bool = False) -> Array:
+    """(N, n, n) from the upper triangle; a lower triangle beside it must agree. ``own``: of the columns own_P_*."""
     _require(sheet, axes)
+    if own:
+        P = np.empty((len(sheet.data), 3, 3))
+        for name, (i, j) in OWN_COVARIANCE.items():
+            P[:, i, j] = P[:, j, i] = sheet.numbers(name)
+        return P
     n = len(axes)
     out = np.empty((len(sheet.data), n, n))
     for i in range(n):

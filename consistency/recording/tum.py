@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.recording.conventions import SPATIAL, spatial_error
+from consistency.geometry.conventions import SPATIAL, spatial_error
 from consistency.recording.record import DEFAULT_DT, Recording, Track, assemble, associate, common_times, symmetric
 from consistency.recording.sheet import Lines, read_numbers
 from consistency.types import Array, Indices

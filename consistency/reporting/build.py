@@ -17,7 +17,8 @@ from consistency.reporting.sections import SECTIONS
 from consistency.runs.findings import read_findings
 from consistency.store.results import read_results
 from consistency.store.storage import read_manifest
-from consistency.verdicts.judge import analyse, curves, design_of
+from consistency.verdicts.curves import curves
+from consistency.verdicts.judge import analyse, design_of
 
 
 def build_report(folder: Path) -> Report:

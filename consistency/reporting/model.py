@@ -13,7 +13,7 @@ from consistency.reporting.drawing import Key, Owner
 from consistency.reporting.looks import Look, style
 from consistency.store.results import Results
 from consistency.types import Array, Failure, Indices
-from consistency.verdicts.judge import Curves
+from consistency.verdicts.curves import Curves
 
 SINGLE_RUN = 1
 DECADE = 10.0  # values that span more are drawn on a log axis
@@ -82,6 +82,11 @@ class Study:
     def judged(self) -> list[str]:
         """Filters whose innovations are judged."""
         return [track.name for track in self.tracks if track.innovations_judged]
+
+    @property
+    def own_errors(self) -> list[str]:
+        """Filters that are judged in an error of their own, with its convention."""
+        return [f"{t.name} ({t.verdict.convention})" for t in self.tracks if t.verdict.world is not None]
 
     @property
     def failures(self) -> list[tuple[str, int, int, str]]:

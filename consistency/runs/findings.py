@@ -22,7 +22,8 @@ from consistency.store.results import Results, joined
 from consistency.store.storage import manifest_of, require_free, write_folder
 from consistency.terminal.table import print_findings
 from consistency.types import Finding
-from consistency.verdicts.judge import Curves, analyse, curves
+from consistency.verdicts.curves import Curves, curves
+from consistency.verdicts.judge import analyse
 
 OURS = "this project"  # how the source of a question begins that no paper asks
 REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from itertools import pairwise
 from operator import itemgetter
@@ -18,13 +18,16 @@ import pyarrow as pa
 from consistency.errors import InputError
 from consistency.store.parquet import COLUMNS, Columns, Writer, write_table
 from consistency.store.results import (
+    MAP_NUMBERS,
     NUMBERS,
+    OWN_NUMBERS,
     Outcome,
     Results,
     StoredResults,
     Tables,
     estimates_table,
     failures_table,
+    map_table,
     truth_table,
 )
 from consistency.store.storage import NewFolder, undisturbed
@@ -62,8 +65,9 @@ class Spool:
 class Gathered:
     """Outcomes of runs of some filters, kept in memory, or where ``new`` is given on disk.
 
-    Outcomes come in order of their runs. ``previous`` are results to which they are added, of which the runs ``kept``
-    count.
+    Outcomes come in order of their runs. ``errors`` has the convention of each filter's own error, where it is not the
+    additive one; only then are there columns for it. ``previous`` are results to which they are added, of which the
+    runs ``kept`` count.
 
     Raises
     ------
@@ -74,16 +78,19 @@ class Gathered:
     def __init__(
         self,
         filters: Sequence[str],
+        errors: Mapping[str, str],
         new: NewFolder | None = None,
         previous: Tables | None = None,
         kept: Iterable[int] = (),
     ) -> None:
         self.filters, self.new, self.previous, self.kept = list(filters), new, previous, frozenset(kept)
+        self.errors = dict(errors)
         self._require_readable()
         self.runs: set[int] = set()
         self._failures: list[Failure] = []
         self._spools: list[Spool] = []
         self._estimates = {name: self._pieces() for name in self.filters}
+        self._maps = {name: self._pieces() for name in self.filters}
         self._truth = self._pieces()
 
     def _pieces(self) -> Pieces:
@@ -97,6 +104,8 @@ class Gathered:
         with nullcontext() if self.new is None else self.new.writing():
             for name, columns in outcome.estimates.items():
                 self._estimates[name].append(columns)
+            for name, columns in outcome.maps.items():
+                self._maps[name].append(columns)
             if outcome.truth is not None:
                 self._truth.append(outcome.truth)
         self._failures += outcome.failures
@@ -114,19 +123,21 @@ class Gathered:
         if self.new is not None and self.finished:
             with undisturbed():
                 return self._stored(self.new, manifest, failures, landmarks)
-        estimates = estimates_table([(name, columns) for name in self.filters for columns in self._of(name)])
+        estimates = [(name, columns) for name in self.filters for columns in self._of(name)]
+        maps = [(name, columns) for name in self.filters for columns in self._map_of(name)]
         truth = truth_table(list(self._true()))
-        return Results(estimates, failures, truth if len(truth) else None, landmarks, manifest)
+        return Results(
+            estimates_table(estimates, bool(self.errors)), failures, truth if len(truth) else None, landmarks, manifest,
+            map_table(maps),
+        )  # fmt: skip
 
     def _stored(
         self, new: NewFolder, manifest: dict[str, Any], failures: pd.DataFrame, landmarks: pd.DataFrame | None
     ) -> StoredResults:
         with new.writing():
-            with Writer(new.path / "estimates.parquet", "estimates") as writer:
-                for name in self.filters:
-                    for columns in self._of(name):
-                        writer.add(columns, filter=name)
-                    writer.end_group()
+            self._write(new, "estimates", self._of, OWN_NUMBERS if self.errors else NUMBERS)
+            if any(next(self._map_of(name), None) is not None for name in self.filters):
+                self._write(new, "map", self._map_of)
             true = self._true()
             if (first := next(true, None)) is not None:
                 with Writer(new.path / "truth.parquet", "truth") as writer:
@@ -141,8 +152,21 @@ class Gathered:
                 spool.path.unlink(missing_ok=True)
         return StoredResults(new.folder, failures, landmarks, new.put_in_place(manifest))
 
+    def _write(
+        self, new: NewFolder, table: str, of: Callable[[str], Iterator[Columns]], columns: Sequence[str] = ()
+    ) -> None:
+        """A table of each filter's rows, one filter after the other."""
+        with Writer(new.path / f"{table}.parquet", table, columns) as writer:
+            for name in self.filters:
+                for rows in of(name):
+                    writer.add(rows, filter=name)
+                writer.end_group()
+
     def _of(self, filter_name: str) -> Iterator[Columns]:
-        return self._merged(self._before("estimates", NUMBERS, filter_name), self._estimates[filter_name])
+        return self._merged(self._estimates_before(filter_name), self._estimates[filter_name])
+
+    def _map_of(self, filter_name: str) -> Iterator[Columns]:
+        return self._merged(self._before("map", MAP_NUMBERS, filter_name), self._maps[filter_name])
 
     def _true(self) -> Iterator[Columns]:
         return self._merged(self._true_before(), self._truth)
@@ -154,8 +178,13 @@ class Gathered:
         return (columns for _, columns in heapq.merge(before, finished, key=itemgetter(0)))
 
     def _require_readable(self) -> None:
-        for before in (*(self._before("estimates", NUMBERS, name) for name in self.filters), self._true_before()):
-            deque(before, maxlen=0)
+        for name in self.filters:
+            deque(self._estimates_before(name), maxlen=0)
+            deque(self._before("map", MAP_NUMBERS, name), maxlen=0)
+        deque(self._true_before(), maxlen=0)
+
+    def _estimates_before(self, filter_name: str) -> Iterator[tuple[int, Columns]]:
+        return self._before("estimates", OWN_NUMBERS if filter_name in self.errors else NUMBERS, filter_name)
 
     def _true_before(self) -> Iterator[tuple[int, Columns]]:
         return self._before("truth", list(COLUMNS["truth"]))

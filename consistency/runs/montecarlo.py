@@ -17,7 +17,8 @@ import pandas as pd
 from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter
 from consistency.filters.compiled import one_blas_thread
-from consistency.filters.stepping import name_of, optimal_gain, run_filter
+from consistency.filters.stepping import error_of, name_of, optimal_gain, run_filter
+from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Filter, WholeTrial
 from consistency.runs.gather import Gathered
 from consistency.scenario import Belief, Scenario
@@ -92,14 +93,15 @@ def run_trials(
     _require_counts(runs, seed)
     world = require_landmarks_in_view(scenario)
     names = [name_of(f) for f in chosen]
-    done = set() if previous is None else _same_study(previous, scenario, names, seed).finished_runs(names)
+    errors = _own_errors(chosen)
+    done = set() if previous is None else _same_study(previous, scenario, names, errors, seed).finished_runs(names)
     if done and max(done) >= runs:
         raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
     todo = [run for run in range(runs) if run not in done]
     work = _Work(lambda run: world.trial(run, seed), chosen, scenario.belief, jobs, timeout)
     said = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
     with _place(None if out is None else Path(out), overwrite, previous) as new:
-        return _finish(work, todo, Gathered(names, new, previous, done), said, _landmarks_table(scenario))
+        return _finish(work, todo, Gathered(names, errors, new, previous, done), said, _landmarks_table(scenario))
 
 
 def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None) -> Results:
@@ -109,7 +111,9 @@ def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: 
     work = _Work(trials.__getitem__, chosen, log.belief, jobs, timeout)
     said = {"seed": None, "runs": len(trials), "log": log.name, "log_sha256": log.sha256}
     said |= {"belief": log.belief.model_dump(mode="json")}
-    results = _finish(work, list(trials), Gathered([name_of(f) for f in chosen]), said, log.landmarks)
+    results = _finish(
+        work, list(trials), Gathered([name_of(f) for f in chosen], _own_errors(chosen)), said, log.landmarks
+    )
     assert isinstance(results, Results)
     return results
 
@@ -130,6 +134,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
         raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
     model = belief.sensor.model
     for filter_ in chosen:
+        error_of(filter_)
         sensors = getattr(filter_, "sensors", None)
         if sensors is not None and model not in sensors:
             fitting = [name for name in filter_names() if model in getattr(get_filter(name), "sensors", (model,))]
@@ -218,6 +223,7 @@ def _finish(
     except KeyboardInterrupt:
         complete = False
     said = said | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
+    said |= {"error": gathered.errors} if gathered.errors else {}
     manifest = manifest_of(filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **said)
     if complete:
         return gathered.results(manifest, landmarks)
@@ -235,11 +241,18 @@ def _place(out: Path | None, overwrite: bool, previous: Tables | None) -> Iterat
         yield new
 
 
-def _same_study(previous: Tables, scenario: Scenario, names: list[str], seed: int) -> Tables:
-    """The results to go on from, refused unless scenario, filters and seed are the same."""
+def _own_errors(filters: Sequence[Filter]) -> dict[str, str]:
+    """Convention of each filter's own error, of those where it is not the additive one."""
+    errors = {name_of(f): error_of(f) for f in filters}
+    return {name: error for name, error in errors.items() if error != ADDITIVE}
+
+
+def _same_study(previous: Tables, scenario: Scenario, names: list[str], errors: dict[str, str], seed: int) -> Tables:
+    """The results to go on from, refused unless scenario, filters with their errors, and seed are the same."""
     for key, now, before in (
         ("scenario", scenario.hash, previous.manifest.get("scenario_hash")),
         ("filter", names, previous.manifest.get("filters")),
+        ("error of a filter", errors, previous.manifest.get("error", {})),
         ("seed", seed, previous.manifest.get("seed")),
     ):
         if now != before:

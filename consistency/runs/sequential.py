@@ -13,7 +13,8 @@ from consistency.protocols import Filter
 from consistency.runs.montecarlo import Interrupted, run_trials
 from consistency.scenario import Scenario
 from consistency.store.results import POSE, Results, Tables
-from consistency.verdicts.judge import curves, evidence_of, refused
+from consistency.verdicts.curves import curves
+from consistency.verdicts.judge import beside, evidence_of, refused
 
 
 def run_until_decided(
@@ -60,9 +61,10 @@ def run_until_decided(
         assert source is not None
         open_ = [name for name in source.filters if name not in decided]
         for name in open_:
-            evidence = evidence_of(curves(source, name), runs)
+            c = curves(source, name)
+            evidence = evidence_of(c, runs)
             if runs == max_runs or speaks(design, evidence, spent):
-                verdict = look(design, evidence, spent)
+                verdict = beside(look(design, evidence, spent), c, design, runs)
                 decided |= {name: verdict} if settled(verdict) or runs == max_runs else {}
         open_ = [name for name in open_ if name not in decided]
         if runs > done:

@@ -262,4 +262,5 @@ def _trial(
         path,
         positions,
         names.ids(seen["source"]) if "source" in seen else None,
+        np.concatenate(names).astype(np.int64),
     )

@@ -17,6 +17,8 @@ from consistency.errors import InputError
 from consistency.types import Array
 
 COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
+OWN_COVARIANCE = {f"own_{name}": place for name, place in COVARIANCE.items()}  # of a filter's own error
+POINT_COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xz": (0, 2), "P_yy": (1, 1), "P_yz": (1, 2), "P_zz": (2, 2)}
 COLUMNS: dict[str, dict[str, str]] = {
     "landmarks": {"landmark": "int64", "x": "float64", "y": "float64", "z": "float64"},
     "truth": {"run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64", "heading": "float64"},
@@ -30,9 +32,17 @@ COLUMNS: dict[str, dict[str, str]] = {
         "nis_dof": "int64",
     },
     "failures": {"filter": "str", "run": "int64", "step": "int64", "reason": "str"},
+    "map": {
+        "filter": "str", "run": "int64", "landmark": "int64", "x": "float64", "y": "float64", "z": "float64",
+        **dict.fromkeys(POINT_COVARIANCE, "float64"), "nees": "float64",
+    },
 }  # fmt: skip
-OPTIONAL = {"observations": {"source": "int64"}}  # columns of a table that may be missing
-NULLABLE = {"nees", "nis"}
+OPTIONAL = {  # columns of a table that may be missing
+    "observations": {"source": "int64"},
+    "estimates": dict.fromkeys([*OWN_COVARIANCE, "own_nees"], "float64"),
+}
+NULLABLE = {"nees", "nis", *OPTIONAL["estimates"]}
+BY_FILTER = {"estimates", "map"}  # tables whose row groups hold one filter each
 REPEATED = {"t", "dt"}  # floating-point columns of few different values
 ROWS = 65_536  # of a row group, and of a batch that is read
 TYPES = {"str": pa.string(), "int64": pa.int64(), "float64": pa.float64()}
@@ -51,6 +61,7 @@ class Writer:
 
     def __init__(self, path: Path, name: str, columns: Iterable[str] = ()) -> None:
         kinds = _kinds(name, columns)
+        self.optional = set(OPTIONAL.get(name, ()))
         self.schema = pa.schema([(column, TYPES[kind]) for column, kind in kinds.items()])
         # the bytes of similar numbers are alike: apart from each other they take less room, and nothing is lost
         split = [column for column, kind in kinds.items() if kind == "float64" and column not in REPEATED]
@@ -70,12 +81,17 @@ class Writer:
         self._file.close()
 
     def add(self, columns: Columns, **constant: str) -> None:
-        """Rows of arrays; ``constant`` is the text of a column that is the same in all of them."""
+        """Rows of arrays; ``constant`` is the text of a column that is the same in all of them.
+
+        An optional column that is not among them is null.
+        """
         rows = len(next(iter(columns.values())))
         arrays = [
             pa.repeat(pa.scalar(constant[field.name], field.type), rows)
             if field.name in constant
             else pa.array(columns[field.name], field.type, from_pandas=True)
+            if field.name in columns or field.name not in self.optional
+            else pa.nulls(rows, field.type)
             for field in self.schema
         ]
         self._pieces.append(pa.RecordBatch.from_arrays(arrays, schema=self.schema))
@@ -102,11 +118,11 @@ def _kinds(name: str, columns: Iterable[str]) -> dict[str, str]:
 
 
 def write_table(path: Path, name: str, table: pd.DataFrame) -> None:
-    """A whole table; estimates in row groups of one filter each."""
+    """A whole table; estimates and maps in row groups of one filter each."""
     kinds = _kinds(name, map(str, table))
     table = table[list(kinds)].astype(kinds)
     with Writer(path, name, kinds) as writer:
-        if name != "estimates":
+        if name not in BY_FILTER:
             writer.add({str(column): table[column].to_numpy() for column in table})
         else:
             for filter_name in table["filter"].unique():
@@ -144,8 +160,8 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
 
 def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
     """Columns of numbers, some rows at a time and checked likewise; of one filter where it is named."""
-    path, wanted = folder / f"{name}.parquet", COLUMNS[name]
-    file = require_table(folder, name)
+    path, wanted = folder / f"{name}.parquet", COLUMNS[name] | OPTIONAL.get(name, {})
+    file = require_table(folder, name, columns)
     needed = [*columns, "filter"] if filter_name is not None else list(columns)
     first = 0
     for group in range(file.num_row_groups):
@@ -167,12 +183,12 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
                 yield {column: values.to_numpy(wanted[column])[chosen] for column, values in table.items()}
 
 
-def require_table(folder: Path, name: str) -> Any:
-    """The opened file of a table, refused where it is missing, damaged or lacks a column."""
+def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
+    """The opened file of a table, refused where it is missing, damaged or lacks a column, those in ``also`` too."""
     path = folder / f"{name}.parquet"
     with _refusals(path):
         file = pq.ParquetFile(path, page_checksum_verification=True)
-    wanted = COLUMNS[name]
+    wanted = dict.fromkeys((*COLUMNS[name], *also))
     if missing := [column for column in wanted if column not in file.schema_arrow.names]:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(wanted)}")
     return file

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,26 @@ from consistency.diagnostics.whitening import whiten
 from consistency.errors import InputError
 from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry import pose_error
+from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
 from consistency.scenario import Scenario, explain
-from consistency.store.parquet import COLUMNS, COVARIANCE, Columns, read_batches, read_parquet, require_table
+from consistency.store.parquet import (
+    COLUMNS,
+    COVARIANCE,
+    OPTIONAL,
+    OWN_COVARIANCE,
+    POINT_COVARIANCE,
+    Columns,
+    read_batches,
+    read_parquet,
+    require_table,
+)
 from consistency.store.storage import read_manifest, write_folder
-from consistency.types import Array, Estimates, Failure, Indices, Trial
+from consistency.types import Array, Estimates, Failure, Indices, Map, Trial
 
 POSE = ["x", "y", "heading"]
 NUMBERS = [column for column in COLUMNS["estimates"] if column != "filter"]
+OWN_NUMBERS = [*NUMBERS, *OPTIONAL["estimates"]]  # of a filter whose error is not the additive one
+MAP_NUMBERS = [column for column in COLUMNS["map"] if column != "filter"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +47,7 @@ class Outcome:
     estimates: dict[str, Columns]
     truth: Columns | None
     failures: tuple[Failure, ...]
+    maps: dict[str, Columns] = field(default_factory=dict)
 
 
 class Tables(ABC):
@@ -45,7 +59,7 @@ class Tables(ABC):
 
     @abstractmethod
     def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
-        """Columns of ``estimates`` (of one filter) or ``truth``, some rows at a time; nothing without the table."""
+        """Columns of ``estimates`` or ``map`` (of one filter) or ``truth``, some rows at a time; none without it."""
 
     @property
     @abstractmethod
@@ -54,6 +68,25 @@ class Tables(ABC):
     @property
     def filters(self) -> list[str]:
         return list(self.manifest["filters"])
+
+    def error_of(self, filter_name: str) -> str:
+        """Convention of a filter's own error, "so2" unless the manifest says otherwise.
+
+        Raises
+        ------
+        InputError
+            The manifest names no such convention.
+        """
+        errors = self.manifest.get("error", {})
+        error = errors.get(filter_name, ADDITIVE) if isinstance(errors, dict) else errors
+        if error not in PLANAR:
+            allowed = ", ".join(PLANAR)
+            raise InputError(f"manifest.json: key 'error': must be one of {allowed} for each filter, got {error!r}")
+        return str(error)
+
+    def numbers_of(self, filter_name: str) -> list[str]:
+        """Columns of ``estimates`` that hold numbers of a filter."""
+        return NUMBERS if self.error_of(filter_name) == ADDITIVE else OWN_NUMBERS
 
     @property
     def scenario(self) -> Scenario | None:
@@ -100,13 +133,14 @@ class Results(Tables):
     truth: pd.DataFrame | None
     landmarks: pd.DataFrame | None
     manifest: dict[str, Any]
+    map: pd.DataFrame | None = None
 
     @property
     def has_truth(self) -> bool:
         return self.truth is not None
 
     def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
-        rows = self.truth if table == "truth" else self.estimates
+        rows = {"truth": self.truth, "estimates": self.estimates, "map": self.map}[table]
         if rows is not None:
             chosen = slice(None) if filter_name is None else (rows["filter"] == filter_name).to_numpy()
             yield {column: rows[column].to_numpy()[chosen] for column in columns}
@@ -114,13 +148,14 @@ class Results(Tables):
     def write(self, folder: Path, overwrite: bool = False, keep_others: bool = False) -> None:
         """Write the folder at once, as :func:`write_folder`: it appears complete or not at all."""
         tables = {"estimates": self.estimates, "failures": self.failures}
-        tables |= {n: t for n, t in (("truth", self.truth), ("landmarks", self.landmarks)) if t is not None}
+        optional = {"truth": self.truth, "landmarks": self.landmarks, "map": self.map}
+        tables |= {name: table for name, table in optional.items() if table is not None}
         write_folder(folder, tables, self.manifest, overwrite=overwrite, keep_others=keep_others)
 
 
 @dataclass(frozen=True)
 class StoredResults(Tables):
-    """The same in a folder: ``estimates`` and ``truth`` are read each time they are asked for."""
+    """The same in a folder: ``estimates``, ``truth`` and ``map`` are read each time they are asked for."""
 
     folder: Path
     failures: pd.DataFrame
@@ -139,8 +174,12 @@ class StoredResults(Tables):
     def truth(self) -> pd.DataFrame | None:
         return read_parquet(self.folder, "truth") if self.has_truth else None
 
+    @property
+    def map(self) -> pd.DataFrame | None:
+        return read_parquet(self.folder, "map") if "map" in self.manifest.get("tables", []) else None
+
     def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
-        if table != "truth" or self.has_truth:
+        if table == "estimates" or table in self.manifest.get("tables", []):
             yield from read_batches(self.folder, table, columns, filter_name)
 
 
@@ -152,9 +191,13 @@ def joined(parts: Sequence[Results]) -> Results:
         "failures": sum(len(part.failures) for part in parts),
         "wall_time_s": round(sum(part.manifest["wall_time_s"] for part in parts), 3),
     }
+    errors = {name: error for part in parts for name, error in part.manifest.get("error", {}).items()}
+    manifest |= {"error": errors} if errors else {}
     estimates = pd.concat([part.estimates for part in parts], ignore_index=True)
+    maps = [part.map for part in parts if part.map is not None]
+    map_ = pd.concat(maps, ignore_index=True) if maps else None
     failures = pd.concat([p.failures for p in parts if len(p.failures)] or [parts[0].failures], ignore_index=True)
-    return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest)
+    return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest, map=map_)
 
 
 def outcome_of(trial: Trial, said: Sequence[Estimates]) -> Outcome:
@@ -164,27 +207,55 @@ def outcome_of(trial: Trial, said: Sequence[Estimates]) -> Outcome:
         {estimates.filter: _columns(trial, estimates) for estimates in said},
         None if trial.truth is None else _truth_columns(trial, trial.truth),
         tuple(estimates.failure for estimates in said if estimates.failure),
+        {e.filter: _map_columns(trial, e.map) for e in said if e.map is not None and e.failure is None},
     )
 
 
 def _columns(trial: Trial, estimates: Estimates) -> Columns:
     last = estimates.failure.step - 1 if estimates.failure else trial.steps
     pose, P = estimates.pose[:last], estimates.covariance[:last]
-    value = np.full(last, np.nan)
-    if trial.truth is not None:
-        first = next((k for k in range(last) if definiteness(P[k]) == 1), last)
-        # the filter has answered for P: what nees() checks need not be checked again
-        w = whiten(pose_error(trial.truth[1 + first : last + 1], pose[first:]), P[first:])
-        value[first:] = np.einsum("ki,ki->k", w, w)
-    return {
+    true = None if trial.truth is None else trial.truth[1 : last + 1]
+    columns = {
         "run": np.full(last, estimates.run),
         "step": np.arange(1, last + 1),
         "t": trial.t[1 : last + 1],
         **dict(zip(POSE, pose.T, strict=True)),
         **{name: P[:, i, j] for name, (i, j) in COVARIANCE.items()},
-        "nees": value,
+        "nees": _nees(None if true is None else pose_error(true, pose), P),
         "nis": estimates.nis[:last],
         "nis_dof": estimates.nis_dof[:last],
+    }
+    if estimates.own is not None:
+        P, error = estimates.own[:last], None if true is None else planar_error(true, pose, estimates.error)
+        columns |= {name: P[:, i, j] for name, (i, j) in OWN_COVARIANCE.items()} | {"own_nees": _nees(error, P)}
+    return columns
+
+
+def _nees(error: Array | None, P: Array) -> Array:
+    """NEES of one run, (T, 3) and (T, 3, 3) -> (T,); NaN before the first covariance of full rank."""
+    value = np.full(len(P), np.nan)
+    if error is not None:
+        first = next((k for k in range(len(P)) if definiteness(P[k]) == 1), len(P))
+        # the filter has answered for P: what nees() checks need not be checked again
+        w = whiten(error[first:], P[first:])
+        value[first:] = np.einsum("ki,ki->k", w, w)
+    return value
+
+
+def _map_columns(trial: Trial, map_: Map) -> Columns:
+    """Rows of ``map.parquet``; without NEES where the id is no landmark of the world, or its place is not known."""
+    ids, count = map_.landmarks, len(map_.landmarks)
+    nees = np.full(count, np.nan)
+    if trial.landmarks is not None:
+        judged = (ids < len(trial.landmarks)) & ~np.isin(ids, trial.things)
+        w = whiten(trial.landmarks[ids[judged]] - map_.mean[judged], map_.covariance[judged])
+        nees[judged] = np.einsum("ki,ki->k", w, w)
+    return {
+        "run": np.full(count, trial.run),
+        "landmark": ids if trial.labels is None else trial.labels[ids],
+        **dict(zip("xyz", map_.mean.T, strict=True)),
+        **{name: map_.covariance[:, i, j] for name, (i, j) in POINT_COVARIANCE.items()},
+        "nees": nees,
     }
 
 
@@ -197,18 +268,38 @@ def _truth_columns(trial: Trial, path: Array) -> Columns:
     }
 
 
-def estimates_table(parts: Sequence[tuple[str, Columns]]) -> pd.DataFrame:
-    """``estimates.parquet`` of (filter, columns), one below the other."""
+def estimates_table(parts: Sequence[tuple[str, Columns]], own: bool = False) -> pd.DataFrame:
+    """``estimates.parquet`` of (filter, columns), one below the other; ``own``: with the columns of own errors."""
+    table = _by_filter("estimates", parts)
+    missing = [column for column in OPTIONAL["estimates"] if own and column not in table]
+    return table.assign(**dict.fromkeys(missing, np.nan)) if missing else table
+
+
+def map_table(parts: Sequence[tuple[str, Columns]]) -> pd.DataFrame | None:
+    """``map.parquet`` of (filter, columns), one below the other; None without a row."""
+    table = _by_filter("map", parts)
+    return table if len(table) else None
+
+
+def _by_filter(name: str, parts: Sequence[tuple[str, Columns]]) -> pd.DataFrame:
     if not parts:
-        return _empty("estimates")
-    rows = [len(columns["step"]) for _, columns in parts]
-    names = pd.Series([name for name, _ in parts], dtype="str").repeat(rows).reset_index(drop=True)
+        return _empty(name)
+    rows = [len(columns["run"]) for _, columns in parts]
+    names = pd.Series([each for each, _ in parts], dtype="str").repeat(rows).reset_index(drop=True)
     return _table({"filter": names} | _stacked([columns for _, columns in parts]))
 
 
 def _stacked(parts: Sequence[Columns]) -> Columns:
-    """The same columns of all parts, one below the other."""
-    return {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+    """Columns of all parts, one below the other; NaN where a part lacks one."""
+    names = dict.fromkeys(column for part in parts for column in part)
+    return {
+        column: np.concatenate([part[column] if column in part else _nothing(part) for part in parts])
+        for column in names
+    }
+
+
+def _nothing(part: Columns) -> Array:
+    return np.full(len(part["run"]), np.nan)
 
 
 def _table(columns: dict[str, Any]) -> pd.DataFrame:
@@ -288,10 +379,13 @@ def open_results(folder: str | Path) -> StoredResults:
     if "filters" not in manifest:
         raise InputError(f"{folder}: holds no estimates; it was not written by 'consistency run'")
     written = manifest.get("tables", [])
-    for name in ("estimates", *(["truth"] if "truth" in written else [])):
+    for name in ("estimates", *(name for name in ("truth", "map") if name in written)):
         require_table(folder, name)
     landmarks = read_parquet(folder, "landmarks") if "landmarks" in written else None
-    return StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest)
+    results = StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest)
+    if OWN_NUMBERS in map(results.numbers_of, results.filters):
+        require_table(folder, "estimates", OWN_NUMBERS)
+    return results
 
 
 def read_results(folder: str | Path) -> Results:
@@ -303,4 +397,4 @@ def read_results(folder: str | Path) -> Results:
         A file is missing, cut short, or lacks a column.
     """
     stored = open_results(folder)
-    return Results(stored.estimates, stored.failures, stored.truth, stored.landmarks, stored.manifest)
+    return Results(stored.estimates, stored.failures, stored.truth, stored.landmarks, stored.manifest, stored.map)

@@ -14,8 +14,10 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from consistency.diagnostics import Interval, Verdict
+from consistency.diagnostics.export import map_text
 from consistency.diagnostics.monitor import CAVEAT, accepted_scales
 from consistency.diagnostics.wording import short
+from consistency.geometry.conventions import ADDITIVE, PLANAR
 from consistency.store.storage import plain
 from consistency.types import Finding
 from consistency.verdicts.comparison import Compared
@@ -34,32 +36,61 @@ def _console() -> Console:
 
 
 def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
-    """One row a filter; with ``reasons`` also why. ``ratio``: of true to stated covariance, with its 95 % interval."""
+    """One row a filter; with ``reasons`` also why. ``ratio``: of true to stated covariance, with its 95 % interval.
+
+    A filter that is judged in an error of its own has a second row, in the additive error of the world. Scores of maps
+    stand in a line below the table.
+    """
     table = RichTable(box=None, pad_edge=False)
-    columns = ("filter", "verdict", "ANEES", "ratio", "RMSE m", "RMSE deg", "NIS/dof", "failed")
+    own = any(verdict.world is not None for verdict in verdicts.values())
+    columns = (
+        "filter", *["error"] * own, "verdict", "ANEES", "ratio", "RMSE m", "RMSE deg", "NIS/dof", "failed",
+    )  # fmt: skip
     for column in columns:
-        table.add_column(column, justify="left" if column in ("filter", "verdict") else "right")
+        table.add_column(column, justify="left" if column in ("filter", "error", "verdict") else "right")
     for name, verdict in verdicts.items():
-        scale, accuracy, innovations = verdict.scale, verdict.accuracy, verdict.innovations
-        colour = COLOURS[verdict.status]
-        table.add_row(
-            escape(name),
-            f"[{colour}]{verdict.status}[/{colour}]{' (NIS only)' if scale is None else ''}",
-            _number(scale.mean_anees if scale else None, ".2f"),
-            _interval(scale.inflation) if scale else "-",
-            _number(accuracy.rmse_position if accuracy else None, ".3f"),
-            _number(np.rad2deg(accuracy.rmse_heading) if accuracy else None, ".2f"),
-            _number(innovations.ratio if innovations else None, ".3f"),
-            f"{len(verdict.failures)} of {verdict.runs}",
-        )
+        of = (verdict.convention or ADDITIVE) if verdict.world is not None else ADDITIVE
+        table.add_row(escape(name), *[of] * own, *_cells(verdict))
+        if verdict.world is not None:
+            status, anees, ratio, *_ = _cells(verdict.world)
+            table.add_row("", f"{ADDITIVE}, beside it", status, anees, ratio)
     console = _console()
     console.print(table)
+    for line in _below(verdicts):
+        console.print(line, markup=False, soft_wrap=not console.is_terminal)
     if reasons:
         for name, verdict in verdicts.items():
             first, *rest = verdict.reasons
             console.print(f"\n{name} is {first}", markup=False, soft_wrap=not console.is_terminal)
             for reason in rest:
                 console.print(f"  - {reason}", markup=False, soft_wrap=not console.is_terminal)
+
+
+def _cells(verdict: Verdict) -> list[str]:
+    """Verdict, ANEES, ratio, RMSE of position and heading in the world, NIS over dof, and failures."""
+    scale, accuracy, innovations = verdict.scale, verdict.in_world.accuracy, verdict.innovations
+    colour = COLOURS[verdict.status]
+    return [
+        f"[{colour}]{verdict.status}[/{colour}]{' (NIS only)' if scale is None else ''}",
+        _number(scale.mean_anees if scale else None, ".2f"),
+        _interval(scale.inflation) if scale else "-",
+        _number(accuracy.rmse_position if accuracy else None, ".3f"),
+        _number(np.rad2deg(accuracy.rmse_heading) if accuracy else None, ".2f"),
+        _number(innovations.ratio if innovations else None, ".3f"),
+        f"{len(verdict.failures)} of {verdict.runs}",
+    ]
+
+
+def _below(verdicts: dict[str, Verdict]) -> list[str]:
+    """What the errors are, where filters have some of their own; then the maps."""
+    lines = []
+    if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
+        texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
+        lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
+    maps = [f"{name} {map_text(v.map)}" for name, v in verdicts.items() if v.map is not None and v.map.landmarks]
+    if maps:
+        lines.append(f"map after the last step, mean NEES / 3, not judged: {', '.join(maps)}")
+    return lines
 
 
 def print_findings(findings: Sequence[Finding]) -> None:

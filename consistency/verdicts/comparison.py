@@ -15,7 +15,7 @@ from consistency.errors import InputError
 from consistency.store.atomic import write_whole
 from consistency.store.results import POSE, Results, read_results
 from consistency.store.storage import SCHEMA_VERSION, manifest_of, plain
-from consistency.verdicts.judge import curves
+from consistency.verdicts.curves import curves
 
 DETECT = 1.5  # ratio that a sentence speaks of
 
@@ -80,9 +80,10 @@ def baseline_of(results: Results, name: str = "results") -> Baseline:
     filters, failures = {}, {}
     for each in results.filters:
         c = curves(results, each)
-        if c.nees is None or c.error is None:
+        nees = c.judged.nees
+        if nees is None or c.error is None:
             raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
-        filters[each] = summary(c.nees, len(POSE), c.error, c.covariance, c.runs)
+        filters[each] = summary(nees, len(POSE), c.error, c.covariance, c.runs)
         failures[each] = len(c.failures)
     scenario = results.scenario
     m = results.manifest

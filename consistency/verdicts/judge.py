@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from consistency.diagnostics import (
     Design,
@@ -18,103 +17,23 @@ from consistency.diagnostics import (
     follow,
     gate_runs,
     judge,
+    map_score,
     pilot_plan,
     required_runs,
     sequential_design,
 )
 from consistency.diagnostics.scale import FEW
 from consistency.errors import InputError
-from consistency.geometry import pose_error
 from consistency.recording import Recording
-from consistency.store.parquet import COLUMNS, COVARIANCE
-from consistency.store.results import NUMBERS, POSE, Tables
-from consistency.types import Array, Failure, Indices
+from consistency.store.results import POSE, Tables
+from consistency.types import Array
+from consistency.verdicts.curves import Curves, curves, run_means, steps_of
 
 OPTION = {
     "ratio": "detect",
     "false_alarm": "false-alarm",
     "max_runs": "max-runs",
 }  # of the plan, as the command calls it
-
-
-@dataclass(frozen=True)
-class Curves:
-    """One filter's results as arrays over (runs, steps); NaN where a run has no value."""
-
-    filter: str
-    runs: Indices  # (R,), run numbers
-    t: Array  # (T,)
-    covariance: Array  # (R, T, 3, 3)
-    error: Array | None  # (R, T, 3), truth minus estimate, heading wrapped
-    nees: Array | None  # (R, T)
-    nis: Array  # (R, T)
-    nis_dof: Indices  # (R, T)
-    failures: tuple[Failure, ...]
-    optimal_gain: bool = False  # declared by the filter
-
-
-def curves(results: Tables, filter_name: str, steps: int | None = None) -> Curves:
-    """Arrays of one filter; of results in a folder nothing else is read but, unless ``steps`` is known, the steps.
-
-    Raises
-    ------
-    InputError
-        The results hold no such filter.
-    """
-    if filter_name not in results.filters:
-        raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
-    broken = results.failures[results.failures["filter"] == filter_name]
-    runs = results.runs_of(filter_name)
-    steps = _steps(results) if steps is None else steps
-    pose, covariance = np.full((len(runs), steps, 3), np.nan), np.full((len(runs), steps, 3, 3), np.nan)
-    nis, nis_dof = np.full(pose.shape[:2], np.nan), np.zeros(pose.shape[:2], np.int64)
-    nees = np.full(pose.shape[:2], np.nan) if results.has_truth else None
-    t = np.full(steps, np.nan)
-    for batch in results.batches("estimates", NUMBERS, filter_name):
-        if (batch["step"] < 1).any():
-            raise InputError(f"estimates of '{filter_name}': column 'step' must be at least 1")
-        at = np.searchsorted(runs, batch["run"]), batch["step"] - 1
-        for i, axis in enumerate(POSE):
-            pose[*at, i] = batch[axis]
-        for name, (i, j) in COVARIANCE.items():
-            covariance[*at, i, j] = covariance[*at, j, i] = batch[name]
-        nis[at], nis_dof[at], t[at[1]] = batch["nis"], batch["nis_dof"], batch["t"]
-        if nees is not None:
-            nees[at] = batch["nees"]
-    failures = tuple(Failure(filter_name, int(r), int(s), str(why)) for _, r, s, why in broken.itertuples(index=False))
-    error = _errors(results, runs, pose, t) if results.has_truth else None
-    optimal = filter_name in results.manifest.get("optimal_gain", [])
-    return Curves(filter_name, runs, t, covariance, error, nees, nis, nis_dof, failures, optimal)
-
-
-def _errors(results: Tables, runs: Indices, pose: Array, t: Array) -> Array:
-    """Truth minus estimate in the place of ``pose``; NaN without truth. Fills ``t`` where every run had failed."""
-    known = np.zeros(pose.shape[:2], bool)
-    for batch in results.batches("truth", list(COLUMNS["truth"])):
-        chosen = (batch["step"] > 0) & np.isin(batch["run"], runs)
-        row, column = np.searchsorted(runs, batch["run"][chosen]), batch["step"][chosen] - 1
-        t[column] = np.where(np.isnan(t[column]), batch["t"][chosen], t[column])
-        true = np.stack([batch[axis][chosen] for axis in POSE], axis=-1)
-        pose[row, column] = pose_error(true, pose[row, column])
-        known[row, column] = True
-    pose[~known] = np.nan
-    return pose
-
-
-def run_means(c: Curves) -> Array:
-    """Mean NEES of each run over its judged steps, shape (R,); infinite for a failed run."""
-    assert c.nees is not None
-    counted = np.isfinite(c.nees)
-    total = np.where(counted, c.nees, 0.0).sum(axis=1)
-    means = np.where(counted.any(axis=1), total / np.maximum(counted.sum(axis=1), 1), np.inf)
-    means[np.isin(c.runs, [failure.run for failure in c.failures])] = np.inf
-    return np.asarray(means)
-
-
-def wins(a: Curves, b: Curves) -> tuple[int, float]:
-    """Runs in which ``a`` has the lower mean NEES than ``b``, and the two-sided p value of a sign test without ties."""
-    better, worse = (int((run_means(x) < run_means(y)).sum()) for x, y in ((a, b), (b, a)))
-    return better, float(stats.binomtest(better, better + worse).pvalue) if better + worse else 1.0
 
 
 def settings_of(confidence: float | None = None, **given: Any) -> Settings:
@@ -159,11 +78,30 @@ def analyse(
     """
     design = design_of(results) if settings is None and confidence is None else None
     settings = settings_of(confidence) if settings is None else settings
-    verdicts, steps = {}, _steps(results)
+    verdicts, steps = {}, steps_of(results)
     for name in filters or results.filters:
         c = curves(results, name, steps)
-        verdicts[name] = judge(evidence_of(c), settings) if design is None else until_decided(c, design)
+        verdicts[name] = verdict_of(c, settings) if design is None else until_decided(c, design)
     return verdicts
+
+
+def verdict_of(c: Curves, settings: Settings) -> Verdict:
+    """The verdict of one filter in its own error, with that in the additive error and the map beside it."""
+    world = None if c.own is None else judge(evidence_of(c, additive=True), settings)
+    return with_map(replace(judge(evidence_of(c), settings), world=world, convention=own_convention(c)), c)
+
+
+def own_convention(c: Curves) -> str | None:
+    """Convention of the filter's own error, None where it is the additive one."""
+    return None if c.own is None else c.convention
+
+
+def with_map(verdict: Verdict, c: Curves, runs: int | None = None) -> Verdict:
+    """The verdict with the score of the maps of runs 0 to ``runs`` - 1, or of all."""
+    if c.landmarks is None:
+        return verdict
+    some = c.landmarks.run < (np.inf if runs is None else runs)
+    return replace(verdict, map=map_score(c.landmarks.run[some], c.landmarks.nees[some]))
 
 
 def design_of(results: Tables) -> Design | None:
@@ -175,15 +113,19 @@ def design_of(results: Tables) -> Design | None:
         raise InputError(f"manifest.json: key 'until_decided': {error}") from None
 
 
-def evidence_of(c: Curves, runs: int | None = None) -> Evidence:
-    """One filter's arrays as the referee takes them; only runs 0 to ``runs`` - 1, where that is given."""
+def evidence_of(c: Curves, runs: int | None = None, additive: bool = False) -> Evidence:
+    """One filter's arrays as the referee takes them, in the filter's own error or in the additive one of the world.
+
+    Only runs 0 to ``runs`` - 1, where that is given.
+    """
+    of = c.additive if additive else c.judged
     some = slice(None if runs is None else int(np.searchsorted(c.runs, runs)))
     numbers = c.runs[some]
     return Evidence(
         c.filter,
-        None if c.error is None else c.error[some],
-        c.covariance[some],
-        None if c.nees is None else c.nees[some],
+        None if of.error is None else of.error[some],
+        of.covariance[some],
+        None if of.nees is None else of.nees[some],
         nis=c.nis[some],
         nis_dof=c.nis_dof[some],
         optimal_gain=c.optimal_gain,
@@ -195,7 +137,14 @@ def evidence_of(c: Curves, runs: int | None = None) -> Evidence:
 
 def until_decided(c: Curves, design: Design) -> Verdict:
     """The verdict of the look that decided, or of the last one."""
-    return follow(design, lambda runs: evidence_of(c, runs), len(c.runs))[0]
+    verdict, runs = follow(design, lambda runs: evidence_of(c, runs), len(c.runs))
+    return beside(verdict, c, design, runs)
+
+
+def beside(verdict: Verdict, c: Curves, design: Design, runs: int) -> Verdict:
+    """The verdict of a look with what the same ``runs`` say in the additive error, looked at likewise, and the map."""
+    world = None if c.own is None else follow(design, lambda n: evidence_of(c, n, additive=True), runs)[0]
+    return with_map(replace(verdict, world=world, convention=own_convention(c)), c, runs)
 
 
 def analyse_recordings(
@@ -278,7 +227,7 @@ def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str
 
 def _pilot_means(c: Curves) -> Array:
     """Mean NEES over dof of the runs that did not fail, (runs,)."""
-    if c.nees is None:
+    if c.judged.nees is None:
         raise InputError(f"{c.filter}: has no truth; only runs with a NEES tell how their steps depend on each other")
     means = run_means(c)
     means = means[np.isfinite(means)] / len(POSE)
@@ -291,12 +240,3 @@ def refused(error: ValueError) -> InputError:
     """What a plan refuses, with the option of the command in place of the argument."""
     name, rest = str(error).split(" ", 1)
     return InputError(f"--{OPTION.get(name, name)} {rest}")
-
-
-def _steps(results: Tables) -> int:
-    """Steps of the longest run, failed steps counted."""
-    last = int(results.failures["step"].max()) if len(results.failures) else 0
-    for table in ("estimates", "truth"):
-        for batch in results.batches(table, ["step"]):
-            last = max(last, int(batch["step"].max(initial=0)))
-    return last

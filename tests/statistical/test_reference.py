@@ -10,7 +10,7 @@ import pytest
 
 import consistency as cs
 from consistency.runs.findings import reproduce
-from consistency.verdicts.judge import curves
+from consistency.verdicts.curves import curves
 
 REFERENCE = Path(__file__).parents[2] / "reports" / "reference"
 

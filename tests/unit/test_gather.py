@@ -26,7 +26,7 @@ from consistency.store.results import Outcome, StoredResults, open_results, outc
 from consistency.terminal.table import verdicts_json
 from consistency.types import Trial
 
-TABLES = ("estimates", "failures", "truth", "landmarks")
+TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 FILTERS = ["ekf-uvd", "ekf-xyz"]
 
 
@@ -282,9 +282,10 @@ def test_resuming_keeps_failures_and_fills_gaps(uvd: cs.Scenario, tmp_path: Path
     filters = [Halts(), "ekf-uvd"]
     whole = cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1)
     whole.write(tmp_path / "whole")
-    gaps = {n: t[~t["run"].isin([1, 4, 8])] for n, t in (("estimates", whole.estimates), ("truth", whole.truth))}
+    tables = (("estimates", whole.estimates), ("truth", whole.truth), ("map", whole.map))
+    gaps = {n: t[~t["run"].isin([1, 4, 8])] for n, t in tables}
     failures = whole.failures[~whole.failures["run"].isin([1, 4, 8])]
-    part = cs.Results(gaps["estimates"], failures, gaps["truth"], whole.landmarks, whole.manifest)
+    part = cs.Results(gaps["estimates"], failures, gaps["truth"], whole.landmarks, whole.manifest, gaps["map"])
     part.write(tmp_path / "out")
     cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1, previous=open_results(tmp_path / "out"), out=tmp_path / "out")
     assert content(tmp_path / "out") == content(tmp_path / "whole")

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from consistency.types import Array, Failure
-from consistency.verdicts.judge import Curves, run_means, wins
+from consistency.verdicts.curves import Curves, run_means, wins
 
 
 def curves(nees: Array, failed: tuple[int, ...] = (), first: int = 0) -> Curves:

@@ -19,9 +19,9 @@ from consistency.runs.montecarlo import simulate_log
 from consistency.store.parquet import COLUMNS
 from consistency.store.storage import require_free
 from consistency.types import Control, Gaussian, Observation
-from consistency.verdicts.judge import curves
+from consistency.verdicts.curves import curves
 
-TABLES = ("estimates", "failures", "truth", "landmarks")
+TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 
 
 class Sleepy:

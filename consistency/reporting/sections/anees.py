@@ -147,8 +147,14 @@ def caption(anees: Anees) -> str:
     )
     return (
         f"{what}; {expected} is expected (line). Shaded: the 95 % band of a single step (eq. 17), which is not judged."
-        f"{_simultaneous(anees)} Above is overconfident, below conservative.{extra}"
+        f"{_simultaneous(anees)} Above is overconfident, below conservative.{extra}{_own(anees)}"
     )
+
+
+def _own(anees: Anees) -> str:
+    """Whose NEES is that of another error than the additive one."""
+    own = anees.study.own_errors
+    return f" In the filter's own error: {listed(own)}." if own else ""
 
 
 def _simultaneous(anees: Anees) -> str:

@@ -13,7 +13,7 @@ from consistency.reporting.model import Study, Track, wide
 from consistency.reporting.section import STUDY, Section
 from consistency.reporting.wording import listed
 from consistency.types import Array
-from consistency.verdicts.judge import Curves
+from consistency.verdicts.curves import Curves
 
 LEAST = 0.1  # correlation drawn on either side of zero, so that noise does not look large
 ONE = Look("#333333", width=0.8)

@@ -79,7 +79,7 @@ def columns(study: Study) -> tuple[Column, ...]:
 
 def row(track: Track) -> tuple[str, ...]:
     """Cells of the verdict table, as :func:`columns`."""
-    v, location, accuracy = track.verdict, track.verdict.location, track.verdict.accuracy
+    v, location, accuracy = track.verdict, track.verdict.location, track.verdict.in_world.accuracy
     since = None if location is None else location.since
     return (
         track.name,
@@ -143,6 +143,8 @@ def caption(study: Study) -> str:
     text += f". Shown inside {equivalence_interval(study)}: whether the ratio {what} is shown to lie there"
     if len(study.judged) < len(study.tracks):
         text += ". NIS in parentheses: reported and not judged, as no optimal gain is declared"
+    if own := study.own_errors:
+        text += f". Judged in an error of their own, but for the RMSE: {listed(own)}; see Errors of their own"
     return f"{text}."
 
 

@@ -1,0 +1,165 @@
+"""From result tables to one filter's arrays over runs and steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from consistency.errors import InputError
+from consistency.geometry.conventions import ADDITIVE, planar_error
+from consistency.store.parquet import COLUMNS, COVARIANCE, OWN_COVARIANCE, Columns
+from consistency.store.results import POSE, Tables
+from consistency.types import Array, Failure, Indices
+
+
+class Errors(NamedTuple):
+    """Errors in one convention, with their covariance and NEES; R runs, T steps, NaN where a run has no value."""
+
+    error: Array | None  # (R, T, 3), truth minus estimate; None without truth
+    covariance: Array  # (R, T, 3, 3)
+    nees: Array | None  # (R, T)
+
+
+class Landmarks(NamedTuple):
+    """NEES of the landmarks in the maps after the last step; M landmarks of all runs."""
+
+    run: Indices  # (M,)
+    nees: Array  # (M,), NaN where the landmark is not judged
+
+
+@dataclass(frozen=True)
+class Curves:
+    """One filter's results as arrays over (runs, steps); NaN where a run has no value."""
+
+    filter: str
+    runs: Indices  # (R,), run numbers
+    t: Array  # (T,)
+    covariance: Array  # (R, T, 3, 3)
+    error: Array | None  # (R, T, 3), truth minus estimate, heading wrapped
+    nees: Array | None  # (R, T)
+    nis: Array  # (R, T)
+    nis_dof: Indices  # (R, T)
+    failures: tuple[Failure, ...]
+    optimal_gain: bool = False  # declared by the filter
+    convention: str = ADDITIVE  # of the filter's own error
+    own: Errors | None = None  # in that convention, where it is not the additive one
+    landmarks: Landmarks | None = None  # None where no run has a map
+
+    @property
+    def additive(self) -> Errors:
+        """The additive errors of the pose in the world."""
+        return Errors(self.error, self.covariance, self.nees)
+
+    @property
+    def judged(self) -> Errors:
+        """The errors that the filter states the covariance of."""
+        return self.additive if self.own is None else self.own
+
+
+def curves(results: Tables, filter_name: str, steps: int | None = None) -> Curves:
+    """Arrays of one filter; of results in a folder nothing else is read but, unless ``steps`` is known, the steps.
+
+    Raises
+    ------
+    InputError
+        The results hold no such filter, or lack the covariance of its own error.
+    """
+    if filter_name not in results.filters:
+        raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
+    broken = results.failures[results.failures["filter"] == filter_name]
+    convention, runs = results.error_of(filter_name), results.runs_of(filter_name)
+    steps = steps_of(results) if steps is None else steps
+    pose, covariance = np.full((len(runs), steps, 3), np.nan), np.full((len(runs), steps, 3, 3), np.nan)
+    own = None if convention == ADDITIVE else covariance.copy()
+    nis, nis_dof = np.full(pose.shape[:2], np.nan), np.zeros(pose.shape[:2], np.int64)
+    nees = np.full(pose.shape[:2], np.nan) if results.has_truth else None
+    own_nees = None if own is None or nees is None else nees.copy()
+    t = np.full(steps, np.nan)
+    for batch in results.batches("estimates", results.numbers_of(filter_name), filter_name):
+        if (batch["step"] < 1).any():
+            raise InputError(f"estimates of '{filter_name}': column 'step' must be at least 1")
+        at = np.searchsorted(runs, batch["run"]), batch["step"] - 1
+        for i, axis in enumerate(POSE):
+            pose[*at, i] = batch[axis]
+        _fill(covariance, at, batch, COVARIANCE)
+        nis[at], nis_dof[at], t[at[1]] = batch["nis"], batch["nis_dof"], batch["t"]
+        if nees is not None:
+            nees[at] = batch["nees"]
+        if own is not None:
+            _require_own(batch, filter_name)
+            _fill(own, at, batch, OWN_COVARIANCE)
+        if own_nees is not None:
+            own_nees[at] = batch["own_nees"]
+    failures = tuple(Failure(filter_name, int(r), int(s), str(why)) for _, r, s, why in broken.itertuples(index=False))
+    own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
+    error = _errors(results, runs, pose, t) if results.has_truth else None
+    return Curves(
+        filter_name, runs, t, covariance, error, nees, nis, nis_dof, failures,
+        optimal_gain=filter_name in results.manifest.get("optimal_gain", []),
+        convention=convention,
+        own=None if own is None else Errors(own_error, own, own_nees),
+        landmarks=_landmarks(results, filter_name),
+    )  # fmt: skip
+
+
+def _fill(covariance: Array, at: tuple[Any, Any], batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
+    for name, (i, j) in columns.items():
+        covariance[*at, i, j] = covariance[*at, j, i] = batch[name]
+
+
+def _require_own(batch: Columns, filter_name: str) -> None:
+    for column in OWN_COVARIANCE:
+        if np.isnan(batch[column]).any():
+            raise InputError(
+                f"estimates of '{filter_name}': column '{column}' is null, but manifest.json says that it has an "
+                "error of its own; run it again"
+            )
+
+
+def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: str = ADDITIVE) -> Array:
+    """Errors in the place of ``pose``; NaN without truth. Fills ``t`` where every run had failed."""
+    known = np.zeros(pose.shape[:2], bool)
+    for batch in results.batches("truth", list(COLUMNS["truth"])):
+        chosen = (batch["step"] > 0) & np.isin(batch["run"], runs)
+        row, column = np.searchsorted(runs, batch["run"][chosen]), batch["step"][chosen] - 1
+        t[column] = np.where(np.isnan(t[column]), batch["t"][chosen], t[column])
+        true = np.stack([batch[axis][chosen] for axis in POSE], axis=-1)
+        pose[row, column] = planar_error(true, pose[row, column], convention)
+        known[row, column] = True
+    pose[~known] = np.nan
+    return pose
+
+
+def _landmarks(results: Tables, filter_name: str) -> Landmarks | None:
+    batches = list(results.batches("map", ["run", "nees"], filter_name))
+    run, nees = (np.concatenate([[], *(batch[column] for batch in batches)]) for column in ("run", "nees"))
+    return Landmarks(run.astype(np.int64), nees) if len(run) else None
+
+
+def run_means(c: Curves) -> Array:
+    """Mean NEES of each run over its judged steps, in the filter's own error, shape (R,); infinite for a failed run."""
+    nees = c.judged.nees
+    assert nees is not None
+    counted = np.isfinite(nees)
+    total = np.where(counted, nees, 0.0).sum(axis=1)
+    means = np.where(counted.any(axis=1), total / np.maximum(counted.sum(axis=1), 1), np.inf)
+    means[np.isin(c.runs, [failure.run for failure in c.failures])] = np.inf
+    return np.asarray(means)
+
+
+def wins(a: Curves, b: Curves) -> tuple[int, float]:
+    """Runs in which ``a`` has the lower mean NEES than ``b``, and the two-sided p value of a sign test without ties."""
+    better, worse = (int((run_means(x) < run_means(y)).sum()) for x, y in ((a, b), (b, a)))
+    return better, float(stats.binomtest(better, better + worse).pvalue) if better + worse else 1.0
+
+
+def steps_of(results: Tables) -> int:
+    """Steps of the longest run, failed steps counted."""
+    last = int(results.failures["step"].max()) if len(results.failures) else 0
+    for table in ("estimates", "truth"):
+        for batch in results.batches(table, ["step"]):
+            last = max(last, int(batch["step"].max(initial=0)))
+    return last

@@ -134,14 +134,17 @@ def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
 
 def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
     P = rig.cameras
-    A = uv[:, :, None] * P[:, 2].repeat(2, axis=0) - P[:, :2].reshape(4, 4)
-    return A[:, :, :3], -A[:, :, 3]
+    rows, last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
+    A = uv[:, :, None] * last[:, :3]
+    A -= rows[:, :3]
+    return A, -(uv * last[:, 3] - rows[:, 3])
 
 
 def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
     At = np.swapaxes(A, 1, 2)
-    inverse, definite = small.inverse(At @ A)
-    alone = np.einsum("nii,nij,nij->ni", inverse, At, At)
+    AtA = At @ A
+    inverse, definite = small.inverse(AtA)
+    alone = np.einsum("nii,nii->ni", inverse, AtA)
     definite &= (alone < 1.0 / FIXED).all(axis=1)
     points = (inverse @ (At @ b[:, :, None]))[:, :, 0]
     depth = points @ rig.cameras[:, 2, :3].T + rig.cameras[:, 2, 3]

@@ -1,12 +1,14 @@
-"""Results as one offline HTML file and as a PDF; both show the same model.
+"""Results as one offline HTML file and as a PDF; both show the same document.
 
-``build`` reads a folder and works out every number, ``html`` and ``pdf`` only show them. No
-statistic is computed here that the diagnostics do not already have.
+``build`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each of which
+is described once. ``html`` and ``pdf`` show the blocks; ``screen`` and ``paper`` draw the figures. No statistic is
+computed here that the diagnostics do not already have.
 """
 
 from __future__ import annotations
 
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,16 +49,17 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     read_manifest(Path(folder))
     for path in targets:
         _require_writable(path, overwrite)
-    from consistency.reporting.build import build_report
+    from consistency.reporting.build import build_report, compose
     from consistency.reporting.html import render_html
-    from consistency.reporting.pdf import render_pdf
+    from consistency.reporting.pdf import pdf_beside
 
-    report = build_report(Path(folder))
+    document = compose(build_report(Path(folder)))
     contents: list[tuple[Path, bytes]] = []
-    if html is not None:
-        contents.append((html, render_html(report).encode("utf-8")))
-    if pdf is not None:
-        contents.append((pdf, render_pdf(report)))
+    with pdf_beside(document) if pdf is not None else nullcontext(bytes) as finished:
+        if html is not None:
+            contents.append((html, render_html(document).encode("utf-8")))
+        if pdf is not None:
+            contents.append((pdf, finished()))
     for path, content in contents:
         _write(path, content)
     return targets

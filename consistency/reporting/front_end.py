@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from io import BytesIO
-
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from consistency.reporting import plots
-from consistency.reporting.figures import RC, WIDTH
+from consistency.reporting import paper
+from consistency.reporting.drawing import Axis, Line, Panel, Points, Sheet, xy
+from consistency.reporting.looks import COLOURS, DASHES, TRUTH, Look
 from consistency.types import Array
 
 FEATURES = 3.0  # standard deviations of the ellipses, fig. 2.4
 POSES = 2.0  # fig. 2.5
 PLANES = ((0, 2, "x (mm)", "z (mm)"), (0, 1, "x (mm)", "y (mm)"), (3, 4, "roll (mrad)", "pitch (mrad)"))
-NOISE = plots.Style(plots.COLOURS[1], (), "o")
-MONTE_CARLO, IMPLICIT = plots.Style(plots.TRUTH, (), "o"), plots.Style(plots.COLOURS[2], plots.DASHES[1], "s")
+NOISE = Look(COLOURS[1], width=1.1)
+MONTE_CARLO, IMPLICIT = Look(TRUTH, width=1.1), Look(COLOURS[2], DASHES[1], width=1.1)
+SAMPLE, MEAN = Look("#8c8c8c", size=1.0, alpha=0.6), Look(COLOURS[1], size=3.5)
 
 
 def matches_png(image: Array, uv: Array, covariances: Array, resolution: int = 200) -> bytes:
@@ -24,13 +24,14 @@ def matches_png(image: Array, uv: Array, covariances: Array, resolution: int = 2
 
     As Valencia & Andrade-Cetto (2018) fig. 2.4.
     """
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(WIDTH, WIDTH * image.shape[0] / image.shape[1]), layout="constrained")
+    with mpl.rc_context(paper.RC):
+        figure = Figure(figsize=(paper.WIDTH, paper.WIDTH * image.shape[0] / image.shape[1]), layout="constrained")
         axes = figure.subplots()
-        plots.image(axes, image)
+        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
+        axes.set_axis_off()
         for centre, covariance in zip(uv, covariances, strict=True):
-            plots.ellipse(axes, centre, covariance, FEATURES, NOISE)
-        return _png(figure, resolution)
+            paper.draw_line(axes, ellipse(centre, covariance, FEATURES, NOISE), 4.0)
+        return paper.picture(figure, "png", resolution)
 
 
 def samples_png(samples: Array, centre: Array, covariance: Array, resolution: int = 200) -> bytes:
@@ -38,18 +39,27 @@ def samples_png(samples: Array, centre: Array, covariance: Array, resolution: in
 
     As Valencia & Andrade-Cetto (2018) fig. 2.5, ellipses of 2 standard deviations.
     """
-    spread = np.cov(samples.T)
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(WIDTH, WIDTH / 3), layout="constrained")
-        for axes, (i, j, *labels) in zip(figure.subplots(1, len(PLANES)), PLANES, strict=True):
-            plots.cloud(axes, 1e3 * samples[:, [i, j]], (labels[0], labels[1]))
-            both = np.ix_([i, j], [i, j])
-            plots.ellipse(axes, 1e3 * samples[:, [i, j]].mean(axis=0), 1e6 * spread[both], POSES, MONTE_CARLO)
-            plots.ellipse(axes, 1e3 * centre[[i, j]], 1e6 * covariance[both], POSES, IMPLICIT)
-        return _png(figure, resolution)
+    spread, panels = np.cov(samples.T), []
+    for i, j, *labels in PLANES:
+        both, points = np.ix_([i, j], [i, j]), 1e3 * samples[:, [i, j]]
+        mean = points.mean(axis=0)
+        marks = (
+            Points(*xy(points), SAMPLE, whole=True),
+            ellipse(mean, 1e6 * spread[both], POSES, MONTE_CARLO),
+            ellipse(1e3 * centre[[i, j]], 1e6 * covariance[both], POSES, IMPLICIT),
+            Points(*xy(mean[None]), MEAN),
+        )
+        panels.append(Panel(Axis(labels[0]), Axis(labels[1]), marks, f"{labels[0]} and {labels[1]} of the poses"))
+    return paper.render(Sheet(tuple(panels), paper.WIDTH / 3), "png", resolution)
 
 
-def _png(figure: Figure, resolution: int) -> bytes:
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=resolution, metadata={"Software": None})
-    return buffer.getvalue()
+def ellipse(centre: Array, covariance: Array, scale: float, look: Look) -> Line:
+    """Iso-uncertainty curve of a covariance (2, 2) about ``centre`` (2,), ``scale`` standard deviations wide.
+
+    Valencia & Andrade-Cetto (2018) fig. 2.4 and 2.5.
+    """
+    width, axis = np.linalg.eigh(covariance)
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    half = scale * np.sqrt(np.maximum(width, 0.0))
+    curve = axis @ (half[:, None] * np.stack([np.cos(turn), np.sin(turn)])) + np.asarray(centre)[:, None]
+    return Line(curve[0], curve[1], look, path=True)

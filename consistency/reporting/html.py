@@ -1,19 +1,18 @@
-"""The report model as one HTML file that needs nothing else."""
+"""A document as one HTML file that needs nothing else."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from bokeh.document import Document as BokehDocument
 from bokeh.embed import components
 from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from consistency.reporting import captions, diagnosis, plots, wording
-from consistency.reporting.charts import MARKERS, distribution_charts, study_charts
-from consistency.reporting.diagnosis_charts import diagnosis_charts
-from consistency.reporting.model import Report
-from consistency.reporting.stereo_charts import front_end_charts
+from consistency.reporting.blocks import Chapter, Document
+from consistency.reporting.drawing import Figure, Panel, numbers
+from consistency.reporting.screen import Screen
 from consistency.reporting.thin import LIMIT
 
 MAXIMUM = 6_000_000  # bytes of the whole file
@@ -21,47 +20,61 @@ SCRIPT = 1_400_000  # bytes of Bokeh itself, style and words
 CHART = 16_000  # bytes of a chart before its data
 POINT = 5.4  # bytes of one number in base64
 LEAST = 120  # points a line below which a curve is no curve
-FRONT_END = 120_000  # bytes of the charts of the stereo front-end
-NUMBERS = 26  # columns of all charts of one filter
 
 
-def render_html(report: Report) -> str:
+def render_html(document: Document) -> str:
     """The whole page: style, script, data and words in one string."""
-    limit = points_a_line(report)
-    groups: list[dict[str, Any]] = []
-    for index, study in enumerate(report.studies):
-        charts = study_charts(study, index, limit) | diagnosis_charts(study, index, limit)
-        groups.append({f"s{index}-{name}": chart for name, chart in charts.items()})
-    for index, distribution in enumerate(report.distributions):
-        pair = distribution_charts(distribution)
-        groups.append({f"d{index}-cloud": pair[0], f"d{index}-histogram": pair[1]})
-    if report.front_end:
-        groups.append({f"f-{name}": chart for name, chart in front_end_charts(report.front_end).items()})
-    # one document a study: Bokeh walks through a whole document for every chart added to it
-    embedded = [components(group) for group in groups]
+    limit = points_a_line(document)
+    drawn = [_charts(chapter, limit) for chapter in document.chapters]
+    charts = {key: markup for _, found in drawn for key, markup in found.items()}
+    scripts = [script for script, found in drawn if found]
+    longest = max((row[0] for row in _rows(document)), default=0)
     environment = Environment(
         loader=PackageLoader("consistency.reporting"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
+    environment.filters["kind"] = lambda block: type(block).__name__
     return environment.get_template("report.html.j2").render(
-        report=report,
-        wording=wording,
-        captions=captions,
-        diagnosis=diagnosis,
-        style=plots.style,
-        plots=plots,
-        shapes=MARKERS,
-        thinned=limit if any(len(study.steps) > limit for study in report.studies) else None,
-        bokeh=Markup(Resources(mode="inline", components=["bokeh"]).render()) if groups else "",
-        chart_scripts=[Markup(script) for script, _ in embedded],
-        chart={name: Markup(div) for _, divs in embedded for name, div in divs.items()},
+        document=document,
+        chart=lambda panel: charts[id(panel)],
+        chart_scripts=scripts,
+        thinned=limit if longest > limit else None,
+        bokeh=Markup(Resources(mode="inline", components=["bokeh"]).render()) if scripts else "",
     )
 
 
-def points_a_line(report: Report) -> int:
+def _panels(chapter: Chapter) -> list[Panel]:
+    return [panel for block in chapter.blocks if isinstance(block, Figure) for panel in block.panels]
+
+
+def _charts(chapter: Chapter, limit: int) -> tuple[Markup, dict[int, Markup]]:
+    """The script of all charts of a chapter, and the place of each panel, by its id."""
+    panels = _panels(chapter)
+    if not panels:
+        return Markup(), {}
+    screen = Screen(limit)
+    roots = [screen.draw(panel) for panel in panels]
+    # one document a chapter, its models collected once: Bokeh walks through a whole document for every chart added
+    bokeh = BokehDocument()
+    with bokeh.models.freeze():
+        for root in roots:
+            bokeh.add_root(root)
+    script, places = components(roots)
+    return Markup(script), {id(panel): Markup(place) for panel, place in zip(panels, places, strict=True)}
+
+
+def _rows(document: Document) -> list[tuple[int, int]]:
+    """Length and number of columns of what is drawn."""
+    return [row for chapter in document.chapters for panel in _panels(chapter) for row in map(numbers, panel.marks)]
+
+
+def points_a_line(document: Document) -> int:
     """Points that a line may have so that the file stays below its greatest size."""
-    tracks = sum(len(study.tracks) for study in report.studies)
-    charts = 11 * len(report.studies) + 2 * len(report.distributions)
-    room = MAXIMUM - SCRIPT - CHART * charts - 30_000 * len(report.distributions)
-    room -= FRONT_END if report.front_end else 0
-    return int(min(LIMIT, max(LEAST, room / (POINT * NUMBERS * max(tracks, 1)))))
+    rows = _rows(document)
+    room: Any = MAXIMUM - SCRIPT - CHART * sum(len(_panels(chapter)) for chapter in document.chapters)
+    low, high = LEAST, LIMIT
+    while low < high:
+        middle = (low + high + 1) // 2
+        size = POINT * sum(columns * min(length, middle) for length, columns in rows)
+        low, high = (middle, high) if size <= room else (low, middle - 1)
+    return low

@@ -2,42 +2,56 @@
 
 from __future__ import annotations
 
-import warnings
-from io import BytesIO
-from typing import Any
+from dataclasses import replace
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
-from consistency.reporting import plots
-from consistency.reporting.figures import RC, WIDTH
-from consistency.reporting.thin import thin
+from consistency.reporting import paper
+from consistency.reporting.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
+from consistency.reporting.looks import EXPECTED, LIMIT, style
 from consistency.types import Array
 from consistency.verdicts.monitoring import Watched
 
 HEIGHT = 3.6  # inches
 POINTS = 600  # at most, of the NIS: few enough to see a change among them
-NO_DATE: dict[str, Any] = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
+FAULT = replace(style(1), dash=(), width=1.1)
 
 
 def monitor_plot(watched: Watched, kind: str, resolution: int = 200) -> bytes:
     """NIS / dof above, the e-value below, over the steps of the file; ``kind`` is png, pdf or svg."""
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
-        upper, lower = figure.subplots(2, 1, sharex=True)
-        step, ratio, together = averaged(watched.step, watched.nis_over_dof)
-        plots.nis(upper, step, ratio, plots.style(0), log=bool((ratio > 0).any()))
-        upper.set(xlabel="", ylabel="NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})")
-        plots.title(upper, watched.name)
-        rows, alarm = thin(watched.evidence), watched.alarm
-        span = None if alarm is None else (float(alarm.since), float(alarm.step))
-        plots.evidence(lower, watched.step[rows], watched.evidence[rows], watched.monitor.threshold, span)
-        buffer = BytesIO()
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # of a name; drawn as boxes
-            figure.savefig(buffer, format=kind, dpi=resolution, metadata=NO_DATE[kind])
-        return buffer.getvalue()
+    return paper.render(sheet(watched), kind, resolution)
+
+
+def sheet(watched: Watched) -> Sheet:
+    """One panel above the other, over the same steps."""
+    return Sheet((_sizes(watched), _evidence(watched)), HEIGHT, columns=1)
+
+
+def _sizes(watched: Watched) -> Panel:
+    step, ratio, together = averaged(watched.step, watched.nis_over_dof)
+    label = "NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})"
+    points = Points(step, ratio, replace(style(0), size=2.0, alpha=0.7))
+    return Panel(
+        Axis("step", share="step"), Axis(label, log=bool((ratio > 0).any())), (points, Rule("y", 1.0, EXPECTED)),
+        f"NIS over degrees of freedom of {watched.name} over steps", title=watched.name,
+    )  # fmt: skip
+
+
+def _evidence(watched: Watched) -> Panel:
+    """E-value after each step with the value at which an alarm is raised; since the fault it is shaded.
+
+    What goes on beyond the square of that value is cut off.
+    """
+    threshold, alarm = watched.monitor.threshold, watched.alarm
+    marks: list[Mark] = []
+    if alarm is not None:
+        marks.append(Span("x", float(alarm.since), float(alarm.step), replace(FAULT, alpha=0.15)))
+        marks.append(Rule("x", float(alarm.step), FAULT))
+    marks += [Rule("y", threshold, LIMIT), Line(watched.step, watched.evidence, style(0))]
+    return Panel(
+        Axis("step", share="step"), Axis("e-value", log=True, most=threshold**2), tuple(marks),
+        f"E-value of {watched.name} over steps",
+    )  # fmt: skip
 
 
 def averaged(step: Array, ratio: Array) -> tuple[Array, Array, int]:

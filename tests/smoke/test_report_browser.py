@@ -13,7 +13,7 @@ import pytest
 import consistency as cs
 from consistency.diagnostics.records import STATUSES
 from consistency.reporting import write_reports
-from consistency.reporting.wording import MARKS
+from consistency.reporting.sections.questions import MARKS
 
 pytestmark = pytest.mark.browser
 
@@ -118,7 +118,7 @@ def test_the_diagnosis_is_drawn_for_every_filter(browser):
     drawn = dict(marks)
     for label in ("covariance ratio (truth / stated)", "within 2 sigma (%)", "lag (steps)"):
         assert drawn[label] == ["0:0", "0:1"], label
-    cells = browser.find_elements("css selector", "table.questions td")
+    cells = browser.find_elements("css selector", "table.marks td")
     assert len(cells) >= 2 * 6
     assert all(cell.text[0] in MARKS for cell in cells)
     spoken = {cell.find_element("css selector", "span").get_attribute("aria-label") for cell in cells}
@@ -161,14 +161,13 @@ def test_hovering_shows_step_and_the_odd_name_as_text(browser):
     chart = browser.find_elements("css selector", ".chart")[4]
     spot = browser.execute_script(
         """
-        const valued = (r) => r.data_source !== undefined && 'value' in r.data_source.data;
-        const chart = Bokeh.documents[0].roots().find((c) => c.renderers.some(valued));
-        const line = chart.renderers.find((r) => r.tags.includes('0:1') && 'value' in r.data_source.data);
+        const chart = Bokeh.documents[0].roots().find((c) => c.left[0].axis_label === 'ANEES of the pose');
+        const line = chart.renderers.find((r) => r.tags.includes('0:1') && 'most' in r.data_source.data);
         const view = Bokeh.index.get_by_id ? Bokeh.index.get_by_id(chart.id) : Bokeh.index[chart.id];
         const data = line.data_source.data, i = 30;
         const frame = view.frame;
         const box = view.el.getBoundingClientRect();
-        return [box.x + frame.x_scale.compute(data.step[i]), box.y + frame.y_scale.compute(data.value[i])];
+        return [box.x + frame.x_scale.compute(data.x[i]), box.y + frame.y_scale.compute(data.y[i])];
         """
     )
     box = browser.execute_script(

@@ -30,7 +30,7 @@ RANK = {
     "runs.gather": 7, "runs.montecarlo": 8, "frontend": 8,
     "verdicts.judge": 8, "verdicts.monitoring": 8, "verdicts.comparison": 9,
     "runs.sequential": 9,
-    "reporting.plots": 10, "terminal.table": 10,
+    "terminal.table": 10,
     "runs.findings": 11,
     "reporting": 12, "gating": 12,
     "cli": 13, "testing": 13, "pytest_plugin": 13,
@@ -74,7 +74,7 @@ def complaints(room: str, source: str) -> list[str]:
                 found.add(f"{room} imports consistency.{other}")
         elif room == "diagnostics" and top not in {"numpy", "scipy"} | sys.stdlib_module_names:
             found.add(f"diagnostics imports {top}")
-        elif top in DRAWING and room not in {"reporting.plots", "reporting"}:
+        elif top in DRAWING and room != "reporting":
             found.add(f"{room} imports {top}")
     return sorted(found)
 
@@ -128,7 +128,7 @@ FORBIDDEN = [
     ("diagnostics", "from consistency.scenario import Belief"),
     ("runs.montecarlo", "from consistency.verdicts.judge import analyse"),
     ("runs.montecarlo", "import matplotlib.pyplot as plt"),
-    ("reporting.plots", "from consistency.reporting import write_reports"),
+    ("terminal.table", "from consistency.reporting import write_reports"),
     ("gating", "from consistency.testing import assert_consistent"),
     ("testing", "from consistency.pytest_plugin import Gates"),
     ("store.results", "if TYPE_CHECKING:\n    from consistency.store.log import Log"),

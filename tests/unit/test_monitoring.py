@@ -13,13 +13,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib import image
-from matplotlib.figure import Figure
 
 import consistency as cs
 from consistency.errors import InputError
 from consistency.recording.nis import NisLog
-from consistency.reporting import plots, require_plot, write_monitor_plot
-from consistency.reporting.monitor import POINTS, averaged, monitor_plot
+from consistency.reporting import paper, require_plot, write_monitor_plot
+from consistency.reporting.monitor import POINTS, averaged, monitor_plot, sheet
 from consistency.terminal.table import print_watched, watched_json
 from consistency.verdicts.monitoring import Watched, make_monitor, read_innovations, watch, watch_lines
 
@@ -327,17 +326,19 @@ def test_a_run_without_any_innovation_can_be_drawn() -> None:
 
 
 def test_evidence_is_drawn_with_its_threshold_and_alarm() -> None:
-    axes = Figure().subplots()
-    values = np.array([1.0, 0.5, 1e3, 1e12])
-    plots.evidence(axes, np.arange(1, 5), values, 1000.0, (2.0, 3.0))
-    line = next(line for line in axes.lines if len(line.get_ydata()) == 4)
-    np.testing.assert_array_equal(line.get_ydata(), values)
-    levels = [line.get_ydata()[0] for line in axes.lines if len(set(line.get_ydata())) == 1]
-    assert levels == [1000.0]
+    watched = changed()
+    alarm, threshold = watched.alarm, watched.monitor.threshold
+    assert alarm is not None
+    axes = paper.draw(sheet(watched)).axes[1]
+    line = next(line for line in axes.lines if len(line.get_ydata()) == len(watched.evidence))
+    np.testing.assert_array_equal(line.get_ydata(), watched.evidence)
+    assert [line.get_ydata()[0] for line in axes.lines if list(line.get_xdata()) == [0, 1]] == [threshold]
     assert axes.get_yscale() == "log"
-    assert axes.get_ylim()[1] == 1e6
+    assert axes.get_ylim()[1] <= threshold**2 < watched.evidence.max()
     span = axes.patches[0]
-    assert (span.get_x(), span.get_x() + span.get_width()) == (2.0, 3.0)
-    assert [tuple(line.get_xdata()) for line in axes.lines if line.get_xdata()[0] == 3.0]
-    plots.evidence(quiet := Figure().subplots(), np.arange(1, 5), values, 1000.0, None)
-    assert not quiet.patches
+    assert (span.get_x(), span.get_x() + span.get_width()) == (alarm.since, alarm.step)
+    assert [line for line in axes.lines if list(line.get_xdata()) == [alarm.step, alarm.step]]
+    quiet = watch(
+        NisLog("f", np.arange(1.0, 6), np.full(5, np.nan), np.full(5, 3.0), np.full(5, 3.0)), make_monitor("optimal")
+    )
+    assert not paper.draw(sheet(quiet)).axes[1].patches

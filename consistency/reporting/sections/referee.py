@@ -10,10 +10,24 @@ from typing import Any
 
 from scipy import stats
 
+from consistency.reporting.blocks import Block, Cell, Column, Details, Facts, Table, Text
+from consistency.reporting.model import Report
+from consistency.reporting.section import Part, Section
 from consistency.scenario import data_folder
 
+REFEREE = Part("calibration", "How far the referee can be trusted", "The referee")
 NAME = "calibration.json"
 CONFIDENCE = 0.99  # of the interval of a measured share
+HEADS = ("World", "What it is")
+COLUMNS = (
+    Column("True / stated covariance", "True / stated\ncovariance", number=True),
+    Column("Runs", number=True),
+    Column("Promised", number=True),
+    Column("Gates", number=True),
+    Column("Measured", number=True),
+    Column("Worst world", width="1fr", number=True),
+    Column("99 % interval there", "99 % interval\nthere", number=True),
+)
 
 
 @dataclass(frozen=True)
@@ -82,6 +96,11 @@ class Calibration:
         return [Promise(str(key[0]), tuple(rates)) for key, rates in found.items()]
 
 
+def read(_: Report) -> Calibration | None:
+    """The shipped table; None where there is none."""
+    return calibration()
+
+
 def calibration(path: Path | None = None) -> Calibration | None:
     """The table of ``path``, or the shipped one; None where there is none."""
     path = path or shipped()
@@ -107,3 +126,52 @@ def _rates(rows: Iterable[dict[str, Any]]) -> Iterable[Rate]:
             row["world"], row["question"], row["ratio"], row["runs"], row["looks"], row.get("mean_runs", row["runs"]),
             row["stated"], row["bound"] == "<=", gates, found / gates, (float(ends.low), float(ends.high)),
         )  # fmt: skip
+
+
+def show(c: Calibration) -> tuple[Block, ...]:
+    """Promises in groups, and the worlds in which they were measured."""
+    promises = Table(COLUMNS, groups(c), "Promises of the referee, and how often they were kept", style="grouped")
+    worlds = Facts(tuple((name, about.replace("`", "")) for name, about in c.worlds.items()), HEADS, "4cm")
+    return Text(text(c)), promises, Details("Worlds", (worlds,))
+
+
+def groups(c: Calibration) -> tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]:
+    """What is counted, and for each promise about it, in all its worlds, cells as COLUMNS."""
+    return tuple(
+        (f"{name}: {about.replace('`', '')}", tuple(_row(p) for p in c.promises if p.question == name))
+        for name, about in c.questions.items()
+    )
+
+
+def _row(promise: Promise) -> tuple[Cell, ...]:
+    worst, best = promise.worst, promise.best
+    low, high = worst.interval
+    several = len(promise.rates) > 1
+    ends = [f"{100 * rate.measured:.1f}" for rate in (best, worst)]
+    gates = {rate.gates for rate in promise.rates}
+    each = f"{min(gates)}" if len(gates) == 1 else f"{min(gates)} to {max(gates)}"
+    return (
+        "1, right" if worst.ratio == 1.0 else f"{worst.ratio:.3g}",
+        str(worst.runs) if worst.looks else f"{worst.mean_runs:.0f}, {worst.runs} at most",
+        f"{'≤' if worst.at_most else '≥'} {100 * worst.promised:g} %",
+        f"{each} in {len(promise.rates)} worlds" if several else each,
+        f"{' to '.join(dict.fromkeys(ends))} %",
+        worst.world,
+        f"{100 * low:.1f} to {100 * high:.1f} %",
+    )
+
+
+def text(c: Calibration) -> str:
+    """What the appendix on the referee measures."""
+    return (
+        "A gate is one verdict on one group of runs. Each line is a promise of the referee: which share of gates is "
+        "counted at most, or at least, and the shares measured, from the world where the promise is kept best to the "
+        "one where it is kept worst. Where the true over the stated covariance is 1 the filter is right, however its "
+        "errors depend on each other. Of gates that end when they are decided, the mean number of runs in the worst "
+        "world stands first. "
+        f"Measured over {c.gates} gates ({c.steps} steps, {c.dof} degrees of freedom where not said otherwise, seed "
+        f"{c.seed}), with exact binomial intervals. A promise is broken where the whole interval is on its wrong side."
+    )
+
+
+SECTION = Section(REFEREE, read, show)

@@ -1,0 +1,46 @@
+"""The sections of a report, each in a file of its own, in the order of the report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from consistency.reporting.section import Section
+from consistency.reporting.sections import (
+    anees,
+    axes,
+    findings,
+    first_order,
+    further,
+    innovations,
+    nees,
+    no_truth,
+    pose_errors,
+    provenance,
+    questions,
+    referee,
+    scenes,
+    shares,
+    stereo_noise,
+    verdicts,
+    world,
+)
+
+SECTIONS: tuple[Section[Any, Any], ...] = (
+    findings.SECTION,
+    verdicts.SECTION,
+    world.SECTION,
+    pose_errors.SECTION,
+    anees.SECTION,
+    no_truth.SECTION,
+    innovations.SECTION,
+    questions.SECTION,
+    axes.SECTION,
+    nees.SECTION,
+    further.SECTION,
+    stereo_noise.SECTION,
+    shares.SECTION,
+    scenes.SECTION,
+    first_order.SECTION,
+    referee.SECTION,
+    provenance.SECTION,
+)

@@ -1,0 +1,202 @@
+"""Verdicts of all filters in all studies, and how a verdict comes about."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consistency.diagnostics.wording import UNCERTAIN, plural, short
+from consistency.reporting.blocks import Block, Cell, Column, Heading, Name, Reason, Reasons, Status, Table, Text, table
+from consistency.reporting.model import Report, Study, Track
+from consistency.reporting.section import Part, Section
+from consistency.reporting.wording import brief, listed, number, p_cell
+
+VERDICTS = Part("verdicts", "Verdicts", "Verdicts")
+FAILURES = (
+    Column("Filter", width="1.4fr"),
+    Column("Run", number=True),
+    Column("Step", number=True),
+    Column("Reason", width="3fr"),
+)
+
+
+def read(report: Report) -> Report:
+    """The whole report: every study has verdicts."""
+    return report
+
+
+def show(report: Report) -> tuple[Block, ...]:
+    """Tables and sentences of each study, then the method."""
+    if not report.studies:
+        return (Text("No study was run for these findings."),)
+    blocks = [block for study in report.studies for block in _study(study)]
+    return (*blocks, Text(method(report), "How a verdict comes about.", "note"))
+
+
+def _study(study: Study) -> list[Block]:
+    blocks: list[Block] = [Heading(study.name), _table(study), Reasons(tuple(_reason(t) for t in study.tracks))]
+    if study.failures:
+        rows: list[tuple[Cell, ...]] = [(name, str(run), str(step), why) for name, run, step, why in study.failures]
+        caption = f"Failed runs of {study.name}: {len(rows)}"
+        blocks.append(table(FAILURES, rows, f"Failed runs of {study.name}", caption=caption))
+    return blocks
+
+
+def _table(study: Study) -> Table:
+    rows = [_cells(track) for track in study.tracks]
+    text = caption(study)
+    return table(
+        columns(study), rows, f"Verdicts of {study.name}", caption=text, paper=f"{study.name}: {text}", style="narrow"
+    )
+
+
+def _cells(track: Track) -> tuple[Cell, ...]:
+    name, status, *others = row(track)
+    return Name(name, track.look), Status(status), *others
+
+
+def _reason(track: Track) -> Reason:
+    sentence, *others = track.verdict.reasons
+    return Reason(track.name, track.look, sentence, tuple(others))
+
+
+def columns(study: Study) -> tuple[Column, ...]:
+    """Heads of the verdict table."""
+    inside = equivalence_interval(study)
+    return (
+        Column("Filter", width="1.3fr"),
+        Column("Verdict"),
+        Column("Mean ANEES", "Mean\nANEES", number=True),
+        Column("Covariance to multiply by", "Covariance to\nmultiply by", number=True),
+        Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True),
+        Column("Mainly", number=True),
+        Column("Since step", "Since\nstep", number=True),
+        Column("RMSE position (m)", "RMSE\n(m)", number=True),
+        Column("RMSE heading (deg)", "RMSE\n(deg)", number=True),
+        Column("NIS / dof", "NIS\n/ dof", number=True),
+        Column("Failed runs", "Failed\nruns", number=True),
+    )
+
+
+def row(track: Track) -> tuple[str, ...]:
+    """Cells of the verdict table, as :func:`columns`."""
+    v, location, accuracy = track.verdict, track.verdict.location, track.verdict.accuracy
+    since = None if location is None else location.since
+    return (
+        track.name,
+        v.status,
+        "–" if v.scale is None else brief(v.scale.mean_anees),
+        inflation(track),
+        shown_inside(track),
+        (location.subset if location is not None else None) or "–",
+        "–" if since is None else str(since),
+        number(None if accuracy is None else accuracy.rmse_position, ".3f"),
+        number(None if accuracy is None else np.rad2deg(accuracy.rmse_heading), ".2f"),
+        nis(track),
+        f"{len(v.failures)} of {v.runs}",
+    )
+
+
+def equivalence_interval(study: Study) -> str:
+    """Where consistent filters are shown to have their ratio of true to stated covariance; the same for all."""
+    if not study.tracks:
+        return ""
+    verdict = study.tracks[0].verdict
+    factor = verdict.settings.factor if verdict.equivalence is None else verdict.equivalence.factor
+    low = "(0" if verdict.settings.one_sided else f"[{short(1.0 / factor)}"
+    return f"{low},\u00a0{short(factor)}]"
+
+
+def inflation(track: Track) -> str:
+    """Factor that makes the stated covariance that of the errors, with its interval."""
+    scale = track.verdict.scale
+    if scale is None or not np.isfinite(scale.inflation.value):
+        return "–"
+    ratio, low, high = scale.inflation
+    known = np.isfinite(high) and high < UNCERTAIN * low
+    return f"×{brief(ratio)} [{f'{brief(low)}, {brief(high)}' if known else 'unknown'}]"
+
+
+def shown_inside(track: Track) -> str:
+    """Whether the ratio of true to stated covariance was shown to lie where it should, and the p value."""
+    shown = track.verdict.equivalence
+    if shown is None or not np.isfinite(shown.p_value):
+        return "–"
+    return f"{'yes' if shown.shown else 'no'}, p {p_cell(shown.p_value)}"
+
+
+def nis(track: Track) -> str:
+    """NIS per degree of freedom, in parentheses where it is not judged."""
+    found = track.verdict.innovations
+    ratio = number(None if found is None else found.ratio, ".3f")
+    return ratio if track.innovations_judged or ratio == "–" else f"({ratio})"
+
+
+def caption(study: Study) -> str:
+    """How large the study is, and how to read the table of verdicts."""
+    text = f"{plural(study.runs, 'run')} of {plural(len(study.steps), 'step')}"
+    if study.single and study.has_truth:
+        text += "; with one run the ANEES is the NEES of that run"
+    if study.until_decided:
+        when = [f"{track.name} after {plural(track.verdict.runs, 'run')}" for track in study.tracks]
+        text += f", until decided: a verdict is that of the look that decided, {listed(when)}"
+    what = "of true to stated covariance" if study.has_truth else "of the NIS to its degrees of freedom"
+    text += f". Shown inside {equivalence_interval(study)}: whether the ratio {what} is shown to lie there"
+    if len(study.judged) < len(study.tracks):
+        text += ". NIS in parentheses: reported and not judged, as no optimal gain is declared"
+    return f"{text}."
+
+
+def method(report: Report) -> str:
+    """How a verdict comes about, in one paragraph."""
+    tracks = [track for study in report.studies for track in study.tracks]
+    rates = [track.verdict.settings.false_alarm for track in tracks]
+    rate = f"{100 * rates[0]:.2g} %" if rates else "the false-alarm rate"
+    text = (
+        "A run is one observation: runs are independent, steps are not. The questions of a verdict together find a "
+        f"fault in a right filter with probability {rate} at most, whatever they have to do with each other "
+        "(Holm 1979, weighted)."
+    )
+    if tracks:
+        text += _consistent(tracks[0])
+    return text + "".join(sentence for applies, sentence in _conditions(report) if applies)
+
+
+def _conditions(report: Report) -> tuple[tuple[bool, str], ...]:
+    """Sentences of the method, and whether the report needs them."""
+    return (
+        (
+            any(study.has_truth for study in report.studies),
+            " Half of the false-alarm rate belongs to the mean NEES of whole runs, for which the number of runs is "
+            "planned; the other questions share the rest. Where a fault was absent before some step, the factor and "
+            "the axes are those since that step.",
+        ),
+        (
+            any(not study.has_truth for study in report.studies),
+            " Without truth the ratio is that of the NIS to its degrees of freedom, and only the innovations of a "
+            "filter that declares an optimal gain are judged: those of any other need be neither white nor of the "
+            "stated size.",
+        ),
+        (
+            any(study.until_decided for study in report.studies),
+            " In a run until decided the scale is judged by an e-process, a bet against the filter that may be looked "
+            "at at any time (Ville 1939); the other questions are asked after 12, 24, 48, ... runs, each time at a "
+            "part of their share.",
+        ),
+    )
+
+
+def _consistent(track: Track) -> str:
+    """What consistent and undecided mean."""
+    settings = track.verdict.settings
+    upper = short(settings.factor)
+    tests, inside = "two one-sided tests, each", f"between {short(1.0 / settings.factor)} and {upper}"
+    if settings.one_sided:
+        tests, inside = "a one-sided test", f"below {upper}"
+    return (
+        f" Consistent is shown: no question found a fault, and {tests} at {100 * (1.0 - settings.power):.2g} %, put "
+        f"the ratio of true to stated covariance {inside}. With neither a fault nor that, a filter is undecided: its "
+        "sentence has the ratio, its interval, and the number of runs that would probably decide."
+    )
+
+
+SECTION = Section(VERDICTS, read, show)

@@ -27,6 +27,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
         truth__sensor__disparity=(1.0, 32.0 * BASELINES[1] / BASELINES[0]),
     )
     wide = cs.load_scenario("herath2007-wide-baseline")
+    study.results(wide, ["ekf-xyz", "ekf-uvd"])
     judged = [study.judged(world, "ekf-xyz") for world in (narrow, between, wide)]
     verdicts = [verdict for verdict, _ in judged]
     means = [float(run_means(curves).mean()) for _, curves in judged]

@@ -43,6 +43,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
 
 def verdicts(study: cs.Study, stereo: str | cs.Scenario, points: str | cs.Scenario) -> dict[str, cs.Verdict]:
     """Verdicts of the filters on the stereo sensor, and of ekf-xyz on direct points, in one world."""
+    study.results(stereo, ON_STEREO)
     out = {name: study.judged(stereo, name)[0] for name in ON_STEREO}
     return out | {"ekf-xyz on points": study.judged(points, "ekf-xyz")[0]}
 

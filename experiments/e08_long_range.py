@@ -25,6 +25,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
         summary="The world of herath2007-stereo with landmarks used up to 8 m",
         truth__sensor__range=(0.5, RANGE),
     )
+    study.results(far, ["ekf-uvd", "ekf-xyz"])
     uvd, uvd_curves = study.judged(far, "ekf-uvd")
     xyz, xyz_curves = study.judged(far, "ekf-xyz")
     worse, p_value = wins(xyz_curves, uvd_curves)

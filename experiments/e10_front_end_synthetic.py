@@ -27,6 +27,7 @@ from consistency.vision.registration import rigid_motions
 from consistency.vision.synthetic import MOTION, common_points, disparity_noise, published_rig
 
 FINDINGS = ("frontend-interval", "frontend-fig2.2", "frontend-fig2.3", "frontend-rate")
+OWN_PROCESS = True  # runs no filter
 
 # --- printed ---------------------------------------------------------------------------------
 NOISE = 2.0  # px
@@ -107,12 +108,12 @@ def figure_22(study: cs.Study) -> cs.Finding:
 
 def figure_23(study: cs.Study) -> list[cs.Finding]:
     """100 points a scene, 1,000 samples a repetition; and other depths and noises."""
-    total = poses_nees(generator(study, 23), FAR, NOISE, REPETITIONS)
+    total = poses_nees(generator(study, 23), FAR, NOISE, REPETITIONS, study.workers)
     mean, inside, p_value = shares(total, 6 * SAMPLES_23)
     low, high = middle(total)
     rows = [(FAR, NOISE, REPETITIONS, mean, inside, p_value, low, high)]
     for number, (far, noise) in enumerate(OTHERS):
-        other = poses_nees(generator(study, 23, number), far, noise, FEWER)
+        other = poses_nees(generator(study, 23, number), far, noise, FEWER, study.workers)
         rows.append((far, noise, FEWER, *shares(other, 6 * SAMPLES_23), *middle(other)))
     columns = ["far", "noise", "repetitions", "mean", "inside", "p_value", "least", "most"]
     study.tables["frontend_fig23"] = scenes_table(pd.DataFrame(rows, columns=columns))
@@ -144,9 +145,9 @@ def figure_23(study: cs.Study) -> list[cs.Finding]:
     return [value, rate]
 
 
-def poses_nees(rng: np.random.Generator, far: float, noise: float, repetitions: int) -> Array:
+def poses_nees(rng: np.random.Generator, far: float, noise: float, repetitions: int, workers: int) -> Array:
     """N times the mean NEES of SVD registrations about the truth, (repetitions,), each with its own scene."""
-    with ThreadPoolExecutor() as threads:
+    with ThreadPoolExecutor(workers) as threads:
         return np.array(list(threads.map(lambda own: pose_nees(own, far, noise), rng.spawn(repetitions))))
 
 

@@ -33,6 +33,7 @@ from consistency.vision.synthetic import MOTION, common_points, disparity_noise,
 
 ROUTES = ("svd", "horn", "weighted", "reprojection")
 FINDINGS = tuple(f"first-order-{name}" for name in ("triangulation", *ROUTES))
+OWN_PROCESS = True  # runs no filter
 
 RAY = np.array([0.075, -0.05, 1.0])  # direction of the triangulated point
 DEPTHS, BASELINES, NOISES = (3.0, 8.0, 20.0), (0.12, 0.385, 1.0), (0.25, 0.7, 2.0)  # m, m, px

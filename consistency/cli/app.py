@@ -425,6 +425,9 @@ def report(
 @app.command()
 def reproduce(
     only: Annotated[list[str] | None, typer.Option("--only", help="Only this finding; may be repeated.")] = None,
+    long: Annotated[
+        bool, typer.Option("--all", help="Also experiments that take long; so far there are none.")
+    ] = False,
     runs: Runs = 50,
     seed: Seed = 0,
     jobs: Jobs = -1,
@@ -437,7 +440,7 @@ def reproduce(
     from consistency.runs.findings import reproduce as reproduce_findings
     from consistency.terminal.table import print_findings
 
-    findings = reproduce_findings(only, runs, seed, jobs, out, overwrite)
+    findings = reproduce_findings(only, runs, seed, jobs, out, overwrite, long)
     print_findings(findings)
     for path in (out / "findings.json", *write_reports(out, out / "report.html", out / "report.pdf", overwrite=True)):
         print(path)

@@ -6,17 +6,18 @@ import importlib.util
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import pandas as pd
 
 from consistency.diagnostics import Verdict
 from consistency.errors import InputError
-from consistency.runs.montecarlo import run_trials
+from consistency.runs.montecarlo import run_trials, worker_count
+from consistency.runs.own_process import OwnProcess
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.store.results import Results, joined
 from consistency.store.storage import manifest_of, require_free, write_folder
@@ -26,6 +27,7 @@ from consistency.verdicts.curves import Curves, curves
 from consistency.verdicts.judge import analyse
 
 OURS = "this project"  # how the source of a question begins that no paper asks
+_Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"
 
 
@@ -35,12 +37,19 @@ class Study:
     Parameters
     ----------
     runs, seed, jobs : as in :func:`consistency.run_trials`
+
+    Raises
+    ------
+    InputError
+        ``jobs`` is out of range.
     """
 
     def __init__(self, runs: int = 50, seed: int = 0, jobs: int = -1) -> None:
         self.runs, self.seed, self.jobs = runs, seed, jobs
+        self.workers = worker_count(jobs)
         self.kept: dict[str, Results] = {}
         self.tables: dict[str, pd.DataFrame] = {}
+        self._judged: dict[tuple[str, str], tuple[Verdict, Curves]] = {}
 
     def results(self, scenario: str | Scenario, filters: Sequence[str]) -> Results:
         """Results of all ``filters`` so far on a scenario; only those not yet run are run."""
@@ -56,9 +65,12 @@ class Study:
         return self.kept[world.name]
 
     def judged(self, scenario: str | Scenario, filter_name: str) -> tuple[Verdict, Curves]:
-        """Verdict and curves of one filter on a scenario."""
+        """Verdict and curves of one filter on a scenario; each is worked out once."""
         results = self.results(scenario, [filter_name])
-        return analyse(results, [filter_name])[filter_name], curves(results, filter_name)
+        key = str(results.manifest["scenario_hash"]), filter_name
+        if key not in self._judged:
+            self._judged[key] = analyse(results, [filter_name])[filter_name], curves(results, filter_name)
+        return self._judged[key]
 
     def finding(self, holds: bool, scenario: str, verdict_if_not: str = NOT_REPRODUCED, **text: str) -> Finding:
         """A finding with this study's runs and seed; ``holds`` says whether its rule was met."""
@@ -88,6 +100,9 @@ class Study:
 
 def experiments() -> dict[str, ModuleType]:
     """Scripts of ``experiments/`` by name; each has FINDINGS (ids) and ``main(study)``.
+
+    A script that takes long says so with ``LONG = True``; one that runs no filter, and so shares no trials with the
+    others, with ``OWN_PROCESS = True``.
 
     Raises
     ------
@@ -128,37 +143,94 @@ def experiment_summaries() -> dict[str, str]:
 
 
 def reproduce(
-    only: Sequence[str] | None, runs: int, seed: int, jobs: int, out: Path, overwrite: bool = False
+    only: Sequence[str] | None,
+    runs: int,
+    seed: int,
+    jobs: int,
+    out: Path,
+    overwrite: bool = False,
+    long: bool = False,
 ) -> list[Finding]:
     """Run the experiments, write ``out`` and return the findings.
 
-    An experiment that breaks becomes findings that are not reproduced, with the error as what was
-    measured.
+    An experiment that breaks becomes findings that are not reproduced, with the error as what was measured. Those that
+    share no trials with others have a process of their own where there are several workers.
+
+    Parameters
+    ----------
+    only : ids of the findings wanted; None or empty for all
+    runs, seed, jobs : as in :func:`consistency.run_trials`
+    out, overwrite : folder to write, and whether it may exist
+    long : also experiments that take long; one that is named in ``only`` runs anyway
 
     Raises
     ------
     InputError
         An unknown id, a number out of range, or an output folder that cannot be written.
     """
-    scripts = experiments()
-    known = {finding: module for module in scripts.values() for finding in module.FINDINGS}
-    if unknown := [name for name in only or () if name not in known]:
-        raise InputError(f"--only {unknown[0]}: no such finding; known: {', '.join(known)}")
+    wanted = _wanted(experiments(), only or (), long)
     require_free(out, overwrite, "findings")
     study, started = Study(runs, seed, jobs), time.monotonic()
-    findings: list[Finding] = []
-    for module in scripts.values():
-        wanted = [name for name in module.FINDINGS if not only or name in only]
-        if wanted:
-            findings += [f for f in _guarded(module, study, wanted) if f.id in wanted]
+    findings = _found(study, wanted)
     study.write(out, findings, time.monotonic() - started, overwrite)
     return findings
 
 
-def _guarded(module: ModuleType, study: Study, ids: Sequence[str]) -> list[Finding]:
-    try:
-        findings: list[Finding] = module.main(study)
+def _wanted(
+    scripts: Mapping[str, ModuleType], only: Sequence[str], long: bool
+) -> list[tuple[ModuleType, Sequence[str]]]:
+    """The scripts to run, in order, each with the ids of its findings that are wanted."""
+    known = [finding for module in scripts.values() for finding in module.FINDINGS]
+    if unknown := [name for name in only if name not in known]:
+        raise InputError(f"--only {unknown[0]}: no such finding; known: {', '.join(known)}")
+    chosen = [
+        (module, [name for name in module.FINDINGS if not only or name in only])
+        for module in scripts.values()
+        if only or long or not getattr(module, "LONG", False)
+    ]
+    return [(module, ids) for module, ids in chosen if ids]
+
+
+def _found(study: Study, wanted: Sequence[tuple[ModuleType, Sequence[str]]]) -> list[Finding]:
+    """The wanted findings in order of their scripts, whichever script ends first."""
+    apart: dict[ModuleType, OwnProcess[_Contribution]] = {}
+
+    def main(module: ModuleType) -> list[Finding]:
+        if module not in apart:
+            findings: list[Finding] = module.main(study)
+            return findings
+        findings, tables = apart[module].result()
+        study.tables |= tables
         return findings
+
+    found: dict[ModuleType, list[Finding]] = {}
+    try:
+        for module, _ in wanted:
+            if study.workers > 1 and getattr(module, "OWN_PROCESS", False):
+                apart[module] = OwnProcess(_contribution, module.__file__, study.runs, study.seed, study.jobs)
+        for module, ids in sorted(wanted, key=lambda pair: pair[0] in apart):  # processes are waited for last
+            found[module] = _guarded(main, module, study, ids)
+    finally:
+        for process in apart.values():
+            process.stop()
+    return [finding for module, ids in wanted for finding in found[module] if finding.id in ids]
+
+
+def _contribution(path: str, runs: int, seed: int, jobs: int) -> _Contribution:
+    """Run one script by itself, in a process that knows no other's trials."""
+    study = Study(runs, seed, jobs)
+    findings = _load(Path(path)).main(study)
+    if study.kept:
+        raise ValueError("OWN_PROCESS is for scripts that run no filter")
+    return findings, study.tables
+
+
+def _guarded(
+    main: Callable[[ModuleType], list[Finding]], module: ModuleType, study: Study, ids: Sequence[str]
+) -> list[Finding]:
+    """Findings of a script; where it breaks, findings that say so."""
+    try:
+        return main(module)
     except InputError:
         raise
     except Exception as error:

@@ -145,6 +145,19 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
     return chosen
 
 
+def worker_count(jobs: int) -> int:
+    """Number of workers that ``jobs`` stands for: itself, or one a core for -1.
+
+    Raises
+    ------
+    InputError
+        Any other number.
+    """
+    if jobs == 0 or jobs < -1:
+        raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
+    return jobs if jobs > 0 else int(joblib.cpu_count())
+
+
 # --- the work --------------------------------------------------------------------------------------
 
 
@@ -159,8 +172,7 @@ class _Work:
     timeout: float | None
 
     def __post_init__(self) -> None:
-        if self.jobs == 0 or self.jobs < -1:
-            raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {self.jobs}")
+        worker_count(self.jobs)
         if self.timeout is not None and not self.timeout > 0:
             raise InputError(f"timeout must be positive, got {self.timeout}")
 
@@ -178,7 +190,7 @@ class _Work:
 
     def outcomes(self, runs: list[int]) -> Outcomes:
         """In order of the runs, whoever does them; BLAS has one thread in each worker, for the bits depend on it."""
-        workers = min(self.jobs if self.jobs > 0 else joblib.cpu_count(), len(runs))
+        workers = min(worker_count(self.jobs), len(runs))
         if workers <= 1:
             return (self(run) for run in runs)
         if all(isinstance(f, WholeTrial) for f in self.filters):  # kernels release the GIL; Python needs processes

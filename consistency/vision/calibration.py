@@ -182,7 +182,7 @@ def _checked(calibration: Calibration) -> Calibration:
 
 def _require_known(path: Path, data: dict[str, Any], missing: list[str]) -> None:
     known = OTHERS.union(*OPENCV_KEYS.values())
-    strange = [key for key, value in data.items() if isinstance(value, dict | list) and key not in known]
+    strange = [key for key, value in data.items() if isinstance(value, dict | list | np.ndarray) and key not in known]
     if missing and strange:
         names = " = ".join(OPENCV_KEYS[missing[0]])
         raise InputError(f"{path}: key '{strange[0]}' is unknown while '{missing[0]}' is missing; known: {names}")

@@ -17,6 +17,7 @@ FARTHEST = 1e6  # depth in baselines from which on a point is at infinity
 # What A'A leaves of a coordinate's own entry when the others are eliminated: some 3e-13 at FARTHEST, up to 6e-16 by
 # rounding alone. Parallel rays must not pass for a point that rounding made up.
 FIXED = 2e-14
+BLOCK = 2000  # matches triangulated at a time, whose matrices fit the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,36 +113,46 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
     PointError
         Rays that meet at infinity, at a camera or behind one: zero or negative disparity. See :func:`triangulable`.
     """
-    return solved(rig, checks.rows("uv", uv, 4))[2]
-
-
-def triangulable(rig: StereoRig, uv: Array) -> Array:
-    """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
-    return _in_front(rig, *_system(rig, checks.rows("uv", uv, 4)))[1]
-
-
-def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
-    """A (N, 4, 3) and b (N, 4) of eq. 2.3, rows in the order u, v, u', v', and the points (N, 3); or PointError."""
-    A, b = _system(rig, uv)
-    points, good = _in_front(rig, A, b)
+    points, good = _points(rig, checks.rows("uv", uv, 4))
     if not good.all():
         raise PointError(
             f"uv: match {int(np.argmin(good))} has zero or negative disparity, its point is at infinity or behind a "
             "camera; leave such matches out (triangulable tells them)"
         )
-    return A, b, points
+    return points
+
+
+def triangulable(rig: StereoRig, uv: Array) -> Array:
+    """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
+    return _points(rig, checks.rows("uv", uv, 4))[1]
+
+
+def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
+    """A (N, 4, 3) and b (N, 4) of eq. 2.3, rows in the order u, v, u', v', and the points (N, 3); or PointError."""
+    return *_system(rig, uv), triangulate(rig, uv)
+
+
+def _points(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
+    """Points (N, 3), and which of them are in front of both cameras (N,)."""
+    if len(uv) <= BLOCK:
+        return _in_front(rig, *_system(rig, uv))
+    points, good = zip(*(_points(rig, uv[i : i + BLOCK]) for i in range(0, len(uv), BLOCK)), strict=True)
+    return np.concatenate(points), np.concatenate(good)
 
 
 def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
     P = rig.cameras
-    A = uv[:, :, None] * P[:, 2].repeat(2, axis=0) - P[:, :2].reshape(4, 4)
-    return A[:, :, :3], -A[:, :, 3]
+    rows, last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
+    A = uv[:, :, None] * last[:, :3]
+    A -= rows[:, :3]
+    return A, -(uv * last[:, 3] - rows[:, 3])
 
 
 def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
     At = np.swapaxes(A, 1, 2)
-    inverse, definite = small.inverse(At @ A)
-    alone = np.einsum("nii,nij,nij->ni", inverse, At, At)
+    AtA = At @ A
+    inverse, definite = small.inverse(AtA)
+    alone = np.einsum("nii,nii->ni", inverse, AtA)
     definite &= (alone < 1.0 / FIXED).all(axis=1)
     points = (inverse @ (At @ b[:, :, None]))[:, :, 0]
     depth = points @ rig.cameras[:, 2, :3].T + rig.cameras[:, 2, 3]

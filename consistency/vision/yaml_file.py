@@ -10,36 +10,75 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.types import Array
+from consistency.vision.features import opencv
+
+SIGNATURE = "%YAML"  # how a file of FileStorage begins: %YAML:1.0 up to OpenCV 4, %YAML 1.2 since
+MATRIX = {"rows", "cols", "dt", "data"}  # keys of a matrix in it
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The keys of a YAML file.
+    """The keys of a YAML file, by OpenCV where FileStorage has written it.
 
-    The first line ``%YAML:1.0`` of OpenCV is not YAML and left out; matrices (``!!opencv-matrix``) are tables.
+    Values are numbers, text, lists, tables and, of FileStorage, arrays.
 
     Raises
     ------
     InputError
-        PyYAML is not installed, or the file is not YAML with keys.
+        PyYAML or OpenCV is not installed, or the file is not YAML with keys.
     """
     try:
-        yaml: Any = importlib.import_module("yaml")
-    except ImportError:
-        raise InputError(f"{path}: YAML needs PyYAML: pip install 'filter-consistency[vision]'") from None
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        text = "\n".join("" if line.startswith("%YAML") else line for line in lines)
-        data = yaml.safe_load(text.replace("!!opencv-matrix", ""))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        first = " ".join(str(error).split())
-        raise InputError(f"{path}: cannot be read as YAML ({first})") from None
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise _unreadable(path, error) from None
+    data = _stored(path, text) if text.startswith(SIGNATURE) else _plain(path, text)
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no 'key: value' lines")
     return {str(key): value for key, value in data.items()}
 
 
+def _plain(path: Path, text: str) -> Any:
+    try:
+        yaml: Any = importlib.import_module("yaml")
+    except ImportError:
+        raise InputError(f"{path}: YAML needs PyYAML: pip install 'filter-consistency[vision]'") from None
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise _unreadable(path, error) from None
+
+
+def _stored(path: Path, text: str) -> Any:
+    cv2 = opencv()
+    try:
+        # the text and not the path, which OpenCV cannot open on Windows where it is not ASCII
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        return _value(cv2, storage.root())
+    except (cv2.error, SystemError) as error:  # SystemError: from the constructor, with OpenCV's as its cause
+        raise _unreadable(path, error.__cause__ or error) from None
+
+
+def _value(cv2: Any, node: Any) -> Any:
+    """Numbers, text, list, dict or array of a node; None for an empty node."""
+    if node.isMap():
+        if set(node.keys()) >= MATRIX:
+            try:
+                return node.mat()
+            except cv2.error:
+                return {}  # a table without numbers, which is refused when they are asked for
+        return {key: _value(cv2, node.getNode(key)) for key in node.keys()}  # noqa: SIM118, no dict
+    if node.isSeq():
+        return [_value(cv2, node.at(i)) for i in range(node.size())]
+    if node.isInt() or node.isReal():
+        return node.real()
+    return node.string() if node.isString() else None
+
+
+def _unreadable(path: Path, error: BaseException) -> InputError:
+    return InputError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())})")
+
+
 def matrix(path: Path, key: str, value: Any) -> Array:
-    """Numbers of one key: a number, a list, or a table with rows, cols and data."""
+    """Numbers of one key: a number, a list, an array, or a table with rows, cols and data."""
     shape: tuple[int, ...] | None = None
     try:
         if isinstance(value, dict):

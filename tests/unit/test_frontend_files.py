@@ -115,6 +115,28 @@ def test_opencv_calibration_is_bouguets(tmp_path: Path) -> None:
     assert rig.t[0] == pytest.approx(np.linalg.norm([0.2, 0.004, 0.001]))
 
 
+def test_every_way_in_which_opencv_writes_numbers(tmp_path: Path) -> None:
+    """Matrices of floats and integers, a bare number, a list (by hand here) and a text that is not needed."""
+    T = [-0.2, 0.004, 0.001]
+    changes = {"K1": K.astype(np.float32), "K2": K.astype(np.int32), "T": None, "R": None, "D1": None, "D2": None}
+    path = opencv_file(tmp_path / "stereo.yaml", **changes, image_width=640, image_height=480.0, made="by hand")
+    path.write_text(f"{path.read_text()}T: {T}\n")
+    calibration = read_calibration(path)
+    np.testing.assert_array_equal([calibration.K_left, calibration.K_right], [K, K])
+    np.testing.assert_array_equal(calibration.T, T)
+    assert calibration.image_size == (640, 480)
+
+
+def test_a_calibration_without_the_first_line_of_opencv(tmp_path: Path) -> None:
+    """Written by hand: plain YAML, with lists and with tables of rows, cols and data."""
+    rows = "[700.0, 0, 320, 0, 700, 240, 0, 0, 1]"
+    text = f"K1: {rows}\nK2: {{rows: 3, cols: 3, data: {rows}}}\nT: [-0.2, 0, 0]\n"
+    (tmp_path / "stereo.yaml").write_text(text)
+    calibration = read_calibration(tmp_path / "stereo.yaml")
+    np.testing.assert_array_equal(calibration.K_left, calibration.K_right)
+    assert calibration.K_left[0, 2] == 320.0
+
+
 def test_rectified_pixels_of_a_point_are_those_of_the_rectified_rig(tmp_path: Path) -> None:
     D = np.array([[-0.2, 0.05, 1e-3, -5e-4, 0.0]])
     c = read_calibration(opencv_file(tmp_path / "stereo.yml", D1=D, D2=0.9 * D))
@@ -164,12 +186,37 @@ def test_one_file_of_euroc(tmp_path: Path) -> None:
         read_calibration(path)
 
 
-@pytest.mark.parametrize(("text", "said"), [("a: [1", "cannot be read as YAML"), ("- 1", "no 'key: value'")])
-def test_a_file_that_is_no_yaml(tmp_path: Path, text: str, said: str) -> None:
+MATRIX = "!!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1., 0., 2. ]"
+
+
+@pytest.mark.parametrize("first", ["", "%YAML:1.0\n---\n", "%YAML 1.2\n---\n"])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: [1", "cannot be read as YAML"),
+        ("- 1", "no 'key: value'"),
+        ("", "no 'key: value'"),
+        ("K1: text", "key 'K1': must be numbers, or a matrix"),
+        ("K1: [ 1., text ]", "key 'K1': must be numbers, or a matrix"),
+        ("K1: [ 1., .nan ]", "key 'K1': holds a number that is not finite"),
+    ],
+)
+def test_a_file_that_is_no_calibration(tmp_path: Path, first: str, text: str, said: str) -> None:
     path = tmp_path / "stereo.yaml"
-    path.write_text(text)
-    with pytest.raises(cs.InputError, match=said):
+    path.write_text(first + text + "\n")
+    with pytest.raises(cs.InputError, match=said) as error:
         read_calibration(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_a_matrix_of_opencv_without_all_its_numbers(tmp_path: Path) -> None:
+    (tmp_path / "stereo.yaml").write_text(f"%YAML:1.0\n---\nK1: {MATRIX}\n")
+    with pytest.raises(cs.InputError, match="key 'K1': must be numbers, or a matrix with rows, cols and data"):
+        read_calibration(tmp_path / "stereo.yaml")
+
+
+def test_a_calibration_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(cs.InputError, match="no such file"):
         read_calibration(tmp_path / "none.yaml")
 

@@ -19,7 +19,7 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # A room may import rooms of lower rank and itself; rooms of equal rank do not know each other. Rooms whose modules have
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
-    "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0,
+    "types": 0, "errors": 0, "terminal.progress": 0, "runs.own_process": 0, "store.atomic": 0,
     "geometry": 1,
     "models": 2,
     "scenario": 3,
@@ -214,8 +214,25 @@ def test_the_package_itself_loads_nothing_heavy() -> None:
     assert "numba" in loaded("import consistency; consistency.get_filter('ekf-uvd')")  # negative control
 
 
+@pytest.mark.parametrize("package", ["consistency", "consistency.vision"])
+def test_a_new_session_lists_the_public_names(package: str) -> None:
+    """``dir``, and so tab completion, without loading what the names stand for."""
+    code = f"import sys, {package} as package; print(*dir(package)); print(*sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    names, modules_ = (set(line.split()) for line in out.stdout.splitlines())
+    expected = {"consistency": {"analyse", "run_trials", "Verdict"}, "consistency.vision": {"relative_motion"}}
+    assert expected[package] <= names
+    assert not modules_ & {"numpy", "cv2"}
+
+
+def test_the_help_loads_nothing_heavy() -> None:
+    modules_ = loaded("from consistency.cli.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
+    assert "typer" in modules_
+    assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh"}
+
+
 def test_every_public_name_is_there() -> None:
     for name in consistency.__all__:
         assert getattr(consistency, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+    with pytest.raises(AttributeError, match="consistency attribute nonsense"):
         _ = consistency.nonsense

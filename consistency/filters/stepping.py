@@ -84,7 +84,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
     pose, covariance = np.full((T, 3), np.nan), np.full((T, 3, 3), np.nan)
     own = None if error == ADDITIVE else covariance.copy()
     nis, dof = np.full(T, np.nan), np.zeros(T, np.int64)
-    ranks = [_Rank("the pose covariance"), _Rank(f"the covariance of the error '{error}'")]
+    rank = _Rank(error)
     reason, step, map_ = "", 0, None
     started = time.monotonic()
     state: Any = None
@@ -99,8 +99,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
                 np.linalg.cholesky(info.S)
                 nis[step - 1], dof[step - 1] = info.nis, len(info.innovation)
             _require_finite(mean, *given)
-            for rank, P in zip(ranks, given, strict=False):
-                rank.require(P)
+            rank.require(given)
             if timeout is not None and time.monotonic() - started > timeout:
                 raise _Unusable(f"time-out after {timeout:g} s")
             map_ = _map(filter_, state, trial) if step == T else None
@@ -140,19 +139,22 @@ def _asked(filter_: Filter, method: str, state: Any) -> Any:
 
 
 class _Rank:
-    """Demands a covariance that is symmetric and, from the first one of full rank on, positive definite."""
+    """Demands covariances that are symmetric and, from the first own one of full rank on, positive definite."""
 
-    def __init__(self, what: str) -> None:
-        self.what, self.full = what, False
+    def __init__(self, error: str) -> None:
+        self.names, self.full = ("the pose covariance", f"the covariance of the error '{error}'"), False
 
-    def require(self, P: Array) -> None:
-        """Raise for what it must not be."""
-        rank = definiteness(P)
-        if _asymmetric(P):
-            raise _Unusable(f"{self.what} is not symmetric")
+    def require(self, given: list[Array]) -> None:
+        """Raise for what they must not be; the last one is of the filter's own error."""
+        for name, P in zip(self.names, given, strict=False):
+            if _asymmetric(P):
+                raise _Unusable(f"{name} is not symmetric")
+        rank = definiteness(given[-1])
         if rank < 0 or (self.full and rank == 0):
-            raise _Unusable(f"{self.what} is not positive definite")
+            raise _Unusable(f"{self.names[len(given) - 1]} is not positive definite")
         self.full = self.full or rank == 1
+        if self.full and definiteness(given[0]) != 1:
+            raise _Unusable(f"{self.names[0]} is not positive definite")
 
 
 def _asymmetric(P: Array) -> bool:

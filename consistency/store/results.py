@@ -215,27 +215,36 @@ def _columns(trial: Trial, estimates: Estimates) -> Columns:
     last = estimates.failure.step - 1 if estimates.failure else trial.steps
     pose, P = estimates.pose[:last], estimates.covariance[:last]
     true = None if trial.truth is None else trial.truth[1 : last + 1]
+    first = _full_rank(P if estimates.own is None else estimates.own[:last])
     columns = {
         "run": np.full(last, estimates.run),
         "step": np.arange(1, last + 1),
         "t": trial.t[1 : last + 1],
         **dict(zip(POSE, pose.T, strict=True)),
         **{name: P[:, i, j] for name, (i, j) in COVARIANCE.items()},
-        "nees": _nees(None if true is None else pose_error(true, pose), P),
+        "nees": _nees(None if true is None else pose_error(true, pose), P, first),
         "nis": estimates.nis[:last],
         "nis_dof": estimates.nis_dof[:last],
     }
     if estimates.own is not None:
         P, error = estimates.own[:last], None if true is None else planar_error(true, pose, estimates.error)
-        columns |= {name: P[:, i, j] for name, (i, j) in OWN_COVARIANCE.items()} | {"own_nees": _nees(error, P)}
+        columns |= {name: P[:, i, j] for name, (i, j) in OWN_COVARIANCE.items()} | {"own_nees": _nees(error, P, first)}
     return columns
 
 
-def _nees(error: Array | None, P: Array) -> Array:
-    """NEES of one run, (T, 3) and (T, 3, 3) -> (T,); NaN before the first covariance of full rank."""
+def _full_rank(P: Array) -> int:
+    """First of the covariances (T, 3, 3) that has full rank, or T.
+
+    That of the filter's own error decides: an additive one that is computed from it has small variances where there
+    are none, left by rounding.
+    """
+    return next((k for k in range(len(P)) if definiteness(P[k]) == 1), len(P))
+
+
+def _nees(error: Array | None, P: Array, first: int) -> Array:
+    """NEES of one run, (T, 3) and (T, 3, 3) -> (T,); NaN before step ``first``."""
     value = np.full(len(P), np.nan)
     if error is not None:
-        first = next((k for k in range(len(P)) if definiteness(P[k]) == 1), len(P))
         # the filter has answered for P: what nees() checks need not be checked again
         w = whiten(error[first:], P[first:])
         value[first:] = np.einsum("ki,ki->k", w, w)

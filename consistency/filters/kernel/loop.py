@@ -220,12 +220,16 @@ def _run(
 
 @inner
 def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedTuple]) -> int:
-    """Estimate of step k + 1; returns the rank of its own covariance as ``definiteness`` says it."""
+    """Estimate of step k + 1; returns the rank of its own covariance as ``definiteness`` says it.
+
+    -1 too where the covariance of the additive error has lost its rank to rounding.
+    """
     r = robot_width(slam.motion)
     copy_matrix(state.P[:r, :r], out.own[k])
     copy(state.x[:r], out.pose[k])
     pose_covariance(slam.error, out.pose[k], out.own[k], out.covariance[k])
-    return definiteness_with(out.own[k], work.small)
+    rank = definiteness_with(out.own[k], work.small)
+    return -1 if rank == 1 and definiteness_with(out.covariance[k], work.small) < 1 else rank
 
 
 trial_kernel = Kernel(run_trial)

@@ -17,6 +17,7 @@ from consistency.filters.kernel.loop import Outcome, trial_kernel
 from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
 from consistency.filters.plain import sensor_noise
 from consistency.filters.upkeep.local import LOCAL_FROM, Local
+from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Problem
 from consistency.scenario import Belief
 from consistency.types import Array, Control, Estimates, Failure, Gaussian, Info, Map, Observation, Trial
@@ -72,7 +73,7 @@ class Compiled:
         sensors: tuple[str, ...],
         uvd: bool,
         innovations: str | None = None,
-        error: str = "so2",
+        error: str = ADDITIVE,
     ) -> None:
         self.twin, self.parts, self.sensors, self.uvd = twin, parts, sensors, uvd
         self.innovations, self.error = innovations, error
@@ -95,6 +96,11 @@ class Compiled:
     def map(self, state: Any) -> dict[int, Gaussian]:
         landmarks: dict[int, Gaussian] = self.twin.map(state)
         return landmarks
+
+    def own_covariance(self, state: Any) -> Array:
+        """Covariance (3, 3) of the error that the filter declares."""
+        own: Array = self.pose(state).covariance if self.error == ADDITIVE else self.twin.own_covariance(state)
+        return own
 
     def is_ready(self, trial: Trial, belief: Belief) -> bool:
         """Whether ``run`` starts at once on this trial, or spends seconds on compiling first."""
@@ -119,7 +125,7 @@ class Compiled:
         except SystemError as error:  # Ctrl-C in the main thread comes out of a kernel like this
             raise KeyboardInterrupt from error
         failure = Failure(self.name, trial.run, out.step, REASONS[out.code]) if out.step else None
-        own = None if self.error == "so2" else out.own
+        own = None if self.error == ADDITIVE else out.own
         labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
         map_ = Map(labels, out.points[labels], out.spread[labels]) if out.code == 0 else None
         return Estimates(

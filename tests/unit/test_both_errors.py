@@ -17,6 +17,7 @@ from consistency.diagnostics import Evidence, Interval, Settings, judge, map_sco
 from consistency.diagnostics.export import map_text
 from consistency.diagnostics.records import MapScore
 from consistency.diagnostics.scale import ratio_interval
+from consistency.filters.stepping import run_filter, step_through
 from consistency.recording import read_recordings
 from consistency.runs.sequential import run_until_decided
 from consistency.store.parquet import OWN_COVARIANCE
@@ -42,16 +43,19 @@ def folder(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return out
 
 
-@pytest.fixture(scope="module")
-def exported(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """What a user would write of the filter: its poses with the covariance of its own error, and the truth."""
-    out = tmp_path_factory.mktemp("exported")
-    rows = results.estimates.query("filter == 'right'")
-    own = rows[list(OWN_COVARIANCE)].rename(columns=lambda name: name.removeprefix("own_"))
-    pd.concat([rows[KEYS], own], axis=1).to_parquet(out / "right.parquet", index=False)
+def export(results: cs.Results, name: str, out: Path) -> tuple[Path, Path]:
+    """What a user would write of a filter: its poses with the covariance of its own error, and the truth."""
+    rows = results.estimates[results.estimates["filter"] == name]
+    own = rows[list(OWN_COVARIANCE)].rename(columns=lambda column: column.removeprefix("own_"))
+    pd.concat([rows[KEYS], own], axis=1).to_parquet(out / f"{name}.parquet", index=False)
     assert results.truth is not None
     results.truth.to_parquet(out / "truth.parquet", index=False)
-    return out / "right.parquet", out / "truth.parquet"
+    return out / f"{name}.parquet", out / "truth.parquet"
+
+
+@pytest.fixture(scope="module")
+def exported(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return export(results, "right", tmp_path_factory.mktemp("exported"))
 
 
 # --- both ways in give the same number --------------------------------------------------------------
@@ -69,6 +73,20 @@ def test_both_ways_in_give_the_same_nees_and_verdict(results: cs.Results, export
     assert ours.inflation_interval == pytest.approx(theirs.inflation_interval, rel=1e-9)
     [wrong] = read_recordings(*exported, convention="so2")
     assert np.nanmax(np.abs(wrong.nees - c.own.nees)) > 1.0, "negative control"
+
+
+def test_both_ways_of_the_invariant_filter_of_the_bench(uvd: cs.Scenario, tmp_path: Path) -> None:
+    results = cs.run_trials(uvd, ["ri-ekf-uvd"], runs=RUNS, seed=5, jobs=1)
+    c = curves(results, "ri-ekf-uvd")
+    [recording] = read_recordings(*export(results, "ri-ekf-uvd", tmp_path), convention="right")
+    np.testing.assert_allclose(recording.nees, c.judged.nees, rtol=1e-9)
+    ours, theirs = cs.analyse(results)["ri-ekf-uvd"], analyse_recordings([recording])["ri-ekf-uvd"]
+    assert (ours.status, ours.convention) == (theirs.status, "right")
+    trial = cs.simulate(uvd, 3, seed=5)
+    compiled = run_filter(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
+    stepped = step_through(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
+    np.testing.assert_allclose(stepped.own, compiled.own, rtol=1e-7, atol=1e-12)
+    np.testing.assert_array_equal(c.own.covariance[3, 1:], compiled.own[1:])
 
 
 def test_both_ways_by_the_command_line(

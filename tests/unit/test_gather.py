@@ -186,7 +186,7 @@ def test_a_filter_is_read_without_the_others(uvd: cs.Scenario, written: Path, mo
 
     monkeypatch.setattr(pq.ParquetFile, "iter_batches", counted)
     cs.analyse(open_results(written), ["ekf-xyz"])
-    assert read == [1]
+    assert read == [1, 1], "the second row group of the estimates, and that of the maps"
 
 
 # --- read back ---------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from consistency.runs.montecarlo import run_log, simulate_log
 from consistency.store.log import read_log
 from consistency.store.parquet import OWN_COVARIANCE, POINT_COVARIANCE
 from consistency.store.results import OWN_NUMBERS, joined, open_results, outcome_of
-from consistency.types import Array, Estimates, Map, Trial
+from consistency.types import Array, Estimates, Failure, Map, Trial
 
 FILTERS = ["ekf-uvd", Invariant()]
 OWN = [*OWN_COVARIANCE, "own_nees"]
@@ -311,7 +311,10 @@ def of_map(labels_in_map: list[int], **changes: Any) -> pd.DataFrame:
     )  # fmt: skip
     map_ = Map(np.array(labels_in_map), np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
     said = Estimates("f", 3, np.zeros((1, 3)), np.eye(3)[None], np.full(1, np.nan), np.zeros(1, np.int64), map=map_)
-    return pd.DataFrame(outcome_of(replace(trial, **changes), [said]).maps["f"])
+    broken = replace(said, filter="g", failure=Failure("g", 3, 1, "NaN"))
+    outcome = outcome_of(replace(trial, **changes), [said, broken])
+    assert list(outcome.maps) == ["f"], "a failed run has no map"
+    return pd.DataFrame(outcome.maps["f"])
 
 
 def test_labels_that_are_no_landmark_have_no_nees() -> None:

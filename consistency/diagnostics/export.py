@@ -134,8 +134,8 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
         judged = "" if v.innovations.judged else ", not judged"
         rows.append(("NIS / dof", f"{v.innovations.ratio:.3f}{judged}"))
     rows.append(("failed runs", f"{len({f.run for f in v.failures})} of {v.runs}"))
-    found = [f"{a.question} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated]
-    rows.append(("faults", f"{', '.join(found) or 'none'} of {plural(len(v.answers), 'question')}"))
+    faults = [f"{a.question} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated]
+    rows.append(("faults", f"{', '.join(faults) or 'none'} of {plural(len(v.answers), 'question')}"))
     return rows
 
 
@@ -147,7 +147,7 @@ def text(v: Verdict) -> str:
 
 
 def html(v: Verdict) -> str:
-    """The same for a notebook."""
+    """Summary of a verdict as an HTML table, for a notebook."""
     rows = "".join(
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in figures(v)

@@ -97,9 +97,9 @@ def run_trials(
         raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
     todo = [run for run in range(runs) if run not in done]
     work = _Work(lambda run: world.trial(run, seed), chosen, scenario.belief, jobs, timeout)
-    said = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
+    manifest_fields = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
     with _place(None if out is None else Path(out), overwrite, previous) as new:
-        return _finish(work, todo, Gathered(names, new, previous, done), said, _landmarks_table(scenario))
+        return _finish(work, todo, Gathered(names, new, previous, done), manifest_fields, _landmarks_table(scenario))
 
 
 def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None) -> Results:
@@ -107,9 +107,9 @@ def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: 
     chosen = resolve_filters(filters, log.belief)
     trials = {trial.run: trial for trial in log.trials}
     work = _Work(trials.__getitem__, chosen, log.belief, jobs, timeout)
-    said = {"seed": None, "runs": len(trials), "log": log.name, "log_sha256": log.sha256}
-    said |= {"belief": log.belief.model_dump(mode="json")}
-    results = _finish(work, list(trials), Gathered([name_of(f) for f in chosen]), said, log.landmarks)
+    manifest_fields = {"seed": None, "runs": len(trials), "log": log.name, "log_sha256": log.sha256}
+    manifest_fields |= {"belief": log.belief.model_dump(mode="json")}
+    results = _finish(work, list(trials), Gathered([name_of(f) for f in chosen]), manifest_fields, log.landmarks)
     assert isinstance(results, Results)
     return results
 
@@ -215,7 +215,7 @@ def _one(trial: Trial, filters: list[Filter], belief: Belief, timeout: float | N
 
 
 def _finish(
-    work: _Work, runs: list[int], gathered: Gathered, said: dict[str, Any], landmarks: pd.DataFrame | None
+    work: _Work, runs: list[int], gathered: Gathered, manifest_fields: dict[str, Any], landmarks: pd.DataFrame | None
 ) -> Results | StoredResults:
     """Do the runs and hand over the results, or, after Ctrl-C, what there is of them."""
     if runs:
@@ -228,8 +228,10 @@ def _finish(
                 advance(1)
     except KeyboardInterrupt:
         complete = False
-    said = said | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
-    manifest = manifest_of(filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **said)
+    manifest_fields = manifest_fields | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
+    manifest = manifest_of(
+        filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **manifest_fields
+    )
     if complete:
         return gathered.results(manifest, landmarks)
     raise Interrupted(gathered.results(manifest | {"finished_runs": gathered.finished}, landmarks))

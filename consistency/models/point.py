@@ -41,13 +41,13 @@ def turned_to_robot(px: Any, py: Any, c: Any, s: Any, lx: Any, ly: Any, lz: Any)
 
 @jitable
 def to_world(px: Any, py: Any, heading: Any, bx: Any, by: Any, bz: Any) -> tuple[Any, Any, Any]:
-    """Point in the world frame, m, from its robot-frame coordinates: inverse of :func:`to_robot`."""
+    """Inverse of :func:`to_robot`."""
     return turned_to_world(px, py, np.cos(heading), np.sin(heading), bx, by, bz)
 
 
 @jitable
 def turned_to_world(px: Any, py: Any, c: Any, s: Any, bx: Any, by: Any, bz: Any) -> tuple[Any, Any, Any]:
-    """Vector in the world frame from one in the robot frame: inverse of :func:`turned_to_robot`."""
+    """Inverse of :func:`turned_to_robot`."""
     return px + c * bx - s * by, py + s * bx + c * by, bz
 
 
@@ -64,7 +64,7 @@ def to_sensor(bx: Any, by: Any, bz: Any, mount: Mounting) -> tuple[Any, Any, Any
 
 @jitable
 def from_sensor(cx: Any, cy: Any, cz: Any, mount: Mounting) -> tuple[Any, Any, Any]:
-    """Point in the robot frame, m, from its sensor-frame coordinates: inverse of :func:`to_sensor`."""
+    """Inverse of :func:`to_sensor`."""
     return (
         mount.x + mount.xx * cx + mount.xy * cy + mount.xz * cz,
         mount.y + mount.yx * cx + mount.yy * cy + mount.yz * cz,

@@ -218,10 +218,11 @@ def _finish(
     work: _Work, runs: list[int], gathered: Gathered, manifest_fields: dict[str, Any], landmarks: pd.DataFrame | None
 ) -> Results | StoredResults:
     """Do the runs and hand over the results, or, after Ctrl-C, what there is of them."""
-    if runs:
-        work.compile(runs[0])
     started, complete = time.monotonic(), True
     try:
+        if runs:
+            work.compile(runs[0])
+            started = time.monotonic()
         with one_blas_thread(), closing(work.outcomes(runs)) as outcomes, progress("runs", len(runs)) as advance:
             for outcome in outcomes:
                 gathered.add(outcome)

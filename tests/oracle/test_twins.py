@@ -214,14 +214,14 @@ def test_ekf_equals_the_kalman_filter_where_noise_vanishes(small: Small) -> None
 
 @pytest.mark.parametrize("points", [{}, MERWE], ids=["cubature", "Merwe"])
 def test_every_filter_is_the_kalman_filter_where_the_heading_is_known(small: Small, points: dict[str, Any]) -> None:
-    """With no noise on omega eq. 18 and 19 are linear in what is left, so all four rules are exact."""
+    """With no noise on omega eq. 18 and 19 are linear in what is left, so all rules are exact."""
     known = {"truth__motion__sigma_omega": 0.0, "belief__motion__sigma_omega": 0.0, "truth__steps": 100}
     scenario = small("linear-gaussian", **known, **points)
     trial = cs.simulate(scenario)
     kf = compiled("kf", trial, scenario.belief)
     assert np.nansum(kf.nis) > 100
     largest = kf.covariance.max(axis=(1, 2), keepdims=True)  # some variances are zero
-    for name in ("ekf-xyz", "ukf-xyz"):
+    for name in ("ekf-xyz", "ukf-xyz", "iekf-xyz", "ri-ekf-xyz"):
         filter_, belief = cs.get_filter(name), with_xyz(scenario.belief)
         for other in (filter_.run(trial, belief), step_through(filter_.twin, trial, belief)):
             pose, _, nis = differences(other, kf)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import consistency
+import consistency.filters
 
 PACKAGE = Path(consistency.__file__).parent
 DOCUMENT = PACKAGE.parent / "docs" / "extending.md"
@@ -63,3 +64,44 @@ def test_the_bias_of_the_document_works(copy: Path) -> None:
     assert "Bias(kind='bias', name=None, bias=(0.0, 0.0, 1.0))" in done.stdout
     names.write_text(names.read_text(encoding="utf-8").replace(line, ""), encoding="utf-8")
     assert "'bias' is not one of" in python(copy, code).stderr  # negative control
+
+
+METHODS = PACKAGE / "filters" / "methods"
+
+
+def test_excerpts_of_filters_are_the_code_that_runs() -> None:
+    registry = (PACKAGE / "filters" / "__init__.py").read_text(encoding="utf-8")
+    sources = [registry, *(path.read_text(encoding="utf-8") for path in METHODS.glob("*.py"))]
+    excerpts = blocks("Add a filter")
+    assert len(excerpts) == 6
+    for excerpt in excerpts:
+        pieces = re.split(r"\n{3,}", excerpt.strip("\n"))
+        assert all(any(piece in source for source in sources) for piece in pieces), excerpt
+
+
+@pytest.mark.parametrize(
+    ("method", "names"), [("iekf", {"iekf"}), ("riekf", {"ri-ekf"}), ("anchored", {"anchored-ekf"})]
+)
+def test_a_filter_is_one_file_and_a_line_for_each_name(method: str, names: set[str]) -> None:
+    """Nothing else in the package knows the file or what it defines."""
+    registered = {name: module for name, (module, _) in consistency.filters.MODULES.items()}
+    mine = {name for name, module in registered.items() if module == f"methods.{method}"}
+    assert {name.rpartition("-")[0] for name in mine} == names
+    source = (METHODS / f"{method}.py").read_text(encoding="utf-8")
+    defined = set(re.findall(r"^class (\w+)", source, flags=re.MULTILINE)) | {f"methods.{method}"}
+    for path in PACKAGE.rglob("*.py"):
+        if path not in (METHODS / f"{method}.py", PACKAGE / "filters" / "__init__.py"):
+            text = path.read_text(encoding="utf-8")
+            assert not [name for name in defined if re.search(rf"\b{re.escape(name)}\b", text)], path
+
+
+def test_the_experiment_of_the_document_runs(tmp_path: Path) -> None:
+    (script,) = blocks("Add an experiment")
+    (tmp_path / "e13_iterated.py").write_text(script, encoding="utf-8")
+    code = "import sys, runpy; sys.argv = ['e13', '2', '0']; runpy.run_path('e13_iterated.py', run_name='__main__')"
+    environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert "iterated-update" in done.stdout

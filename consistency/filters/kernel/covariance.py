@@ -6,7 +6,7 @@ writes P does it here, but for the block and the rows of the robot, which are wh
 
 from __future__ import annotations
 
-from consistency.filters.kernel.arrays import copy_matrix
+from consistency.filters.kernel.arrays import copy_matrix, fill_matrix
 from consistency.filters.kernel.blas import add_gram, upper_cholesky
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.linalg import DEFICIENT
@@ -28,6 +28,19 @@ def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Arr
                 rows[first + a, j] = P[o + a, j]
             for b in range(a):
                 rows[first + a, o + b] = rows[first + b, o + a]
+
+
+@inner
+def combine_rows(Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
+    """``out`` (3, width) <- H P of the i-th seen landmark, of any number of variables."""
+    r, w = Hp.shape[1], Hl.shape[1]
+    fill_matrix(out, 0.0)
+    for a in range(OBSERVED):
+        for c in range(r + w):
+            h = Hp[a, c] if c < r else Hl[a, c - r]
+            row = rows[c] if c < r else rows[r + w * i + c - r]
+            for j in range(out.shape[1]):
+                out[a, j] += h * row[j]
 
 
 @inner

@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import numba
 from filelock import FileLock
 
 from consistency.filters.kernel.dispatch import OPTIONS, PACKAGE, Function, outside_files
+
+MARK = "compiled"  # a file beside what is kept
 
 
 def inner(function: Function) -> Function:
@@ -30,7 +33,8 @@ def _digest(outside: Iterable[Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _cache_folder(outside: Iterable[Path]) -> Path:
+@cache
+def _cache_folder(outside: tuple[Path, ...]) -> Path:
     base = os.environ.get("NUMBA_CACHE_DIR")
     if not base:
         base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
@@ -40,45 +44,50 @@ def _cache_folder(outside: Iterable[Path]) -> Path:
 class Kernel:
     """A whole-trial entry: compiled on first use for each combination of parts, kept on disk for later processes.
 
-    Parts from outside the package (of a test, or of a user) have a folder of the cache of their own, keyed by
-    their sources too. One process compiles at a time; those that waited for it read what it has kept.
+    Each signature has a folder of its own in the cache, named by the sources too of parts from outside the package
+    (of a test, or of a user). One process compiles a signature; those that waited for it read what it has kept.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
-        self._entries: dict[tuple[Path, ...], tuple[Any, Path]] = {}
+        self._entries: dict[Any, tuple[Any, Path]] = {}
 
     def __call__(self, *args: Any) -> Any:
         return self.compile(*args)(*args)
 
     def compile(self, *args: Any) -> Callable[..., Any]:
         """The entry, compiled for these arguments or loaded from disk."""
-        entry, folder = self._entry()
         signature = _signature(args)
-        if signature not in entry.overloads:
+        entry, folder = self._entry(signature)
+        if not entry.overloads:
             with _one_at_a_time(folder):
                 entry.compile(signature)
-                _mark(folder, signature)
+                _mark(folder)
         compiled: Callable[..., Any] = entry
         return compiled
 
     def is_ready(self, *args: Any) -> bool:
         """Whether a call with these arguments starts at once, or spends seconds on compiling first."""
-        entry, folder = self._entry()
-        signature = _signature(args)
-        return signature in entry.overloads or _marker(folder, signature).exists()
+        entry, folder = self._entry(_signature(args))
+        return bool(entry.overloads) or (folder / MARK).exists()
 
     @property
     def signatures(self) -> list[Any]:
         """Signatures compiled or loaded in this process."""
         return [signature for entry, _ in self._entries.values() for signature in entry.signatures]
 
-    def _entry(self) -> tuple[Any, Path]:
-        outside = tuple(outside_files())
-        if outside not in self._entries:
-            folder = _cache_folder(outside)
-            self._entries[outside] = _cached(self.function, folder), folder
-        return self._entries[outside]
+    @property
+    def loaded(self) -> int:
+        """How many signatures this process has read from disk."""
+        return sum(sum(entry.stats.cache_hits.values()) for entry, _ in self._entries.values())
+
+    def _entry(self, signature: tuple[Any, ...]) -> tuple[Any, Path]:
+        key = signature, tuple(outside_files())
+        if key not in self._entries:
+            name = hashlib.sha256(f"{self.function.__qualname__}{signature}".encode()).hexdigest()[:16]
+            folder = _cache_folder(key[1]) / name
+            self._entries[key] = _cached(self.function, folder), folder
+        return self._entries[key]
 
 
 def _cached(function: Any, folder: Path) -> Any:
@@ -97,13 +106,9 @@ def _signature(args: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(typeof(arg) for arg in args)
 
 
-def _marker(folder: Path, signature: tuple[Any, ...]) -> Path:
-    return folder / f"{hashlib.sha256(str(signature).encode()).hexdigest()[:16]}.compiled"
-
-
-def _mark(folder: Path, signature: tuple[Any, ...]) -> None:
+def _mark(folder: Path) -> None:
     if folder.is_dir() and os.access(folder, os.W_OK):
-        _marker(folder, signature).touch()
+        (folder / MARK).touch()
 
 
 def _one_at_a_time(folder: Path) -> AbstractContextManager[Any]:

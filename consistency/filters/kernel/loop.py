@@ -220,12 +220,12 @@ def _run(
 
 @inner
 def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedTuple]) -> int:
-    """Estimate of step k + 1; returns the rank of its covariance as ``definiteness`` says it."""
+    """Estimate of step k + 1; returns the rank of its own covariance as ``definiteness`` says it."""
     r = robot_width(slam.motion)
     copy_matrix(state.P[:r, :r], out.own[k])
     copy(state.x[:r], out.pose[k])
     pose_covariance(slam.error, out.pose[k], out.own[k], out.covariance[k])
-    return definiteness_with(out.covariance[k], work.small)
+    return definiteness_with(out.own[k], work.small)
 
 
 trial_kernel = Kernel(run_trial)

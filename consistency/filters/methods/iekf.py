@@ -1,0 +1,168 @@
+"""Iterated EKF-SLAM: the update linearised again where it led to, Bell & Cathey (1993).
+
+Each pass linearises h at the result of the one before and solves from the same prior; what it converges to is the
+most probable state. The covariance is that of the last pass, from the prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.filters import plain
+from consistency.filters.compiled import Compiled
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, whiten
+from consistency.filters.kernel.jit import inner
+from consistency.filters.kernel.local_state import Factors
+from consistency.filters.kernel.slam import (
+    OBSERVED,
+    Data,
+    Slam,
+    State,
+    correct,
+    landmark_width,
+    make_room,
+    predict,
+    propagate,
+    robot_width,
+)
+from consistency.filters.kernel.work import Work
+from consistency.filters.methods import ekf
+from consistency.filters.plain import SlamState
+from consistency.protocols import Problem
+from consistency.types import Array, Control, Gaussian, Info, Observation
+
+PASSES = 5  # linearisations of an update; the first is the EKF's
+
+
+@part(error="Additive", point="AtEstimate")
+class Iterated(NamedTuple):
+    """Number of linearisations of an update."""
+
+    passes: int
+
+
+class PriorRoom(NamedTuple):
+    """The prior of the variables involved, r + w m."""
+
+    prior: Array
+
+
+@implement(make_room, Iterated)
+def iterated_room(update: Iterated, r: int, w: int, m: int) -> PriorRoom:
+    return PriorRoom(np.empty(r + w * m))
+
+
+@implement(predict, Iterated)
+def predict_iterated(
+    update: Iterated, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[PriorRoom]
+) -> None:
+    propagate(slam.error, slam, state, k, u, Phi, work)
+
+
+@implement(correct, Iterated)
+def correct_iterated(
+    update: Iterated, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[PriorRoom]
+) -> tuple[int, float]:
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    involved, first_nis = r + w * m, np.nan
+    gather(slam, state, m, local, work)
+    for a in range(involved):
+        work.room.prior[a] = state.x[_variable(r, w, a, work)]
+    for i in range(update.passes):
+        linearise_seen(slam, state, k, m, work)
+        combine_seen(slam, state, m, work)
+        _relate_to_prior(r, w, state, m, innovate(state, data, m, work), work)
+        code, nis = whiten(state, data, m, work)
+        if code > 0:
+            return code, nis
+        first_nis = nis if i == 0 else first_nis
+        is_last = i == update.passes - 1
+        for a in range(involved):
+            j = _variable(r, w, a, work)
+            state.x[j] = work.room.prior[a] + (0.0 if is_last else _shift(state, m, j, work))
+    apply(slam, state, m, local, work)
+    return 0, first_nis
+
+
+@inner
+def _variable(r: int, w: int, a: int, work: Work[PriorRoom]) -> int:
+    """State index of the a-th of the variables involved."""
+    return a if a < r else work.at[(a - r) // w] + (a - r) % w
+
+
+@inner
+def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[PriorRoom]) -> None:
+    """y <- z - h(x) - H (prior - x)."""
+    x, prior = state.x, work.room.prior
+    for i in range(m):
+        o = work.at[i]
+        for a in range(OBSERVED):
+            for c in range(r):
+                y[OBSERVED * i + a] -= work.Hp[i, a, c] * (prior[c] - x[c])
+            for c in range(w):
+                y[OBSERVED * i + a] -= work.Hl[i, a, c] * (prior[r + w * i + c] - x[o + c])
+
+
+@inner
+def _shift(state: State, m: int, j: int, work: Work[PriorRoom]) -> float:
+    """By how much the whitened gain moves variable j."""
+    total, y = 0.0, state.n + state.base
+    for row in range(OBSERVED * m):
+        total += work.A[row, j] * work.A[row, y]
+    return total
+
+
+class IteratedKalman:
+    """EKF-SLAM whose update is a Gauss-Newton iteration."""
+
+    def __init__(self, name: str, uvd: bool, passes: int = PASSES) -> None:
+        self.name, self.uvd, self.passes = name, uvd, passes
+
+    def init(self, problem: Problem) -> SlamState:
+        return plain.start(problem)
+
+    def predict(self, state: SlamState, control: Control) -> SlamState:
+        return plain.predict_extended(state, control)
+
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        def correct(state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+            x, infos = state.x, []
+            for _ in range(self.passes):
+                zhat, H = plain.expect(replace(state, x=x), seen, self.uvd)
+                innovation = z.ravel() - zhat - H @ (state.x - x)
+                S, W = plain.gain(state.P, H, plain.block_diagonal(R))
+                x = state.x + W @ innovation
+                infos.append(Info(innovation, S, W))
+            return replace(state, x=x, P=state.P - W @ S @ W.T), infos[0]
+
+        def locate(state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+            return plain.locate_point(state, z, self.uvd)
+
+        return plain.update_jointly(state, observation, self.uvd, correct, locate)
+
+    def pose(self, state: SlamState) -> Gaussian:
+        return plain.pose_of(state)
+
+    def map(self, state: SlamState) -> dict[int, Gaussian]:
+        return plain.map_of(state)
+
+    def joint(self, state: SlamState) -> Gaussian:
+        return plain.joint_of(state)
+
+
+def xyz_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``iekf-xyz``."""
+    return ekf.xyz_parts(problem, controls)._replace(update=Iterated(PASSES))
+
+
+def uvd_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``iekf-uvd``."""
+    return ekf.uvd_parts(problem, controls)._replace(update=Iterated(PASSES))
+
+
+XYZ = Compiled(IteratedKalman("iekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
+UVD = Compiled(IteratedKalman("iekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)

@@ -1,0 +1,280 @@
+"""Every registered combination of parts: Jacobians by finite differences, a Kalman filter at the truth, the twin.
+
+The Kalman filter linearised at the truth is exact in a world of first order. A filter that linearises elsewhere
+differs from it by terms of second order: relative to standard deviations, by a multiple of the noise. So at a tenth
+of the noise the gap is a tenth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import consistency as cs
+from consistency.filters import filter_names, plain
+from consistency.filters.compiled import Compiled, problem_of
+from consistency.filters.kernel.dispatch import require_fitting
+from consistency.filters.kernel.gain import linearise_seen
+from consistency.filters.kernel.slam import Slam, State, insert_error, landmark_width, place, propagate, retract
+from consistency.filters.kernel.work import make_work
+from consistency.filters.motion.unicycle import Unicycle
+from consistency.filters.plain import SlamState
+from consistency.filters.stepping import step_through
+from consistency.protocols import Problem
+from consistency.types import Array, Control, Estimates, Gaussian, Info, Observation, Trial
+
+Small = Callable[..., cs.Scenario]
+NAMES = [name for name in filter_names() if isinstance(cs.get_filter(name), Compiled)]
+WORLDS = {"kf": "linear-gaussian", "xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline"}
+STEP = 1e-6  # of finite differences
+
+
+def world_of(name: str) -> str:
+    return WORLDS[name.rpartition("-")[2]]
+
+
+# --- Jacobians -----------------------------------------------------------------------------------
+
+
+class Bench:
+    """The kernels of a filter at a state with two landmarks, and one more to come."""
+
+    def __init__(self, name: str, scenario: cs.Scenario) -> None:
+        trial = cs.simulate(scenario, run=1)
+        filter_ = cs.get_filter(name)
+        problem = problem_of(trial, scenario.belief)
+        self.slam: Slam = filter_.parts(problem, np.array(trial.controls))
+        self.w, self.n = landmark_width(self.slam.landmark), 3 + 2 * landmark_width(self.slam.landmark)
+        self.labels, self.z, self.u = trial.landmark[:3], trial.z[:3], np.array(trial.controls[0])
+        self.work = make_work(self.slam, self.n + self.w, 3)
+        self.work.label[:2], self.work.at[:2] = self.labels[:2], [3, 3 + self.w]
+        self.x = np.concatenate([trial.start + np.array([0.3, -0.2, 0.1]), np.zeros(3 * self.w)])
+        for i in range(2):
+            self.place(self.x, 3 + i * self.w, i, self.z[i] * (1.01, 0.98, 1.02))
+
+    def state(self, x: Array, n: int, P: Array | None = None) -> State:
+        return State(x, np.zeros((len(x), len(x))) if P is None else P, n, 0, np.zeros(200, int))
+
+    def place(self, x: Array, n: int, i: int, z: Array) -> None:
+        place(self.slam.point, self.slam, self.state(x, n), 0, int(self.labels[i]), z, self.work)
+
+    def moved(self, x: Array, n: int, error: Array) -> Array:
+        """x with an error of its first n variables."""
+        x = x.copy()
+        retract(self.slam.error, self.slam, self.state(x, n), error[None, :n].copy(), np.ones(1), self.work)
+        return x
+
+    def along_errors(self, function: Callable[[Array], Array], n: int) -> Array:
+        """Derivative (k, n) of a function of the state by the error of its first n variables."""
+        steps = STEP * np.eye(n)
+        ahead, behind = ([function(self.moved(self.x, n, sign * e)) for e in steps] for sign in (1.0, -1.0))
+        return (np.array(ahead) - np.array(behind)).T / (2.0 * STEP)
+
+    def additive_from_own(self, x: Array, n: int) -> Array:
+        """T (n, n): what an error does to the variables at x."""
+        here, self.x = self.x, x
+        T = self.along_errors(lambda moved: moved[:n], n)
+        self.x = here
+        return T
+
+    def expected(self, x: Array) -> Array:
+        linearise_seen.py_func(self.slam, self.state(x, self.n), 0, 2, self.work)  # type: ignore[attr-defined]
+        return self.work.zhat[:6].copy()
+
+    def predicted(self, x: Array, u: Array, P: Array | None = None) -> Array:
+        x = x.copy()
+        propagate(self.slam.error, self.slam, self.state(x, self.n, P), 0, u, np.zeros((3, 3)), self.work)
+        return x
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def bench(request: pytest.FixtureRequest, small: Small, tilted: dict[str, Any]) -> Bench:
+    name = request.param
+    return Bench(name, small(world_of(name), truth__sensor__mount=tilted, belief__sensor__mount=tilted))
+
+
+def close(a: Array, b: Array, tolerance: float = 1e-6) -> bool:
+    return bool(np.abs(a - b).max() <= tolerance * max(1.0, np.abs(b).max()))
+
+
+def test_observation_jacobians_are_those_of_the_retraction(bench: Bench) -> None:
+    exact = bench.along_errors(bench.expected, bench.n)
+    bench.expected(bench.x)
+    H = np.zeros((6, bench.n))
+    for i in range(2):
+        rows, at = slice(3 * i, 3 * i + 3), slice(3 + i * bench.w, 3 + (i + 1) * bench.w)
+        H[rows, :3], H[rows, at] = bench.work.Hp[i], bench.work.Hl[i]
+    assert close(H, exact)
+    assert not close(1.001 * H, exact)  # negative control
+
+
+def test_motion_moves_the_covariance_of_the_error(bench: Bench, rng: np.random.Generator) -> None:
+    n, sigmas = bench.n, bench.slam.motion
+    assert isinstance(sigmas, Unicycle)
+    after = bench.predicted(bench.x, bench.u)
+    back = np.linalg.inv(bench.additive_from_own(after, n))
+    F = back @ bench.along_errors(lambda x: bench.predicted(x, bench.u)[:n], n)
+    G = np.zeros((n, 2))
+    for j, sigma in enumerate(sigmas):
+        du = STEP * np.eye(3)[1 + j]
+        ahead, behind = (bench.predicted(bench.x, bench.u + sign * du)[:n] for sign in (1.0, -1.0))
+        G[:, j] = back @ (ahead - behind) / (2.0 * STEP) * sigma
+    A = rng.normal(size=(n, n))
+    P = np.zeros((len(bench.x), len(bench.x)))
+    P[:n, :n] = A @ A.T
+    bench.predicted(bench.x, bench.u, P)
+    expected = F @ A @ A.T @ F.T + G @ G.T
+    upper = np.triu_indices(n)
+    assert close(P[:n, :n][upper], expected[upper])
+    assert close(P[:3, :3], expected[:3, :3])
+    assert not close((A @ A.T + G @ G.T)[upper], expected[upper]) or close(F, np.eye(n))
+
+
+def test_a_new_landmark_has_the_jacobians_of_its_error(bench: Bench) -> None:
+    n, w, z = bench.n, bench.w, bench.z[2].copy()
+
+    def augmented(x: Array, z: Array) -> Array:
+        x = x.copy()
+        bench.place(x, n, 2, z)
+        return x
+
+    after = augmented(bench.x, z)
+    insert_error(bench.slam.error, bench.x[:3], after[n:], bench.work.Jp)
+    Jp, Jz = bench.work.Jp.copy(), bench.work.Jz.copy()
+    back = np.linalg.inv(bench.additive_from_own(after, n + w))
+    by_error = back @ bench.along_errors(lambda x: augmented(x, z), n)
+    by_z = back @ np.column_stack([augmented(bench.x, z + d) - augmented(bench.x, z - d) for d in STEP * np.eye(3)])
+    assert close(Jp, by_error[n:, :3])
+    assert np.abs(by_error[n:, 3:]).max() < 1e-6  # other landmarks have no part in it
+    assert close(Jz, by_z[n:] / (2.0 * STEP))
+    assert not close(1.001 * Jz, by_z[n:] / (2.0 * STEP))
+
+
+# --- a Kalman filter at the truth ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TrueState:
+    slam: SlamState
+    step: int
+
+
+class AtTruth:
+    """The Kalman filter of the world linearised about the true path and the true landmarks."""
+
+    name = "at-truth"
+
+    def __init__(self, trial: Trial, uvd: bool) -> None:
+        assert trial.truth is not None
+        assert trial.landmarks is not None
+        self.path, self.landmarks, self.uvd = trial.truth, trial.landmarks, uvd
+        self.robot = plain.Unicycle()
+
+    def init(self, problem: Problem) -> TrueState:
+        return TrueState(plain.start(problem), 0)
+
+    def predict(self, state: TrueState, control: Control) -> TrueState:
+        before, x, P = self.path[state.step], state.slam.x.copy(), state.slam.P.copy()
+        F, G = self.robot.jacobians(before, control)
+        x[:3] = self.robot.move(before, control) + F @ (x[:3] - before)
+        P[:3] = F @ P[:3]
+        P[:, :3] = P[:, :3] @ F.T
+        P[:3, :3] += plain.process_noise(G, state.slam.problem.belief)
+        return TrueState(replace(state.slam, x=x, P=P), state.step + 1)
+
+    def update(self, state: TrueState, observation: Observation) -> tuple[TrueState, Info]:
+        pose, sensor = self.path[state.step], plain.PointSensor(state.slam.problem.belief.sensor, self.uvd)
+
+        def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+            known = np.concatenate([pose, *(self.landmarks[label] for label in slam.landmarks)])
+            zhat, H = plain.expect(replace(slam, x=known), seen, self.uvd)
+            innovation = z.ravel() - zhat - H @ (slam.x - known)
+            S, W = plain.gain(slam.P, H, plain.block_diagonal(R))
+            return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
+
+        def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+            Hp, Hl = sensor.jacobians(pose, self.landmarks[label])
+            Jz = np.linalg.inv(Hl)
+            error = z - sensor.measure(pose, self.landmarks[label]) - Hp @ (slam.x[:3] - pose)
+            return self.landmarks[label] + Jz @ error, -Jz @ Hp, Jz
+
+        slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
+        return TrueState(slam, state.step), info
+
+    def pose(self, state: TrueState) -> Gaussian:
+        return plain.pose_of(state.slam)
+
+
+def scaled(scenario: cs.Scenario, scale: float) -> cs.Scenario:
+    """The world with all noise, true and believed, multiplied."""
+    sigma = tuple(scale * s for s in scenario.belief.sensor.sigma)
+    motion = scenario.belief.motion
+    changes: dict[str, Any] = {"motion__sigma_v": scale * motion.sigma_v, "sensor__sigma": sigma}
+    changes["motion__sigma_omega"] = scale * motion.sigma_omega
+    both = {f"{table}__{key}": value for table in ("truth", "belief") for key, value in changes.items()}
+    return scenario.variant("scaled", **both)
+
+
+def gap(name: str, scenario: cs.Scenario) -> float:
+    """Largest distance of a filter's pose from that of the Kalman filter at the truth, in standard deviations."""
+    trial, filter_ = cs.simulate(scenario, run=1), cs.get_filter(name)
+    exact = step_through(AtTruth(trial, filter_.uvd), trial, scenario.belief)
+    ours = filter_.run(trial, scenario.belief)
+    assert ours.failure is None
+    assert exact.failure is None
+    sigma = np.sqrt(np.einsum("kii->ki", exact.covariance))[5:]
+    return float((np.abs(ours.pose - exact.pose)[5:] / sigma).max())
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "kf"])
+def test_the_gap_to_the_kalman_filter_at_the_truth_shrinks_with_the_noise(small: Small, name: str) -> None:
+    full, tenth, hundredth = (gap(name, scaled(small(world_of(name)), scale)) for scale in (1.0, 0.1, 0.01))
+    assert tenth < 0.5 * full
+    assert 0.8 < np.log10(tenth / hundredth) < 1.2
+    assert hundredth < 0.01
+
+
+# --- twins -----------------------------------------------------------------------------------------
+
+
+def difference(a: Estimates, b: Estimates) -> float:
+    """Largest difference of poses (m, rad), of covariances and of NIS relative to their size."""
+    assert a.failure is None
+    assert b.failure is None
+    size = np.abs(b.covariance).max(axis=(1, 2), keepdims=True)
+    nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
+    return float(max(np.abs(a.pose - b.pose).max(), (np.abs(a.covariance - b.covariance) / size).max(), nis))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_kernel_equals_its_twin_over_a_trial(small: Small, name: str, tilted: dict[str, Any]) -> None:
+    scenario = small(world_of(name), truth__steps=200, truth__sensor__mount=tilted, belief__sensor__mount=tilted)
+    trial, filter_ = cs.simulate(scenario, run=2), cs.get_filter(name)
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    assert difference(ours, twin) < 1e-10
+    straight = small(world_of(name), truth__steps=200, truth__sensor__mount=tilted)  # negative control
+    assert difference(filter_.run(trial, straight.belief), twin) > 1e-6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_map_is_that_of_the_twin(small: Small, name: str) -> None:
+    scenario = small(world_of(name))
+    trial, filter_ = cs.simulate(scenario, run=2), cs.get_filter(name)
+    state = filter_.init(problem_of(trial, scenario.belief))
+    for k in range(1, trial.steps + 1):
+        state, _ = filter_.update(filter_.predict(state, trial.control(k)), trial.observation(k))
+    ours, twin = filter_.run(trial, scenario.belief).map, filter_.map(state)
+    assert ours.landmarks.tolist() == sorted(twin)
+    for label, mean, P in zip(ours.landmarks, ours.mean, ours.covariance, strict=True):
+        assert close(mean, twin[label].mean, 1e-10)
+        assert np.abs(P - twin[label].covariance).max() <= 1e-10 * np.abs(P).max()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_combinations_fit(small: Small, name: str) -> None:
+    trial, scenario = cs.simulate(small(world_of(name))), small(world_of(name))
+    require_fitting(cs.get_filter(name).parts(problem_of(trial, scenario.belief), np.array(trial.controls)))

@@ -74,13 +74,13 @@ def consistency_runs(request: pytest.FixtureRequest) -> int:
 
 def marked(item: pytest.Item) -> tuple[dict[str, Any], str]:
     """Values of the test's markers, of which the nearest counts, and what is wrong with them ('' if nothing)."""
-    said: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for mark in reversed(list(item.iter_markers("consistency"))):
         unknown = [*map(repr, mark.args), *(key for key in mark.kwargs if key not in DEFAULTS)]
         if unknown:
             return {}, f"marker consistency: takes {', '.join(DEFAULTS)} as keywords, got {', '.join(unknown)}"
-        said |= mark.kwargs
-    return said, ""
+        options |= mark.kwargs
+    return options, ""
 
 
 class Gates:
@@ -106,11 +106,11 @@ class Gates:
 
         if self.runs is not None:
             return self.runs
-        said, _ = marked(item)
-        asked = DEFAULTS | said
-        if self.budget is not None and "false_alarm" not in said:  # enough whatever else will run
-            asked["false_alarm"] = in_place_rate(self.budget, self.collected)
-        return gate_runs(asked["dof"], asked["detect"], asked["false_alarm"], asked["power"], asked["allow"])
+        options, _ = marked(item)
+        terms = DEFAULTS | options
+        if self.budget is not None and "false_alarm" not in options:  # enough whatever else will run
+            terms["false_alarm"] = in_place_rate(self.budget, self.collected)
+        return gate_runs(terms["dof"], terms["detect"], terms["false_alarm"], terms["power"], terms["allow"])
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:

@@ -103,34 +103,34 @@ def assert_consistent(
         Input that cannot be judged, named by run (from 0) and step (from 1); options that do not fit.
     """
     __tracebackhide__ = True
-    asked = terms(false_alarm, detect, power, allow, tolerance)
+    demand = terms(false_alarm, detect, power, allow, tolerance)
     arrays: dict[str, Any] = {
         "covariances": covariances, "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
         "innovations": innovations, "innovation_covariances": innovation_covariances, "axes": axes,
     }  # fmt: skip
     if filter is not None or hasattr(errors, "estimates"):
         _refuse(arrays, "results bring their own")
-        given = of_results(cast("Results", errors), filter, name, subsets, method)
+        candidate = of_results(cast("Results", errors), filter, name, subsets, method)
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
-        given = evidence(
+        candidate = evidence(
             name or "the estimator", cast(ArrayLike, errors), subsets=subsets, method=method,
             optimal_gain=optimal_gain, **arrays,
         )  # fmt: skip
 
     def look(rate: float) -> _Look:
-        verdict = given.judge(rate, asked)
-        sure = bool(given.failures) or verdict.status == "failed"
+        verdict = candidate.judge(rate, demand)
+        sure = bool(candidate.failures) or verdict.status == "failed"
         bad = verdict.status not in ("consistent", "undecided")
         return _Look(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
-        return gate_runs(given.planned_dof, asked.detect, rate, asked.power, asked.allow)
+        return gate_runs(candidate.planned_dof, demand.detect, rate, demand.power, demand.allow)
 
-    seen = _settle("assert_consistent", given, asked, look, needed)
-    assert seen.verdict is not None
-    return seen.verdict
+    result = _settle("assert_consistent", candidate, demand, look, needed)
+    assert result.verdict is not None
+    return result.verdict
 
 
 def assert_not_worse(
@@ -179,7 +179,7 @@ def assert_not_worse(
         As :func:`assert_consistent`; different numbers of runs.
     """
     __tracebackhide__ = True
-    asked = terms(false_alarm, detect, power, None)
+    demand = terms(false_alarm, detect, power, None)
     arrays: dict[str, Any] = {
         "covariances_a": covariances_a, "errors_b": errors_b, "covariances_b": covariances_b, "nees_a": nees_a,
         "nees_b": nees_b, "dof": dof, "axes": axes,
@@ -193,15 +193,15 @@ def assert_not_worse(
         if nees_a is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
         sides = of_arrays(name or "the candidate", cast(ArrayLike, errors_a), **arrays)
-    return _compare(sides, asked)
+    return _compare(sides, demand)
 
 
-def _compare(sides: Sides, asked: Terms) -> Comparison:
+def _compare(sides: Sides, demand: Terms) -> Comparison:
     __tracebackhide__ = True
     if sides.usable_runs < FEWEST:
         if sides.failed_more:
             found = f"worse than {sides.name_b}: {sides.failures[0]} runs failed, of {sides.name_b} {sides.failures[1]}"
-            verdict = sides.candidate.judge(asked.false_alarm, asked)
+            verdict = sides.candidate.judge(demand.false_alarm, demand)
             raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [found]), verdict)
         raise InsufficientTrials(
             f"assert_not_worse: {sides.usable_runs} runs are too few for a standard error; simulate {FEWEST} at least",
@@ -217,11 +217,11 @@ def _compare(sides: Sides, asked: Terms) -> Comparison:
         return _Look(worse, sides.failed_more, comparison.p_value, status, reasons, None, comparison)
 
     def needed(rate: float) -> int:
-        return sides.compare(rate).needed_runs(asked.detect, asked.power)
+        return sides.compare(rate).needed_runs(demand.detect, demand.power)
 
-    seen = _settle("assert_not_worse", sides.candidate, asked, look, needed)
-    assert seen.comparison is not None
-    return seen.comparison
+    result = _settle("assert_not_worse", sides.candidate, demand, look, needed)
+    assert result.comparison is not None
+    return result.comparison
 
 
 # --- what both do ----------------------------------------------------------------------------------
@@ -241,57 +241,59 @@ class _Look:
 
 
 def _settle(
-    gate: str, given: Candidate, asked: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
+    gate: str, candidate: Candidate, demand: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
 ) -> _Look:
     """Record what a gate found, and raise where that is settled now."""
     __tracebackhide__ = True
-    seen, late = look(asked.false_alarm), None
-    fault = seen.bad and (asked.may_fail or seen.sure)
-    if not fault and asked.budget is not None and seen.p_value <= asked.budget:
-        late = look(max(seen.p_value, 1e-300))  # in case the end of the session finds it
-    least = needed(asked.planned)
-    few = not fault and (given.runs < least if seen.verdict is None else seen.status == "undecided")
+    result, late = look(demand.false_alarm), None
+    fault = result.bad and (demand.may_fail or result.sure)
+    if not fault and demand.budget is not None and result.p_value <= demand.budget:
+        late = look(max(result.p_value, 1e-300))  # in case the end of the session finds it
+    least = needed(demand.planned)
+    few = not fault and (candidate.runs < least if result.verdict is None else result.status == "undecided")
     outcome = "fault found" if fault else "too few runs" if few else "passed"
     if few:  # ask for what is enough at the end of the session too, and for more than there are
-        least = max(needed(asked.false_alarm), _deciding(seen, given.runs))
-    current().keep(_entry(gate, given, asked, seen, late, outcome, least))
+        least = max(needed(demand.false_alarm), _deciding(result, candidate.runs))
+    current().keep(_entry(gate, candidate, demand, result, late, outcome, least))
     if fault:
-        verdict = seen.verdict or given.judge(asked.false_alarm, asked)
-        raise ConsistencyError(fault_text(gate, given.name, seen.reasons), verdict, seen.comparison)
+        verdict = result.verdict or candidate.judge(demand.false_alarm, demand)
+        raise ConsistencyError(fault_text(gate, candidate.name, result.reasons), verdict, result.comparison)
     if few:
-        plan = asked.detect, asked.false_alarm, asked.power
-        if seen.verdict is None:
-            text = few_to_compare(gate, given.name, given.runs, least, *plan)
+        plan = demand.detect, demand.false_alarm, demand.power
+        if result.verdict is None:
+            text = few_to_compare(gate, candidate.name, candidate.runs, least, *plan)
         else:
-            text = undecided_text(gate, given.name, seen.reasons[0], least, given.planned_dof, *plan, asked.allow)
-        raise InsufficientTrials(text, least, given.runs, seen.verdict)
-    return seen
+            text = undecided_text(
+                gate, candidate.name, result.reasons[0], least, candidate.planned_dof, *plan, demand.allow
+            )
+        raise InsufficientTrials(text, least, candidate.runs, result.verdict)
+    return result
 
 
-def _deciding(seen: _Look, runs: int) -> int:
+def _deciding(result: _Look, runs: int) -> int:
     """Runs that would probably decide, more than there are; 0 for a comparison, which says so itself."""
-    if seen.verdict is None:
+    if result.verdict is None:
         return 0
-    shown = seen.verdict.equivalence
+    shown = result.verdict.equivalence
     return max(runs + 1, (shown.runs or 0) if shown is not None else 0)
 
 
 def _entry(
-    gate: str, given: Candidate, asked: Terms, seen: _Look, late: _Look | None, outcome: str, least: int
+    gate: str, candidate: Candidate, demand: Terms, result: _Look, late: _Look | None, outcome: str, least: int
 ) -> Entry:
-    statistics = seen.verdict.statistics if seen.verdict is not None else {}
-    fields = _found(seen)
-    if (c := seen.comparison) is not None:
+    statistics = result.verdict.statistics if result.verdict is not None else {}
+    fields = _found(result)
+    if (c := result.comparison) is not None:
         fields |= {key: _finite(getattr(c, key)) for key in ("distance", "standard_error")}
         spread = {key: getattr(c, key) for key in ("at_most", "sum_error", "reference")}
         fields["spread"] = {key: value for key, value in spread.items() if np.isfinite(value)}
         statistics = {"differences": [vars(d) for d in c.differences]}
     return Entry(
-        gate=gate, name=given.name, outcome=outcome, p_value=_finite(seen.p_value),
-        false_alarm=asked.false_alarm, in_budget=asked.budget is not None,
-        in_place=asked.false_alarm if asked.budget is not None and asked.may_fail else 0.0,
-        runs=given.runs, needed=least, dof=given.planned_dof, detect=asked.detect, power=asked.power,
-        allow=asked.allow, late={} if late is None else _found(late), statistics=statistics, **fields,
+        gate=gate, name=candidate.name, outcome=outcome, p_value=_finite(result.p_value),
+        false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
+        in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
+        runs=candidate.runs, needed=least, dof=candidate.planned_dof, detect=demand.detect, power=demand.power,
+        allow=demand.allow, late={} if late is None else _found(late), statistics=statistics, **fields,
     )  # fmt: skip
 
 

@@ -275,8 +275,8 @@ def analyse(
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
     if innovations not in (None, "optimal"):
         raise InputError(f"--innovations must be 'optimal', got '{innovations}'")
-    given = _given(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance)
-    settings = settings_of(**given) if given else None
+    changes = _given(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance)
+    settings = settings_of(**changes) if changes else None
     options: dict[str, Any] = {
         "truth": truth, "covariance": covariance, "convention": error,
         "state": None if state is None else [name.strip() for name in state.split(",")],
@@ -415,10 +415,10 @@ def report(
     from consistency.reporting import write_reports
 
     # one of the two named: only that one is written
-    wanted = (
+    targets = (
         {"html": html, "pdf": pdf} if html or pdf else {"html": folder / "report.html", "pdf": folder / "report.pdf"}
     )
-    for path in write_reports(folder, wanted["html"], wanted["pdf"], overwrite):
+    for path in write_reports(folder, targets["html"], targets["pdf"], overwrite):
         print(path)
 
 
@@ -491,9 +491,9 @@ def monitor(
         raise InputError(f"--fail-on must be 'alarm', got '{fail_on}'")
     watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
     if path == "-":
-        given = _given(filter=filter_name, run=run, plot=plot)
-        if given:
-            raise InputError(f"--{next(iter(given))}: does not go with lines as they come (-)")
+        options = _given(filter=filter_name, run=run, plot=plot)
+        if options:
+            raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
         watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
     else:
         log = read_innovations(Path(path), filter_name, run)

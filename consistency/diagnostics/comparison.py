@@ -145,11 +145,9 @@ def compare(
     return _comparison(fewest, paired, tuple(differences), gap, total, false_alarm)
 
 
-def _rows(x: RunSummary, chosen: Array) -> RunSummary:
-    order = np.argsort(x.runs[chosen])
-    return RunSummary(
-        x.runs[chosen][order], x.dof, x.nees[chosen][order], x.squared[chosen][order], x.covered[chosen][order]
-    )
+def _rows(x: RunSummary, rows: Array) -> RunSummary:
+    order = np.argsort(x.runs[rows])
+    return RunSummary(x.runs[rows][order], x.dof, x.nees[rows][order], x.squared[rows][order], x.covered[rows][order])
 
 
 def _comparison(

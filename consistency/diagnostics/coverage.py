@@ -52,9 +52,9 @@ def coverage_interval(
     error = np.asarray(error, float)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     there = by_runs(lambda e, v: (np.isfinite(e) & np.isfinite(v) & (v >= 0)).all(axis=-1), error, variance)
-    chosen = spread_steps(there)
-    rows = np.flatnonzero(chosen >= 0)
-    inside = (np.abs(error[rows, chosen[rows]]) <= bound * _sigma(variance[rows, chosen[rows]])).sum(axis=0)
+    steps = spread_steps(there)
+    rows = np.flatnonzero(steps >= 0)
+    inside = (np.abs(error[rows, steps[rows]]) <= bound * _sigma(variance[rows, steps[rows]])).sum(axis=0)
     if not len(rows):
         n = error.shape[-1]
         return np.full(n, np.nan), np.tile([0.0, 1.0], (n, 1))

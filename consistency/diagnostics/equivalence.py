@@ -36,7 +36,7 @@ def equivalence(means: Array, dof: int, steps: int, settings: Settings, factor: 
 
 
 def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:
-    """The same from the e-process inverted: valid whenever it is looked at, and under any dependence."""
+    """Equivalence of the scale from the inverted e-process: valid at any look, and under any dependence."""
     factor = settings.factor
     below = ever(e_process(means / factor, dof).down)
     above = ever(e_process(means * factor, dof).up)
@@ -44,7 +44,7 @@ def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equiva
 
 
 def equivalence_of_innovations(test: NisTest, settings: Settings, factor: float | None = None) -> Equivalence:
-    """The same of the total NIS, whose innovations are independent over steps too."""
+    """Equivalence of the scale of the innovations, from the total NIS; innovations are independent over steps too."""
     factor, total = settings.factor if factor is None else factor, test.ratio * test.dof
     if not test.dof:
         return Equivalence(factor, float("nan"), 1.0 - settings.power, None)

@@ -151,8 +151,8 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
     if v.map is not None:
         rows.append(("map NEES / 3", f"{map_text(v.map)}, after the last step; not judged"))
     rows.append(("failed runs", f"{len({f.run for f in v.failures})} of {v.runs}"))
-    found = [f"{a.question} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated]
-    rows.append(("faults", f"{', '.join(found) or 'none'} of {plural(len(v.answers), 'question')}"))
+    faults = [f"{a.question} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated]
+    rows.append(("faults", f"{', '.join(faults) or 'none'} of {plural(len(v.answers), 'question')}"))
     return rows
 
 
@@ -178,7 +178,7 @@ def text(v: Verdict) -> str:
 
 
 def html(v: Verdict) -> str:
-    """The same for a notebook."""
+    """Summary of a verdict as an HTML table, for a notebook."""
     rows = "".join(
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in figures(v)

@@ -76,7 +76,7 @@ def whiteness(innovations: Array, covariances: Array, lags: int = LAGS) -> White
 
 
 def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
-    """The same of the NIS alone, where no innovations are kept: its cube root,
+    """Whiteness of the NIS alone, where no innovations are kept: its cube root,
     which is nearly Gaussian (Wilson & Hilferty 1931), shapes (runs, steps).
 
     Correlated innovations show in their squares, with the correlation squared.

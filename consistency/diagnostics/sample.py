@@ -51,7 +51,7 @@ class Sample:
         return int(np.isfinite(self.nees).sum(axis=1).max(initial=0))
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None)) -> Array:
-        """The same of a group of components by itself, over its number of components."""
+        """Mean NEES of a group of components by itself, over its number of components."""
         assert self.errors is not None
         w = subset(self.errors.error[:, steps], self.errors.covariance[:, steps], list(index))
         nees = np.where(np.isfinite(self.nees[:, steps]), squared_length(w), np.nan)

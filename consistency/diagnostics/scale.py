@@ -99,9 +99,10 @@ def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
 
 
 def spreads_more_in_steps(nees: Array, dof: int) -> bool:
-    """The same of the NEES (runs, steps) in single steps: log nu in the mean of the steps, with the error of one.
+    """Does the NEES (runs, steps) differ more between runs, step by step, than that of Gaussian errors can?
 
-    Steps need not be independent. Those in which a run has no value, or none of the runs an error, do not count.
+    The mean of log nu over the steps is compared, with the standard error of one step. Steps need not be independent.
+    Those in which a run has no value, or none of the runs an error, do not count.
     """
     whole = np.isfinite(nees).all(axis=0) & (nees > 0).all(axis=0)
     if len(nees) < FEW or not whole.any():

@@ -23,25 +23,25 @@ Found = Mapping[str, Answer]
 
 def reasons(v: Verdict) -> list[str]:
     """First the sentence, then the figures."""
-    found = {a.question: a for a in v.answers if a.found and not a.tolerated}
+    faults = {a.question: a for a in v.answers if a.found and not a.tolerated}
     broken = _failures(v)
     judged = v.scale is not None and v.scale.judged_steps > 0
     lines: list[str] = []
     if judged:
         assert v.scale is not None
-        lines = [_sentence(v, found), *_level(v), *_coverage(v)]
+        lines = [_sentence(v, faults), *_level(v), *_coverage(v)]
     elif v.scale is not None:
         lines = ["no step has a covariance of full rank to judge"]
     elif v.innovations is not None and v.innovations.dof:
-        lines = [_without_truth(v, found)]
+        lines = [_without_truth(v, faults)]
     else:
         lines = ["neither truth nor innovations to judge"]
-    lines = [lines[0], *broken, *lines[1:]] if found else [*broken, *lines]
+    lines = [lines[0], *broken, *lines[1:]] if faults else [*broken, *lines]
     if v.innovations is not None:
         lines.append(_nis(v))
     if v.answers:
-        lines.append(_asked(v, found))
-    return [f"{v.status}{_since(v, found)}: {lines[0]}", *lines[1:]]
+        lines.append(_asked(v, faults))
+    return [f"{v.status}{_since(v, faults)}: {lines[0]}", *lines[1:]]
 
 
 def short(value: float) -> str:
@@ -106,38 +106,38 @@ def _failures(v: Verdict) -> list[str]:
     return lines
 
 
-def _since(v: Verdict, found: Found) -> str:
+def _since(v: Verdict, faults: Found) -> str:
     since = v.location.since if v.location is not None else None
-    if not found or since is None or v.status in ("biased", "heavy-tailed"):  # it is that of the scale
+    if not faults or since is None or v.status in ("biased", "heavy-tailed"):  # it is that of the scale
         return ""
     return f" since step {since}"
 
 
-def _sentence(v: Verdict, found: Found) -> str:
-    if not found:
+def _sentence(v: Verdict, faults: Found) -> str:
+    if not faults:
         return _no_fault(v)
     parts = []
-    if any(q in found for q in BIAS):
-        parts.append(_bias(v, "bias" not in found))
+    if any(q in faults for q in BIAS):
+        parts.append(_bias(v, "bias" not in faults))
     if v.status == "heavy-tailed":
         assert v.scale is not None
         parts.append(f"in the mean the covariance ratio is {plain(v.scale.inflation)}")
     elif v.status != "biased":
-        parts += [_scale(v, found)] if any(q in found for q in SCALE) else []
-        parts += [_shape(v, found)] if any(q in found for q in SHAPE) else []
-    if "outliers" in found:
+        parts += [_scale(v, faults)] if any(q in faults for q in SCALE) else []
+        parts += [_shape(v, faults)] if any(q in faults for q in SHAPE) else []
+    if "outliers" in faults:
         assert v.tails is not None
         where = f"run {v.tails.run} lies {short(v.tails.distance)} sigma from the other runs in step {v.tails.step}"
         parts.insert(0 if v.status == "heavy-tailed" else len(parts), f"heavy tails: {where}")
     elif v.status == "heavy-tailed":
         parts.insert(0, "heavy tails: the runs differ more than Gaussian errors would")
-    if "distribution" in found and len(found) == 1:
+    if "distribution" in faults and len(faults) == 1:
         parts.append("the NEES does not follow the chi-square distribution")
-    if "innovation scale" in found and v.innovations is not None:
+    if "innovation scale" in faults and v.innovations is not None:
         parts.append(f"innovations {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
-    if "innovation whiteness" in found:
+    if "innovation whiteness" in faults:
         parts.append("innovations correlated over steps")
-    if any(q in found for q in SCALE) and v.status != "heavy-tailed" and _no_bias(v):
+    if any(q in faults for q in SCALE) and v.status != "heavy-tailed" and _no_bias(v):
         parts.append("no bias found")
     return "; ".join(parts)
 
@@ -171,17 +171,17 @@ def _do(runs: int) -> str:
     return "does" if runs == 1 else "do"
 
 
-def _scale(v: Verdict, found: Found) -> str:
+def _scale(v: Verdict, faults: Found) -> str:
     assert v.scale is not None
     assert v.location is not None
     where, inflation, about = v.location, v.scale.inflation, ""
     if v.bias is not None and v.bias.inflation_without is not None:
         inflation, about = v.bias.inflation_without, " about the mean"
-    if MAIN not in found and STEP not in found:
+    if MAIN not in faults and STEP not in faults:
         return _one_axis(v)
     if about and v.status != ("overconfident" if inflation.value > 1.0 else "conservative"):
         return f"covariance{about} too {'small' if v.status == 'overconfident' else 'large'} in some steps"
-    if not where.lasting and MAIN not in found:
+    if not where.lasting and MAIN not in faults:
         count = where.above + where.below
         side = "too small" if where.above else "too large"
         return f"covariance {side} in {count} of {v.scale.judged_steps} steps, first in step {where.first_step}"
@@ -246,16 +246,16 @@ def _sigmas(value: float) -> str:
     return f"{value:+.2f}" if abs(value) < 100.0 else f"{value:+.1e}"
 
 
-def _shape(v: Verdict, found: Found) -> str:
+def _shape(v: Verdict, faults: Found) -> str:
     assert v.shape is not None
     assert v.axes is not None
-    where = "" if "shape" in found else f" in step {v.shape.step}"
+    where = "" if "shape" in faults else f" in step {v.shape.step}"
     text = f"covariance of the wrong shape{where}"
     gap = abs(v.shape.actual - v.shape.stated)
-    if v.shape.pair is not None and gap > (VISIBLE if "shape" in found else NOTABLE):
+    if v.shape.pair is not None and gap > (VISIBLE if "shape" in faults else NOTABLE):
         a, b = (v.axes.names[i] for i in v.shape.pair)
         return f"{text}: {a} and {b} are correlated {v.shape.actual:+.2f}, stated {v.shape.stated:+.2f}"
-    return text if "shape" in found else f"{text}: axes are wrong by different factors"
+    return text if "shape" in faults else f"{text}: axes are wrong by different factors"
 
 
 # --- the figures behind it -----------------------------------------------------------------------------
@@ -295,7 +295,7 @@ def _coverage(v: Verdict) -> list[str]:
     return [text]
 
 
-def _without_truth(v: Verdict, found: Found) -> str:
+def _without_truth(v: Verdict, faults: Found) -> str:
     assert v.innovations is not None
     if not v.innovations.judged:
         return (
@@ -303,12 +303,12 @@ def _without_truth(v: Verdict, found: Found) -> str:
             "filter are neither white nor of the stated size even if it is right"
         )
     parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
-    if "innovation scale" in found:
+    if "innovation scale" in faults:
         parts.append(f"they are {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
-    if "innovation whiteness" in found:
+    if "innovation whiteness" in faults:
         parts.append("they are correlated over steps")
     shown = v.innovations.equivalence
-    if not found and shown is not None:
+    if not faults and shown is not None:
         is_shown = "is shown to be" if shown.shown else "is not shown to be"
         parts.append(f"their NIS {is_shown} {_within(v, shown)} times its degrees of freedom")
     return "; ".join(parts)
@@ -328,10 +328,10 @@ def _nis(v: Verdict) -> str:
     return text
 
 
-def _asked(v: Verdict, found: Found) -> str:
+def _asked(v: Verdict, faults: Found) -> str:
     count, rate = len(v.answers), v.settings.false_alarm
     text = f"{plural(count, 'question')} at a false-alarm rate of {rate:.3g}{' together' if count > 1 else ''}"
-    if not found:
+    if not faults:
         least = min(v.answers, key=lambda a: a.adjusted)
         return f"{text}; nearest to a fault: {least.question} (corrected p {p_text(least.adjusted)})"
-    return f"{text}; found: " + ", ".join(f"{q} (p {p_text(a.adjusted)})" for q, a in found.items())
+    return f"{text}; found: " + ", ".join(f"{q} (p {p_text(a.adjusted)})" for q, a in faults.items())

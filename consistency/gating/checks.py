@@ -62,15 +62,15 @@ def evidence(
     optimal_gain: bool = False,
 ) -> Candidate:
     """Checked arrays of one estimator; shapes and errors as :func:`consistency.testing.assert_consistent`."""
-    given: dict[str, Any] = {"axes": axes}
+    arrays: dict[str, Any] = {"axes": axes}
     if (errors is None) != (covariances is None):
         there, missing = ("covariances", "errors") if errors is None else ("errors", "covariances")
         raise ValueError(f"{there} without {missing}: give both")
     if errors is not None and nees is not None:
         raise ValueError("give errors and covariances, or nees and dof, not both")
     if errors is not None and covariances is not None:
-        given["error"], given["covariance"] = pair(errors, covariances)
-        n = given["error"].shape[-1]
+        arrays["error"], arrays["covariance"] = pair(errors, covariances)
+        n = arrays["error"].shape[-1]
         if dof is not None and dof != n:
             raise ValueError(f"dof is {dof}, but the errors have {n} components")
         dof = n
@@ -79,25 +79,25 @@ def evidence(
             raise ValueError("nees without dof: give dof, the dimension of the error")
         if dof < 1:
             raise ValueError(f"dof must be at least 1, got {dof}")
-        given |= {"nees": values("nees", nees), "dof": dof}
+        arrays |= {"nees": values("nees", nees), "dof": dof}
         for key, value in (("axes", axes), ("subsets", subsets)):
             if value is not None:
                 raise ValueError(f"{key} needs errors and covariances: the nees does not know its components")
-    given |= _innovations(nis, nis_dof, innovations, innovation_covariances)
-    first = next((given[key] for key in ("error", "nees", "nis") if key in given), None)
+    arrays |= _innovations(nis, nis_dof, innovations, innovation_covariances)
+    first = next((arrays[key] for key in ("error", "nees", "nis") if key in arrays), None)
     if first is None:
         raise ValueError("nothing to judge: give errors and covariances, or nees and dof, or nis and nis_dof")
     for key in ("nis", "innovations"):
-        if key in given and given[key].shape[:2] != first.shape[:2]:
-            raise ValueError(f"{key} has {given[key].shape[:2]} runs and steps, the errors have {first.shape[:2]}")
-    if dof is None or ("error" not in given and "nees" not in given):
+        if key in arrays and arrays[key].shape[:2] != first.shape[:2]:
+            raise ValueError(f"{key} has {arrays[key].shape[:2]} runs and steps, the errors have {first.shape[:2]}")
+    if dof is None or ("error" not in arrays and "nees" not in arrays):
         if not optimal_gain:
             raise ValueError(
                 "innovations alone are judged only with optimal_gain=True: those of any other gain are not white, nor "
                 "of the stated size, even if the filter is right"
             )
-        dof = max(1, int(given["nis_dof"].sum(axis=1).min()))
-    return Candidate(Evidence(name, **given, optimal_gain=optimal_gain), len(first), dof, subsets, method)
+        dof = max(1, int(arrays["nis_dof"].sum(axis=1).min()))
+    return Candidate(Evidence(name, **arrays, optimal_gain=optimal_gain), len(first), dof, subsets, method)
 
 
 def of_results(
@@ -127,9 +127,9 @@ def of_results(
             raise ValueError(f"filter: name one of {', '.join(results.filters)}")
         filter_name = results.filters[0]
     c = curves(results, filter_name)
-    given = evidence_of(c)
+    full = evidence_of(c)
     dof = len(POSE) if c.error is not None else max(1, int(c.nis_dof.sum(axis=1).min()))
-    return Candidate(replace(given, name=name or filter_name), len(c.runs), dof, subsets, method)
+    return Candidate(replace(full, name=name or filter_name), len(c.runs), dof, subsets, method)
 
 
 # --- arrays ----------------------------------------------------------------------------------------
@@ -171,9 +171,9 @@ def covariance(P: Array, name: str, there: Array | None = None) -> None:
     require(smallest > SINGULAR, f"{name}: singular; leave out steps in which a component is known exactly")
 
 
-def values(name: str, given: ArrayLike, there: Array | None = None) -> Array:
+def values(name: str, value: ArrayLike, there: Array | None = None) -> Array:
     """Squared norms (runs, steps): finite and not negative, where ``there``."""
-    v = array(name, given)
+    v = array(name, value)
     if v.ndim != 2 or 0 in v.shape:
         raise ValueError(f"{name} must have shape (runs, steps), got {v.shape}")
     there = np.ones(v.shape, bool) if there is None else there
@@ -182,10 +182,10 @@ def values(name: str, given: ArrayLike, there: Array | None = None) -> Array:
     return v
 
 
-def array(name: str, given: ArrayLike) -> Array:
+def array(name: str, value: ArrayLike) -> Array:
     """Floats, or a ValueError with the name of the argument."""
     try:
-        return np.asarray(given, float)
+        return np.asarray(value, float)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: not an array of numbers with as many steps in each run") from None
 
@@ -204,7 +204,7 @@ def _innovations(
         raise ValueError("give nis and nis_dof together")
     if (vectors is None) != (covariances is None):
         raise ValueError("give innovations and innovation_covariances together")
-    given: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     if vectors is not None and covariances is not None:
         v, S = array("innovations", vectors), array("innovation_covariances", covariances)
         if v.ndim != 3 or 0 in v.shape or S.shape != (*v.shape, v.shape[-1]):
@@ -215,9 +215,9 @@ def _innovations(
         there: Array = ~np.asarray(np.isnan(v).all(axis=-1))  # a step without a measurement has no innovation
         require(np.isfinite(v).all(axis=-1) | ~there, "innovations: not finite")
         covariance(S, "innovation_covariances", there)
-        given |= {"innovations": v, "innovation_covariances": S}
+        arrays |= {"innovations": v, "innovation_covariances": S}
         if nis is None:
-            given["nis"], given["nis_dof"] = nis_of(v, S)
+            arrays["nis"], arrays["nis_dof"] = nis_of(v, S)
     if nis is not None and nis_dof is not None:
         dof = array("nis_dof", nis_dof)
         shape = np.shape(nis)
@@ -227,5 +227,5 @@ def _innovations(
         if not (np.isfinite(dof).all() and (dof >= 0).all() and (dof == np.round(dof)).all()):
             raise ValueError("nis_dof must hold whole numbers, 0 where there was no innovation")
         counts: Indices = dof.astype(np.int64)
-        given |= {"nis": values("nis", nis, counts > 0), "nis_dof": counts}
-    return given
+        arrays |= {"nis": values("nis", nis, counts > 0), "nis_dof": counts}
+    return arrays

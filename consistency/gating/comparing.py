@@ -95,13 +95,13 @@ def _side(
     axes: Sequence[str] | None,
 ) -> tuple[Candidate, RunSummary]:
     try:
-        given = evidence(name, errors, covariances, nees, dof, None, None, None, None, axes, None, "max")
+        case = evidence(name, errors, covariances, nees, dof, None, None, None, None, axes, None, "max")
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
-    e, P = given.evidence.error, given.evidence.covariance
-    values = given.evidence.nees if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
+    e, P = case.evidence.error, case.evidence.covariance
+    values = case.evidence.nees if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
     assert values is not None
-    return given, summary(values, given.planned_dof, e, P)
+    return case, summary(values, case.planned_dof, e, P)
 
 
 def of_filters(

@@ -42,15 +42,15 @@ class Ledger:
 
     def take(self, report: Any) -> None:
         """Remember what a pytest ``TestReport`` carries; the last report of a test carries all its gates."""
-        found = [json.loads(text) for key, text in report.user_properties if key == PROPERTY]
+        properties = [json.loads(text) for key, text in report.user_properties if key == PROPERTY]
         key = (getattr(report, "worker_id", ""), report.nodeid)
-        if not found and key not in self.tests:
+        if not properties and key not in self.tests:
             return
         tested = self.tests.setdefault(key, Tested(report.nodeid, report.location))
         statistics = getattr(report, STATISTICS, None)
-        kept = json.loads(statistics) if statistics else [{}] * len(found)
+        details = json.loads(statistics) if statistics else [{}] * len(properties)
         tested.entries = [
-            Entry(**data, statistics=more, test=report.nodeid) for data, more in zip(found, kept, strict=True)
+            Entry(**data, statistics=more, test=report.nodeid) for data, more in zip(properties, details, strict=True)
         ]
         tested.expected_to_fail |= hasattr(report, "wasxfail")
         if report.when == "setup":  # also of a second try

@@ -115,23 +115,25 @@ def terms(
     given: dict[str, Any] = {
         "false_alarm": false_alarm, "detect": detect, "power": power, "allow": allow, "tolerance": tolerance,
     }  # fmt: skip
-    chosen: dict[str, Any] = dict(watch.marked) | {key: value for key, value in given.items() if value is not None}
-    asked = DEFAULTS | chosen
+    choices: dict[str, Any] = dict(watch.marked) | {key: value for key, value in given.items() if value is not None}
+    options = DEFAULTS | choices
     for key in ("false_alarm", "power"):
-        if not 0.0 < asked[key] < 1.0:
-            raise ValueError(f"{key} must lie between 0 and 1, got {asked[key]}")
-    if not 0.0 < asked["detect"] < float("inf") or asked["detect"] == 1.0:
-        raise ValueError(f"detect must be a positive ratio of true to stated covariance, not 1; got {asked['detect']}")
-    if asked["allow"] not in (None, "conservative"):
-        raise ValueError(f"allow must be 'conservative' or None, got '{asked['allow']}'")
-    if asked["allow"] == "conservative" and asked["detect"] < 1.0:
-        raise ValueError(f"detect {asked['detect']} is a covariance too large, which allow='conservative' accepts")
-    wide = asked["tolerance"]
+        if not 0.0 < options[key] < 1.0:
+            raise ValueError(f"{key} must lie between 0 and 1, got {options[key]}")
+    if not 0.0 < options["detect"] < float("inf") or options["detect"] == 1.0:
+        raise ValueError(
+            f"detect must be a positive ratio of true to stated covariance, not 1; got {options['detect']}"
+        )
+    if options["allow"] not in (None, "conservative"):
+        raise ValueError(f"allow must be 'conservative' or None, got '{options['allow']}'")
+    if options["allow"] == "conservative" and options["detect"] < 1.0:
+        raise ValueError(f"detect {options['detect']} is a covariance too large, which allow='conservative' accepts")
+    wide = options["tolerance"]
     if wide is not None and (not 0.0 < wide < float("inf") or wide == 1.0):
         raise ValueError(f"tolerance must be a positive ratio of true to stated covariance, not 1; got {wide}")
-    rest = float(asked["detect"]), float(asked["power"]), asked["allow"], wide
-    if watch.budget is None or "false_alarm" in chosen:
-        return Terms(float(asked["false_alarm"]), *rest)
+    rest = float(options["detect"]), float(options["power"]), options["allow"], wide
+    if watch.budget is None or "false_alarm" in choices:
+        return Terms(float(options["false_alarm"]), *rest)
     rate = in_place_rate(watch.budget, watch.tests, watch.budgeted)
     watch.budgeted += 1
     return Terms(rate or in_place_rate(watch.budget, watch.tests), *rest, budget=watch.budget, may_fail=rate > 0)

@@ -58,7 +58,7 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     return _of_sheet(str(sheet.data["filter"].iloc[0]) if "filter" in sheet else path.stem, sheet)
 
 
-def choose(path: Path, option: str, there: list[Any], wanted: Any) -> Any:
+def choose(path: Path, option: str, there: list[Any], choice: Any) -> Any:
     """The wanted one of those there, or the only one.
 
     Raises
@@ -66,13 +66,13 @@ def choose(path: Path, option: str, there: list[Any], wanted: Any) -> Any:
     InputError
         It is not there, or there are several and none is named.
     """
-    if wanted is None and len(there) == 1:
+    if choice is None and len(there) == 1:
         return there[0]
-    if wanted is None:
+    if choice is None:
         raise InputError(f"{path}: holds more than one {option} ({listed(there)}); choose with --{option}")
-    if wanted not in there:
-        raise InputError(f"--{option} {wanted}: is not in {path}; there are: {listed(there)}")
-    return wanted
+    if choice not in there:
+        raise InputError(f"--{option} {choice}: is not in {path}; there are: {listed(there)}")
+    return choice
 
 
 def checked_dof(nis: Array, dof: Array, place: Callable[[int], str]) -> Array:
@@ -102,15 +102,15 @@ def _require_columns(place: str, columns: list[str]) -> None:
         )
 
 
-def _of_one(sheet: Sheet, column: str, wanted: str | int | None) -> Sheet:
+def _of_one(sheet: Sheet, column: str, choice: str | int | None) -> Sheet:
     """The rows of one filter or run."""
     if column not in sheet:
-        if wanted is not None:
-            raise InputError(f"--{column} {wanted}: {sheet.path} has no column '{column}'")
+        if choice is not None:
+            raise InputError(f"--{column} {choice}: {sheet.path} has no column '{column}'")
         return sheet
     values = sheet.data[column].astype(str).to_numpy() if column == "filter" else sheet.numbers(column, whole=True)
     there = [str(v) if column == "filter" else int(v) for v in dict.fromkeys(values.tolist())]
-    return sheet.rows(values == choose(sheet.path, column, there, wanted))
+    return sheet.rows(values == choose(sheet.path, column, there, choice))
 
 
 def _of_sheet(name: str, sheet: Sheet) -> NisLog:

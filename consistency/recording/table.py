@@ -140,8 +140,8 @@ def _recording(
         )
         for run, rows, column in zip(numbers, members, columns, strict=True)
     ]
-    made = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
-    return made if truth is not None else replace(made, error=None, dof=0)
+    record = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
+    return record if truth is not None else replace(record, error=None, dof=0)
 
 
 def row_order(sheet: Sheet, runs: Array, key: str) -> Indices:

@@ -62,14 +62,14 @@ def read_tum(
     if split and order == ORDERS[0]:
         raise InputError(f"--covariance-order: {trajectories[0].path} has {SPLIT} columns, rotation before translation")
     chosen = convention or ("so3-body" if split else "so3")
-    found = []
+    matches = []
     for (_, true_path, P_path), own in zip(runs, trajectories, strict=True):
         if (own.values.shape[1] == SPLIT) != split:
             raise InputError(f"{own.path}: has {own.values.shape[1]} columns, {trajectories[0].path} another layout")
-        found.append(_run(own, true_path, P_path, chosen, order or ORDERS[0], max_dt))
-    columns, t = common_times([run.t for run in found])
-    tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, found, strict=True))]
-    notes = _said(estimates, found, max_dt)
+        matches.append(_run(own, true_path, P_path, chosen, order or ORDERS[0], max_dt))
+    columns, t = common_times([run.t for run in matches])
+    tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, matches, strict=True))]
+    notes = _said(estimates, matches, max_dt)
     why = "" if convention else f"; the default of this layout, {_origin(split)}"
     notes.append(f"error convention {chosen}: {SPATIAL[chosen]}{why}")
     name, file = estimates.stem, str(covariance or estimates)
@@ -121,10 +121,10 @@ def trajectory_files(folder: Path) -> list[Path]:
 
 
 def _same_stem(folder: Path, path: Path, option: str) -> Path:
-    found = [other for other in trajectory_files(folder) if other.stem == path.stem]
-    if not found:
+    matches = [other for other in trajectory_files(folder) if other.stem == path.stem]
+    if not matches:
         raise InputError(f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum for {path}")
-    return found[0]
+    return matches[0]
 
 
 def _run(
@@ -186,16 +186,16 @@ def _doubts(truth: Lines, match: Indices, t: Array, error: Array, P: Array) -> t
     return angle, float(np.median(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else 0.0
 
 
-def _said(estimates: Path, found: Sequence[Found], max_dt: float | None) -> list[str]:
+def _said(estimates: Path, matches: Sequence[Found], max_dt: float | None) -> list[str]:
     """What was left out, and what looks like a matter of clocks or of conventions."""
     notes = []
-    total = sum(run.left_out + len(run.t) for run in found)
-    if left_out := sum(run.left_out for run in found):
+    total = sum(run.left_out + len(run.t) for run in matches)
+    if left_out := sum(run.left_out for run in matches):
         notes.append(
             f"{estimates}: {left_out} of {total} estimates have no truth or no covariance "
             f"within {DEFAULT_DT if max_dt is None else max_dt:g} s (--max-dt) and are left out"
         )
-    angle, moved = max(run.angle for run in found), max(run.moved for run in found)
+    angle, moved = max(run.angle for run in matches), max(run.moved for run in matches)
     if angle > FAR:
         notes.append(
             f"{estimates}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run: "

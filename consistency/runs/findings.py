@@ -13,11 +13,11 @@ from types import ModuleType
 from typing import Any, TypeAlias
 
 import pandas as pd
+from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.diagnostics import Verdict
 from consistency.errors import InputError
 from consistency.runs.montecarlo import run_trials, worker_count
-from consistency.runs.own_process import OwnProcess
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.store.results import Results, joined
 from consistency.store.storage import manifest_of, require_free, write_folder
@@ -193,26 +193,28 @@ def _wanted(
 
 def _found(study: Study, wanted: Sequence[tuple[ModuleType, Sequence[str]]]) -> list[Finding]:
     """The wanted findings in order of their scripts, whichever script ends first."""
-    apart: dict[ModuleType, OwnProcess[_Contribution]] = {}
+    apart = [module for module, _ in wanted if study.workers > 1 and getattr(module, "OWN_PROCESS", False)]
+    pool = ProcessPoolExecutor(len(apart)) if apart else None
+    futures: dict[ModuleType, Future[_Contribution]] = {}
 
     def main(module: ModuleType) -> list[Finding]:
-        if module not in apart:
+        if module not in futures:
             findings: list[Finding] = module.main(study)
             return findings
-        findings, tables = apart[module].result()
+        findings, tables = futures[module].result()
         study.tables |= tables
         return findings
 
     found: dict[ModuleType, list[Finding]] = {}
     try:
-        for module, _ in wanted:
-            if study.workers > 1 and getattr(module, "OWN_PROCESS", False):
-                apart[module] = OwnProcess(_contribution, module.__file__, study.runs, study.seed, study.jobs)
-        for module, ids in sorted(wanted, key=lambda pair: pair[0] in apart):  # processes are waited for last
+        for module in apart:
+            assert pool is not None
+            futures[module] = pool.submit(_contribution, module.__file__, study.runs, study.seed, study.jobs)
+        for module, ids in sorted(wanted, key=lambda pair: pair[0] in futures):  # processes are waited for last
             found[module] = _guarded(main, module, study, ids)
     finally:
-        for process in apart.values():
-            process.stop()
+        if pool is not None:
+            pool.shutdown(kill_workers=True)
     return [finding for module, ids in wanted for finding in found[module] if finding.id in ids]
 
 

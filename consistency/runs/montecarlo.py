@@ -99,9 +99,11 @@ def run_trials(
         raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
     todo = [run for run in range(runs) if run not in done]
     work = _Work(lambda run: world.trial(run, seed), chosen, scenario.belief, jobs, timeout)
-    said = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
+    manifest_fields = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
     with _place(None if out is None else Path(out), overwrite, previous) as new:
-        return _finish(work, todo, Gathered(names, errors, new, previous, done), said, _landmarks_table(scenario))
+        return _finish(
+            work, todo, Gathered(names, errors, new, previous, done), manifest_fields, _landmarks_table(scenario)
+        )
 
 
 def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None) -> Results:
@@ -109,10 +111,10 @@ def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: 
     chosen = resolve_filters(filters, log.belief)
     trials = {trial.run: trial for trial in log.trials}
     work = _Work(trials.__getitem__, chosen, log.belief, jobs, timeout)
-    said = {"seed": None, "runs": len(trials), "log": log.name, "log_sha256": log.sha256}
-    said |= {"belief": log.belief.model_dump(mode="json")}
+    manifest_fields = {"seed": None, "runs": len(trials), "log": log.name, "log_sha256": log.sha256}
+    manifest_fields |= {"belief": log.belief.model_dump(mode="json")}
     results = _finish(
-        work, list(trials), Gathered([name_of(f) for f in chosen], _own_errors(chosen)), said, log.landmarks
+        work, list(trials), Gathered([name_of(f) for f in chosen], _own_errors(chosen)), manifest_fields, log.landmarks
     )
     assert isinstance(results, Results)
     return results
@@ -220,7 +222,7 @@ def _one(trial: Trial, filters: list[Filter], belief: Belief, timeout: float | N
 
 
 def _finish(
-    work: _Work, runs: list[int], gathered: Gathered, said: dict[str, Any], landmarks: pd.DataFrame | None
+    work: _Work, runs: list[int], gathered: Gathered, manifest_fields: dict[str, Any], landmarks: pd.DataFrame | None
 ) -> Results | StoredResults:
     """Do the runs and hand over the results, or, after Ctrl-C, what there is of them."""
     started, complete = time.monotonic(), True
@@ -234,9 +236,11 @@ def _finish(
                 advance(1)
     except KeyboardInterrupt:
         complete = False
-    said = said | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
-    said |= {"error": gathered.errors} if gathered.errors else {}
-    manifest = manifest_of(filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **said)
+    manifest_fields = manifest_fields | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
+    manifest_fields |= {"error": gathered.errors} if gathered.errors else {}
+    manifest = manifest_of(
+        filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **manifest_fields
+    )
     if complete:
         return gathered.results(manifest, landmarks)
     raise Interrupted(gathered.results(manifest | {"finished_runs": gathered.finished}, landmarks))

@@ -40,12 +40,21 @@ class World:
 
     def trial(self, run: int, seed: int) -> Trial:
         """Truth, controls and observations of run ``run``, as :func:`simulate`."""
-        true_path, told = self._drive(generator(seed, run, MOTION_NOISE))
+        true_path, controls = self._drive(generator(seed, run, MOTION_NOISE))
         context = self.context(true_path)
-        seen = self._chain.rest(self._begin(context), context, self._number, run, seed)
-        first = np.searchsorted(seen.step, self._ends)
+        observations = self._chain.rest(self._begin(context), context, self._number, run, seed)
+        first = np.searchsorted(observations.step, self._ends)
         return Trial(
-            run, self.start, told, first, seen.landmark, seen.z, seen.ids, true_path, self.landmarks, _source(seen)
+            run,
+            self.start,
+            controls,
+            first,
+            observations.landmark,
+            observations.z,
+            observations.ids,
+            true_path,
+            self.landmarks,
+            _source(observations),
         )
 
     def _begin(self, context: Context) -> Observations:
@@ -77,9 +86,13 @@ def simulate(scenario: Scenario, run: int = 0, seed: int = 0) -> Trial:
     return World(scenario.truth).trial(run, seed)
 
 
-def _source(seen: Observations) -> Indices | None:
+def _source(observations: Observations) -> Indices | None:
     """What the observations are really of, where that is not what they say."""
-    return None if seen.source is None or np.array_equal(seen.source, seen.landmark) else seen.source
+    return (
+        None
+        if observations.source is None or np.array_equal(observations.source, observations.landmark)
+        else observations.source
+    )
 
 
 def draw_landmarks(truth: Truth) -> Array:
@@ -98,13 +111,15 @@ def require_landmarks_in_view(scenario: Scenario) -> World:
     for k in range(0, truth.steps, SOME):
         here = slice(k, k + SOME + 1)
         context = Context(sensor, world.landmarks, world.reference[here], world.reference[here])
-        seen = Chain([FieldOfView()]).shared(context, 1)
+        observations = Chain([FieldOfView()]).shared(context, 1)
         # effects that are listed may bring any disparity into the search range
         if isinstance(sensor, UvdSensor) and not sensor.effects:
             low, high = sensor.disparity
             slack = 6.0 * sensor.sigma[2]
-            seen = seen.keep((seen.z[:, 2] > low - slack) & (seen.z[:, 2] < high + slack))
-        if len(seen):
+            observations = observations.keep(
+                (observations.z[:, 2] > low - slack) & (observations.z[:, 2] < high + slack)
+            )
+        if len(observations):
             return world
     raise InputError(
         f"scenario '{scenario.name}': no landmark comes into view in {truth.steps} steps; "

@@ -242,7 +242,7 @@ def _trial(
 ) -> Trial:
     controls = controls.sort_values("step")
     steps = len(controls)
-    seen = observations[observations["run"] == run].sort_values("step", kind="stable")
+    rows = observations[observations["run"] == run].sort_values("step", kind="stable")
     path = None
     if truth is not None:
         own = truth[truth["run"] == run].sort_values("step")
@@ -255,12 +255,12 @@ def _trial(
         run,
         start,
         controls[["dt", "v", "omega"]].to_numpy(float),
-        np.searchsorted(seen["step"], np.arange(1, steps + 2)),
-        names.ids(seen["landmark"]),
-        seen[["z0", "z1", "z2"]].to_numpy(float),
+        np.searchsorted(rows["step"], np.arange(1, steps + 2)),
+        names.ids(rows["landmark"]),
+        rows[["z0", "z1", "z2"]].to_numpy(float),
         len(names.landmarks) + len(names.things),
         path,
         positions,
-        names.ids(seen["source"]) if "source" in seen else None,
+        names.ids(rows["source"]) if "source" in rows else None,
         np.concatenate(names).astype(np.int64),
     )

@@ -146,21 +146,21 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
     path = folder / f"{name}.parquet"
     with _refusals(path):
         file = require_table(folder, name)
-        wanted = _kinds(name, file.schema_arrow.names)
-        read = file.read(list(wanted))
+        dtypes = _kinds(name, file.schema_arrow.names)
+        read = file.read(list(dtypes))
         table = read.to_pandas()
-    for column, kind in wanted.items():
+    for column, kind in dtypes.items():
         if kind == "str":
             _require_text(path, read.column(column))
         else:
             _check_column(path, table[column], kind)
-    checked: pd.DataFrame = table.astype(wanted)
+    checked: pd.DataFrame = table.astype(dtypes)
     return checked
 
 
 def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
     """Columns of numbers, some rows at a time and checked likewise; of one filter where it is named."""
-    path, wanted = folder / f"{name}.parquet", COLUMNS[name] | OPTIONAL.get(name, {})
+    path, dtypes = folder / f"{name}.parquet", COLUMNS[name] | OPTIONAL.get(name, {})
     file = require_table(folder, name, columns)
     needed = [*columns, "filter"] if filter_name is not None else list(columns)
     first = 0
@@ -174,13 +174,13 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
                 table = {column: batch.column(column).to_pandas() for column in columns}
                 for column, values in table.items():
                     values.name = column
-                    _check_column(path, values, wanted[column], first)
-                chosen: Any = slice(None)
+                    _check_column(path, values, dtypes[column], first)
+                mask: Any = slice(None)
                 if filter_name is not None:
                     _require_text(path, batch.column("filter"), first)
-                    chosen = pc.equal(batch.column("filter"), filter_name).to_numpy(zero_copy_only=False)
+                    mask = pc.equal(batch.column("filter"), filter_name).to_numpy(zero_copy_only=False)
                 first += batch.num_rows
-                yield {column: values.to_numpy(wanted[column])[chosen] for column, values in table.items()}
+                yield {column: values.to_numpy(dtypes[column])[mask] for column, values in table.items()}
 
 
 def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
@@ -188,9 +188,9 @@ def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
     path = folder / f"{name}.parquet"
     with _refusals(path):
         file = pq.ParquetFile(path, page_checksum_verification=True)
-    wanted = dict.fromkeys((*COLUMNS[name], *also))
-    if missing := [column for column in wanted if column not in file.schema_arrow.names]:
-        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(wanted)}")
+    needed = dict.fromkeys((*COLUMNS[name], *also))
+    if missing := [column for column in needed if column not in file.schema_arrow.names]:
+        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
     return file
 
 

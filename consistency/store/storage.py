@@ -53,13 +53,13 @@ def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
 @functools.cache
 def _versions() -> tuple[tuple[str, str], ...]:
     """Python and the packages that results depend on; reading them takes milliseconds, so once a process."""
-    found = [("python", platform.python_version())]
+    versions = [("python", platform.python_version())]
     for package in PACKAGES:
         try:
-            found.append((package, metadata.version(package)))
+            versions.append((package, metadata.version(package)))
         except metadata.PackageNotFoundError:
-            found.append((package, "not installed"))
-    return tuple(found)
+            versions.append((package, "not installed"))
+    return tuple(versions)
 
 
 @functools.cache

@@ -185,17 +185,17 @@ def print_watched(watched: Watched) -> None:
 def _sentence(watched: Watched) -> str:
     monitor = watched.monitor
     if watched.alarm is None:
-        said = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
+        sentence = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
     else:
-        said = str(watched.alarm)
+        sentence = str(watched.alarm)
         if np.isfinite(watched.alarm_t):
-            said += f" Alarm at t = {watched.alarm_t:.10g} s, since t = {watched.since_t:.10g} s."
+            sentence += f" Alarm at t = {watched.alarm_t:.10g} s, since t = {watched.since_t:.10g} s."
     if monitor.gate is not None and monitor.rejections:
-        said += (
+        sentence += (
             f" The gate rejected {100 * monitor.rejections / monitor.measurements:.2g} % of the measurements "
             f"(designed for {100 * (1 - monitor.gate):.2g} %), which is not judged."
         )
-    return said
+    return sentence
 
 
 def watched_json(watched: Watched) -> str:

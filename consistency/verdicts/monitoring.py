@@ -44,9 +44,9 @@ def make_monitor(innovations: str | None, **options: Any) -> Monitor:
         The declaration is missing, or an option is out of its range.
     """
     if innovations != OPTIMAL:
-        said = "" if innovations is None else f", got '{innovations}'"
+        value = "" if innovations is None else f", got '{innovations}'"
         raise InputError(
-            f"--innovations must be '{OPTIMAL}'{said}: declare that the filter has the optimal (Kalman) gain for its "
+            f"--innovations must be '{OPTIMAL}'{value}: declare that the filter has the optimal (Kalman) gain for its "
             "model. Of any other filter the innovations are not white, and no false-alarm rate holds"
         )
     try:
@@ -114,14 +114,16 @@ def _updated(monitor: Monitor, place: str, nis: float, dof: float) -> Alarm | No
 def _of_results(folder: Path, filter_name: str | None, run: int | None) -> NisLog:
     results = open_results(folder)
     name = choose(folder, "filter", results.filters, filter_name)
-    chosen = choose(folder, "run", results.runs_of(name).tolist(), run)
+    run_number = choose(folder, "run", results.runs_of(name).tolist(), run)
     parts = []
     for batch in results.batches("estimates", COLUMNS, name):
-        rows = batch["run"] == chosen
+        rows = batch["run"] == run_number
         parts.append(np.stack([batch[column][rows].astype(float) for column in COLUMNS[1:]]))
     step, t, nis, dof = np.concatenate(parts, axis=1) if parts else np.empty((4, 0))
     if not len(step):
-        raise InputError(f"{folder}: run {chosen} of '{name}' failed before its first estimate")
+        raise InputError(f"{folder}: run {run_number} of '{name}' failed before its first estimate")
     order = np.argsort(step, kind="stable")
     step, t, nis, dof = step[order], t[order], nis[order], dof[order]
-    return NisLog(name, step, t, nis, checked_dof(nis, dof, lambda row: f"{folder}, run {chosen}, step {step[row]:g}"))
+    return NisLog(
+        name, step, t, nis, checked_dof(nis, dof, lambda row: f"{folder}, run {run_number}, step {step[row]:g}")
+    )

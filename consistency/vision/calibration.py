@@ -102,26 +102,28 @@ def read_opencv(path: Path) -> Calibration:
     of D1, D2 and R is left out, another list or matrix of an unknown name may be that one misspelt, and is refused.
     """
     data = read_yaml(path)
-    found: dict[str, Array] = {}
+    matrices: dict[str, Array] = {}
     for key, names in OPENCV_KEYS.items():
         name = next((name for name in names if name in data), None)
         if name is not None:
-            found[key] = matrix(path, name, data[name])
+            matrices[key] = matrix(path, name, data[name])
         elif "T_BS" in data:
             raise InputError(f"{path}: is one of the two files of EuRoC; --calibration takes the folder with both")
         elif key in ("K1", "K2", "T"):
             known = "; ".join(" = ".join(names) for names in OPENCV_KEYS.values())
             raise InputError(f"{path}: key '{key}' is missing; known keys: {known}, image_width, image_height")
-    _require_known(path, data, [key for key in ("D1", "D2", "R") if key not in found])
+    _require_known(path, data, [key for key in ("D1", "D2", "R") if key not in matrices])
     for key, shape in (("K1", (3, 3)), ("K2", (3, 3)), ("R", (3, 3)), ("T", (3,))):
-        if key in found:
-            if found[key].size != np.prod(shape):
-                raise InputError(f"{path}: key '{key}': has {found[key].size} numbers, not {np.prod(shape)}")
-            found[key] = found[key].reshape(shape)
+        if key in matrices:
+            if matrices[key].size != np.prod(shape):
+                raise InputError(f"{path}: key '{key}': has {matrices[key].size} numbers, not {np.prod(shape)}")
+            matrices[key] = matrices[key].reshape(shape)
     size = tuple(int(_number(path, data, key)) for key in ("image_width", "image_height") if key in data)
-    D_left, D_right = (_distortion(path, key, found.get(key, np.zeros(4))) for key in ("D1", "D2"))
-    R, image_size = found.get("R", np.eye(3)), (size[0], size[1]) if len(size) == 2 else None
-    return _checked(Calibration(str(path), found["K1"], found["K2"], D_left, D_right, R, found["T"], image_size))
+    D_left, D_right = (_distortion(path, key, matrices.get(key, np.zeros(4))) for key in ("D1", "D2"))
+    R, image_size = matrices.get("R", np.eye(3)), (size[0], size[1]) if len(size) == 2 else None
+    return _checked(
+        Calibration(str(path), matrices["K1"], matrices["K2"], D_left, D_right, R, matrices["T"], image_size)
+    )
 
 
 def read_euroc(folder: Path) -> Calibration:

@@ -62,19 +62,19 @@ def covariances(name: str, value: Any, count: int, size: int) -> Array:
     InputError
         Another shape, a value that is not finite, or a matrix that is not symmetric positive semidefinite.
     """
-    given = floats(name, value)
-    if given.shape not in {(size, size), (count, size, size)}:
-        raise InputError(f"{name}: shape {given.shape}, allowed are ({size}, {size}) and ({count}, {size}, {size})")
-    if given.size == 0:
-        return given
-    slack = ROUNDING * np.abs(given).max(axis=(-2, -1), keepdims=True)
-    if (np.abs(given - np.swapaxes(given, -1, -2)) > slack).any():
+    matrices = floats(name, value)
+    if matrices.shape not in {(size, size), (count, size, size)}:
+        raise InputError(f"{name}: shape {matrices.shape}, allowed are ({size}, {size}) and ({count}, {size}, {size})")
+    if matrices.size == 0:
+        return matrices
+    slack = ROUNDING * np.abs(matrices).max(axis=(-2, -1), keepdims=True)
+    if (np.abs(matrices - np.swapaxes(matrices, -1, -2)) > slack).any():
         raise InputError(f"{name}: not symmetric; give covariances, for pixels in px^2")
     try:
-        np.linalg.cholesky(given + (slack + np.finfo(float).tiny) * np.eye(size))
+        np.linalg.cholesky(matrices + (slack + np.finfo(float).tiny) * np.eye(size))
     except np.linalg.LinAlgError:
         raise InputError(f"{name}: not positive semidefinite; give covariances, for pixels in px^2") from None
-    return np.broadcast_to(given, (count, size, size))
+    return np.broadcast_to(matrices, (count, size, size))
 
 
 def floats(name: str, value: Any) -> Array:

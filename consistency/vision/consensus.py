@@ -114,15 +114,15 @@ def squared_distances(
 
 def _search(p1: Array, p2: Array, inliers_of: Callable[[Array, Array], Array], rng: np.random.Generator) -> Array:
     """Inliers (N,) of the best of adaptively many draws."""
-    best, drawn, needed = np.zeros(len(p1), bool), 0, MOST
-    while drawn < needed:
+    best, draws, needed = np.zeros(len(p1), bool), 0, MOST
+    while draws < needed:
         triples = rng.random((ROUND, len(p1))).argpartition(2, axis=1)[:, :3]
         R, t, fixed = rigid_motions(p1[triples], p2[triples])
         inliers = inliers_of(R, t) & (fixed > FIXED)[:, None]
         first = inliers[np.argmax(inliers.sum(axis=1))]
         if first.sum() > best.sum():
             best = first
-        drawn += ROUND
+        draws += ROUND
         clean = best.mean() ** 3  # probability that a draw has inliers only
         if clean > 0.0:
             needed = min(MOST, np.log1p(-CONFIDENCE) / np.log1p(-min(clean, 1.0 - 1e-12)))

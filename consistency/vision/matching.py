@@ -96,7 +96,7 @@ def stereo_matches(
     the left ones twice that, so that each left feature of the band and each right one it may match has all its rivals.
     """
     height, step = (rig.image_size[1], BAND) if is_rectified(rig) else (1, 1)
-    found = [np.empty((0, 2), np.int64)]
+    groups = [np.empty((0, 2), np.int64)]
     for top in range(0, height, step):
         ends = (-np.inf if top == 0 else top, np.inf if top + step >= height else top + step)
         i, j = (_within(f.uv[:, 1], ends, margin * tolerance) for f, margin in ((left, 2), (right, 1)))
@@ -104,8 +104,8 @@ def stereo_matches(
         matches = mutual_matches(left.descriptors[i], right.descriptors[j], allowed, ratio)
         pairs = np.column_stack([i[matches[:, 0]], j[matches[:, 1]]])
         row = left.uv[pairs[:, 0], 1]
-        found.append(pairs[(row >= ends[0]) & (row < ends[1])])
-    pairs = np.concatenate(found)
+        groups.append(pairs[(row >= ends[0]) & (row < ends[1])])
+    pairs = np.concatenate(groups)
     return StereoFeatures(left, right, pairs[np.argsort(pairs[:, 0])])
 
 

@@ -59,7 +59,7 @@ class RelativePose:
 
     @property
     def matrix(self) -> Array:
-        """(4, 4), homogeneous."""
+        """Homogeneous matrix [R t; 0 1] of the motion, (4, 4)."""
         return np.block([[self.R, self.t[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
     def apply(self, points: Array) -> Array:

@@ -193,10 +193,13 @@ def _cost(
 
 def _step(f: Derivatives, weight: Array, bend: Array, damping: float) -> tuple[Array, Array, float]:
     """Step of the pose (6,) and of the points (N, 3), and twice the decrease that it predicts; NaN: not downhill."""
-    inverse, definite = small.inverse(f.qq * (1.0 + damping * np.eye(3)))
+    dd, qq = f.dd, f.qq
+    if damping:
+        dd, qq = dd * (1.0 + damping * np.eye(6)), qq * (1.0 + damping * np.eye(3))
+    inverse, definite = small.inverse(qq)
     gain = f.dq @ inverse
     g = f.d - (gain @ f.q[:, :, None])[:, :, 0]
-    H = np.tensordot(weight, f.dd * (1.0 + damping * np.eye(6)) - gain @ np.swapaxes(f.dq, 1, 2), 1)
+    H = np.dot(weight[None], (dd - gain @ np.swapaxes(f.dq, 1, 2)).reshape(-1, 36)).reshape(6, 6)
     H += 2.0 * (g.T * bend) @ g
     try:
         np.linalg.cholesky(H)

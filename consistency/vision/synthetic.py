@@ -43,13 +43,13 @@ def common_points(
     -------
     (n, 3), in frame 1, m
     """
-    found = np.zeros((0, 3))
+    points = np.zeros((0, 3))
     back = np.linalg.inv(rig.K_left).T
-    while len(found) < n:
+    while len(points) < n:
         z = np.cbrt(rng.uniform(near**3, far**3, 8 * n))
         pixels = np.column_stack([rng.uniform(0.0, rig.image_size, (8 * n, 2)), np.ones(8 * n)])
         p = pixels @ back * z[:, None]
         q = motion.inverse().apply(p)
         p, q = (cloud[q[:, 2] > 0.5 * near] for cloud in (p, q))
-        found = np.concatenate([found, p[rig.inside(rig.project(p)) & rig.inside(rig.project(q))]])
-    return found[:n]
+        points = np.concatenate([points, p[rig.inside(rig.project(p)) & rig.inside(rig.project(q))]])
+    return points[:n]

@@ -71,11 +71,11 @@ def thinned(rows: pd.DataFrame, rule: Selection) -> pd.DataFrame:
     alive: list[tuple[int, int, int]] = []  # piece, landmark, observations left
     picked: list[tuple[int, int]] = []  # row, landmark
     started = 0
-    for step, seen in rows.groupby("step"):
+    for step, step_rows in rows.groupby("step"):
         alive = [(piece, landmark, life - 1) for piece, landmark, life in alive if life > 1]
         used = {piece for piece, _, _ in alive}
-        candidates = seen[(seen["left"] >= rule.min_life) & ~seen["piece"].isin(used)]
-        crowd = np.bincount(seen.loc[seen["piece"].isin(used), "band"], minlength=rule.bands)
+        candidates = step_rows[(step_rows["left"] >= rule.min_life) & ~step_rows["piece"].isin(used)]
+        crowd = np.bincount(step_rows.loc[step_rows["piece"].isin(used), "band"], minlength=rule.bands)
         for piece, life in _chosen(candidates, crowd, rule.slots - len(alive), rule):
             alive.append((piece, started, life if life <= rule.max_age else staggered(started, rule.max_age)))
             started += 1

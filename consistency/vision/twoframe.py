@@ -21,11 +21,11 @@ class Measure(Protocol):
     """What a frame measures of points (N, 3) in it: k numbers each."""
 
     def value(self, p: Array) -> Array:
-        """(N, k)."""
+        """What is measured of points p (N, 3): (N, k)."""
         ...
 
     def jacobian(self, p: Array) -> Array:
-        """(N, k, 3)."""
+        """Derivative of :meth:`value` by each point p (N, 3): (N, k, 3)."""
         ...
 
     def second(self, p: Array, J: Array, w: Array) -> Array:

@@ -19,7 +19,7 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # A room may import rooms of lower rank and itself; rooms of equal rank do not know each other. Rooms whose modules have
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
-    "types": 0, "errors": 0, "terminal.progress": 0, "runs.own_process": 0, "store.atomic": 0,
+    "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0,
     "geometry": 1,
     "models": 2,
     "scenario": 3,

@@ -25,11 +25,14 @@ def inner(function: Function) -> Function:
 
 
 def _digest(outside: Iterable[Path]) -> str:
-    """Numba checks only the file of the cached entry; the key must cover all that it calls."""
-    digest = hashlib.sha256(numba.__version__.encode())
+    """Numba checks only the file of the cached entry; the key must cover all that it calls.
+
+    It also keeps entries by path and time of that file, so another checkout of the same sources has another key.
+    """
+    digest = hashlib.sha256(f"{numba.__version__} {PACKAGE}".encode())
     sources = [*PACKAGE.glob("models/*.py"), *PACKAGE.glob("filters/**/*.py")]
     for path in [*sorted(sources), *outside]:
-        digest.update(path.read_bytes())
+        digest.update(path.read_bytes() + str(path.stat().st_mtime_ns).encode())
     return digest.hexdigest()[:16]
 
 

@@ -129,7 +129,8 @@ def triangulable(rig: StereoRig, uv: Array) -> Array:
 
 def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
     """A (N, 4, 3) and b (N, 4) of eq. 2.3, rows in the order u, v, u', v', and the points (N, 3); or PointError."""
-    return *_system(rig, uv), triangulate(rig, uv)
+    A, b = _system(rig, uv)
+    return np.moveaxis(A, -1, 0), b.T, triangulate(rig, uv)
 
 
 def _points(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
@@ -141,20 +142,21 @@ def _points(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
 
 
 def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
+    """A (4, 3, N) and b (4, N): the points last, so that sums run along memory."""
     P = rig.cameras
-    rows, last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
-    A = uv[:, :, None] * last[:, :3]
+    rows, last = P[:, :2].reshape(4, 4, 1), P[:, 2].repeat(2, axis=0)[:, :, None]
+    A = uv.T[:, None] * last[:, :3]
     A -= rows[:, :3]
-    return A, -(uv * last[:, 3] - rows[:, 3])
+    return A, rows[:, 3] - uv.T * last[:, 3]
 
 
 def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
-    At = np.swapaxes(A, 1, 2)
-    AtA = At @ A
-    inverse, definite = small.inverse(AtA)
-    alone = np.einsum("nii,nii->ni", inverse, AtA)
-    definite &= (alone < 1.0 / FIXED).all(axis=1)
-    points = (inverse @ (At @ b[:, :, None]))[:, :, 0]
-    depth = points @ rig.cameras[:, 2, :3].T + rig.cameras[:, 2, 3]
+    AtA = np.einsum("kin,kjn->ijn", A, A)
+    inverse, definite = small.inverse(np.moveaxis(AtA, -1, 0))
+    inverse = np.moveaxis(inverse, 0, -1)
+    alone = np.einsum("iin,iin->in", inverse, AtA)
+    definite &= (alone < 1.0 / FIXED).all(axis=0)
+    points = np.einsum("ijn,jn->in", inverse, np.einsum("kin,kn->in", A, b))
+    depth = rig.cameras[:, 2, :3] @ points + rig.cameras[:, 2, 3:]
     near, far = NEAREST * rig.baseline, FARTHEST * rig.baseline
-    return points, definite & ((depth > near) & (depth < far)).all(axis=1)
+    return np.ascontiguousarray(points.T), definite & ((depth > near) & (depth < far)).all(axis=0)

@@ -19,7 +19,7 @@ def inverse(C: Array) -> tuple[Array, Array]:
         definite = finite & (np.linalg.eigvalsh(np.where(finite[..., None, None], C, one))[..., 0] > 0.0)
         return np.linalg.inv(np.where(definite[..., None, None], C, one)), definite
     a, b, c, d, e, f = (C[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
-    out = np.empty(C.shape)
+    out = np.empty_like(C)
     out[..., 0, 0] = d * f - e * e
     out[..., 0, 1] = out[..., 1, 0] = c * e - b * f
     out[..., 0, 2] = out[..., 2, 0] = b * e - c * d

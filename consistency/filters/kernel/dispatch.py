@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from numba.extending import overload
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+INNER: dict[str, Any] = OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 PACKAGE = Path(__file__).parents[2]
 
 _overload: Callable[..., Any] = overload
@@ -82,7 +83,7 @@ def generic(deciding: int = 1) -> Callable[[Function], Function]:
             classes = tuple(getattr(a, "instance_class", None) for a in args[:deciding])
             return _body(stub, bodies, classes)
 
-        _overload(call, strict=False, jit_options=OPTIONS)(choose)
+        _overload(call, strict=False, jit_options=INNER)(choose)
         _bodies[call] = bodies
         chosen: Any = call
         return chosen

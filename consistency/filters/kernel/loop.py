@@ -150,20 +150,9 @@ class Memory(NamedTuple):
     home: Indices  # and in the whole state
 
 
-def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
-    """Filter a whole trial whose state grows to at most ``size`` variables."""
-    slam, data = lend(own_slam), lend(own_data)
-    T, r, w = len(data.controls), robot_width(slam.motion), landmark_width(slam.landmark)
-    own_memory = Memory(
-        np.zeros(size), np.zeros((size, size)), np.full(data.n_landmarks, -1), np.full(data.n_landmarks, -1)
-    )
-    own_work = make_work(slam, size, _most_seen(data.first))
-    own_local = make_local(slam.covariance, r, w, size)
-    out = _empty_outcome(T, r, data.n_landmarks)
-    memory, work, local, said = lend(own_memory), lend(own_work), lend(own_local), lend(out)
-    step, code = _run(slam, data, memory, local, work, said)
-    keep((own_slam, own_data, own_memory, own_work, own_local))
-    return Outcome(out.pose, out.covariance, out.own, out.nis, out.nis_dof, step, code, out.points, out.spread)
+@inner
+def _make_memory(size: int, n_landmarks: int) -> Memory:
+    return Memory(np.zeros(size), np.zeros((size, size)), np.full(n_landmarks, -1), np.full(n_landmarks, -1))
 
 
 @inner
@@ -182,43 +171,6 @@ def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
 
 
 @inner
-def _run(
-    slam: Slam, data: Data, memory: Memory, local: Factors, work: Work[NamedTuple], out: Outcome
-) -> tuple[int, int]:
-    """``out`` <- all steps of a trial; step and code of a failure, or zeros."""
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    copy(data.start, memory.x[:r])
-    whole = State(memory.x, memory.P, r, 0, memory.home)
-    state = State(memory.x, memory.P, r, 0, memory.active)  # of a step: the whole, unless it has a base
-    full_rank = False
-    for k in range(len(data.controls)):
-        labels = data.landmark[data.first[k] : data.first[k + 1]]
-        state = prepare(slam.covariance, slam, whole, state, labels, local)
-        state, code, m, nis = _step(slam, state, data, k, local, work)
-        if m > 0:
-            out.nis[k], out.nis_dof[k] = nis, OBSERVED * m
-        if code == 0:
-            rank = _keep_pose(slam, state, k, out, work)
-            if rank < 0 or (full_rank and rank == 0):
-                code = POSE
-                fill(out.pose[k], np.nan)
-                fill_matrix(out.covariance[k], np.nan)
-                fill_matrix(out.own[k], np.nan)
-            full_rank = full_rank or rank == 1
-        if code > 0:
-            return k + 1, code
-        n = whole.n
-        for label in labels:
-            if memory.home[label] < 0:
-                memory.home[label] = n
-                n += w
-        whole = State(memory.x, memory.P, n, 0, memory.home)
-    settle(slam.covariance, slam, whole, state, local)
-    _map(slam, whole, out.points, out.spread)
-    return 0, 0
-
-
-@inner
 def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedTuple]) -> int:
     """Estimate of step k + 1; returns the rank of its own covariance as ``definiteness`` says it.
 
@@ -230,6 +182,64 @@ def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedT
     pose_covariance(slam.error, out.pose[k], out.own[k], out.covariance[k])
     rank = definiteness_with(out.own[k], work.small)
     return -1 if rank == 1 and definiteness_with(out.covariance[k], work.small) < 1 else rank
+
+
+@inner
+def _settle_new(labels: Indices, n: int, w: int, home: Indices) -> int:
+    """Give the landmarks that are new their places from ``n`` on; returns the size of the state."""
+    for label in labels:
+        if home[label] < 0:
+            home[label] = n
+            n += w
+    return n
+
+
+@inner
+def _forget_pose(k: int, out: Outcome) -> None:
+    fill(out.pose[k], np.nan)
+    fill_matrix(out.covariance[k], np.nan)
+    fill_matrix(out.own[k], np.nan)
+
+
+def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
+    """Filter a whole trial whose state grows to at most ``size`` variables.
+
+    The loop stands here, not in a function of its own: compiling such a function a second time, as a part of this one,
+    would take a tenth of the whole.
+    """
+    slam, data = lend(own_slam), lend(own_data)
+    T, r, w = len(data.controls), robot_width(slam.motion), landmark_width(slam.landmark)
+    own_memory, own_out = _make_memory(size, data.n_landmarks), _empty_outcome(T, r, data.n_landmarks)
+    own_work, own_local = make_work(slam, size, _most_seen(data.first)), make_local(slam.covariance, r, w, size)
+    memory, work, local, out = lend(own_memory), lend(own_work), lend(own_local), lend(own_out)
+    copy(data.start, memory.x[:r])
+    whole = State(memory.x, memory.P, r, 0, memory.home)
+    state = State(memory.x, memory.P, r, 0, memory.active)  # of a step: the whole, unless it has a base
+    full_rank, step, code = False, 0, 0
+    for k in range(T):
+        labels = data.landmark[data.first[k] : data.first[k + 1]]
+        state = prepare(slam.covariance, slam, whole, state, labels, local)
+        state, code, m, nis = _step(slam, state, data, k, local, work)
+        if m > 0:
+            out.nis[k], out.nis_dof[k] = nis, OBSERVED * m
+        if code == 0:
+            rank = _keep_pose(slam, state, k, out, work)
+            if rank < 0 or (full_rank and rank == 0):
+                code = POSE
+                _forget_pose(k, out)
+            full_rank = full_rank or rank == 1
+        if code > 0:
+            step = k + 1
+            break
+        whole = State(memory.x, memory.P, _settle_new(labels, whole.n, w, memory.home), 0, memory.home)
+    if code == 0:
+        settle(slam.covariance, slam, whole, state, local)
+        _map(slam, whole, out.points, out.spread)
+    keep((own_slam, own_data, own_memory, own_work, own_local))
+    return Outcome(
+        own_out.pose, own_out.covariance, own_out.own, own_out.nis, own_out.nis_dof, step, code,
+        own_out.points, own_out.spread,
+    )  # fmt: skip
 
 
 trial_kernel = Kernel(run_trial)

@@ -25,6 +25,8 @@ MODULES = {
     "ri-ekf-uvd": ("methods.riekf", "UVD"),
     "anchored-ekf-xyz": ("methods.anchored", "XYZ"),
     "anchored-ekf-uvd": ("methods.anchored", "UVD"),
+    "robocentric-ekf-uvd": ("methods.robocentric", "ROBOCENTRIC"),
+    "parked-ekf-uvd": ("methods.robocentric", "PARKED"),
     "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ"),
     "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD"),
     "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ"),

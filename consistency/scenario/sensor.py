@@ -68,11 +68,28 @@ class ImageSensor(Sensor):
 class BelievedSensor(StereoSensor):
     """Noise and calibration as the filter has them; f and B are needed for ``uvd``."""
 
+    disparity: tuple[Positive, Positive] | None = None  # px, the search range, for filters that allow for it
+
     @model_validator(mode="after")
     def _rig(self) -> BelievedSensor:
         if self.model == "uvd" and (self.f is None or self.B is None):
             raise ValueError("a uvd sensor needs f (px) and B (m)")
+        if self.disparity is not None:
+            _require_search_range(self.disparity)
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_an_unknown_range(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A belief without a search range has the content, and so the hash, of one that knows of none."""
+        content: dict[str, Any] = handler(self)
+        if self.disparity is None:
+            content.pop("disparity", None)
+        return content
+
+
+def _require_search_range(disparity: tuple[float, float]) -> None:
+    if disparity[0] >= disparity[1]:
+        raise ValueError("disparity must be [low, high] with low < high")
 
 
 class PicturedSensor(BelievedSensor, ImageSensor):
@@ -164,8 +181,7 @@ class UvdSensor(TrueSensor, StereoSensor):
 
     @model_validator(mode="after")
     def _search_range(self) -> UvdSensor:
-        if self.disparity[0] >= self.disparity[1]:
-            raise ValueError("disparity must be [low, high] with low < high")
+        _require_search_range(self.disparity)
         return self
 
 

@@ -64,6 +64,19 @@ def subtract_gram(P: Array, n: int, r: int, W: Array) -> None:
 
 
 @inner
+def replace_rows(P: Array, n: int, o: int, rows: Array, own: Array) -> None:
+    """Rows and columns of the three variables at ``o`` <- ``rows`` (3, >= n), their own block <- ``own`` (3, 3)."""
+    for j in range(o):
+        for a in range(3):
+            P[j, o + a] = rows[a, j]
+    for a in range(3):
+        for j in range(o + 3, n):
+            P[o + a, j] = rows[a, j]
+        for b in range(a, 3):
+            P[o + a, o + b] = P[o + b, o + a] = 0.5 * (own[a, b] + own[b, a])
+
+
+@inner
 def append_landmark(P: Array, n: int, Jp: Array, Jz: Array, R: Array) -> None:
     """Covariance of a landmark put at n: its own and the one with everything before it."""
     w, r = Jp.shape

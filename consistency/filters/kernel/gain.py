@@ -101,6 +101,15 @@ def whiten(state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[in
             for c in range(OBSERVED):
                 S[r, OBSERVED * i + c] += data.R[work.known[i], a, c]
             total += y[r] + S[r, r:].sum()
+    return divide_by_root(state, m, work, total)
+
+
+@inner
+def divide_by_root(state: State, m: int, work: Work[NamedTuple], total: float) -> tuple[int, float]:
+    """S <- its root, and A and the innovation <- divided by it; ``total`` is finite if all that is given is."""
+    rows, width = OBSERVED * m, state.n + state.base
+    S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
+    y = joined[:, width]
     if not definite_root(S, work.scale):
         return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan
     solve_transposed(S, joined)

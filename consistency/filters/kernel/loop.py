@@ -12,13 +12,14 @@ from consistency.filters.kernel.gain import NOT_FINITE, POSE
 from consistency.filters.kernel.jit import Kernel, inner
 from consistency.filters.kernel.lending import keep, lend
 from consistency.filters.kernel.linalg import definiteness_with
-from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.slam import (
     OBSERVED,
     Data,
     Slam,
     State,
+    append,
     correct,
+    held_at,
     insert_error,
     landmark_width,
     make_local,
@@ -29,6 +30,7 @@ from consistency.filters.kernel.slam import (
     robot_frame,
     robot_width,
     settle,
+    spare_width,
     to_error,
     world_point,
 )
@@ -63,7 +65,7 @@ def _find_known(data: Data, k: int, offset: Indices, work: Work[NamedTuple]) -> 
 
 
 @inner
-def _insert_new(slam: Slam, state: State, data: Data, k: int, local: Factors, work: Work[NamedTuple]) -> State:
+def _insert_new(slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple]) -> State:
     """The state with the landmarks that step k + 1 sees for the first time."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     x, P, n, base, offset = state.x, state.P, state.n, state.base, state.offset
@@ -74,31 +76,17 @@ def _insert_new(slam: Slam, state: State, data: Data, k: int, local: Factors, wo
             place(slam.point, slam, State(x, P, n, base, offset), k, label, data.z[i], work)
             insert_error(slam.error, x[:r], x[n : n + w], work.Jp)
             append_landmark(P, n, work.Jp, work.Jz, data.R[i])
-            if base > 0:
-                _append_factors(label, r, w, n, base, work.Jp, local)
+            append(slam.covariance, slam, State(x, P, n, base, offset), label, local, work)
             n += w
     return State(x, P, n, base, offset)
 
 
 @inner
-def _append_factors(label: int, r: int, w: int, n: int, base: int, Jp: Array, local: Factors) -> None:
-    """A new landmark at ``n`` of the active part."""
-    Phi = local.Phi
-    for a in range(w):
-        for j in range(base):
-            total = 0.0
-            for c in range(r):
-                total += Jp[a, c] * Phi[c, j]
-            Phi[n + a, j] = total
-    local.label[(n - r) // w] = label
-
-
-@inner
 def _step(
-    slam: Slam, state: State, data: Data, k: int, local: Factors, work: Work[NamedTuple]
+    slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple]
 ) -> tuple[State, int, int, float]:
     """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, and the NIS."""
-    predict(slam.update, slam, state, k, data.controls[k], local.Phi, work)
+    predict(slam.update, slam, state, k, data.controls[k], local, work)
     m, nis = _find_known(data, k, state.offset, work), np.nan
     if m > 0:
         code, nis = correct(slam.update, slam, state, data, k, m, local, work)
@@ -117,21 +105,22 @@ def _most_seen(first: Indices) -> int:
 
 
 @inner
-def _map(slam: Slam, state: State, points: Array, spread: Array) -> None:
+def _map(slam: Slam, state: State, local: NamedTuple, points: Array, spread: Array) -> None:
     """Positions of the landmarks in the world, and covariances of their additive errors."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    pose, D, block = state.x[:r], np.empty((3, r + w)), np.empty((r + w, r + w))
-    frame = robot_frame(slam.motion, pose)
+    D, block = np.empty((3, r + w)), np.empty((r + w, r + w))
     for label in range(len(points)):
         o = state.offset[label]
         if o >= 0:
-            values = state.x[o : o + w]
+            at, values = held_at(slam.covariance, label, local), state.x[o : o + w]
+            pose = state.x[at : at + r]
+            frame = robot_frame(slam.motion, pose)
             world_point(slam.landmark, frame, values, points[label], D[:, :r], D[:, r:])
             to_error(slam.error, pose, values, D[:, :r], D[:, r:])
             for i in range(r + w):
                 for j in range(i, r + w):
-                    p, q = i if i < r else o + i - r, j if j < r else o + j - r
-                    block[i, j] = block[j, i] = state.P[p, q]
+                    p, q = at + i if i < r else o + i - r, at + j if j < r else o + j - r
+                    block[i, j] = block[j, i] = state.P[min(p, q), max(p, q)]
             for i in range(3):
                 for j in range(3):
                     total = 0.0
@@ -185,8 +174,11 @@ def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedT
 
 
 @inner
-def _settle_new(labels: Indices, n: int, w: int, home: Indices) -> int:
-    """Give the landmarks that are new their places from ``n`` on; returns the size of the state."""
+def _settle_new(labels: Indices, n: int, w: int, state: State, home: Indices) -> int:
+    """Places of the landmarks that are new, from ``n`` on if updating is local; returns the size of the whole."""
+    if state.base == 0:
+        copy(state.offset, home)
+        return state.n
     for label in labels:
         if home[label] < 0:
             home[label] = n
@@ -209,8 +201,10 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     """
     slam, data = lend(own_slam), lend(own_data)
     T, r, w = len(data.controls), robot_width(slam.motion), landmark_width(slam.landmark)
+    size += spare_width(slam.covariance, T, data.n_landmarks)
     own_memory, own_out = _make_memory(size, data.n_landmarks), _empty_outcome(T, r, data.n_landmarks)
-    own_work, own_local = make_work(slam, size, _most_seen(data.first)), make_local(slam.covariance, r, w, size)
+    own_work = make_work(slam, size, _most_seen(data.first))
+    own_local = make_local(slam.covariance, r, w, size, T, data.n_landmarks)
     memory, work, local, out = lend(own_memory), lend(own_work), lend(own_local), lend(own_out)
     copy(data.start, memory.x[:r])
     whole = State(memory.x, memory.P, r, 0, memory.home)
@@ -231,10 +225,10 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
         if code > 0:
             step = k + 1
             break
-        whole = State(memory.x, memory.P, _settle_new(labels, whole.n, w, memory.home), 0, memory.home)
+        whole = State(memory.x, memory.P, _settle_new(labels, whole.n, w, state, memory.home), 0, memory.home)
     if code == 0:
         settle(slam.covariance, slam, whole, state, local)
-        _map(slam, whole, out.points, out.spread)
+        _map(slam, whole, local, out.points, out.spread)
     keep((own_slam, own_data, own_memory, own_work, own_local))
     return Outcome(
         own_out.pose, own_out.covariance, own_out.own, own_out.nis, own_out.nis_dof, step, code,

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 from consistency.filters.kernel.dispatch import generic
-from consistency.filters.kernel.local_state import Factors
 from consistency.models.point import Mounting
 from consistency.types import Array, Indices
 
@@ -270,20 +269,22 @@ def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Ar
 
 
 @generic()
-def make_room(update: NamedTuple, r: int, w: int, m: int) -> NamedTuple:
-    """Arrays of this update for up to ``m`` landmarks in a step."""
+def make_room(update: NamedTuple, r: int, w: int, m: int, n: int) -> NamedTuple:
+    """Arrays of this update for up to ``m`` landmarks in a step and a state of up to ``n`` variables."""
     raise NotImplementedError
 
 
 @generic()
-def predict(update: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
-    """x, P, Phi <- one step of motion."""
+def predict(
+    update: NamedTuple, slam: Slam, state: State, k: int, u: Array, local: NamedTuple, work: NamedTuple
+) -> None:
+    """x, P and what ``local`` says of them <- one step of motion."""
     raise NotImplementedError
 
 
 @generic()
 def correct(
-    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: NamedTuple
+    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
 ) -> tuple[int, float]:
     """x, P <- the joint update with the ``m`` landmarks in ``work``; returns a code of REASONS or 0, and the NIS."""
     raise NotImplementedError
@@ -293,18 +294,38 @@ def correct(
 
 
 @generic()
-def make_local(covariance: NamedTuple, r: int, w: int, n: int) -> Factors:
-    """Factors for a state of up to ``n`` variables; empty where updating is dense."""
+def spare_width(covariance: NamedTuple, steps: int, n_landmarks: int) -> int:
+    """Variables that the state may need beside robot and landmarks in a trial of so many ``steps``."""
     raise NotImplementedError
 
 
 @generic()
-def prepare(covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+def make_local(covariance: NamedTuple, r: int, w: int, n: int, steps: int, n_landmarks: int) -> NamedTuple:
+    """What this upkeep keeps beside a state of up to ``n`` variables."""
+    raise NotImplementedError
+
+
+@generic()
+def prepare(
+    covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: NamedTuple
+) -> State:
     """The variables that a step works on in which ``labels`` are seen."""
     raise NotImplementedError
 
 
 @generic()
-def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: Factors) -> None:
+def append(covariance: NamedTuple, slam: Slam, state: State, label: int, local: NamedTuple, work: NamedTuple) -> None:
+    """``local`` <- a new landmark at the end of ``state``, with Jacobian ``work.Jp``."""
+    raise NotImplementedError
+
+
+@generic()
+def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: NamedTuple) -> None:
     """``whole`` <- what is known of all variables."""
+    raise NotImplementedError
+
+
+@generic()
+def held_at(covariance: NamedTuple, label: int, local: NamedTuple) -> int:
+    """Offset of the pose in whose frame a landmark is; 0 is the robot's."""
     raise NotImplementedError

@@ -57,5 +57,5 @@ def make_work(slam: Slam, n: int, m: int) -> Work[NamedTuple]:
         np.empty((3, 3)),
         np.empty(r),
         np.empty((r, r)),
-        make_room(slam.update, r, w, m),
+        make_room(slam.update, r, w, m, n),
     )

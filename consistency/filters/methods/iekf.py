@@ -52,15 +52,15 @@ class PriorRoom(NamedTuple):
 
 
 @implement(make_room, Iterated)
-def iterated_room(update: Iterated, r: int, w: int, m: int) -> PriorRoom:
+def iterated_room(update: Iterated, r: int, w: int, m: int, n: int) -> PriorRoom:
     return PriorRoom(np.empty(r + w * m))
 
 
 @implement(predict, Iterated)
 def predict_iterated(
-    update: Iterated, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[PriorRoom]
+    update: Iterated, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[PriorRoom]
 ) -> None:
-    propagate(slam.error, slam, state, k, u, Phi, work)
+    propagate(slam.error, slam, state, k, u, local.Phi, work)
 
 
 @implement(correct, Iterated)

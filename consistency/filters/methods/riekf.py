@@ -17,6 +17,7 @@ from scipy.linalg import expm
 
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled
+from consistency.filters.error.planar import exponential, shifted_covariance
 from consistency.filters.kernel.arrays import fill
 from consistency.filters.kernel.blas import add_gram, add_transposed_times
 from consistency.filters.kernel.dispatch import implement, part
@@ -37,8 +38,6 @@ from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Gaussian, Info, Observation
-
-ROUNDED = 1e-14  # of what cancels in a variance: less is rounding
 
 
 @part(motion="Unicycle", landmark="WorldPoint", point="AtEstimate", update="Joint", covariance="Dense")
@@ -84,21 +83,12 @@ def retract_right(error: RightInvariant, slam: Slam, state: State, A: Array, y: 
     x, delta = state.x, work.delta[: state.n]
     fill(delta, 0.0)
     add_transposed_times(A, y, delta)
-    c, s, along, across = _exponential(delta[2])
+    c, s, along, across = exponential(delta[2])
     _move(x, delta, 0, c, s, along, across)
     x[2] += delta[2]
     for o in range(3, state.n, 3):
         _move(x, delta, o, c, s, along, across)
         x[o + 2] += delta[o + 2]
-
-
-@inner
-def _exponential(angle: float) -> tuple[float, float, float, float]:
-    """Cosine, sine, sin(a) / a and (1 - cos(a)) / a."""
-    c, s = np.cos(angle), np.sin(angle)
-    if abs(angle) < 1e-4:
-        return c, s, 1.0 - angle * angle / 6.0, 0.5 * angle * (1.0 - angle * angle / 12.0)
-    return c, s, s / angle, (1.0 - c) / angle
 
 
 @inner
@@ -111,16 +101,7 @@ def _move(x: Array, delta: Array, o: int, c: float, s: float, along: float, acro
 
 @implement(pose_covariance, RightInvariant)
 def right_pose_covariance(error: RightInvariant, x: Array, P: Array, out: Array) -> None:
-    t = (-x[1], x[0])  # what a turn moves
-    for a in range(2):
-        out[a, 2] = out[2, a] = P[a, 2] + t[a] * P[2, 2]
-        for b in range(2):
-            out[a, b] = P[a, b] + P[a, 2] * t[b] + t[a] * P[2, b] + t[a] * P[2, 2] * t[b]
-    out[2, 2] = P[2, 2]
-    for a in range(2):
-        if out[a, a] < ROUNDED * (P[a, a] + t[a] * t[a] * P[2, 2]):  # a variance of zero, but for rounding
-            for b in range(3):
-                out[a, b] = out[b, a] = 0.0
+    shifted_covariance(x, P, out)
 
 
 class RightInvariantKalman:

@@ -22,13 +22,15 @@ class NoRoom(NamedTuple):
 
 
 @implement(make_room, Joint)
-def joint_room(update: Joint, r: int, w: int, m: int) -> NoRoom:
+def joint_room(update: Joint, r: int, w: int, m: int, n: int) -> NoRoom:
     return NoRoom()
 
 
 @implement(predict, Joint)
-def predict_joint(update: Joint, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NoRoom]) -> None:
-    propagate(slam.error, slam, state, k, u, Phi, work)
+def predict_joint(
+    update: Joint, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[NoRoom]
+) -> None:
+    propagate(slam.error, slam, state, k, u, local.Phi, work)
 
 
 @implement(correct, Joint)

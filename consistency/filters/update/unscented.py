@@ -68,7 +68,7 @@ class SigmaRoom(NamedTuple):
 
 
 @implement(make_room, Unscented)
-def sigma_room(update: Unscented, r: int, w: int, m: int) -> SigmaRoom:
+def sigma_room(update: Unscented, r: int, w: int, m: int, n: int) -> SigmaRoom:
     L = r + w * m
     return SigmaRoom(
         np.empty((r, r)),
@@ -93,7 +93,7 @@ def _weights(L: int, points: Unscented) -> tuple[float, float, float, float]:
 
 @implement(predict, Unscented)
 def predict_unscented(
-    update: Unscented, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[SigmaRoom]
+    update: Unscented, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[SigmaRoom]
 ) -> None:
     x, P, r = state.x, state.P, robot_width(slam.motion)
     spread, w0m, w0c, w = _weights(r, update)
@@ -117,7 +117,7 @@ def predict_unscented(
         for j in range(r):
             F[a, j] = w * spread * (Y[2 * j, a] - Y[2 * j + 1, a])
     carry_root(slam.motion, P, r, state.n, C, F)
-    carry_root(slam.motion, Phi, 0, state.base, C, F)
+    carry_root(slam.motion, local.Phi, 0, state.base, C, F)
     for a in range(r):
         for b in range(r):
             P[a, b] = w0c * (Y[2 * r, a] - x[a]) * (Y[2 * r, b] - x[b])

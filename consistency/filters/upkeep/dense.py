@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.local_state import Factors, make_factors
-from consistency.filters.kernel.slam import Slam, State, make_local, prepare, settle
+from consistency.filters.kernel.slam import Slam, State, append, held_at, make_local, prepare, settle, spare_width
+from consistency.filters.kernel.work import Work
 from consistency.types import Indices
 
 
@@ -15,14 +16,31 @@ class Dense(NamedTuple):
     """No parameters."""
 
 
+@implement(spare_width, Dense)
+def dense_spares_nothing(covariance: Dense, steps: int, n_landmarks: int) -> int:
+    return 0
+
+
+@implement(held_at, Dense)
+def held_by_robot(covariance: Dense, label: int, local: Factors) -> int:
+    return 0
+
+
 @implement(make_local, Dense)
-def make_no_factors(covariance: Dense, r: int, w: int, n: int) -> Factors:
+def make_no_factors(covariance: Dense, r: int, w: int, n: int, steps: int, n_landmarks: int) -> Factors:
     return make_factors(r, r, 1)
 
 
 @implement(prepare, Dense)
 def prepare_all(covariance: Dense, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
     return state
+
+
+@implement(append, Dense)
+def append_nothing(
+    covariance: Dense, slam: Slam, state: State, label: int, local: Factors, work: Work[NamedTuple]
+) -> None:
+    pass
 
 
 @implement(settle, Dense)

@@ -39,7 +39,19 @@ from consistency.filters.kernel.covariance import gather_rows
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors, make_factors
-from consistency.filters.kernel.slam import Slam, State, landmark_width, make_local, prepare, robot_width, settle
+from consistency.filters.kernel.slam import (
+    Slam,
+    State,
+    append,
+    held_at,
+    landmark_width,
+    make_local,
+    prepare,
+    robot_width,
+    settle,
+    spare_width,
+)
+from consistency.filters.kernel.work import Work
 from consistency.types import Array, Indices
 
 LOCAL_FROM = 100  # variables in the state from which local updating is tried; measured, as the next three
@@ -59,8 +71,18 @@ class Local(NamedTuple):
     start: int
 
 
+@implement(spare_width, Local)
+def local_spares_nothing(covariance: Local, steps: int, n_landmarks: int) -> int:
+    return 0
+
+
+@implement(held_at, Local)
+def held_by_robot(covariance: Local, label: int, local: Factors) -> int:
+    return 0
+
+
 @implement(make_local, Local)
-def make_local_factors(covariance: Local, r: int, w: int, n: int) -> Factors:
+def make_local_factors(covariance: Local, r: int, w: int, n: int, steps: int, n_landmarks: int) -> Factors:
     if n < covariance.start:
         return make_factors(r, r, 1)
     c = max(n // (2 * w), 1) * w
@@ -85,6 +107,22 @@ def prepare_active(covariance: Local, slam: Slam, whole: State, state: State, la
         n, b = n + more, b + more
         count(whole.n, n, b, more, w * len(labels), local)
     return State(x, P, n, b, offset)
+
+
+@implement(append, Local)
+def append_factors(
+    covariance: Local, slam: Slam, state: State, label: int, local: Factors, work: Work[NamedTuple]
+) -> None:
+    r, w, n, base, Phi = robot_width(slam.motion), landmark_width(slam.landmark), state.n, state.base, local.Phi
+    if base == 0:
+        return
+    for a in range(w):
+        for j in range(base):
+            total = 0.0
+            for c in range(r):
+                total += work.Jp[a, c] * Phi[c, j]
+            Phi[n + a, j] = total
+    local.label[(n - r) // w] = label
 
 
 @implement(settle, Local)

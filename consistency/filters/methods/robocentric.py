@@ -1,0 +1,457 @@
+"""Robot-centred EKF-SLAM in inverse range, with landmarks out of sight parked: consistent at a small baseline.
+
+Landmarks are azimuth, elevation (rad) and inverse range (1/m) in the frame of the sensor, where the error of stereo is
+nearly Gaussian; an observation (u, v, d) is converted to the same three numbers, so that insertion and update are
+linear and say nothing about the pose (Castellanos et al. 2007; Civera, Davison & Montiel 2008). Prediction moves all
+landmarks through the new frame. What a landmark that is carried so for hundreds of steps says of the way back is right
+to first order only; one that has not been seen for a while is therefore *parked*: it keeps its numbers in the frame of
+a clone of the pose, and is carried over at once, by an iterated update, when it is seen again.
+
+The error of pose and clones in that update is right-invariant, T_true = Exp(xi) T. With M(p) the matrix that takes
+(dp, dheading) to xi, and J_l the left Jacobian of SE(2), a covariance about T holds about Exp(xi) T after a turn by
+M(p+)^-1 J_l(xi) M(p-).
+
+Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
+its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not
+the conversion of the mean, to second order in the noise of u and v.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import log_ndtr
+from scipy.stats import norm
+
+from consistency.errors import InputError
+from consistency.filters import plain
+from consistency.filters.compiled import Compiled
+from consistency.filters.error.invariant_pose import InvariantPose
+from consistency.filters.kernel.slam import Slam
+from consistency.filters.landmark.inverse_range import InverseRange
+from consistency.filters.parts import motion_of, sensor_of
+from consistency.filters.sensor.conversion import Pixels
+from consistency.filters.update.converting import Converted, Converting
+from consistency.filters.upkeep.parking import Parking
+from consistency.geometry import wrap
+from consistency.protocols import Problem
+from consistency.scenario.sensor import BelievedSensor
+from consistency.types import Array, Control, Gaussian, Info, Observation
+
+EVERY, UNSEEN = 50, 20  # steps between two rounds of parking, and without a sight before a landmark is parked
+PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
+TEMPERED = 2.0  # decades by which the noise of parked landmarks is raised in the first pass; half a decade less in each
+BESIDE = 0.1  # cosine of the angle to the optical axis below which a prediction is in no image
+BEYOND = 4.0  # standard deviations outside the search range at which a predicted disparity is held
+
+
+class Corrections(NamedTuple):
+    """What tells this filter from a plain robot-centred one; each can be left out, to see what it is worth."""
+
+    parking: bool = True
+    turning: bool = True
+    truncation: bool = True
+    debiasing: bool = True
+    iteration: bool = True
+
+
+@dataclass(frozen=True)
+class CentredState:
+    """Pose and blocks of three: clones of the pose, and landmarks, active or parked at a clone."""
+
+    x: Array  # (n,)
+    P: Array  # (n, n), of dp, dheading; xi of a clone; a, e, rho of a landmark
+    problem: Problem
+    step: int = 0
+    places: dict[int, int] = field(default_factory=dict)  # offset of each landmark by label
+    seen: dict[int, int] = field(default_factory=dict)  # step at which each was seen last
+    parked: dict[int, int] = field(default_factory=dict)  # number of the clone at which a landmark is parked, by label
+    clones: dict[int, int] = field(default_factory=dict)  # offset of each clone by number
+
+
+# --- geometry ----------------------------------------------------------------------------------------
+
+
+def rays(y: Array) -> tuple[Array, Array]:
+    """Unit vectors (..., 3) of azimuth and elevation, and their derivatives (..., 3, 2)."""
+    (sa, se), (ca, ce) = np.sin(y[..., :2]).T, np.cos(y[..., :2]).T
+    sa, se, ca, ce = sa.T, se.T, ca.T, ce.T
+    m = np.stack([ce * ca, ce * sa, se], axis=-1)
+    by_azimuth = np.stack([-ce * sa, ce * ca, np.zeros_like(ca)], axis=-1)
+    by_elevation = np.stack([-se * ca, -se * sa, ce], axis=-1)
+    return m, np.stack([by_azimuth, by_elevation], axis=-1)
+
+
+def carried(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array, Array, Array, Array]:
+    """Landmarks y (m, 3) in the frame of the sensor after a change b -> R b + t of the robot's frame.
+
+    Returns
+    -------
+    y' (m, 3), dy'/dy (m, 3, 3), dy'/db' (m, 3, 3), and rho times the point in the new frame of the robot, b' (m, 3)
+    """
+    mount = sensor.mount.packed()
+    offset, axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
+    m, dm = rays(y)
+    rho = y[:, 2:]
+    b = (m @ axes.T + rho * offset) @ R.T + rho * t
+    q = (b - rho * offset) @ axes
+    by_range = np.broadcast_to((axes.T @ (R @ offset + t - offset))[:, None], (len(y), 3, 1))
+    dq = np.concatenate([axes.T @ R @ axes @ dm, by_range], axis=2)
+    h2, r2 = q[:, 0] ** 2 + q[:, 1] ** 2, (q**2).sum(axis=1)
+    h, r = np.sqrt(h2), np.sqrt(r2)
+    D = np.zeros((len(y), 3, 3))
+    D[:, 0, 0], D[:, 0, 1] = -q[:, 1] / h2, q[:, 0] / h2
+    D[:, 1, 0], D[:, 1, 1], D[:, 1, 2] = -q[:, 2] * q[:, 0] / (h * r2), -q[:, 2] * q[:, 1] / (h * r2), h / r2
+    D[:, 2] = -(rho[:, 0] / (r * r2))[:, None] * q
+    J = D @ dq
+    J[:, 2, 2] += 1.0 / r
+    there = np.stack([np.arctan2(q[:, 1], q[:, 0]), np.arctan2(q[:, 2], h), rho[:, 0] / r], axis=1)
+    return there, J, D @ axes.T, b
+
+
+def exponential(xi: Array) -> tuple[Array, Array]:
+    """Exp of SE(2): rotation (2, 2) and translation (2,) of xi = (x, y, angle)."""
+    angle = xi[2]
+    along = np.sinc(angle / np.pi)
+    across = 0.5 * angle if abs(angle) < 1e-4 else (1.0 - np.cos(angle)) / angle
+    V = np.array([[along, -across], [across, along]])
+    return plain.heading_matrix(angle)[:2, :2], V @ xi[:2]
+
+
+def moved(pose: Array, xi: Array) -> Array:
+    """Exp(xi) T of a pose (3,)."""
+    R, t = exponential(xi)
+    return np.array([*(R @ pose[:2] + t), pose[2] + xi[2]])
+
+
+def shift_matrix(pose: Array) -> Array:
+    """M (3, 3) with xi = M (dp, dheading)."""
+    return np.array([[1.0, 0.0, pose[1]], [0.0, 1.0, -pose[0]], [0.0, 0.0, 1.0]])
+
+
+def left_jacobian(xi: Array) -> Array:
+    """J_l of SE(2) to second order, (3, 3)."""
+    ad = np.array([[0.0, -xi[2], xi[1]], [xi[2], 0.0, -xi[0]], [0.0, 0.0, 0.0]])
+    return np.eye(3) + ad / 2.0 + ad @ ad / 6.0
+
+
+# --- conversion --------------------------------------------------------------------------------------
+
+
+def converted(z: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
+    """(u, v, d) (m, 3) in px to azimuth, elevation and inverse range (m, 3), and the Jacobians (m, 3, 3)."""
+    f, B = sensor.f or 0.0, sensor.B or 0.0
+    u, v, d = z.T
+    a = np.arctan2(-u, f)
+    sa, ca = np.sin(a), np.cos(a)
+    e = np.arctan2(-v * ca, f)
+    se, ce = np.sin(e), np.cos(e)
+    J = np.zeros((len(z), 3, 3))
+    J[:, 0, 0] = a_u = -f / (f**2 + u**2)
+    J[:, 1, 0] = e_u = ce**2 * v * sa * a_u / f
+    J[:, 1, 1] = e_v = -(ce**2) * ca / f
+    J[:, 2, 0] = -d / (f * B) * (se * ca * e_u + ce * sa * a_u)
+    J[:, 2, 1] = -d / (f * B) * se * ca * e_v
+    J[:, 2, 2] = ce * ca / (f * B)
+    return np.stack([a, e, d * ce * ca / (f * B)], axis=1), J
+
+
+def imaged(y: Array, sensor: BelievedSensor) -> Array:
+    """Inverse of :func:`converted`; NaN for what is in no image."""
+    f, B = sensor.f or 0.0, sensor.B or 0.0
+    ca, ce = np.cos(y[:, 0]), np.cos(y[:, 1])
+    z = np.stack([-f * np.tan(y[:, 0]), -f * np.tan(y[:, 1]) / ca, y[:, 2] * f * B / (ce * ca)], axis=1)
+    return np.where(((ca > BESIDE) & (ce > BESIDE))[:, None], z, np.nan)
+
+
+def bias(z: Array, sensor: BelievedSensor) -> Array:
+    """Mean of the conversion less the conversion of the mean, (m, 3), by three points in u and in v."""
+    b = np.zeros(z.shape)
+    for axis in range(2):
+        step = np.zeros(3)
+        step[axis] = np.sqrt(3.0) * sensor.sigma[axis]
+        b += (converted(z + step, sensor)[0] + converted(z - step, sensor)[0] - 2.0 * converted(z, sensor)[0]) / 6.0
+    return b
+
+
+def untruncated(d: Array, expected: Array, sigma: float, searched: tuple[float, float]) -> tuple[Array, Array]:
+    """What d would be without the search range, and its variance: moments of the truncated normal about ``expected``.
+
+    d* = e + (d - e - sigma lambda) / kappa with variance sigma^2 / kappa, where sigma lambda and sigma^2 kappa are
+    mean and variance of d - e given that d is in the range.
+    """
+    low, high = searched
+    e = np.clip(expected, low - BEYOND * sigma, high + BEYOND * sigma)
+    alpha, beta = (low - e) / sigma, (high - e) / sigma
+    mass = np.exp(log_ndtr(beta)) - np.exp(log_ndtr(alpha))
+    at_low, at_high = norm.pdf(alpha), norm.pdf(beta)
+    shift = (at_low - at_high) / mass
+    kappa = 1.0 + (alpha * at_low - beta * at_high) / mass - shift**2
+    return e + (d - e - sigma * shift) / kappa, sigma**2 / kappa
+
+
+def searched(sensor: BelievedSensor, name: str) -> tuple[float, float]:
+    """Least and greatest disparity that the filter is told of, px.
+
+    Raises
+    ------
+    InputError
+        It is told of none.
+    """
+    if sensor.disparity is None:
+        raise InputError(
+            f"filter '{name}' needs key 'belief.sensor.disparity_px', the least and greatest disparity that are "
+            "reported; add it, as in truth.sensor"
+        )
+    return sensor.disparity
+
+
+def observed(z: Array, expected: Array, sensor: BelievedSensor, which: Corrections) -> tuple[Array, Array]:
+    """Observations (m, 3) as inverse range where ``expected`` (m, 3) is predicted, and their noise (m, 3, 3)."""
+    at = imaged(expected, sensor)
+    at = np.where(np.isnan(at), z, at)
+    z, variance = z.copy(), np.tile(np.square(sensor.sigma), (len(z), 1))
+    if which.truncation:
+        range_ = searched(sensor, "robot-centred")
+        z[:, 2], variance[:, 2] = untruncated(z[:, 2], at[:, 2], sensor.sigma[2], range_)
+    y, J = converted(z, sensor)[0], converted(at, sensor)[1]
+    if which.debiasing:
+        y -= bias(z, sensor)
+    return y, (J * variance[:, None]) @ np.swapaxes(J, 1, 2)
+
+
+# --- the filter --------------------------------------------------------------------------------------
+
+
+class RobotCentredKalman:
+    """EKF-SLAM in a robot-centred map of inverse ranges, every Jacobian by its definition."""
+
+    robot = plain.Unicycle()
+    sensors = ("uvd",)
+
+    def __init__(self, name: str, which: Corrections) -> None:
+        self.name, self.which = name, which
+
+    def init(self, problem: Problem) -> CentredState:
+        sensor = problem.belief.sensor
+        if sensor.model != "uvd":
+            raise InputError(f"filter '{self.name}' needs a uvd sensor, and belief.sensor.model is '{sensor.model}'")
+        if self.which.truncation:
+            searched(sensor, self.name)
+        return CentredState(problem.start.copy(), np.zeros((3, 3)), problem)
+
+    def predict(self, state: CentredState, control: Control) -> CentredState:
+        belief, x, n = state.problem.belief, state.x.copy(), len(state.x)
+        F, G = np.eye(n), np.zeros((n, 2))
+        F[:3, :3], G[:3] = self.robot.jacobians(x[:3], control)
+        x[:3] = self.robot.move(x[:3], control)
+        active = [at for label, at in state.places.items() if label not in state.parked]
+        if active:
+            rows = np.array(active)[:, None] + np.arange(3)
+            forward, turn = control.dt * control.v, control.dt * control.omega
+            R = plain.heading_matrix(-turn)
+            y, J, D, b = carried(x[rows], R, -R[:, 0] * forward, belief.sensor)
+            rho = x[rows][:, 2:]
+            x[rows] = y
+            F[rows[:, :, None], rows[:, None, :]] = J
+            by_forward, by_turn = -rho * R[:, 0], np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1)
+            G[rows] = control.dt * (D @ np.stack([by_forward, by_turn], axis=2))
+        P = F @ state.P @ F.T + plain.process_noise(G, belief)
+        return replace(state, x=x, P=P, step=state.step + 1)
+
+    def update(self, state: CentredState, observation: Observation) -> tuple[CentredState, Info]:
+        labels = [int(label) for label in observation.landmarks]
+        known = np.array([label in state.places for label in labels], dtype=bool)
+        info = Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
+        if known.any():
+            seen = [label for label in labels if label in state.places]
+            state, info = self._correct(state, seen, observation.z[known])
+        for label, z in zip(np.array(labels)[~known], observation.z[~known], strict=True):
+            state = self._inserted(state, int(label), z)
+        state = replace(state, seen=state.seen | dict.fromkeys(labels, state.step))
+        if self.which.parking and state.step % EVERY == 0:
+            state = _parked(state)
+        return state, info
+
+    def _correct(self, state: CentredState, seen: list[int], z: Array) -> tuple[CentredState, Info]:
+        delta, shifts = np.zeros(len(state.x)), _shifts(state)
+        deviation = np.sqrt(np.diag(shifts @ state.P @ shifts.T))
+        is_parked = np.array([label in state.parked for label in seen])
+        is_iterated = self.which.iteration and bool(is_parked.any())
+        expected = np.zeros((len(seen), 3))
+        for i in range(PASSES if is_iterated else 1):
+            here = _moved_by(state, delta)
+            h, H = _expected(here, seen)
+            H = H @ _tangent(state, delta)
+            expected = np.where(is_parked[:, None] | (i == 0), h, expected)
+            y, R = observed(z, expected, state.problem.belief.sensor, self.which)
+            if is_iterated:
+                R[is_parked] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
+            gap = y - h
+            gap[:, 0] = wrap(gap[:, 0])
+            innovation = gap.ravel() + H @ delta
+            S, W = plain.gain(state.P, H, plain.block_diagonal(R))
+            before, delta = delta, W @ innovation
+            if i >= 2 * TEMPERED and np.all(np.abs(shifts @ (delta - before)) <= SETTLED * deviation):
+                break
+        after = _moved_by(state, delta)
+        P = state.P - W @ S @ W.T
+        if self.which.turning:
+            turned = state if is_parked.any() else replace(state, clones={})
+            T = np.linalg.inv(_shifts(after)) @ _tangent(turned, delta)
+            P = T @ P @ T.T
+        after = replace(after, P=P)
+        return _activated(after, [label for label in seen if label in state.parked]), Info(innovation, S, W)
+
+    def _inserted(self, state: CentredState, label: int, z: Array) -> CentredState:
+        sensor, n = state.problem.belief.sensor, len(state.x)
+        (y,), (J,) = converted(z[None], sensor)
+        if self.which.debiasing:
+            y = y - bias(z[None], sensor)[0]
+        P = np.zeros((n + 3, n + 3))
+        P[:n, :n], P[n:, n:] = state.P, (J * np.square(sensor.sigma)) @ J.T
+        return replace(state, x=np.append(state.x, y), P=P, places=state.places | {label: n})
+
+    def pose(self, state: CentredState) -> Gaussian:
+        return Gaussian(state.x[:3], state.P[:3, :3])
+
+    def map(self, state: CentredState) -> dict[int, Gaussian]:
+        return {label: _world_point(state, label) for label in state.places}
+
+
+def _block(at: int) -> slice:
+    return slice(at, at + 3)
+
+
+def _moved_by(state: CentredState, delta: Array) -> CentredState:
+    """The state moved by an error (n,): pose and clones by Exp, landmarks by a sum."""
+    x = state.x + delta
+    x[:3] = moved(state.x[:3], shift_matrix(state.x[:3]) @ delta[:3])
+    for at in state.clones.values():
+        x[_block(at)] = moved(state.x[_block(at)], delta[_block(at)])
+    return replace(state, x=x)
+
+
+def _shifts(state: CentredState) -> Array:
+    """(n, n), from the additive error of the pose to xi; the identity elsewhere."""
+    T = np.eye(len(state.x))
+    T[:3, :3] = shift_matrix(state.x[:3])
+    return T
+
+
+def _tangent(state: CentredState, delta: Array) -> Array:
+    """(n, n), d xi about the moved state / d error about ``state``, at the error ``delta``."""
+    T = _shifts(state)
+    T[:3, :3] = left_jacobian(T[:3, :3] @ delta[:3]) @ T[:3, :3]
+    for at in state.clones.values():
+        T[_block(at), _block(at)] = left_jacobian(delta[_block(at)])
+    return T
+
+
+def _expected(state: CentredState, seen: list[int]) -> tuple[Array, Array]:
+    """What is expected of landmarks, (m, 3), and its Jacobian (3 m, n) with respect to xi of pose and clones."""
+    h, H = np.zeros((len(seen), 3)), np.zeros((3 * len(seen), len(state.x)))
+    for i, label in enumerate(seen):
+        rows, at = _block(3 * i), _block(state.places[label])
+        if label not in state.parked:
+            h[i], H[rows, at] = state.x[at], np.eye(3)
+            continue
+        clone = _block(state.clones[state.parked[label]])
+        h[i], H[rows, at], by_shift = _seen_from(state, state.x[clone], state.x[at])
+        H[rows, clone], H[rows, :3] = by_shift, -by_shift
+    return h, H
+
+
+def _seen_from(state: CentredState, clone: Array, y: Array) -> tuple[Array, Array, Array]:
+    """A landmark parked at ``clone`` as it is seen now, and its derivatives by y and by xi_clone - xi, (3, 3) each."""
+    pose = state.x[:3]
+    Rt = plain.heading_matrix(pose[2]).T
+    R, t = Rt @ plain.heading_matrix(clone[2]), Rt @ np.array([*(clone[:2] - pose[:2]), 0.0])
+    (there,), (J,), (D,), (b,) = carried(y[None], R, t, state.problem.belief.sensor)
+    W = Rt.T @ b + y[2] * np.array([*pose[:2], 0.0])  # rho times the point in the world
+    by_shift = np.column_stack([y[2] * Rt[:, 0], y[2] * Rt[:, 1], Rt @ [-W[1], W[0], 0.0]])
+    return there, J, D @ by_shift
+
+
+def _activated(state: CentredState, labels: list[int]) -> CentredState:
+    """Landmarks that were parked, in the frame of the sensor again; clones that no landmark needs are dropped."""
+    if not labels:
+        return state
+    x, T = state.x.copy(), np.eye(len(state.x))
+    M = shift_matrix(x[:3])
+    for label in labels:
+        at, clone = _block(state.places[label]), _block(state.clones[state.parked[label]])
+        x[at], T[at, at], by_shift = _seen_from(state, state.x[clone], state.x[at])
+        T[at, clone], T[at, :3] = by_shift, -by_shift @ M
+    parked = {label: number for label, number in state.parked.items() if label not in labels}
+    state = replace(state, x=x, P=T @ state.P @ T.T, parked=parked)
+    for number in set(state.clones) - set(parked.values()):
+        state = _without(state, number)
+    return state
+
+
+def _without(state: CentredState, number: int) -> CentredState:
+    gone = state.clones[number]
+    keep = np.delete(np.arange(len(state.x)), _block(gone))
+
+    def moved_up(places: dict[int, int]) -> dict[int, int]:
+        return {key: at - 3 if at > gone else at for key, at in places.items() if at != gone}
+
+    places, clones = moved_up(state.places), moved_up(state.clones)
+    return replace(state, x=state.x[keep], P=state.P[np.ix_(keep, keep)], places=places, clones=clones)
+
+
+def _parked(state: CentredState) -> CentredState:
+    """Active landmarks unseen for a while, at one new clone of the pose."""
+    labels = [label for label in state.places if label not in state.parked and state.step - state.seen[label] >= UNSEEN]
+    if not labels:
+        return state
+    n, number = len(state.x), max(state.clones, default=0) + 1
+    T = np.vstack([np.eye(n), np.zeros((3, n))])
+    T[n:, :3] = shift_matrix(state.x[:3])
+    return replace(
+        state, x=np.append(state.x, state.x[:3]), P=T @ state.P @ T.T,
+        parked=state.parked | dict.fromkeys(labels, number), clones=state.clones | {number: n},
+    )  # fmt: skip
+
+
+def _world_point(state: CentredState, label: int) -> Gaussian:
+    """A landmark as a point in the world, m, to first order."""
+    at = _block(state.places[label])
+    frame = slice(0, 3) if label not in state.parked else _block(state.clones[state.parked[label]])
+    pose, mount = state.x[frame], state.problem.belief.sensor.mount.packed()
+    offset, axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
+    (m,), (dm,) = rays(state.x[at][None])
+    rho, R = state.x[at][2], plain.heading_matrix(pose[2])
+    point = R @ (axes @ m / rho + offset) + np.array([*pose[:2], 0.0])
+    D = np.zeros((3, len(state.x)))
+    D[:, at] = R @ axes @ np.column_stack([dm / rho, -m / rho**2])
+    by_shift = np.column_stack([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-point[1], point[0], 0.0]])
+    D[:, frame] = by_shift if label in state.parked else by_shift @ shift_matrix(pose)
+    return Gaussian(point, D @ state.P @ D.T)
+
+
+def compiled(twin: RobotCentredKalman) -> Compiled:
+    """The filter with its kernel."""
+    which = twin.which
+
+    def parts(problem: Problem, controls: Array) -> Slam:
+        sensor = problem.belief.sensor
+        low, high = searched(sensor, twin.name) if which.truncation else (0.0, 0.0)
+        pixels = Pixels(*sensor.sigma, low, high, which.truncation, which.debiasing)
+        every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
+        return Slam(
+            motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
+            InvariantPose(), Converted(), Converting(pixels, which.turning, PASSES if which.iteration else 1),
+            Parking(every, unseen),
+        )  # fmt: skip
+
+    return Compiled(twin, parts, sensors=("uvd",), uvd=True)
+
+
+PARKED = compiled(RobotCentredKalman("parked-ekf-uvd", Corrections()))
+ROBOCENTRIC = compiled(
+    RobotCentredKalman("robocentric-ekf-uvd", Corrections(parking=False, turning=False, iteration=False))
+)

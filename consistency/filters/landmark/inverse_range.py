@@ -68,7 +68,7 @@ def by_ray(q: Triple, rho: float, there: Array, D: Array) -> float:
     D[1, 0], D[1, 1], D[1, 2] = -q[2] * q[0] / (h * r2), -q[2] * q[1] / (h * r2), h / r2
     g = -rho / (r * r2)
     D[2, 0], D[2, 1], D[2, 2] = g * q[0], g * q[1], g * q[2]
-    return 1.0 / r
+    return float(1.0 / r)
 
 
 @inner

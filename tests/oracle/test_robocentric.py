@@ -1,0 +1,188 @@
+"""The robot-centred filter: geometry by finite differences, conversion by quadrature, kernel by its twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import truncnorm
+
+import consistency as cs
+from consistency.filters import centred, plain
+from consistency.filters.compiled import problem_of
+from consistency.filters.methods import robocentric as rc
+from consistency.filters.stepping import step_through
+from consistency.types import Array
+
+Small = Callable[..., cs.Scenario]
+Y = np.array([[0.3, -0.2, 0.4], [-0.6, 0.1, 0.15], [2.4, 0.3, 0.9]])  # the last one is behind the robot
+STEP = 1e-6
+
+
+def close(a: Array, b: Array, tolerance: float = 1e-7) -> bool:
+    return bool(np.abs(a - b).max() <= tolerance)
+
+
+def along(function: Callable[[Array], Array], x: Array) -> Array:
+    """Derivative of a function of x by central differences, its last axis that of x."""
+    steps = STEP * np.eye(len(x))
+    return np.stack([(function(x + d) - function(x - d)) / (2.0 * STEP) for d in steps], axis=-1)
+
+
+@pytest.fixture
+def sensor(small: Small, tilted: dict[str, Any]) -> Any:
+    return small("herath2007-stereo", belief__sensor__mount=tilted).belief.sensor
+
+
+# --- geometry ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("i", range(len(Y)))
+def test_carrying_a_landmark_has_the_derivatives_it_says(sensor: Any, i: int) -> None:
+    R, t = plain.heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
+    _, J, _, _ = centred.carried(Y, R, t, sensor)
+    assert close(J[i], along(lambda y: centred.carried(y[None], R, t, sensor)[0][0], Y[i]))
+    assert not close(1.001 * J[i], along(lambda y: centred.carried(y[None], R, t, sensor)[0][0], Y[i]))
+
+
+def test_carrying_there_and_back_changes_nothing(sensor: Any) -> None:
+    R, t = plain.heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
+    there = centred.carried(Y, R, t, sensor)[0]
+    assert close(centred.carried(there, R.T, -R.T @ t, sensor)[0], Y, 1e-12)
+
+
+@pytest.mark.parametrize("y", Y)
+def test_a_parked_landmark_has_the_derivatives_it_says(small: Small, tilted: dict[str, Any], y: Array) -> None:
+    scenario = small("herath2007-stereo", belief__sensor__mount=tilted)
+    trial = cs.simulate(scenario)
+    clone, pose = np.array([1.0, -0.5, 0.4]), np.array([1.6, 0.3, -0.7])
+
+    def seen(y: Array, clone: Array, pose: Array) -> tuple[Array, Array, Array]:
+        state = rc.CentredState(pose, np.zeros((3, 3)), problem_of(trial, scenario.belief))
+        return rc._seen_from(state, clone, y)
+
+    _, J, by_shift = seen(y, clone, pose)
+    assert close(J, along(lambda y: seen(y, clone, pose)[0], y))
+    assert close(by_shift, along(lambda xi: seen(y, centred.moved(clone, xi), pose)[0], np.zeros(3)))
+    assert close(-by_shift, along(lambda xi: seen(y, clone, centred.moved(pose, xi))[0], np.zeros(3)))
+    assert not close(by_shift, 0.0 * by_shift, 1e-3)
+
+
+def test_the_left_jacobian_is_that_of_exp_up_to_the_third_order() -> None:
+    pose = np.array([1.0, -0.5, 0.4])
+    gaps = []
+    for size in (0.2, 0.1):
+        xi = size * np.array([0.8, -0.6, 0.5])
+        ahead = along(lambda error, xi=xi: centred.moved(pose, xi + error), np.zeros(3))
+        left = along(lambda error, xi=xi: centred.moved(centred.moved(pose, xi), error), np.zeros(3))
+        gaps.append(np.abs(ahead - left @ centred.left_jacobian(xi)).max())
+    assert gaps[0] < 1e-3
+    assert gaps[1] < gaps[0] / 6.0
+    assert close(
+        along(lambda error: centred.moved(pose, error), np.zeros(3)), np.linalg.inv(centred.shift_matrix(pose)), 1e-7
+    )
+
+
+# --- conversion ----------------------------------------------------------------------------------
+
+Z = np.array([[20.0, -35.0, 4.0], [-110.0, 60.0, 1.7], [5.0, 90.0, 12.0]])
+
+
+def test_the_conversion_is_the_inverse_of_the_image_and_has_the_derivatives_it_says(sensor: Any) -> None:
+    y, J = centred.converted(Z, sensor)
+    assert close(centred.imaged(y, sensor), Z, 1e-9)
+    for i in range(len(Z)):
+        assert close(J[i], along(lambda z: centred.converted(z[None], sensor)[0][0], Z[i]))
+        x = np.array([sensor.f * sensor.B / Z[i, 2]])
+        point = np.array([x[0], -x[0] * Z[i, 0] / sensor.f, -x[0] * Z[i, 1] / sensor.f])
+        assert y[i, 2] == pytest.approx(1.0 / np.linalg.norm(point))
+
+
+def test_the_bias_is_that_of_quadrature(sensor: Any) -> None:
+    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+    u, v = np.meshgrid(nodes * sensor.sigma[0], nodes * sensor.sigma[1], indexing="ij")
+    weight = np.outer(weights, weights).ravel() / (2.0 * np.pi)
+    steps = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=1)
+    said = centred.bias(Z, sensor)
+    for i in range(len(Z)):
+        values = centred.converted(Z[i] + steps, sensor)[0]
+        exact = weight @ values - centred.converted(Z[i][None], sensor)[0][0]
+        assert np.abs(said[i] - exact).max() < 0.01 * np.abs(exact).max()
+        assert np.abs(exact).max() > 1e-6
+
+
+@pytest.mark.parametrize("expected", [0.6, 1.0, 1.69, 5.0, 31.5])
+def test_a_disparity_freed_of_its_range_has_the_expected_mean_and_the_variance_it_says(expected: float) -> None:
+    low, high, sigma = 1.0, 32.0, 0.65
+    inside = truncnorm((low - expected) / sigma, (high - expected) / sigma, loc=expected, scale=sigma)
+    d = np.array([inside.mean()])
+    mean, variance = centred.untruncated(d, np.array([expected]), sigma, (low, high))
+    assert mean[0] == pytest.approx(expected)
+    slope = centred.untruncated(d + 1.0, np.array([expected]), sigma, (low, high))[0] - mean
+    assert variance[0] == pytest.approx(slope[0] ** 2 * inside.var())
+
+
+# --- kernel and twin -----------------------------------------------------------------------------
+
+CLOSING = {  # a lap in 150 steps: what was parked is seen again
+    "truth__path__radius": 1.2, "truth__steps": 320, "truth__sensor__range": (0.5, 3.0),
+    "truth__landmarks__x": (-4.0, 4.0), "truth__landmarks__y": (-4.0, 4.0), "truth__landmarks__count": 30,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("left_out", ["nothing", "parking", "turning", "truncation", "debiasing", "iteration"])
+def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any], left_out: str) -> None:
+    changes = {"truth__sensor__mount": tilted, "belief__sensor__mount": tilted}
+    scenario = small("herath2007-stereo", **CLOSING, **changes)
+    trial = cs.simulate(scenario, run=3)
+    which = centred.Corrections()._replace(**({} if left_out == "nothing" else {left_out: False}))
+    filter_ = rc.compiled(rc.RobotCentredKalman("trial", which))
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    assert ours.failure is None
+    assert twin.failure is None
+    size = np.abs(twin.covariance).max(axis=(1, 2), keepdims=True)
+    assert np.abs(ours.pose - twin.pose).max() < 1e-9
+    assert (np.abs(ours.covariance - twin.covariance) / size).max() < 1e-8
+    assert np.nanmax(np.abs(ours.nis - twin.nis) / np.maximum(twin.nis, 1.0)) < 1e-8
+    assert ours.map is not None
+    assert twin.map is not None
+    assert np.allclose(ours.map.mean, twin.map.mean, rtol=1e-7, atol=1e-9)
+    whole = rc.compiled(rc.RobotCentredKalman("trial", centred.Corrections())).run(trial, scenario.belief)
+    assert (left_out == "nothing") == bool(np.array_equal(ours.pose, whole.pose))  # each correction does something
+
+
+def test_landmarks_are_parked_and_come_back(small: Small) -> None:
+    scenario = small("herath2007-stereo", **CLOSING)
+    trial, filter_ = cs.simulate(scenario, run=3), rc.RobotCentredKalman("trial", centred.Corrections())
+    state = filter_.init(problem_of(trial, scenario.belief))
+    parked, back = set(), set()
+    for k in range(1, trial.steps + 1):
+        before = dict(state.parked)
+        state, _ = filter_.update(filter_.predict(state, trial.control(k)), trial.observation(k))
+        parked |= set(state.parked)
+        back |= set(before) - set(state.parked)
+        assert set(state.clones) == set(state.parked.values())
+        assert len(state.x) == 3 + 3 * (len(state.places) + len(state.clones))
+    assert len(parked) > 5
+    assert len(back) > 5
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+
+def test_a_belief_without_search_range_is_refused(small: Small) -> None:
+    scenario = small("herath2007-stereo", belief__sensor__disparity=None)
+    with pytest.raises(cs.InputError, match=r"'parked-ekf-uvd' needs key 'belief.sensor.disparity_px'"):
+        cs.run_trials(scenario, ["parked-ekf-uvd"], runs=1)
+
+
+def test_a_search_range_must_be_an_interval(small: Small) -> None:
+    with pytest.raises(ValueError, match=r"disparity must be \[low, high\] with low < high"):
+        small("herath2007-stereo", belief__sensor__disparity=(4.0, 4.0))
+
+
+def test_a_belief_without_search_range_has_the_hash_it_had(small: Small) -> None:
+    content = small("herath2007-stereo", belief__sensor__disparity=None).model_dump(mode="json")
+    assert "disparity" not in content["belief"]["sensor"]

@@ -1,11 +1,13 @@
 """What the plain twins have in common: SLAM as a textbook writes it, dense and in NumPy, for reading and as oracle.
 
 Herath, Kodagoda & Dissanayake (2007) eq. 1-13. Nothing is shared with the kernels but the models. Each twin is a
-class of its own in ``methods``, made of the functions here.
+class of its own in ``methods``, made of the functions here; those on world points with an additive error share
+:class:`WorldPointTwin`.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -204,6 +206,37 @@ def map_of(state: SlamState) -> dict[int, Gaussian]:
 def joint_of(state: SlamState) -> Gaussian:
     """Robot and landmarks together of a state whose error is additive."""
     return Gaussian(state.x, state.P)
+
+
+class WorldPointTwin(ABC):
+    """SLAM on points in the world with an additive error; a twin adds how it predicts and how it corrects."""
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def init(self, problem: Problem) -> SlamState:
+        return start(problem)
+
+    @abstractmethod
+    def predict(self, state: SlamState, control: Control) -> SlamState: ...
+
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        return update_jointly(state, observation, self.uvd, self._correct, self._locate)
+
+    @abstractmethod
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]: ...
+
+    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        return locate_point(state, z, self.uvd)
+
+    def pose(self, state: SlamState) -> Gaussian:
+        return pose_of(state)
+
+    def map(self, state: SlamState) -> dict[int, Gaussian]:
+        return map_of(state)
+
+    def joint(self, state: SlamState) -> Gaussian:
+        return joint_of(state)
 
 
 def require_landmarks(problem: Problem, name: str) -> Array:

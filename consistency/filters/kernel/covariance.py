@@ -15,6 +15,12 @@ from consistency.types import Array, Indices
 
 
 @inner
+def state_index(r: int, w: int, a: int, at: Indices) -> int:
+    """Index in the state of the a-th of some variables: the robot's, then those of the landmarks at ``at``."""
+    return a if a < r else at[(a - r) // w] + (a - r) % w
+
+
+@inner
 def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Array) -> None:
     """Whole rows of P: of the robot in rows 0..r-1, then of the ``m`` landmarks of ``w`` variables at ``at``."""
     copy_matrix(P[:r, :n], rows[:r, :n])

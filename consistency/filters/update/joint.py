@@ -27,7 +27,10 @@ def joint_room(update: Joint, r: int, w: int, m: int) -> NoRoom:
 
 
 @implement(predict, Joint)
-def predict_joint(update: Joint, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NoRoom]) -> None:
+def predict_by_error(
+    update: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    """Motion as the part ``error`` has it, for every update that linearises."""
     propagate(slam.error, slam, state, k, u, Phi, work)
 
 

@@ -82,7 +82,7 @@ class Bench:
         return T
 
     def expected(self, x: Array) -> Array:
-        linearise_seen.py_func(self.slam, self.state(x, self.n), 0, 2, self.work)  # type: ignore[attr-defined]
+        linearise_seen(self.slam, self.state(x, self.n), 0, 2, self.work)
         return self.work.zhat[:6].copy()
 
     def predicted(self, x: Array, u: Array, P: Array | None = None) -> Array:

@@ -200,9 +200,9 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
     __tracebackhide__ = True
     if sides.usable_runs < FEWEST:
         if sides.failed_more:
-            found = f"worse than {sides.name_b}: {sides.failures[0]} runs failed, of {sides.name_b} {sides.failures[1]}"
+            fault = f"worse than {sides.name_b}: {sides.failures[0]} runs failed, of {sides.name_b} {sides.failures[1]}"
             verdict = sides.candidate.judge(demand.false_alarm, demand)
-            raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [found]), verdict)
+            raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [fault]), verdict)
         raise InsufficientTrials(
             f"assert_not_worse: {sides.usable_runs} runs are too few for a standard error; simulate {FEWEST} at least",
             FEWEST,
@@ -282,7 +282,7 @@ def _entry(
     gate: str, candidate: Candidate, demand: Terms, result: _Look, late: _Look | None, outcome: str, least: int
 ) -> Entry:
     statistics = result.verdict.statistics if result.verdict is not None else {}
-    fields = _found(result)
+    fields = _summary(result)
     if (c := result.comparison) is not None:
         fields |= {key: _finite(getattr(c, key)) for key in ("distance", "standard_error")}
         spread = {key: getattr(c, key) for key in ("at_most", "sum_error", "reference")}
@@ -293,17 +293,17 @@ def _entry(
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
         runs=candidate.runs, needed=least, dof=candidate.planned_dof, detect=demand.detect, power=demand.power,
-        allow=demand.allow, late={} if late is None else _found(late), statistics=statistics, **fields,
+        allow=demand.allow, late={} if late is None else _summary(late), statistics=statistics, **fields,
     )  # fmt: skip
 
 
-def _found(look: _Look) -> dict[str, Any]:
-    found: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
+def _summary(look: _Look) -> dict[str, Any]:
+    summary: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
     if look.comparison is not None:
-        return found | {"statistic": _finite(look.comparison.differences[0].a)}
+        return summary | {"statistic": _finite(look.comparison.differences[0].a)}
     assert look.verdict is not None
     v = look.verdict
-    return found | {
+    return summary | {
         "statistic": _finite(v.statistic), "threshold": [_finite(x) for x in v.threshold],
         "inflation": _finite(v.inflation), "inflation_interval": [_finite(x) for x in v.inflation_interval],
         "first_step": v.first_step, "subset": v.subset, "faults": list(v.faults),

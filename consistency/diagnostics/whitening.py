@@ -90,5 +90,5 @@ def spread_steps(present: Array) -> Array:
     place = np.mod(0.5 + np.arange(runs) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0)
     rank = np.minimum((place * count).astype(int), np.maximum(count - 1, 0))
     nth = np.cumsum(present, axis=1) - 1
-    chosen = np.argmax(present & (nth == rank[:, None]), axis=1) if steps else np.zeros(runs, int)
-    return np.where(count > 0, chosen, -1)
+    step = np.argmax(present & (nth == rank[:, None]), axis=1) if steps else np.zeros(runs, int)
+    return np.where(count > 0, step, -1)

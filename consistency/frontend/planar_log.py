@@ -101,15 +101,15 @@ def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
         raise InputError(f"no match has a disparity of at least {NEAR:g} of its sigmas; the scene is too far for a log")
     rows = rows.assign(piece=np.cumsum((rows["piece"].diff() != 0) | (rows["step"].diff() != 1)))
 
-    def chosen(slots: int) -> pd.DataFrame:
+    def selection_of(slots: int) -> pd.DataFrame:
         return thinned(rows, Selection(slots, MAX_AGE, MIN_LIFE, BANDS, float(width)))
 
-    low, high, best = 1, MOST_SLOTS, chosen(1)
+    low, high, best = 1, MOST_SLOTS, selection_of(1)
     if (fewest := best["landmark"].nunique()) > most:
         raise InputError(f"--max-landmarks {most}: one landmark at once makes {fewest} over the sequence; allow more")
     while low < high:  # the largest number at once
         middle = (low + high + 1) // 2
-        table = chosen(middle)
+        table = selection_of(middle)
         if table["landmark"].nunique() <= most:
             low, best = middle, table
         else:

@@ -48,9 +48,9 @@ class Sides:
     def reasons(self, c: Comparison) -> list[str]:
         """A sentence, then each quantity of both."""
         anees = c.differences[0]
-        found = "worse" if c.worse or self.failed_more else "not worse"
+        outcome = "worse" if c.worse or self.failed_more else "not worse"
         lines = [
-            f"{found} than {self.name_b}: mean NEES {anees.a:.3g} against {anees.b:.3g}, {self.a.dof} expected; "
+            f"{outcome} than {self.name_b}: mean NEES {anees.a:.3g} against {anees.b:.3g}, {self.a.dof} expected; "
             f"its ratio to {self.a.dof} is {'farther from' if c.distance > 0 else 'nearer to'} 1 "
             f"by x{np.exp(abs(c.distance)):.3g} (p {c.p_value:.2g}, {c.runs} {'paired runs' if c.paired else 'runs'})"
         ]

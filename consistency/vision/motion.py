@@ -165,8 +165,8 @@ def motion_between(
         raise type(error)(f"{names[0]} to {names[1]}: {error}") from None
     if estimator == "reprojection" and estimate.chi2 > MISFIT * estimate.dof:
         raise ConsensusError(
-            f"{names[0]} to {names[1]}: chi2/dof of the inliers is {estimate.chi2 / estimate.dof:.1f} where 1 is right; "
-            "are the cameras swapped or badly calibrated, or is sigma_per_scale too small?"
+            f"{names[0]} to {names[1]}: chi2/dof of the inliers is {estimate.chi2 / estimate.dof:.1f} where 1 is "
+            "right; are the cameras swapped or badly calibrated, or is sigma_per_scale too small?"
         )
     return RelativeMotion(**vars(estimate), uv0=uv0, uv1=uv1, sigma0=sigma0, sigma1=sigma1, rows=rows)
 

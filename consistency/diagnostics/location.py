@@ -164,7 +164,7 @@ def shape_of(sample: Sample, tests: Tests, answers: Answers) -> Shape | None:
 
 
 def tails_of(tests: Tests, run_numbers: Indices | None) -> Tails:
-    """The error that stands out most, and the whole distribution."""
+    """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
     odd = tests.outlier
     if odd is None:
         return Tails(-1, 0, float("nan"), tests.pit.values, tests.pit.half_width)

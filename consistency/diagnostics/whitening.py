@@ -52,7 +52,7 @@ def standardise(error: Array, covariance: Array) -> Array:
 
 
 def subset(error: Array, covariance: Array, index: list[int]) -> Array:
-    """Whitened errors of a group of components, (runs, steps, len(index))."""
+    """Whitened errors of a group, (runs, steps, n) and (runs, steps, n, n) -> (runs, steps, len(index))."""
 
     def of_block(e: Array, P: Array) -> Array:
         e, P = e[..., index], P[..., index, :][..., index]

@@ -145,7 +145,7 @@ class _Rank:
         self.names, self.full = ("the pose covariance", f"the covariance of the error '{error}'"), False
 
     def require(self, covariances: list[Array]) -> None:
-        """Raise for what they must not be; the last one is of the filter's own error."""
+        """Raise for covariances (3, 3) that are not as they must be; the last one is of the filter's own error."""
         for name, P in zip(self.names, covariances, strict=False):
             if _asymmetric(P):
                 raise _Unusable(f"{name} is not symmetric")

@@ -120,7 +120,8 @@ def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
 def misfit(seen: pd.DataFrame, path: Array, mount: Mount, rig: StereoRig) -> tuple[float, float, float]:
     """Root mean square of u, v, d (px) about landmarks placed by their nearest sight along the planar path.
 
-    It holds the noise of the pixels and what the plane leaves out, roll and pitch above all. No truth is used.
+    ``path`` is (T + 1, 3). The misfit holds the noise of the pixels and what the plane leaves out, roll and pitch above
+    all. No truth is used.
     """
     f, B, packed = float(rig.K_left[0, 0]), rig.baseline, mount.packed()
     nearest = seen.loc[seen.groupby("landmark")["z2"].idxmax()].set_index("landmark")
@@ -139,7 +140,13 @@ def misfit(seen: pd.DataFrame, path: Array, mount: Mount, rig: StereoRig) -> tup
 
 
 def odometry_noise(motions: list[RelativeMotion], axes: Array, dt: Array) -> BelievedMotion:
-    """Noise of v and omega from the covariances of the motions, root mean square over the steps."""
+    """Noise of v and omega from the covariances of the motions, root mean square over the steps.
+
+    Parameters
+    ----------
+    axes : (3, 3), rows are forward, left and up of the robot in the camera's frame
+    dt : (T,), duration of each motion, s
+    """
     forward, up = axes[0], axes[2]
     along = [forward @ m.covariance[:3, :3] @ forward for m in motions]
     turn = [up @ angular(m.pose) for m in motions]

@@ -38,10 +38,10 @@ class Candidate:
     def failures(self) -> tuple[Failure, ...]:
         return self.evidence.failures
 
-    def judge(self, false_alarm: float, asked: Terms) -> Verdict:
+    def judge(self, false_alarm: float, terms: Terms) -> Verdict:
         """See :func:`consistency.diagnostics.judge`."""
         settings = Settings(
-            false_alarm, asked.detect, asked.power, asked.tolerance, asked.allow, self.method, self.subsets
+            false_alarm, terms.detect, terms.power, terms.tolerance, terms.allow, self.method, self.subsets
         )
         return judge(self.evidence, settings)
 
@@ -61,7 +61,11 @@ def evidence(
     method: str,
     optimal_gain: bool = False,
 ) -> Candidate:
-    """Checked arrays of one estimator; shapes and errors as :func:`consistency.testing.assert_consistent`."""
+    """Checked arrays of one estimator.
+
+    Shapes as in :func:`consistency.testing.assert_consistent`: errors (runs, steps, n), covariances (runs, steps, n,
+    n), NEES (runs, steps); so are the errors raised.
+    """
     arrays: dict[str, Any] = {"axes": axes}
     if (errors is None) != (covariances is None):
         there, missing = ("covariances", "errors") if errors is None else ("errors", "covariances")

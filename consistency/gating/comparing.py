@@ -75,7 +75,11 @@ def of_arrays(
     dof: int | None,
     axes: Sequence[str] | None,
 ) -> Sides:
-    """Both sides from arrays, row i of both the same trial; errors as :func:`consistency.testing.assert_not_worse`."""
+    """Both sides from arrays; row i of both is the same trial.
+
+    Shapes as in :func:`consistency.testing.assert_not_worse`: errors (runs, steps, n), covariances (runs, steps, n, n),
+    NEES (runs, steps); so are the errors raised.
+    """
     a, row_a = _side("candidate a", name, errors_a, covariances_a, nees_a, dof, axes)
     b, row_b = _side("reference b", name, errors_b, covariances_b, nees_b, dof, axes)
     if a.runs != b.runs:

@@ -70,7 +70,7 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
 
 
 def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
-    """All arrays of an archive; ``keys`` says in messages which it should hold.
+    """All arrays of an archive by key, of any shape; ``keys`` says in messages which it should hold.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def _require_truth(path: Path, truth: Array, estimates: Array) -> None:
 
 
 def run_lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> list[int]:
-    """Steps of each run; key ``lengths`` where they differ."""
+    """Steps of each run; those of the array ``lengths`` (runs,) where they differ."""
     if "lengths" not in arrays:
         return [steps] * runs
     lengths = np.atleast_1d(arrays["lengths"])

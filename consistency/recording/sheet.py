@@ -68,6 +68,7 @@ class Lines:
 
     @property
     def t(self) -> Array:
+        """First column, (N,), s."""
         return self.values[:, 0]
 
     def place(self, row: int) -> str:

@@ -113,7 +113,7 @@ def relative_motion(
 def stereo_features(
     rig: StereoRig, left: Array, right: Array, settings: Settings | None = None, name: str = "pair"
 ) -> StereoFeatures:
-    """Features and stereo matches of a pair of images: what a sequence keeps for the next motion.
+    """Features and stereo matches of a pair of images (h, w): what a sequence keeps for the next motion.
 
     Raises
     ------

@@ -23,7 +23,7 @@ class Rectification:
     maps: tuple[tuple[Array, Array], tuple[Array, Array]] | None  # left and right for cv2.remap; None: nothing to do
 
     def apply(self, left: Array, right: Array) -> tuple[Array, Array]:
-        """Raw images (h, w) to rectified ones of the same size, bilinear."""
+        """Raw images (h, w) of the left and right camera -> rectified ones of the same size, bilinear."""
         if self.maps is None:
             return left, right
         cv2 = opencv()

@@ -85,7 +85,7 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
 
 
 def matched(p1: Array, p2: Array) -> tuple[Array, Array]:
-    """Both clouds, checked: errors as :func:`register_svd`."""
+    """Both clouds as floats, (N, 3) and (N, 3), checked: errors as :func:`register_svd`."""
     p1, p2 = checks.rows("p1", p1, 3), checks.rows("p2", p2, 3)
     checks.same_length("p1, p2", p1, p2)
     if len(p1) < 3:

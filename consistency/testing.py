@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from consistency.diagnostics import Comparison, Verdict, gate_runs
 from consistency.diagnostics.comparison import FEWEST
-from consistency.gating.checks import Candidate, evidence, of_results
+from consistency.gating.checks import Arrays, Candidate, evidence, of_results
 from consistency.gating.comparing import Sides, of_arrays, of_filters
 from consistency.gating.watch import Entry, Terms, current, terms
 from consistency.gating.wording import fault_text, few_to_compare, undecided_text
@@ -114,10 +114,8 @@ def assert_consistent(
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
-        candidate = evidence(
-            name or "the estimator", cast(ArrayLike, errors), subsets=subsets, method=method,
-            optimal_gain=optimal_gain, **arrays,
-        )  # fmt: skip
+        unchecked = Arrays(cast(ArrayLike, errors), **arrays)
+        candidate = evidence(name or "the estimator", unchecked, subsets, method, optimal_gain)
 
     def look(rate: float) -> _Look:
         verdict = candidate.judge(rate, demand)
@@ -191,8 +189,10 @@ def assert_not_worse(
         if than is not None or reference is not None:
             raise ValueError("than and reference need results in place of errors_a")
         if nees_a is not None and dof is None:
-            arrays["dof"] = current().marked.get("dof")
-        sides = of_arrays(name or "the candidate", cast(ArrayLike, errors_a), **arrays)
+            dof = current().marked.get("dof")
+        a = Arrays(cast(ArrayLike, errors_a), covariances_a, nees_a, dof, axes=axes)
+        b = Arrays(errors_b, covariances_b, nees_b, dof, axes=axes)
+        sides = of_arrays(name or "the candidate", a, b)
     return _compare(sides, demand)
 
 
@@ -259,13 +259,10 @@ def _settle(
         verdict = result.verdict or candidate.judge(demand.false_alarm, demand)
         raise ConsistencyError(fault_text(gate, candidate.name, result.reasons), verdict, result.comparison)
     if few:
-        plan = demand.detect, demand.false_alarm, demand.power
         if result.verdict is None:
-            text = few_to_compare(gate, candidate.name, candidate.runs, least, *plan)
+            text = few_to_compare(gate, candidate.name, candidate.runs, least, demand)
         else:
-            text = undecided_text(
-                gate, candidate.name, result.reasons[0], least, candidate.planned_dof, *plan, demand.allow
-            )
+            text = undecided_text(gate, candidate.name, result.reasons[0], least, candidate.planned_dof, demand)
         raise InsufficientTrials(text, least, candidate.runs, result.verdict)
     return result
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from consistency.diagnostics import Comparison, RunSummary, compare, summary, whiten
-from consistency.gating.checks import Candidate, evidence, of_results
+from consistency.gating.checks import Arrays, Candidate, evidence, of_results
 
 if TYPE_CHECKING:
     from consistency.store.results import Results
@@ -64,42 +62,22 @@ class Sides:
         return lines
 
 
-def of_arrays(
-    name: str,
-    errors_a: ArrayLike | None,
-    covariances_a: ArrayLike | None,
-    errors_b: ArrayLike | None,
-    covariances_b: ArrayLike | None,
-    nees_a: ArrayLike | None,
-    nees_b: ArrayLike | None,
-    dof: int | None,
-    axes: Sequence[str] | None,
-) -> Sides:
-    """Both sides from arrays; row i of both is the same trial.
-
-    Shapes as in :func:`consistency.testing.assert_not_worse`: errors (runs, steps, n), covariances (runs, steps, n, n),
-    NEES (runs, steps); so are the errors raised.
-    """
-    a, row_a = _side("candidate a", name, errors_a, covariances_a, nees_a, dof, axes)
-    b, row_b = _side("reference b", name, errors_b, covariances_b, nees_b, dof, axes)
+def of_arrays(name: str, candidate: Arrays, reference: Arrays) -> Sides:
+    """Both sides from arrays, row i of both the same trial; errors as :func:`consistency.testing.assert_not_worse`."""
+    a, row_a = _side("candidate a", name, candidate)
+    b, row_b = _side("reference b", name, reference)
     if a.runs != b.runs:
         raise ValueError(f"the candidate has {a.runs} runs and the reference {b.runs}; row i of both must be one trial")
     if a.planned_dof != b.planned_dof:
         raise ValueError(f"the errors have {a.planned_dof} and {b.planned_dof} components")
-    return Sides(a, row_a, row_b, "the reference", None if axes is None else tuple(axes), paired=True)
+    return Sides(
+        a, row_a, row_b, "the reference", None if candidate.axes is None else tuple(candidate.axes), paired=True
+    )
 
 
-def _side(
-    side: str,
-    name: str,
-    errors: ArrayLike | None,
-    covariances: ArrayLike | None,
-    nees: ArrayLike | None,
-    dof: int | None,
-    axes: Sequence[str] | None,
-) -> tuple[Candidate, RunSummary]:
+def _side(side: str, name: str, arrays: Arrays) -> tuple[Candidate, RunSummary]:
     try:
-        case = evidence(name, errors, covariances, nees, dof, None, None, None, None, axes, None, "max")
+        case = evidence(name, arrays)
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
     e, P = case.evidence.error, case.evidence.covariance

@@ -200,7 +200,7 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
     __tracebackhide__ = True
     if sides.usable_runs < FEWEST:
         if sides.failed_more:
-            fault = f"worse than {sides.name_b}: {sides.failures[0]} runs failed, of {sides.name_b} {sides.failures[1]}"
+            fault = f"worse than {sides.name_b}: {sides.failures.a} runs failed, of {sides.name_b} {sides.failures.b}"
             verdict = sides.candidate.judge(demand.false_alarm, demand)
             raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [fault]), verdict)
         raise InsufficientTrials(

@@ -141,6 +141,7 @@ def trajectory_files(
     R, t, P = trajectory(motions)
     files = {"trajectory.tum": trajectory_text(sequence.t, R, t), "covariance.txt": covariance_text(sequence.t, P)}
     if truth is not None:
-        back = truth[0][0].T
-        files["truth.tum"] = trajectory_text(sequence.t, back @ truth[0], (truth[1] - truth[1][0]) @ back.T)
+        true_R, true_t = truth
+        back = true_R[0].T
+        files["truth.tum"] = trajectory_text(sequence.t, back @ true_R, (true_t - true_t[0]) @ back.T)
     return files

@@ -147,7 +147,7 @@ def odometry_noise(motions: list[RelativeMotion], axes: Array, dt: Array) -> Bel
     axes : (3, 3), rows are forward, left and up of the robot in the camera's frame
     dt : (T,), duration of each motion, s
     """
-    forward, up = axes[0], axes[2]
+    forward, _, up = axes
     along = [forward @ m.covariance[:3, :3] @ forward for m in motions]
     turn = [up @ angular(m.pose) for m in motions]
     about = [row @ m.covariance[3:, 3:] @ row for row, m in zip(turn, motions, strict=True)]

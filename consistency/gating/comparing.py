@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.diagnostics import Comparison, RunSummary, compare, summary, whiten
+from consistency.diagnostics.comparison import FailedRuns
 from consistency.gating.checks import Arrays, Candidate, evidence, of_results
 
 if TYPE_CHECKING:
     from consistency.store.results import Results
     from consistency.verdicts.comparison import Baseline
+
+
+NONE_FAILED = FailedRuns(0, 0)
 
 
 @dataclass(frozen=True)
@@ -26,12 +30,12 @@ class Sides:
     name_b: str
     axes: tuple[str, ...] | None
     paired: bool
-    failures: tuple[int, int] = (0, 0)
+    failures: FailedRuns = NONE_FAILED
 
     @property
     def failed_more(self) -> bool:
         """a has more failed runs than b on the same trials."""
-        return self.paired and self.failures[0] > self.failures[1]
+        return self.paired and self.failures.a > self.failures.b
 
     @property
     def usable_runs(self) -> int:
@@ -53,7 +57,7 @@ class Sides:
             f"by x{np.exp(abs(c.distance)):.3g} (p {c.p_value:.2g}, {c.runs} {'paired runs' if c.paired else 'runs'})"
         ]
         if self.failed_more:
-            lines.append(f"{self.failures[0]} runs failed, of {self.name_b} {self.failures[1]}")
+            lines.append(f"{self.failures.a} runs failed, of {self.name_b} {self.failures.b}")
         lines += [
             f"{d.name} {d.a:.4g} against {d.b:.4g}: {'difference' if 'coverage' in d.name else 'ratio'} "
             f"{d.difference:.3g} [{d.low:.3g}, {d.high:.3g}]"
@@ -119,5 +123,5 @@ def of_filters(
         raise ValueError(f"filter '{of_b}' is not in the reference; there are: {', '.join(old.filters)}")
     paired = old is new or (None not in new.origin and new.origin == old.origin)
     label = of_b if old is new else f"{of_b} in {old.name}"
-    failures = (new.failures[of_a], old.failures[of_b])
+    failures = FailedRuns(new.failures[of_a], old.failures[of_b])
     return Sides(candidate, new.filters[of_a], old.filters[of_b], label, tuple(POSE), paired, failures)

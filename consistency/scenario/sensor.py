@@ -166,8 +166,7 @@ class UvdSensor(TrueSensor, StereoSensor):
 
     @model_validator(mode="after")
     def _search_range(self) -> UvdSensor:
-        low, high = self.disparity
-        if low >= high:
+        if self.disparity[0] >= self.disparity[1]:
             raise ValueError("disparity must be [low, high] with low < high")
         return self
 

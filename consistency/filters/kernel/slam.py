@@ -260,7 +260,7 @@ def expands(point: NamedTuple) -> bool:
 
 @generic()
 def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
-    """Pose (r,) at which f of step k + 1 is linearised; ``pose`` (r,) is the estimate."""
+    """Pose (r,) at which f of step k + 1 is linearised."""
     raise NotImplementedError
 
 
@@ -272,7 +272,7 @@ def observation_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 @generic()
 def landmark_point(point: NamedTuple, values: Array, label: int) -> Array:
-    """Landmark (w,) at which h is linearised; ``values`` (w,) is the estimate of landmark ``label``."""
+    """Landmark (w,) at which h is linearised."""
     raise NotImplementedError
 
 
@@ -287,13 +287,13 @@ def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Ar
 
 @generic()
 def make_room(update: NamedTuple, r: int, w: int, m: int) -> NamedTuple:
-    """Arrays that this update needs for up to ``m`` landmarks in a step."""
+    """Arrays of this update for up to ``m`` landmarks in a step."""
     raise NotImplementedError
 
 
 @generic()
 def predict(update: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
-    """x (n,), P (n, n), Phi (n, base) <- one step of motion under the control ``u`` (3,), to step k + 1."""
+    """x, P, Phi <- one step of motion."""
     raise NotImplementedError
 
 
@@ -319,11 +319,11 @@ def make_local(covariance: NamedTuple, r: int, w: int, n: int) -> Factors:
 
 @generic()
 def prepare(covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
-    """The variables to work on in a step in which the landmarks ``labels`` (m,) are seen: all, or the active part."""
+    """The variables that a step works on in which ``labels`` are seen."""
     raise NotImplementedError
 
 
 @generic()
 def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: Factors) -> None:
-    """``whole`` <- all variables as they are after the steps so far, the passive ones included."""
+    """``whole`` <- what is known of all variables."""
     raise NotImplementedError

@@ -45,7 +45,6 @@ def observation_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
 
 @implement(landmark_point, AtEstimate)
 def landmark_at_estimate(point: AtEstimate, values: Array, label: int) -> Array:
-    """The estimate ``values`` (w,)."""
     return values
 
 

@@ -52,7 +52,6 @@ def observation_at_reference(point: Reference, pose: Array, k: int) -> Array:
 
 @implement(landmark_point, Reference)
 def landmark_at_reference(point: Reference, values: Array, label: int) -> Array:
-    """Reference (w,) of landmark ``label``."""
     return point.landmarks[label]
 
 

@@ -40,14 +40,16 @@ def unicycle_width(motion: Unicycle) -> int:
 @implement(move, Unicycle)
 def move_unicycle(motion: Unicycle, pose: Array, u: Array, out: Array) -> None:
     """out (3,) <- eq. 18 without noise, Euler, at the heading before the step."""
-    out[0], out[1], out[2] = unicycle(pose[0], pose[1], pose[2], u[0], u[1], u[2])
+    dt, v, omega = u[0], u[1], u[2]
+    out[0], out[1], out[2] = unicycle(pose[0], pose[1], pose[2], dt, v, omega)
 
 
 @implement(move_about, Unicycle)
 def move_unicycle_about(motion: Unicycle, at: Array, u: Array, pose: Array) -> None:
     """pose (3,) <- eq. 18 to first order about ``at`` (3,)."""
-    fx, fy = unicycle_jacobian(at[2], u[0], u[1])
-    x, y, heading = unicycle(at[0], at[1], at[2], u[0], u[1], u[2])
+    dt, v, omega = u[0], u[1], u[2]
+    fx, fy = unicycle_jacobian(at[2], dt, v)
+    x, y, heading = unicycle(at[0], at[1], at[2], dt, v, omega)
     turn = pose[2] - at[2]
     pose[0] = x + (pose[0] - at[0]) + fx * turn
     pose[1] = y + (pose[1] - at[1]) + fy * turn
@@ -77,7 +79,8 @@ def _move_rows(P: Array, n: int, fx: float, fy: float) -> None:
 @implement(add_motion_noise, Unicycle)
 def add_unicycle_noise(motion: Unicycle, at: Array, u: Array, P: Array) -> None:
     """P[:3, :3] += G diag(sigma_v^2, sigma_omega^2) G' with G (3, 2)."""
-    xx, xy, yy, hh = unicycle_noise(at[2], u[0], motion.sigma_v, motion.sigma_omega)
+    dt = u[0]
+    xx, xy, yy, hh = unicycle_noise(at[2], dt, motion.sigma_v, motion.sigma_omega)
     P[0, 0] += xx
     P[0, 1] += xy
     P[1, 0] += xy
@@ -88,8 +91,9 @@ def add_unicycle_noise(motion: Unicycle, at: Array, u: Array, P: Array) -> None:
 @implement(noise_columns, Unicycle)
 def unicycle_noise_columns(motion: Unicycle, at: Array, u: Array, G: Array) -> int:
     """G[:, :2] <- dt sigma_v along the heading ``at`` and dt sigma_omega in heading; returns 2."""
-    along, turn = u[0] * motion.sigma_v, u[0] * motion.sigma_omega
-    G[0, 0], G[1, 0], G[2, 0] = along * np.cos(at[2]), along * np.sin(at[2]), 0.0
+    dt, heading = u[0], at[2]
+    along, turn = dt * motion.sigma_v, dt * motion.sigma_omega
+    G[0, 0], G[1, 0], G[2, 0] = along * np.cos(heading), along * np.sin(heading), 0.0
     G[0, 1], G[1, 1], G[2, 1] = 0.0, 0.0, turn
     return 2
 

@@ -79,13 +79,13 @@ class PointSensor:
         self.turn = np.reshape(self.mount[3:], (3, 3))  # sensor axes in the robot frame
 
     def measure(self, pose: Array, landmark: Array) -> Array:
-        """h: landmarks (..., 3) seen from poses (..., 3)."""
+        """h: observations (..., 3) of landmarks (..., 3), m, from poses (..., 3)."""
         body = point.to_robot(*np.moveaxis(pose, -1, 0), *np.moveaxis(landmark, -1, 0))
         x, y, z = point.to_sensor(*body, self.mount)
         return np.stack(stereo.project(x, y, z, self.f, self.B) if self.uvd else (x, y, z), axis=-1)
 
     def jacobians(self, pose: Array, landmark: Array) -> tuple[Array, Array]:
-        """dh/d pose and dh/d landmark, each (3, 3)."""
+        """Derivatives of h by the pose (3,) and by the landmark (3,), each (3, 3)."""
         body = point.to_robot(*pose, *landmark)
         c = point.to_sensor(*body, self.mount)
         J = np.reshape(stereo.project_jacobian(*c, self.f, self.B), (3, 3)) if self.uvd else np.eye(3)
@@ -94,7 +94,7 @@ class PointSensor:
         return J @ self.turn.T @ d_body, J @ self.turn.T @ world_to_robot
 
     def locate(self, pose: Array, z: Array) -> tuple[Array, Array, Array]:
-        """Landmark (3,) from one observation, with its Jacobians with respect to pose and z."""
+        """Landmark (3,) in m from one observation z (3,) at ``pose`` (3,), with its Jacobians (3, 3) by pose and z."""
         c, J = z, np.eye(3)
         if self.uvd:
             u, v, d = z
@@ -120,7 +120,7 @@ def process_noise(G: Array, belief: Belief) -> Array:
 
 
 def predict_extended(state: SlamState, control: Control) -> SlamState:
-    """Eq. 9 and 10, Jacobians at the estimate."""
+    """Eq. 9 and 10 with Jacobians at the estimate: the mean moves by f, P <- F P F' + G Q G'."""
     robot, x, F = Unicycle(), state.x.copy(), np.eye(len(state.x))
     F[:3, :3], G = robot.jacobians(x[:3], control)
     x[:3] = robot.move(x[:3], control)
@@ -159,7 +159,7 @@ def update_jointly(
 
 
 def augment(state: SlamState, label: int, placed: tuple[Array, Array, Array], R: Array) -> SlamState:
-    """The state with a new landmark and its full cross-covariance."""
+    """The state with a new landmark (w,), its Jacobians (w, 3) by pose and z, and full cross-covariance; R (3, 3)."""
     landmark, Jp, Jz = placed
     n, w = len(state.x), len(landmark)
     J = np.zeros((n + w, n))
@@ -182,29 +182,29 @@ def expect(state: SlamState, seen: list[int], uvd: bool) -> tuple[Array, Array]:
 
 
 def gain(P: Array, H: Array, R: Array) -> tuple[Array, Array]:
-    """S (k, k) and the gain (n, k), eq. 11 and 12."""
+    """S = H P H' + R (k, k) and the gain P H' S^-1 (n, k), eq. 11 and 12; P (n, n), H (k, n)."""
     S = H @ P @ H.T + R
     return S, np.linalg.solve(S, H @ P).T
 
 
 def locate_point(state: SlamState, z: Array, uvd: bool) -> tuple[Array, Array, Array]:
-    """A landmark (3,) as a point in the world, by eq. 21 from the estimated pose, and its Jacobians."""
+    """A landmark (3,) as a point in the world, m, by eq. 21 from the estimated pose; Jacobians (3, 3) by pose and z."""
     return PointSensor(state.problem.belief.sensor, uvd).locate(state.x[:3], z)
 
 
 def pose_of(state: SlamState) -> Gaussian:
-    """Pose of a state whose error is additive."""
+    """Pose (3,) and covariance (3, 3) of a state whose error is additive."""
     return Gaussian(state.x[:3], state.P[:3, :3])
 
 
 def map_of(state: SlamState) -> dict[int, Gaussian]:
-    """Landmarks by label of a state of world points whose error is additive, m."""
+    """Landmarks (3,) by label, m, with covariance (3, 3), of a state of world points whose error is additive."""
     blocks = {label: slice(state.at(label), state.at(label) + 3) for label in state.landmarks}
     return {label: Gaussian(state.x[at], state.P[at, at]) for label, at in blocks.items()}
 
 
 def joint_of(state: SlamState) -> Gaussian:
-    """Robot and landmarks together of a state whose error is additive."""
+    """Robot and landmarks together, (n,) and (n, n), of a state whose error is additive."""
     return Gaussian(state.x, state.P)
 
 

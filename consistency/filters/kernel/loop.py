@@ -110,6 +110,7 @@ def _step(
 
 @inner
 def _most_seen(first: Indices) -> int:
+    """The most landmarks seen in a step, of first (T + 1,)."""
     most = 0
     for k in range(len(first) - 1):
         most = max(most, first[k + 1] - first[k])
@@ -157,6 +158,7 @@ def _make_memory(size: int, n_landmarks: int) -> Memory:
 
 @inner
 def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
+    """Outcome of T steps, NaN everywhere."""
     return Outcome(
         np.full((T, r), np.nan),
         np.full((T, r, r), np.nan),
@@ -196,6 +198,7 @@ def _settle_new(labels: Indices, n: int, w: int, home: Indices) -> int:
 
 @inner
 def _forget_pose(k: int, out: Outcome) -> None:
+    """NaN in the rows of step k + 1."""
     fill(out.pose[k], np.nan)
     fill_matrix(out.covariance[k], np.nan)
     fill_matrix(out.own[k], np.nan)

@@ -87,7 +87,7 @@ def correct_iterated(
 
 @inner
 def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[PriorRoom]) -> None:
-    """y <- z - h(x) - H (prior - x)."""
+    """y (3 m,) <- z - h(x) - H (prior - x)."""
     x, prior = state.x, work.room.prior
     for i in range(m):
         o = work.at[i]

@@ -74,7 +74,7 @@ def sigma_points(x: Array, P: Array, involved: Array, belief: Belief) -> tuple[A
 
 
 def ordered_root(P: Array, first: Array) -> Array:
-    """Root C with C C' = P, lower triangular once the variables ``first`` are put first."""
+    """Root C (n, n) with C C' = P (n, n), lower triangular once the variables ``first`` (L,) are put first."""
     order = np.concatenate([first, np.setdiff1d(np.arange(len(P)), first)])
     root = np.empty_like(P)
     root[order] = square_root(P[np.ix_(order, order)])
@@ -82,7 +82,7 @@ def ordered_root(P: Array, first: Array) -> Array:
 
 
 def square_root(P: Array) -> Array:
-    """Lower C with C C' = P for a positive semidefinite P; where a pivot vanishes so does its column.
+    """Lower C (n, n) with C C' = P (n, n), positive semidefinite; where a pivot vanishes so does its column.
 
     Raises
     ------

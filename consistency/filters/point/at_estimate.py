@@ -27,16 +27,19 @@ class AtEstimate(NamedTuple):
 
 @implement(expands, AtEstimate)
 def estimate_is_not_expanded(point: AtEstimate) -> bool:
+    """False: f and h are evaluated at the estimate itself."""
     return False
 
 
 @implement(motion_point, AtEstimate)
 def motion_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), before the step."""
     return pose
 
 
 @implement(observation_point, AtEstimate)
 def observation_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), after the prediction."""
     return pose
 
 
@@ -49,4 +52,5 @@ def landmark_at_estimate(point: AtEstimate, values: Array, label: int) -> Array:
 def place_at_estimate(
     point: AtEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
+    """x[n:n + w] <- the inverse of h at the estimated pose, with its Jacobians."""
     place_observed(slam, state.x[: robot_width(slam.motion)], z, state.x[state.n :], work)

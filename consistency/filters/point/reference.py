@@ -34,16 +34,19 @@ class Reference(NamedTuple):
 
 @implement(expands, Reference)
 def reference_is_expanded(point: Reference) -> bool:
+    """True: f and h are affine functions."""
     return True
 
 
 @implement(motion_point, Reference)
 def motion_at_reference(point: Reference, pose: Array, k: int) -> Array:
+    """Reference pose (r,) of step k, before the step."""
     return point.path[k]
 
 
 @implement(observation_point, Reference)
 def observation_at_reference(point: Reference, pose: Array, k: int) -> Array:
+    """Reference pose (r,) of step k + 1."""
     return point.path[k + 1]
 
 
@@ -56,6 +59,7 @@ def landmark_at_reference(point: Reference, values: Array, label: int) -> Array:
 def place_about_reference(
     point: Reference, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
+    """x[n:n + w] <- the landmark that solves the expanded h for z (3,), where w = 3; Jz = Hl^-1 and Jp = -Hl^-1 Hp."""
     pose, landmark, n = point.path[k + 1], point.landmarks[label], state.n
     r = robot_width(slam.motion)
     z0, Hp, Hl = np.empty(3), np.empty((3, r)), np.empty((3, len(landmark)))

@@ -38,6 +38,7 @@ def predict_by_error(
 def correct_joint(
     update: Joint, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NoRoom]
 ) -> tuple[int, float]:
+    """One update with Jacobians at the prediction, eq. 11-13."""
     gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)
     combine_seen(slam, state, m, work)

@@ -22,9 +22,10 @@ def make_no_factors(covariance: Dense, r: int, w: int, n: int) -> Factors:
 
 @implement(prepare, Dense)
 def prepare_all(covariance: Dense, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+    """The state as it is."""
     return state
 
 
 @implement(settle, Dense)
 def settle_nothing(covariance: Dense, slam: Slam, whole: State, state: State, local: Factors) -> None:
-    pass
+    """Nothing to do: every step has worked on the whole state."""

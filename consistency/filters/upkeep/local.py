@@ -69,6 +69,7 @@ def make_local_factors(covariance: Local, r: int, w: int, n: int) -> Factors:
 
 @implement(prepare, Local)
 def prepare_active(covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+    """The active part that a step works on, settled first where that is due, and split where it begins."""
     r, w, home, offset = robot_width(slam.motion), landmark_width(slam.landmark), whole.offset, state.offset
     x, P, n, b = state.x, state.P, state.n, state.base
     if b > 0 and is_due(whole.n, n, b, w * len(labels), local):
@@ -89,12 +90,14 @@ def prepare_active(covariance: Local, slam: Slam, whole: State, state: State, la
 
 @implement(settle, Local)
 def settle_active(covariance: Local, slam: Slam, whole: State, state: State, local: Factors) -> None:
+    """``whole`` <- what the active part and the factors say, if there is an active part."""
     if state.base > 0:
         join(slam, whole, state.n, state.base, local)
 
 
 @inner
 def _entry(P: Array, i: int, j: int) -> float:
+    """P[i, j] of P (n, n) whose upper half is valid."""
     return P[i, j] if i <= j else P[j, i]
 
 

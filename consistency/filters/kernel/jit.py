@@ -13,14 +13,14 @@ from typing import Any
 import numba
 from filelock import FileLock
 
-from consistency.filters.kernel.dispatch import INNER, OPTIONS, PACKAGE, Function, outside_files
+from consistency.filters.kernel.dispatch import OPTIONS, PACKAGE, Function, outside_files
 
 MARK = "compiled"  # a file beside what is kept
 
 
 def inner(function: Function) -> Function:
-    """Decorator of a function that other kernels call."""
-    compiled: Any = numba.njit(**INNER)(function)
+    """Decorator of a function that other kernels call, and Python too: tests do."""
+    compiled: Any = numba.njit(no_cfunc_wrapper=True, **OPTIONS)(function)
     return compiled
 
 

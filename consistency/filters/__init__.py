@@ -23,6 +23,8 @@ MODULES = {
     "iekf-uvd": ("methods.iekf", "UVD"),
     "ri-ekf-xyz": ("methods.riekf", "XYZ"),
     "ri-ekf-uvd": ("methods.riekf", "UVD"),
+    "fej-ekf-xyz": ("methods.fej", "XYZ"),
+    "fej-ekf-uvd": ("methods.fej", "UVD"),
     "anchored-ekf-xyz": ("methods.anchored", "XYZ"),
     "anchored-ekf-uvd": ("methods.anchored", "UVD"),
     "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ"),

@@ -19,7 +19,16 @@ from consistency.filters import filter_names, plain
 from consistency.filters.compiled import Compiled, problem_of
 from consistency.filters.kernel.dispatch import require_fitting
 from consistency.filters.kernel.gain import linearise_seen
-from consistency.filters.kernel.slam import Slam, State, insert_error, landmark_width, place, propagate, retract
+from consistency.filters.kernel.slam import (
+    Slam,
+    State,
+    insert_error,
+    landmark_width,
+    place,
+    propagate,
+    retract,
+    stands_apart,
+)
 from consistency.filters.kernel.work import make_work
 from consistency.filters.motion.unicycle import Unicycle
 from consistency.filters.plain import SlamState
@@ -50,7 +59,7 @@ class Bench:
         self.slam: Slam = filter_.parts(problem, np.array(trial.controls))
         self.w, self.n = landmark_width(self.slam.landmark), 3 + 2 * landmark_width(self.slam.landmark)
         self.labels, self.z, self.u = trial.landmark[:3], trial.z[:3], np.array(trial.controls[0])
-        self.work = make_work(self.slam, self.n + self.w, 3)
+        self.work = make_work(self.slam, self.n + self.w, 3, 1, trial.n_landmarks)
         self.work.label[:2], self.work.at[:2] = self.labels[:2], [3, 3 + self.w]
         self.x = np.concatenate([trial.start + np.array([0.3, -0.2, 0.1]), np.zeros(3 * self.w)])
         for i in range(2):
@@ -60,7 +69,14 @@ class Bench:
         return State(x, np.zeros((len(x), len(x))) if P is None else P, n, 0, np.zeros(200, int))
 
     def place(self, x: Array, n: int, i: int, z: Array) -> None:
+        self.stand(x, x)
         place(self.slam.point, self.slam, self.state(x, n), 0, int(self.labels[i]), z, self.work)
+
+    def stand(self, before: Array, after: Array) -> None:
+        """A point that is not the estimate is put there, so that finite differences are the Jacobians at it."""
+        if stands_apart(self.slam.point):
+            path = self.work.notes.path
+            path[0], path[1] = before[: path.shape[1]], after[: path.shape[1]]
 
     def moved(self, x: Array, n: int, error: Array) -> Array:
         """x with an error of its first n variables."""

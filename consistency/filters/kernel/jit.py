@@ -15,12 +15,13 @@ from filelock import FileLock
 
 from consistency.filters.kernel.dispatch import OPTIONS, PACKAGE, Function, outside_files
 
+CALLED: dict[str, Any] = OPTIONS | {"no_cfunc_wrapper": True}
 MARK = "compiled"  # a file beside what is kept
 
 
 def inner(function: Function) -> Function:
     """Decorator of a function that other kernels call, and Python too: tests do."""
-    compiled: Any = numba.njit(no_cfunc_wrapper=True, **OPTIONS)(function)
+    compiled: Any = numba.njit(**CALLED)(function)
     return compiled
 
 

@@ -25,6 +25,8 @@ MODULES = {
     "ri-ekf-uvd": ("methods.riekf", "UVD"),
     "fej-ekf-xyz": ("methods.fej", "XYZ"),
     "fej-ekf-uvd": ("methods.fej", "UVD"),
+    "ideal-ekf-xyz": ("methods.ideal", "XYZ"),
+    "ideal-ekf-uvd": ("methods.ideal", "UVD"),
     "anchored-ekf-xyz": ("methods.anchored", "XYZ"),
     "anchored-ekf-uvd": ("methods.anchored", "UVD"),
     "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ"),
@@ -32,6 +34,7 @@ MODULES = {
     "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ"),
     "filterpy-ukf-uvd": ("external.filterpy", "UKF_UVD"),
 }
+BOUNDS = frozenset({"ideal-ekf-xyz", "ideal-ekf-uvd"})  # told the truth: ``realisable`` of these is False
 
 
 def filter_names() -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters.compiled import problem_of
+from consistency.filters.compiled import problem_for
 from consistency.filters.plain import SlamState
 from consistency.types import Array, Control, Observation, Trial
 
@@ -59,7 +59,7 @@ def split(state: Any, observation: Observation) -> tuple[Observation, Observatio
 
 def observability_matrix(twin: Any, trial: Trial, belief: Any) -> Array:
     """M over all landmarks of the trial, a row for each number that was observed."""
-    state, Phi, blocks = twin.init(problem_of(trial, belief)), np.eye(3), []
+    state, Phi, blocks = twin.init(problem_for(twin, trial, belief)), np.eye(3), []
     for k in range(1, trial.steps + 1):
         Phi = motion_jacobian(twin, state, trial.control(k)) @ Phi
         state = twin.predict(state, trial.control(k))
@@ -86,7 +86,7 @@ def unobserved(name: str, scenario: cs.Scenario) -> int:
     return int(zero.sum())
 
 
-@pytest.mark.parametrize(("method", "directions"), [("ekf", 2), ("fej-ekf", 3)])
+@pytest.mark.parametrize(("method", "directions"), [("ekf", 2), ("fej-ekf", 3), ("ideal-ekf", 3)])
 @pytest.mark.parametrize("sensor", ["xyz", "uvd"])
 def test_unobserved_directions(small: Small, tilted: dict[str, Any], method: str, sensor: str, directions: int) -> None:
     """Three where the filter is a remedy; the EKF believes that it sees the heading."""

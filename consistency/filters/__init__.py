@@ -25,6 +25,8 @@ MODULES = {
     "ri-ekf-uvd": ("methods.riekf", "UVD"),
     "fej-ekf-xyz": ("methods.fej", "XYZ"),
     "fej-ekf-uvd": ("methods.fej", "UVD"),
+    "oc-ekf-xyz": ("methods.oc", "XYZ"),
+    "oc-ekf-uvd": ("methods.oc", "UVD"),
     "ideal-ekf-xyz": ("methods.ideal", "XYZ"),
     "ideal-ekf-uvd": ("methods.ideal", "UVD"),
     "anchored-ekf-xyz": ("methods.anchored", "XYZ"),

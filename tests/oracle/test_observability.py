@@ -86,7 +86,7 @@ def unobserved(name: str, scenario: cs.Scenario) -> int:
     return int(zero.sum())
 
 
-@pytest.mark.parametrize(("method", "directions"), [("ekf", 2), ("fej-ekf", 3), ("ideal-ekf", 3)])
+@pytest.mark.parametrize(("method", "directions"), [("ekf", 2), ("fej-ekf", 3), ("oc-ekf", 3), ("ideal-ekf", 3)])
 @pytest.mark.parametrize("sensor", ["xyz", "uvd"])
 def test_unobserved_directions(small: Small, tilted: dict[str, Any], method: str, sensor: str, directions: int) -> None:
     """Three where the filter is a remedy; the EKF believes that it sees the heading."""

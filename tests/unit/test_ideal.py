@@ -22,7 +22,7 @@ def test_only_the_ideal_filters_are_marked() -> None:
 
 def test_no_other_filter_is_told_the_truth(uvd: cs.Scenario) -> None:
     trial = cs.simulate(uvd)
-    for name in ("ekf-uvd", "fej-ekf-uvd"):
+    for name in ("ekf-uvd", "fej-ekf-uvd", "oc-ekf-uvd"):
         assert problem_for(cs.get_filter(name), trial, uvd.belief) == problem_of(trial, uvd.belief)
     told = problem_for(cs.get_filter("ideal-ekf-uvd"), trial, uvd.belief).truth
     assert told is not None

@@ -113,6 +113,11 @@ def heading_matrix(heading: float) -> Array:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
+def quarter_turn(v: Array) -> Array:
+    """J v of a vector (2,) in the plane: by how much a small turn moves its tip."""
+    return np.array([-v[1], v[0]])
+
+
 def process_noise(G: Array, belief: Belief) -> Array:
     """G Q G' with Q = diag(sigma_v^2, sigma_omega^2), shape (3, 3)."""
     Q = np.diag(np.square([belief.motion.sigma_v, belief.motion.sigma_omega]))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.filters.compiled import problem_of
+from consistency.filters.compiled import problem_for
 from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 from consistency.protocols import Filter, WholeTrial
@@ -78,7 +78,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
     Raises
     ------
     InputError
-        The filter's error is no convention, or nothing gives its covariance.
+        The filter's error is no convention, or nothing gives its covariance; it needs the truth and there is none.
     """
     T, name, error = trial.steps, name_of(filter_), error_of(filter_)
     pose, covariance = np.full((T, 3), np.nan), np.full((T, 3, 3), np.nan)
@@ -87,11 +87,12 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
     rank = _Rank(error)
     reason, step, map_ = "", 0, None
     started = time.monotonic()
+    problem = problem_for(filter_, trial, belief)
     state: Any = None
     for step in range(1, T + 1):
         try:
             if step == 1:
-                state = filter_.init(problem_of(trial, belief))
+                state = filter_.init(problem)
             state = filter_.predict(state, trial.control(step))
             state, info = _state_and_info(filter_.update(state, trial.observation(step)))
             mean, covariances = _pose_and_covariances(filter_, state, error)

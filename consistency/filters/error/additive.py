@@ -11,7 +11,7 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     add_motion_noise,
-    carry,
+    carry_at,
     expands,
     insert_error,
     motion_point,
@@ -39,7 +39,7 @@ def propagate_additive(
     """One step of motion, eq. 9 and 10: x <- f(x) and P <- F P F' + G Q G' in the robot's rows."""
     pose = state.x[: robot_width(slam.motion)]
     at = motion_point(slam.point, pose, k)
-    carry(slam.motion, at, u, state.P, state.n, Phi, state.base)
+    carry_at(slam.point, slam, state, k, u, Phi, work)
     add_motion_noise(slam.motion, at, u, state.P)
     if expands(slam.point):
         move_about(slam.motion, at, u, pose)

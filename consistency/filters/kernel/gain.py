@@ -56,7 +56,7 @@ def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTup
     for i in range(m):
         o, expected = work.at[i], work.zhat[OBSERVED * i : OBSERVED * i + OBSERVED]
         values = state.x[o : o + w]
-        linearise(slam, pose, values, k, work.label[i], expected, work.Hp[i], work.Hl[i])
+        linearise(slam, pose, values, k, work.label[i], expected, work.Hp[i], work.Hl[i], work)
         to_error(slam.error, pose, values, work.Hp[i], work.Hl[i])
 
 

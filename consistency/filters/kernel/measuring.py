@@ -21,6 +21,7 @@ from consistency.filters.kernel.slam import (
     observation_point,
     pull_back,
     robot_frame,
+    stands_apart,
 )
 from consistency.filters.kernel.work import Work
 from consistency.models import point
@@ -54,14 +55,18 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
 
 
 @inner
-def linearise(slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array) -> None:
+def linearise(
+    slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array, work: Work[NamedTuple]
+) -> None:
     """z (3,) <- h expected of (pose, values) in step k + 1; Hp (3, r), Hl (3, w) <- Jacobians at the chosen point."""
-    at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label)
+    at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label, work)
     linearise_at(slam, robot_frame(slam.motion, at), landmark, z, Hp, Hl)
     if expands(slam.point):
         for i in range(OBSERVED):
             for j in range(len(pose)):
                 z[i] += Hp[i, j] * (pose[j] - at[j]) + Hl[i, j] * (values[j] - landmark[j])
+    if stands_apart(slam.point):
+        observe(slam, robot_frame(slam.motion, pose), values, z)
 
 
 @inner

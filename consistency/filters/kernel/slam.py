@@ -104,6 +104,12 @@ def carry(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array,
 
 
 @generic()
+def carry_by(motion: NamedTuple, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
+    """As :func:`carry`, with F the Jacobian of a motion that displaces the robot by (dx, dy) in the world, m."""
+    raise NotImplementedError
+
+
+@generic()
 def add_motion_noise(motion: NamedTuple, at: Array, u: Array, P: Array) -> None:
     """P[:r, :r] += G Q G', with G the Jacobian of f by the noise at ``at`` (r,) under the control ``u`` (3,)."""
     raise NotImplementedError
@@ -259,8 +265,26 @@ def expands(point: NamedTuple) -> bool:
 
 
 @generic()
+def stands_apart(point: NamedTuple) -> bool:
+    """Whether only the Jacobians are taken at the point, f and h at the estimate; a constant."""
+    raise NotImplementedError
+
+
+@generic()
+def make_notes(point: NamedTuple, r: int, w: int, steps: int, labels: int) -> NamedTuple:
+    """What the point remembers of a trial of so many steps and ids of landmarks, ``work.notes``; made once."""
+    raise NotImplementedError
+
+
+@generic()
 def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
-    """Pose (r,) at which f of step k + 1 is linearised."""
+    """Pose (r,) at which the noise of step k + 1 acts, and about which f is expanded where the point expands."""
+    raise NotImplementedError
+
+
+@generic()
+def carry_at(point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
+    """P <- F P F' and Phi <- F Phi as :func:`carry`, F of step k + 1 as the point asks; called before x moves."""
     raise NotImplementedError
 
 
@@ -271,7 +295,7 @@ def observation_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 
 @generic()
-def landmark_point(point: NamedTuple, values: Array, label: int) -> Array:
+def landmark_point(point: NamedTuple, values: Array, label: int, work: NamedTuple) -> Array:
     """Landmark (w,) at which h is linearised."""
     raise NotImplementedError
 

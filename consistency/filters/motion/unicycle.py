@@ -12,6 +12,7 @@ from consistency.filters.kernel.slam import (
     Frame,
     add_motion_noise,
     carry,
+    carry_by,
     carry_root,
     move,
     move_about,
@@ -60,6 +61,17 @@ def move_unicycle_about(motion: Unicycle, at: Array, u: Array, pose: Array) -> N
 def carry_unicycle(motion: Unicycle, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
     """P (n, n) <- F P F' and Phi (n, base) <- F Phi, where F (3, 3) is the identity but for its last column."""
     fx, fy = unicycle_jacobian(at[2], u[0], u[1])
+    _carry(P, n, Phi, base, fx, fy)
+
+
+@implement(carry_by, Unicycle)
+def carry_unicycle_by(motion: Unicycle, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
+    _carry(P, n, Phi, base, -dy, dx)
+
+
+@inner
+def _carry(P: Array, n: int, Phi: Array, base: int, fx: float, fy: float) -> None:
+    """P <- F P F' and Phi <- F Phi, F the identity but for F[0, 2] = fx and F[1, 2] = fy."""
     _move_rows(P, n, fx, fy)
     for i in range(3):
         P[i, 0] += fx * P[i, 2]

@@ -9,14 +9,18 @@ from consistency.filters.kernel.measuring import place_observed
 from consistency.filters.kernel.slam import (
     Slam,
     State,
+    carry,
+    carry_at,
     expands,
     landmark_point,
+    make_notes,
     motion_point,
     observation_point,
     place,
     robot_width,
+    stands_apart,
 )
-from consistency.filters.kernel.work import Work
+from consistency.filters.kernel.work import NoNotes, Work
 from consistency.types import Array
 
 
@@ -31,10 +35,27 @@ def estimate_is_not_expanded(point: AtEstimate) -> bool:
     return False
 
 
+@implement(stands_apart, AtEstimate)
+def estimate_stands_apart(point: AtEstimate) -> bool:
+    return False
+
+
+@implement(make_notes, AtEstimate)
+def no_notes_estimate(point: AtEstimate, r: int, w: int, steps: int, labels: int) -> NoNotes:
+    return NoNotes()
+
+
 @implement(motion_point, AtEstimate)
 def motion_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
     """The estimate ``pose`` (r,), before the step."""
     return pose
+
+
+@implement(carry_at, AtEstimate)
+def carry_at_estimate(
+    point: AtEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    carry(slam.motion, state.x[: robot_width(slam.motion)], u, state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, AtEstimate)
@@ -44,7 +65,7 @@ def observation_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
 
 
 @implement(landmark_point, AtEstimate)
-def landmark_at_estimate(point: AtEstimate, values: Array, label: int) -> Array:
+def landmark_at_estimate(point: AtEstimate, values: Array, label: int, work: Work[NamedTuple]) -> Array:
     return values
 
 

@@ -102,7 +102,7 @@ def _observed(
     sensor = belief.sensor
     body = point.to_robot(*path[step + 1].T, *true[landmark].T)
     c = point.to_sensor(*body, sensor.mount.packed())
-    z = np.column_stack(stereo.project(*c, sensor.f, sensor.B) if sensor.model == "uvd" else c)
+    z = np.column_stack(stereo.project(*c, sensor.f or 0.0, sensor.B or 0.0) if sensor.model == "uvd" else c)
     z += rng.standard_normal(z.shape) * np.array(sensor.sigma)
     first = np.concatenate([[0], np.cumsum(counts)])
     return Case(cs.Trial(0, path[0], controls, first, landmark, z, len(true), path), belief)

@@ -10,12 +10,21 @@ from consistency.types import Array, Control, Estimates, Gaussian, Info, Observa
 
 
 @dataclass(frozen=True)
+class Truth:
+    """Where robot and landmarks of a trial are."""
+
+    path: Array  # (T + 1, 3)
+    landmarks: Array  # (N, 3)
+
+
+@dataclass(frozen=True)
 class Problem:
     """What a filter is told before step 1."""
 
     belief: Belief
     start: Array  # (3,), pose at step 0, known exactly
     landmarks: Array | None = None  # (N, 3): reference of a linear world, None in any other
+    truth: Truth | None = None  # told to a filter that declares ``realisable = False``, None to any other
 
 
 @runtime_checkable
@@ -29,6 +38,9 @@ class Filter(Protocol):
     ``pose`` gives the covariance of the additive error in the world. A filter whose own error is another declares
     it in an attribute ``error``, one of ``PLANAR`` in :mod:`consistency.geometry.conventions`, and gives the
     covariance of that error by ``own_covariance(state)``, (3, 3). It is then judged in its own error.
+
+    An attribute ``realisable = False`` marks a bound: a filter that is told the truth (``Problem.truth``) and so runs
+    on trials whose truth is known, and on no other.
 
     Two more methods are optional. ``map(state)`` gives the landmarks in the state by label, as points (3,) in the
     world with their covariance (3, 3); it is asked after the last step, for the NEES of the map. ``joint(state)``

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from consistency.diagnostics import Comparison, Verdict, gate_runs
 from consistency.diagnostics.comparison import FEWEST
-from consistency.gating.checks import Candidate, evidence, of_results
+from consistency.gating.checks import Arrays, Candidate, evidence, of_results
 from consistency.gating.comparing import Sides, of_arrays, of_filters
 from consistency.gating.watch import Entry, Terms, current, terms
 from consistency.gating.wording import fault_text, few_to_compare, undecided_text
@@ -114,10 +114,8 @@ def assert_consistent(
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
-        candidate = evidence(
-            name or "the estimator", cast(ArrayLike, errors), subsets=subsets, method=method,
-            optimal_gain=optimal_gain, **arrays,
-        )  # fmt: skip
+        unchecked = Arrays(cast(ArrayLike, errors), **arrays)
+        candidate = evidence(name or "the estimator", unchecked, subsets, method, optimal_gain)
 
     def look(rate: float) -> _Look:
         verdict = candidate.judge(rate, demand)
@@ -191,8 +189,10 @@ def assert_not_worse(
         if than is not None or reference is not None:
             raise ValueError("than and reference need results in place of errors_a")
         if nees_a is not None and dof is None:
-            arrays["dof"] = current().marked.get("dof")
-        sides = of_arrays(name or "the candidate", cast(ArrayLike, errors_a), **arrays)
+            dof = current().marked.get("dof")
+        a = Arrays(cast(ArrayLike, errors_a), covariances_a, nees_a, dof, axes=axes)
+        b = Arrays(errors_b, covariances_b, nees_b, dof, axes=axes)
+        sides = of_arrays(name or "the candidate", a, b)
     return _compare(sides, demand)
 
 
@@ -200,9 +200,9 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
     __tracebackhide__ = True
     if sides.usable_runs < FEWEST:
         if sides.failed_more:
-            found = f"worse than {sides.name_b}: {sides.failures[0]} runs failed, of {sides.name_b} {sides.failures[1]}"
+            fault = f"worse than {sides.name_b}: {sides.failures.a} runs failed, of {sides.name_b} {sides.failures.b}"
             verdict = sides.candidate.judge(demand.false_alarm, demand)
-            raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [found]), verdict)
+            raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [fault]), verdict)
         raise InsufficientTrials(
             f"assert_not_worse: {sides.usable_runs} runs are too few for a standard error; simulate {FEWEST} at least",
             FEWEST,
@@ -259,13 +259,10 @@ def _settle(
         verdict = result.verdict or candidate.judge(demand.false_alarm, demand)
         raise ConsistencyError(fault_text(gate, candidate.name, result.reasons), verdict, result.comparison)
     if few:
-        plan = demand.detect, demand.false_alarm, demand.power
         if result.verdict is None:
-            text = few_to_compare(gate, candidate.name, candidate.runs, least, *plan)
+            text = few_to_compare(gate, candidate.name, candidate.runs, least, demand)
         else:
-            text = undecided_text(
-                gate, candidate.name, result.reasons[0], least, candidate.planned_dof, *plan, demand.allow
-            )
+            text = undecided_text(gate, candidate.name, result.reasons[0], least, candidate.planned_dof, demand)
         raise InsufficientTrials(text, least, candidate.runs, result.verdict)
     return result
 
@@ -282,7 +279,7 @@ def _entry(
     gate: str, candidate: Candidate, demand: Terms, result: _Look, late: _Look | None, outcome: str, least: int
 ) -> Entry:
     statistics = result.verdict.statistics if result.verdict is not None else {}
-    fields = _found(result)
+    fields = _summary(result)
     if (c := result.comparison) is not None:
         fields |= {key: _finite(getattr(c, key)) for key in ("distance", "standard_error")}
         spread = {key: getattr(c, key) for key in ("at_most", "sum_error", "reference")}
@@ -293,17 +290,17 @@ def _entry(
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
         runs=candidate.runs, needed=least, dof=candidate.planned_dof, detect=demand.detect, power=demand.power,
-        allow=demand.allow, late={} if late is None else _found(late), statistics=statistics, **fields,
+        allow=demand.allow, late={} if late is None else _summary(late), statistics=statistics, **fields,
     )  # fmt: skip
 
 
-def _found(look: _Look) -> dict[str, Any]:
-    found: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
+def _summary(look: _Look) -> dict[str, Any]:
+    summary: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
     if look.comparison is not None:
-        return found | {"statistic": _finite(look.comparison.differences[0].a)}
+        return summary | {"statistic": _finite(look.comparison.differences[0].a)}
     assert look.verdict is not None
     v = look.verdict
-    return found | {
+    return summary | {
         "statistic": _finite(v.statistic), "threshold": [_finite(x) for x in v.threshold],
         "inflation": _finite(v.inflation), "inflation_interval": [_finite(x) for x in v.inflation_interval],
         "first_step": v.first_step, "subset": v.subset, "faults": list(v.faults),

@@ -99,7 +99,7 @@ class Trial:
 
     @property
     def things(self) -> Indices:
-        """Ids that are no landmark in any of their rows, sorted: what a score of the map leaves out."""
+        """Ids (things,) that are no landmark in any of their rows, sorted: what a score of the map leaves out."""
         if self.source is None:
             return np.zeros(0, np.int64)
         return np.setdiff1d(self.landmark, self.source)

@@ -77,7 +77,7 @@ def transformed(baseline: float, rng: np.random.Generator) -> pd.DataFrame:
     u0, _, d0 = project(X, Y, 0.0, F, baseline)
     u = u0 + SIGMA_U * rng.standard_normal(SAMPLES)
     d = d0 + SIGMA_D * rng.standard_normal(SAMPLES)
-    x, y, _ = triangulate(u, 0.0, d, F, baseline)
+    x, y, _ = triangulate(u, np.zeros(SAMPLES), d, F, baseline)
     return pd.DataFrame({"x": x, "y": y, "u": u, "d": d})
 
 

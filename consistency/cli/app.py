@@ -49,7 +49,7 @@ def _main(
 @app.command("list")
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
     """Scenarios, filters and experiments."""
-    from consistency.filters import filter_names
+    from consistency.filters import BOUNDS, filter_names
     from consistency.runs.findings import experiment_summaries
     from consistency.scenario import load_scenario, scenario_names
 
@@ -64,7 +64,8 @@ def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")]
         for name, summary in entries.items():
             print(f"  {name:<{width}}  {summary}")
         print()
-    print("Filters\n  " + "\n  ".join(filter_names()))
+    marked = (f"{name}  (a bound, not realisable)" if name in BOUNDS else name for name in filter_names())
+    print("Filters\n  " + "\n  ".join(marked))
 
 
 @app.command()
@@ -119,16 +120,16 @@ def frontend(
     from consistency.frontend import Options, write_frontend_log
     from consistency.vision.motion import Settings
 
-    settings = Settings(estimator=estimator, **_given(sigma_per_scale=sigma_per_scale))
+    settings = Settings(estimator=estimator, **_options(sigma_per_scale=sigma_per_scale))
     options = Options(
         calibration, truth, format, left, right, rate, lever=lever, seed=seed, settings=settings,
-        **_given(max_landmarks=max_landmarks),
+        **_options(max_landmarks=max_landmarks),
     )  # fmt: skip
     for line in write_frontend_log(images, out, options, overwrite).lines(out):
         print(line)
 
 
-def _given(**options: Any) -> dict[str, Any]:
+def _options(**options: Any) -> dict[str, Any]:
     """Options that were given; the others keep the defaults of what they are handed to."""
     return {name: value for name, value in options.items() if value is not None}
 
@@ -169,7 +170,7 @@ def run(
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
-    planned = _given(max_runs=max_runs, detect=detect, false_alarm=false_alarm)
+    planned = _options(max_runs=max_runs, detect=detect, false_alarm=false_alarm)
     if planned and not until_decided:
         raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
     if until_decided and runs is not None:
@@ -275,7 +276,7 @@ def analyse(
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
     if innovations not in (None, "optimal"):
         raise InputError(f"--innovations must be 'optimal', got '{innovations}'")
-    changes = _given(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance)
+    changes = _options(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance)
     settings = settings_of(**changes) if changes else None
     options: dict[str, Any] = {
         "truth": truth, "covariance": covariance, "convention": error,
@@ -295,8 +296,8 @@ def analyse(
             )
         verdicts = judge_results(results, filters, settings=settings)
         if not results.manifest["complete"]:
-            done, asked = results.manifest["finished_runs"], results.manifest["runs"]
-            text = f"{path}: only {done} of {asked} runs are there; the same 'consistency run' with --resume goes on"
+            done, total = results.manifest["finished_runs"], results.manifest["runs"]
+            text = f"{path}: only {done} of {total} runs are there; the same 'consistency run' with --resume goes on"
             if fail_on:
                 raise InputError(f"--fail-on: {text}")
             print(f"consistency: {text}", file=sys.stderr)
@@ -491,7 +492,7 @@ def monitor(
         raise InputError(f"--fail-on must be 'alarm', got '{fail_on}'")
     watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
     if path == "-":
-        options = _given(filter=filter_name, run=run, plot=plot)
+        options = _options(filter=filter_name, run=run, plot=plot)
         if options:
             raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
         watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))

@@ -24,7 +24,7 @@ GRID = 9  # ratios within the tolerance at which the distribution is compared
 
 
 @dataclass(frozen=True)
-class Asked:
+class Tests:
     """p value of each question, NaN where it cannot be asked, and what was worked out on the way."""
 
     p_values: Mapping[str, float]
@@ -39,7 +39,7 @@ class Asked:
     shape_step: int | None = None
 
 
-def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: float | None = None) -> Asked:
+def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: float | None = None) -> Tests:
     """Ask everything that can be asked of a sample.
 
     Parameters
@@ -73,12 +73,12 @@ def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: fl
     band = _band(sample, settings, dict(also) | p)
     if sample.nees.shape[1] > 1:
         p[STEP] = band.p_value
-    return Asked(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step)
+    return Tests(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step)
 
 
-def _band(sample: Sample, settings: Settings, asked: Mapping[str, float]) -> Band:
+def _band(sample: Sample, settings: Settings, p_values: Mapping[str, float]) -> Band:
     """The band over all steps at the share of the false-alarm rate that it has among the questions asked."""
-    among = dict.fromkeys([q for q, p in asked.items() if np.isfinite(p)] + [STEP], 1.0)
+    among = dict.fromkeys([q for q, p in p_values.items() if np.isfinite(p)] + [STEP], 1.0)
     rate = answers(among, 0.5)[STEP].share * settings.false_alarm
     return simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
 
@@ -107,10 +107,10 @@ def _shape(whitened: Array, p: dict[str, float]) -> tuple[Array, int | None]:
 
 def _least(p_values: Array) -> tuple[float, int | None]:
     """The smallest p value of all steps, corrected for their number, and its step 1..T."""
-    asked = int(np.isfinite(p_values).sum())
-    if not asked:
+    count = int(np.isfinite(p_values).sum())
+    if not count:
         return float("nan"), None
-    return min(1.0, float(np.nanmin(p_values)) * asked), int(np.nanargmin(p_values)) + 1
+    return min(1.0, float(np.nanmin(p_values)) * count), int(np.nanargmin(p_values)) + 1
 
 
 def _distribution(sample: Sample, settings: Settings, at_one: Pit) -> float:

@@ -25,6 +25,7 @@ class Band:
 
     @property
     def outside(self) -> Array:
+        """Whether the curve is outside in a step, on either side, (steps,) of bool."""
         return np.asarray(self.above | self.below)
 
 

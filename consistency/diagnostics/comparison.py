@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -36,6 +37,13 @@ class Difference:
     difference: float  # a against b: a ratio for ANEES and RMSE, a difference for coverage
     low: float
     high: float
+
+
+class FailedRuns(NamedTuple):
+    """How many runs of either filter failed."""
+
+    a: int
+    b: int
 
 
 @dataclass(frozen=True)

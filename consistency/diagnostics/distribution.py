@@ -34,9 +34,9 @@ def pit(nees: Array, dof: int, false_alarm: float = 0.05) -> Pit:
     nees : (runs, steps), NaN where a run has no value
     dof : degrees of freedom, which no data are used to choose
     """
-    chosen = spread_steps(np.isfinite(nees))
-    rows = np.flatnonzero(chosen >= 0)
-    u = np.sort(stats.chi2.cdf(nees[rows, chosen[rows]], dof))
+    steps = spread_steps(np.isfinite(nees))
+    rows = np.flatnonzero(steps >= 0)
+    u = np.sort(stats.chi2.cdf(nees[rows, steps[rows]], dof))
     N = len(u)
     if N == 0:
         return Pit(u, float("nan"), float("nan"), float("nan"))

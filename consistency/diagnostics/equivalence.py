@@ -36,7 +36,13 @@ def equivalence(means: Array, dof: int, steps: int, settings: Settings, factor: 
 
 
 def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:
-    """Equivalence of the scale from the inverted e-process: valid at any look, and under any dependence."""
+    """Equivalence of the scale from the inverted e-process: valid at any look, and under any dependence.
+
+    Parameters
+    ----------
+    means : (runs,), mean over its steps of each run's NEES over ``dof``
+    dof : components of the error
+    """
     factor = settings.factor
     below = ever(e_process(means / factor, dof).down)
     above = ever(e_process(means * factor, dof).up)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics.asking import Asked
+from consistency.diagnostics.asking import Tests
 from consistency.diagnostics.band import Band
 from consistency.diagnostics.bias import hotelling
 from consistency.diagnostics.blocks import blocks
@@ -34,14 +34,14 @@ from consistency.types import Array, Indices
 FEWEST = 8  # runs; with fewer the axes are not told apart
 SURE = 0.04  # false-alarm rate of naming an axis, or a beginning, that does not stand out
 
-Found = Mapping[str, Answer]
+Answers = Mapping[str, Answer]
 
 
-def location_of(sample: Sample, band: Band, found: Found) -> Location:
+def location_of(sample: Sample, band: Band, answers: Answers) -> Location:
     """Steps outside the band, since when, and which axes."""
     outside = band.outside
     first = int(np.argmax(outside)) if outside.any() else None
-    faulty = first is not None and _any(found, (STEP,))
+    faulty = first is not None and _any(answers, (STEP,))
     since, lasting = None, False
     if first is not None and faulty:
         sign = 1 if band.above[first] else -1
@@ -56,7 +56,7 @@ def location_of(sample: Sample, band: Band, found: Found) -> Location:
         first_step=first + 1 if first is not None and faulty else None,
         since=since,
         lasting=lasting,
-        subset=chief_axes(sample, late) if sample.errors is not None and _any(found, SCALE) else None,
+        subset=chief_axes(sample, late) if sample.errors is not None and _any(answers, SCALE) else None,
     )
 
 
@@ -112,7 +112,7 @@ def _stands_out(own: Array, others: Array, axes: int) -> bool:
 # --- records -----------------------------------------------------------------------------------------
 
 
-def axes_of(sample: Sample, asked: Asked, location: Location) -> Axes:
+def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
     """Inflation of each component and group, since the fault began."""
     errors = _errors(sample)
     late, confidence = _late(location), 1.0 - (1.0 - INTERVAL) / len(errors.groups)
@@ -120,14 +120,14 @@ def axes_of(sample: Sample, asked: Asked, location: Location) -> Axes:
         key: ratio_interval(sample.group_means(index, late), len(index), confidence)
         for key, index in errors.groups.items()
     }
-    largest = asked.largest
+    largest = tests.largest
     return Axes(
         errors.names, errors.groups, inflation,
         None if largest is None else largest.ratio, None if largest is None else largest.direction,
     )  # fmt: skip
 
 
-def bias_of(sample: Sample, asked: Asked, location: Location, found: Found) -> Bias:
+def bias_of(sample: Sample, tests: Tests, location: Location, answers: Answers) -> Bias:
     """Mean error of each axis, and what the scale is without it."""
     errors, late = _errors(sample), _late(location)
     standard = standardise(errors.error[:, late], errors.covariance[:, late])
@@ -138,10 +138,10 @@ def bias_of(sample: Sample, asked: Asked, location: Location, found: Found) -> B
     if len(of_runs) > sample.dof:
         test = hotelling(of_runs, INTERVAL)
         by_axis = {a: Interval(test.mean[i], *test.interval[i]) for i, a in enumerate(errors.names)}
-    if not _any(found, BIAS):
-        return Bias(by_axis, asked.bias_step, None, None)
+    if not _any(answers, BIAS):
+        return Bias(by_axis, tests.bias_step, None, None)
     without = ratio_interval(sample.centred().means(late), sample.dof, INTERVAL)
-    return Bias(by_axis, asked.bias_step, _axis_in_step(sample, asked.bias_step), without)
+    return Bias(by_axis, tests.bias_step, _axis_in_step(sample, tests.bias_step), without)
 
 
 def _axis_in_step(sample: Sample, step: int | None) -> str | None:
@@ -152,24 +152,24 @@ def _axis_in_step(sample: Sample, step: int | None) -> str | None:
     return errors.names[int(np.argmax(np.abs(at.mean(axis=0)) / at.std(axis=0, ddof=1).clip(1e-300)))]
 
 
-def shape_of(sample: Sample, asked: Asked, found: Found) -> Shape | None:
+def shape_of(sample: Sample, tests: Tests, answers: Answers) -> Shape | None:
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
-    if asked.matrix is None or sample.dof == 1:
+    if tests.matrix is None or sample.dof == 1:
         return None
     errors = _errors(sample)
-    in_step = not _any(found, ("shape",)) and asked.shape_step is not None
-    here = slice(asked.shape_step - 1, asked.shape_step) if in_step and asked.shape_step else slice(None)
+    in_step = not _any(answers, ("shape",)) and tests.shape_step is not None
+    here = slice(tests.shape_step - 1, tests.shape_step) if in_step and tests.shape_step else slice(None)
     pair, actual, stated = _correlation(errors.error[:, here], errors.covariance[:, here], sample.counted[:, here])
-    return Shape(asked.matrix, asked.shape_step, pair, actual, stated)
+    return Shape(tests.matrix, tests.shape_step, pair, actual, stated)
 
 
-def tails_of(asked: Asked, run_numbers: Indices | None) -> Tails:
-    """The error that stands out most, and the whole distribution."""
-    odd = asked.outlier
+def tails_of(tests: Tests, run_numbers: Indices | None) -> Tails:
+    """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
+    odd = tests.outlier
     if odd is None:
-        return Tails(-1, 0, float("nan"), asked.pit.values, asked.pit.half_width)
+        return Tails(-1, 0, float("nan"), tests.pit.values, tests.pit.half_width)
     run = int(run_numbers[odd.run]) if run_numbers is not None and odd.run >= 0 else odd.run
-    return Tails(run, odd.step + 1, odd.distance, asked.pit.values, asked.pit.half_width)
+    return Tails(run, odd.step + 1, odd.distance, tests.pit.values, tests.pit.half_width)
 
 
 def accuracy_of(sample: Sample) -> Accuracy:
@@ -180,8 +180,8 @@ def accuracy_of(sample: Sample) -> Accuracy:
     inside, interval = coverage_interval(error, errors.covariance)
 
     def rmse_of(members: set[str]) -> float:
-        chosen = [i for i, axis in enumerate(errors.names) if axis in members]
-        return rmse(error[..., chosen]) if chosen else float("nan")
+        columns = [i for i, axis in enumerate(errors.names) if axis in members]
+        return rmse(error[..., columns]) if columns else float("nan")
 
     return Accuracy(
         coverage=coverage(error, errors.covariance),
@@ -204,8 +204,8 @@ def _late(location: Location) -> slice:
     return slice(0 if location.since is None else location.since - 1, None)
 
 
-def _any(found: Found, questions: tuple[str, ...]) -> bool:
-    return any(q in found and found[q].found for q in questions)
+def _any(answers: Answers, questions: tuple[str, ...]) -> bool:
+    return any(q in answers and answers[q].found for q in questions)
 
 
 def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple[int, int] | None, float, float]:

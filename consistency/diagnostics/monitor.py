@@ -19,6 +19,18 @@ CAVEAT = (
 )
 
 
+class _Reset(NamedTuple):
+    """The last reset of a CUSUM, and the sums up to there."""
+
+    step: int  # the one after it
+    nis: float
+    dof: int
+    innovations: int
+
+
+START = _Reset(1, 0.0, 0, 0)
+
+
 @dataclass(frozen=True)
 class Alarm:
     """The NIS of a filter is not what the filter states; ``print`` shows it as a sentence.
@@ -193,8 +205,7 @@ class Monitor:
         self._unspent = 1.0  # 1 - (p_1 + ... + p_t)
         self._skip = 0  # accepted innovations still not to be judged
         self._R, self._cusum = [0.0] * count, [0.0] * count
-        # at the last reset of each CUSUM: next step, and NIS, degrees of freedom and innovations up to there
-        self._resets: list[tuple[int, float, int, int]] = [(1, 0.0, 0, 0)] * count
+        self._resets = [START] * count
 
     def update(self, nis: float | None, dof: int) -> Alarm | None:
         """Take the NIS of a step; the alarm in the step in which it is raised, else None.
@@ -252,7 +263,7 @@ class Monitor:
     @property
     def scale(self) -> float:
         """Scale of the NIS over all that was judged: ``ratio``, corrected for what the gate cuts off."""
-        return self._scale_since((1, 0.0, 0, 0)) if self._dof else math.nan
+        return self._scale_since(START) if self._dof else math.nan
 
     def _judge(self, nis: float, dof: int, bet: Bet) -> None:
         self.innovations += 1
@@ -260,7 +271,7 @@ class Monitor:
         self._dof += dof
         share = start_share(self.innovations, self.mission)
         self._unspent = max(self._unspent - share, 0.0)
-        R, cusum, here = self._R, self._cusum, (self.steps + 1, self._nis, self._dof, self.innovations)
+        R, cusum, here = self._R, self._cusum, _Reset(self.steps + 1, self._nis, self._dof, self.innovations)
         total = 0.0
         for i, (constant, slope) in enumerate(bet.terms):
             log_ratio = constant + slope * nis
@@ -278,10 +289,9 @@ class Monitor:
         reset = self._resets[best]
         direction = "overconfident" if best < len(RATIOS) else "conservative"
         return Alarm(
-            self.steps, reset[0], direction, self.evidence, self._scale_since(reset), self.false_alarm, self.tolerance
+            self.steps, reset.step, direction, self.evidence, self._scale_since(reset), self.false_alarm, self.tolerance
         )
 
-    def _scale_since(self, reset: tuple[int, float, int, int]) -> float:
-        _, nis, dof, innovations = reset
-        count = self.innovations - innovations
-        return gated_scale((self._nis - nis) / count, (self._dof - dof) / count, self.gate)
+    def _scale_since(self, reset: _Reset) -> float:
+        count = self.innovations - reset.innovations
+        return gated_scale((self._nis - reset.nis) / count, (self._dof - reset.dof) / count, self.gate)

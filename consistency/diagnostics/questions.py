@@ -54,16 +54,16 @@ def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answ
     keeps its share; the shares of questions that cannot be asked (p is NaN) go to the other ones. The
     adjusted p value of a question is the false-alarm rate at which it would just be found.
     """
-    asked = {q: p for q, p in p_values.items() if np.isfinite(p)}
-    total = sum(SHARES[q] for q in asked if q != MAIN)
-    kept = SHARES[MAIN] if MAIN in asked else 0.0
-    share = {q: kept if q == MAIN else SHARES[q] * (1.0 - kept) / total for q in asked}
-    if set(asked) == {MAIN}:
+    by_question = {q: p for q, p in p_values.items() if np.isfinite(p)}
+    total = sum(SHARES[q] for q in by_question if q != MAIN)
+    kept = SHARES[MAIN] if MAIN in by_question else 0.0
+    share = {q: kept if q == MAIN else SHARES[q] * (1.0 - kept) / total for q in by_question}
+    if set(by_question) == {MAIN}:
         share = {MAIN: 1.0}
     result: dict[str, Answer] = {}
     left, least = 1.0, 0.0
-    for question in sorted(asked, key=lambda q: asked[q] / share[q]):
-        least = max(least, min(1.0, asked[question] * left / share[question]))
-        result[question] = Answer(question, asked[question], share[question], least, least <= false_alarm)
+    for question in sorted(by_question, key=lambda q: by_question[q] / share[q]):
+        least = max(least, min(1.0, by_question[question] * left / share[question]))
+        result[question] = Answer(question, by_question[question], share[question], least, least <= false_alarm)
         left -= share[question]
-    return {q: result[q] for q in asked}
+    return {q: result[q] for q in by_question}

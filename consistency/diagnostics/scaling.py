@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.diagnostics.asking import Asked
+from consistency.diagnostics.asking import Tests
 from consistency.diagnostics.intervals import anees_interval
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.planning import detectable_ratio
@@ -18,7 +18,7 @@ INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
 NOTHING = (float("nan"), float("nan"))
 
 
-def scale_of(sample: Sample, asked: Asked, settings: Settings, location: Location, shown: Equivalence) -> Scale:
+def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence) -> Scale:
     """Put together what is known of the scale; the inflation is that since the fault began, if it began late."""
     dof, means = sample.dof, sample.means()
     alive = sample.counted.sum(axis=0)
@@ -33,9 +33,9 @@ def scale_of(sample: Sample, asked: Asked, settings: Settings, location: Locatio
         anees=curve,
         alive=alive,
         band=band,
-        mean_anees=asked.main.ratio * dof,
-        accepted=acceptance(asked.main, dof, rate, settings.allow),
-        effective_dof=asked.main.effective_dof,
+        mean_anees=tests.main.ratio * dof,
+        accepted=acceptance(tests.main, dof, rate, settings.allow),
+        effective_dof=tests.main.effective_dof,
         inflation=ratio_interval(late, dof, INTERVAL),
         detectable=detectable_ratio(dof, len(means), rate, two_sided=not settings.one_sided) if some else np.nan,
         median_run=float(np.median(means)) * dof if some else np.nan,

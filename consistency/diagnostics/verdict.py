@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.diagnostics import wording
-from consistency.diagnostics.asking import Asked, ask
+from consistency.diagnostics.asking import Tests, ask
 from consistency.diagnostics.band import simultaneous_band
 from consistency.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
@@ -57,21 +57,21 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     runs, steps = shape_of_arrays(evidence)
     innovations, p_values = _innovations(evidence, settings)
     sample = sample_of(evidence, settings)
-    asked = None
+    tests = None
     if sample is not None:
-        asked = ask(sample, settings, p_values, look.scale if look else None)
-        p_values |= asked.p_values
+        tests = ask(sample, settings, p_values, look.scale if look else None)
+        p_values |= tests.p_values
     if look is not None:
         p_values = _at(look, p_values)
-    found = answers(p_values, settings.false_alarm)
+    by_question = answers(p_values, settings.false_alarm)
     near = {"innovation scale"} if innovations is not None and _near(innovations, settings) else set()
     verdict = Verdict(
-        evidence.name, "failed", (), runs, steps, settings, _excused(found.values(), near), evidence.failures,
+        evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), near), evidence.failures,
         innovations=innovations,
     )  # fmt: skip
-    if sample is not None and asked is not None:
-        verdict = _with_records(verdict, evidence, sample, asked, look)
-    status = _status(verdict, sample, asked)
+    if sample is not None and tests is not None:
+        verdict = _with_records(verdict, evidence, sample, tests, look)
+    status = _status(verdict, sample, tests)
     verdict = replace(verdict, status=status)
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 
@@ -87,15 +87,15 @@ def _at(look: Look, p_values: dict[str, float]) -> dict[str, float]:
 
 
 def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | None, dict[str, float]]:
-    given = innovations_of(evidence)
-    if given is None:
+    nis_and_dof = innovations_of(evidence)
+    if nis_and_dof is None:
         return None, {}
-    test = nis_test(*given)
+    test = nis_test(*nis_and_dof)
     low_high = chi2_mean_interval(test.dof, INTERVAL) if test.dof else (float("nan"), float("nan"))
     if evidence.innovations is not None and evidence.innovation_covariances is not None:
         white = whiteness(evidence.innovations, evidence.innovation_covariances)
     else:
-        white = nis_whiteness(*given)
+        white = nis_whiteness(*nis_and_dof)
     judged = evidence.optimal_gain
     shown = equivalence_of_innovations(test, settings, max(settings.factor, settings.tolerated)) if judged else None
     record = Innovations(test.ratio, low_high, test.dof, judged, white.correlation, white.bound, shown)
@@ -109,21 +109,21 @@ def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | 
 # --- what is known beside the p values -----------------------------------------------------------------
 
 
-def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, asked: Asked, look: Look | None) -> Verdict:
+def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: Tests, look: Look | None) -> Verdict:
     settings = verdict.settings
     shown = _equivalence(sample, settings, look)
     if settings.tolerance is not None:
-        verdict = replace(verdict, answers=_excused(verdict.answers, _tolerated(sample, asked, settings)))
+        verdict = replace(verdict, answers=_excused(verdict.answers, _tolerated(sample, tests, settings)))
     by_question = {a.question: a for a in verdict.answers if not a.tolerated}
-    band = asked.band
+    band = tests.band
     step = by_question.get(STEP)
     if step is not None and step.found and not band.outside.any():  # found by what Holm's correction left over
-        rate = np.nextafter(asked.band.p_value, 1.0) * (1 + 1e-6)
+        rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
         band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     location = location_of(sample, band, by_question)
-    scale = scale_of(sample, asked, settings, location, shown)
+    scale = scale_of(sample, tests, settings, location, shown)
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
-        return replace(verdict, scale=scale, location=location, tails=tails_of(asked, None))
+        return replace(verdict, scale=scale, location=location, tails=tails_of(tests, None))
     odd = impossible(evidence, sample.counted)
     there = np.isfinite(evidence.covariance).all(axis=(-2, -1))
     return replace(
@@ -132,10 +132,10 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, asked: A
         location=location,
         impossible=tuple((int(run), int(k) + 1) for run, k in np.argwhere(odd)),
         left_out_steps=tuple(int(k) + 1 for k in np.flatnonzero((there & ~sample.counted).any(axis=0))),
-        axes=axes_of(sample, asked, location),
-        bias=bias_of(sample, asked, location, by_question),
-        shape=shape_of(sample, asked, by_question),
-        tails=tails_of(asked, evidence.run_numbers),
+        axes=axes_of(sample, tests, location),
+        bias=bias_of(sample, tests, location, by_question),
+        shape=shape_of(sample, tests, by_question),
+        tails=tails_of(tests, evidence.run_numbers),
         accuracy=accuracy_of(sample),
     )
 
@@ -147,9 +147,9 @@ def _equivalence(sample: Sample, settings: Settings, look: Look | None) -> Equiv
     return equivalence(sample.means(), sample.dof, sample.longest, settings, factor)
 
 
-def _excused(found: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:
+def _excused(all_answers: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:
     """Answers with the faults in these questions marked as tolerated."""
-    return tuple(replace(a, tolerated=True) if a.found and a.question in questions else a for a in found)
+    return tuple(replace(a, tolerated=True) if a.found and a.question in questions else a for a in all_answers)
 
 
 def _near(innovations: Innovations, settings: Settings) -> bool:
@@ -160,7 +160,7 @@ def _near(innovations: Innovations, settings: Settings) -> bool:
     return equivalence_of_innovations(test, settings, settings.tolerated).shown
 
 
-def _tolerated(sample: Sample, asked: Asked, settings: Settings) -> set[str]:
+def _tolerated(sample: Sample, tests: Tests, settings: Settings) -> set[str]:
     """Questions about the scale whose ratio is shown to lie within the tolerance, whatever they found."""
     R, steps = settings.tolerated, sample.longest
     if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
@@ -170,9 +170,9 @@ def _tolerated(sample: Sample, asked: Asked, settings: Settings) -> set[str]:
         groups = sample.errors.groups.values()
         if all(equivalence(sample.group_means(g), len(g), steps, settings, R).shown for g in groups):
             tolerated |= {AXIS}
-    if asked.largest is not None and asked.largest.ratio.high <= R:
+    if tests.largest is not None and tests.largest.ratio.high <= R:
         tolerated |= {DIRECTION}
-    band = asked.band
+    band = tests.band
     curve = anees(sample.nees)
     outside = (curve > band.high * R) | (curve < band.low / R)
     return tolerated if outside.any() else tolerated | {STEP}
@@ -181,7 +181,7 @@ def _tolerated(sample: Sample, asked: Asked, settings: Settings) -> set[str]:
 # --- status ------------------------------------------------------------------------------------------
 
 
-def _status(verdict: Verdict, sample: Sample | None, asked: Asked | None) -> str:
+def _status(verdict: Verdict, sample: Sample | None, tests: Tests | None) -> str:
     if verdict.scale is not None and verdict.scale.judged_steps == 0:
         return "failed"
     if verdict.scale is None and not (verdict.innovations is not None and verdict.innovations.dof):
@@ -192,12 +192,12 @@ def _status(verdict: Verdict, sample: Sample | None, asked: Asked | None) -> str
             return "failed"
         shown = verdict.equivalence
         return "consistent" if shown is not None and shown.shown else "undecided"
-    if sample is None or asked is None:
+    if sample is None or tests is None:
         return _by_innovations(verdict, faults)
     if not faults & set(BIAS):
-        return _by_errors(verdict.settings, faults, sample, asked)
-    sample, asked, rest = _without_bias(verdict, sample)
-    status = _by_errors(verdict.settings, rest, sample, asked) if rest else "biased"
+        return _by_errors(verdict.settings, faults, sample, tests)
+    sample, tests, rest = _without_bias(verdict, sample)
+    status = _by_errors(verdict.settings, rest, sample, tests) if rest else "biased"
     return "biased" if status == "heavy-tailed" else status  # a few errors explain less than the mean of all
 
 
@@ -208,46 +208,46 @@ def _by_innovations(verdict: Verdict, faults: set[str]) -> str:
     return "overconfident" if verdict.innovations.ratio > 1.0 else "conservative"
 
 
-def _without_bias(verdict: Verdict, sample: Sample) -> tuple[Sample, Asked, set[str]]:
+def _without_bias(verdict: Verdict, sample: Sample) -> tuple[Sample, Tests, set[str]]:
     """Errors less their mean over runs, what they are asked, and the faults that remain."""
     others = {a.question: a.p_value for a in verdict.answers if a.question in INNOVATIONS}
     centred = sample.centred()
     again = ask(centred, verdict.settings, others)
     p_values = {q: p for q, p in again.p_values.items() if q not in BIAS} | others
-    found = {q for q, a in answers(p_values, verdict.settings.false_alarm).items() if a.found}
-    return centred, again, found & set(verdict.faults)
+    faults = {q for q, a in answers(p_values, verdict.settings.false_alarm).items() if a.found}
+    return centred, again, faults & set(verdict.faults)
 
 
-def _by_errors(settings: Settings, faults: set[str], sample: Sample, asked: Asked) -> str:
+def _by_errors(settings: Settings, faults: set[str], sample: Sample, tests: Tests) -> str:
     """Which headline: of the scale only where it is no matter of a few large errors."""
     if MAIN in faults:
         if not _robust(sample.means(), sample.dof, sample.longest, settings, 1):
             return "heavy-tailed"
-        return "overconfident" if asked.main.ratio > 1.0 else "conservative"
-    heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, asked))
+        return "overconfident" if tests.main.ratio > 1.0 else "conservative"
+    heavy = "outliers" in faults or (STEP in faults and _heavy_steps(sample, tests))
     if STEP in faults and not heavy:
-        opposite = AXIS in faults and _by_axis(settings, asked) == "inconsistent"
-        return "inconsistent" if opposite else _by_step(sample, asked)
+        opposite = AXIS in faults and _by_axis(settings, tests) == "inconsistent"
+        return "inconsistent" if opposite else _by_step(sample, tests)
     if AXIS in faults or DIRECTION in faults:
-        if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, asked, settings)):
-            return _by_axis(settings, asked)
+        if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
+            return _by_axis(settings, tests)
         heavy = True
     return "heavy-tailed" if heavy else "inconsistent"
 
 
-def _by_step(sample: Sample, asked: Asked) -> str:
+def _by_step(sample: Sample, tests: Tests) -> str:
     """The side on which the ANEES is farthest from its band."""
-    curve, band = anees(sample.nees), asked.band
+    curve, band = anees(sample.nees), tests.band
     with np.errstate(divide="ignore", invalid="ignore"):
         above, below = np.nanmax(curve / band.high), np.nanmax(band.low / curve)
     return "overconfident" if above >= below else "conservative"
 
 
-def _heavy_steps(sample: Sample, asked: Asked) -> bool:
+def _heavy_steps(sample: Sample, tests: Tests) -> bool:
     """Do the runs differ more than Gaussian errors can, in most steps, or in all of those outside the band?"""
     if spreads_more_in_steps(sample.nees, sample.dof):
         return True
-    outside = np.flatnonzero(asked.band.outside)
+    outside = np.flatnonzero(tests.band.outside)
     values = (sample.nees[sample.counted[:, k], k] / sample.dof for k in outside)
     return bool(len(outside)) and all(spreads_more(value, sample.dof, SURE) for value in values)
 
@@ -259,21 +259,21 @@ def _robust(means: Array, dof: int, steps: int, settings: Settings, questions: i
     return bool(p * questions <= SHARES[MAIN] * settings.false_alarm)
 
 
-def _robust_axis(sample: Sample, asked: Asked, settings: Settings) -> bool:
+def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
     assert sample.errors is not None
     groups = sample.errors.groups
     return any(
         _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups))
-        for key, test in asked.axes.items()
+        for key, test in tests.axes.items()
         if (test.above if settings.one_sided else test.p_value) * len(groups) <= settings.false_alarm
     )
 
 
-def _by_axis(settings: Settings, asked: Asked) -> str:
+def _by_axis(settings: Settings, tests: Tests) -> str:
     """Axes that err in one direction name the verdict, those that err in both do not."""
     if settings.one_sided:
         return "overconfident"
-    wrong = [t for t in asked.axes.values() if t.p_value * len(asked.axes) <= settings.false_alarm]
+    wrong = [t for t in tests.axes.values() if t.p_value * len(tests.axes) <= settings.false_alarm]
     sides = {test.ratio > 1.0 for test in wrong}
     if len(sides) != 1:
         return "inconsistent"

@@ -52,7 +52,7 @@ def standardise(error: Array, covariance: Array) -> Array:
 
 
 def subset(error: Array, covariance: Array, index: list[int]) -> Array:
-    """Whitened errors of a group of components, (runs, steps, len(index))."""
+    """Whitened errors of a group, (runs, steps, n) and (runs, steps, n, n) -> (runs, steps, len(index))."""
 
     def of_block(e: Array, P: Array) -> Array:
         e, P = e[..., index], P[..., index, :][..., index]
@@ -90,5 +90,5 @@ def spread_steps(present: Array) -> Array:
     place = np.mod(0.5 + np.arange(runs) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0)
     rank = np.minimum((place * count).astype(int), np.maximum(count - 1, 0))
     nth = np.cumsum(present, axis=1) - 1
-    chosen = np.argmax(present & (nth == rank[:, None]), axis=1) if steps else np.zeros(runs, int)
-    return np.where(count > 0, chosen, -1)
+    step = np.argmax(present & (nth == rank[:, None]), axis=1) if steps else np.zeros(runs, int)
+    return np.where(count > 0, step, -1)

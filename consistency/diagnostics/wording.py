@@ -18,7 +18,7 @@ MUCH = 100_000  # runs; more are no advice
 MOST = 3  # axes that a sentence names with their figures
 TINY = 1e-12  # ratio of an error that is rounding
 
-Found = Mapping[str, Answer]
+Faults = Mapping[str, Answer]
 
 
 def reasons(v: Verdict) -> list[str]:
@@ -40,7 +40,7 @@ def reasons(v: Verdict) -> list[str]:
     if v.innovations is not None:
         lines.append(_nis(v))
     if v.answers:
-        lines.append(_asked(v, faults))
+        lines.append(_questions(v, faults))
     return [f"{v.status}{_since(v, faults)}: {lines[0]}", *lines[1:]]
 
 
@@ -106,14 +106,14 @@ def _failures(v: Verdict) -> list[str]:
     return lines
 
 
-def _since(v: Verdict, faults: Found) -> str:
+def _since(v: Verdict, faults: Faults) -> str:
     since = v.location.since if v.location is not None else None
     if not faults or since is None or v.status in ("biased", "heavy-tailed"):  # it is that of the scale
         return ""
     return f" since step {since}"
 
 
-def _sentence(v: Verdict, faults: Found) -> str:
+def _sentence(v: Verdict, faults: Faults) -> str:
     if not faults:
         return _no_fault(v)
     parts = []
@@ -171,7 +171,7 @@ def _do(runs: int) -> str:
     return "does" if runs == 1 else "do"
 
 
-def _scale(v: Verdict, faults: Found) -> str:
+def _scale(v: Verdict, faults: Faults) -> str:
     assert v.scale is not None
     assert v.location is not None
     where, inflation, about = v.location, v.scale.inflation, ""
@@ -246,7 +246,7 @@ def _sigmas(value: float) -> str:
     return f"{value:+.2f}" if abs(value) < 100.0 else f"{value:+.1e}"
 
 
-def _shape(v: Verdict, faults: Found) -> str:
+def _shape(v: Verdict, faults: Faults) -> str:
     assert v.shape is not None
     assert v.axes is not None
     where = "" if "shape" in faults else f" in step {v.shape.step}"
@@ -295,7 +295,7 @@ def _coverage(v: Verdict) -> list[str]:
     return [text]
 
 
-def _without_truth(v: Verdict, faults: Found) -> str:
+def _without_truth(v: Verdict, faults: Faults) -> str:
     assert v.innovations is not None
     if not v.innovations.judged:
         return (
@@ -328,7 +328,7 @@ def _nis(v: Verdict) -> str:
     return text
 
 
-def _asked(v: Verdict, faults: Found) -> str:
+def _questions(v: Verdict, faults: Faults) -> str:
     count, rate = len(v.answers), v.settings.false_alarm
     text = f"{plural(count, 'question')} at a false-alarm rate of {rate:.3g}{' together' if count > 1 else ''}"
     if not faults:

@@ -23,6 +23,12 @@ MODULES = {
     "iekf-uvd": ("methods.iekf", "UVD"),
     "ri-ekf-xyz": ("methods.riekf", "XYZ"),
     "ri-ekf-uvd": ("methods.riekf", "UVD"),
+    "fej-ekf-xyz": ("methods.fej", "XYZ"),
+    "fej-ekf-uvd": ("methods.fej", "UVD"),
+    "oc-ekf-xyz": ("methods.oc", "XYZ"),
+    "oc-ekf-uvd": ("methods.oc", "UVD"),
+    "ideal-ekf-xyz": ("methods.ideal", "XYZ"),
+    "ideal-ekf-uvd": ("methods.ideal", "UVD"),
     "anchored-ekf-xyz": ("methods.anchored", "XYZ"),
     "anchored-ekf-uvd": ("methods.anchored", "UVD"),
     "robocentric-ekf-uvd": ("methods.robocentric", "ROBOCENTRIC"),
@@ -32,6 +38,7 @@ MODULES = {
     "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ"),
     "filterpy-ukf-uvd": ("external.filterpy", "UKF_UVD"),
 }
+BOUNDS = frozenset({"ideal-ekf-xyz", "ideal-ekf-uvd"})  # told the truth: ``realisable`` of these is False
 
 
 def filter_names() -> list[str]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from consistency.errors import InputError
 from consistency.filters.kernel.dispatch import fits, require_fitting
 from consistency.filters.kernel.gain import REASONS
 from consistency.filters.kernel.loop import Outcome, trial_kernel
@@ -18,7 +20,7 @@ from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_wi
 from consistency.filters.plain import sensor_noise
 from consistency.filters.upkeep.local import LOCAL_FROM, Local
 from consistency.geometry.conventions import ADDITIVE
-from consistency.protocols import Problem
+from consistency.protocols import Problem, Truth
 from consistency.scenario import Belief
 from consistency.types import Array, Control, Estimates, Failure, Gaussian, Info, Map, Observation, Trial
 
@@ -60,7 +62,7 @@ class Compiled:
         :mod:`consistency.geometry.conventions`
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
-    allow it; the numbers are the same.
+    allow it; the numbers are the same. ``realisable`` is that of the twin: False for a bound that is told the truth.
     """
 
     local_from = LOCAL_FROM
@@ -78,6 +80,7 @@ class Compiled:
         self.twin, self.parts, self.sensors, self.uvd = twin, parts, sensors, uvd
         self.innovations, self.error = innovations, error
         self.name: str = twin.name
+        self.realisable: bool = is_realisable(twin)
 
     def init(self, problem: Problem) -> Any:
         return self.twin.init(problem)
@@ -133,7 +136,7 @@ class Compiled:
         )
 
     def _arguments(self, trial: Trial, belief: Belief) -> tuple[Slam, Data, int]:
-        problem = problem_of(trial, belief)
+        problem = problem_for(self, trial, belief)
         slam = self.parts(problem, np.array(trial.controls, float))
         z, R = sensor_noise(trial.z, belief.sensor, converted=belief.sensor.model == "uvd" and not self.uvd)
         # copies: writable and C-contiguous, so that one compiled signature serves every caller
@@ -155,3 +158,31 @@ class Compiled:
 def problem_of(trial: Trial, belief: Belief) -> Problem:
     """What a filter is told before step 1 of ``trial``."""
     return Problem(belief, trial.start, trial.landmarks if belief.sensor.model == "linear" else None)
+
+
+def is_realisable(filter_: Any) -> bool:
+    """False for a filter that declares itself a bound, to be told the truth."""
+    return getattr(filter_, "realisable", True) is not False
+
+
+def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
+    """What this filter is told before step 1 of ``trial``: the truth too, if it is not realisable without.
+
+    Raises
+    ------
+    InputError
+        It needs the truth, and the trial has none, or has observations of what is no landmark.
+    """
+    problem = problem_of(trial, belief)
+    if is_realisable(filter_):
+        return problem
+    name = getattr(filter_, "name", type(filter_).__name__)
+    needs = f"filter '{name}' is a bound that takes its Jacobians at the truth"
+    if trial.truth is None or trial.landmarks is None:
+        missing = "truth.parquet" if trial.truth is None else "landmarks.parquet"
+        raise InputError(f"{needs}: run {trial.run} has none; a log needs {missing}, or leave the filter out")
+    if len(trial.landmark) and trial.landmark.max() >= len(trial.landmarks):
+        raise InputError(
+            f"{needs}: run {trial.run} has observations of things that are no landmark; leave the filter out"
+        )
+    return replace(problem, truth=Truth(trial.truth, trial.landmarks))

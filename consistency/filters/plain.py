@@ -1,11 +1,13 @@
 """What the plain twins have in common: SLAM as a textbook writes it, dense and in NumPy, for reading and as oracle.
 
 Herath, Kodagoda & Dissanayake (2007) eq. 1-13. Nothing is shared with the kernels but the models. Each twin is a
-class of its own in ``methods``, made of the functions here.
+class of its own in ``methods``, made of the functions here; those on world points with an additive error share
+:class:`WorldPointTwin`.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -77,13 +79,13 @@ class PointSensor:
         self.turn = np.reshape(self.mount[3:], (3, 3))  # sensor axes in the robot frame
 
     def measure(self, pose: Array, landmark: Array) -> Array:
-        """h: landmarks (..., 3) seen from poses (..., 3)."""
+        """h: observations (..., 3) of landmarks (..., 3), m, from poses (..., 3)."""
         body = point.to_robot(*np.moveaxis(pose, -1, 0), *np.moveaxis(landmark, -1, 0))
         x, y, z = point.to_sensor(*body, self.mount)
         return np.stack(stereo.project(x, y, z, self.f, self.B) if self.uvd else (x, y, z), axis=-1)
 
     def jacobians(self, pose: Array, landmark: Array) -> tuple[Array, Array]:
-        """dh/d pose and dh/d landmark, each (3, 3)."""
+        """Derivatives of h by the pose (3,) and by the landmark (3,), each (3, 3)."""
         body = point.to_robot(*pose, *landmark)
         c = point.to_sensor(*body, self.mount)
         J = np.reshape(stereo.project_jacobian(*c, self.f, self.B), (3, 3)) if self.uvd else np.eye(3)
@@ -92,7 +94,7 @@ class PointSensor:
         return J @ self.turn.T @ d_body, J @ self.turn.T @ world_to_robot
 
     def locate(self, pose: Array, z: Array) -> tuple[Array, Array, Array]:
-        """Landmark (3,) from one observation, with its Jacobians with respect to pose and z."""
+        """Landmark (3,) in m from one observation z (3,) at ``pose`` (3,), with its Jacobians (3, 3) by pose and z."""
         c, J = z, np.eye(3)
         if self.uvd:
             u, v, d = z
@@ -111,6 +113,11 @@ def heading_matrix(heading: float) -> Array:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
+def quarter_turn(v: Array) -> Array:
+    """J v of a vector (2,) in the plane: by how much a small turn moves its tip."""
+    return np.array([-v[1], v[0]])
+
+
 def process_noise(G: Array, belief: Belief) -> Array:
     """G Q G' with Q = diag(sigma_v^2, sigma_omega^2), shape (3, 3)."""
     Q = np.diag(np.square([belief.motion.sigma_v, belief.motion.sigma_omega]))
@@ -118,7 +125,7 @@ def process_noise(G: Array, belief: Belief) -> Array:
 
 
 def predict_extended(state: SlamState, control: Control) -> SlamState:
-    """Eq. 9 and 10, Jacobians at the estimate."""
+    """Eq. 9 and 10 with Jacobians at the estimate: the mean moves by f, P <- F P F' + G Q G'."""
     robot, x, F = Unicycle(), state.x.copy(), np.eye(len(state.x))
     F[:3, :3], G = robot.jacobians(x[:3], control)
     x[:3] = robot.move(x[:3], control)
@@ -157,7 +164,7 @@ def update_jointly(
 
 
 def augment(state: SlamState, label: int, placed: tuple[Array, Array, Array], R: Array) -> SlamState:
-    """The state with a new landmark and its full cross-covariance."""
+    """The state with a new landmark (w,), its Jacobians (w, 3) by pose and z, and full cross-covariance; R (3, 3)."""
     landmark, Jp, Jz = placed
     n, w = len(state.x), len(landmark)
     J = np.zeros((n + w, n))
@@ -180,30 +187,61 @@ def expect(state: SlamState, seen: list[int], uvd: bool) -> tuple[Array, Array]:
 
 
 def gain(P: Array, H: Array, R: Array) -> tuple[Array, Array]:
-    """S (k, k) and the gain (n, k), eq. 11 and 12."""
+    """S = H P H' + R (k, k) and the gain P H' S^-1 (n, k), eq. 11 and 12; P (n, n), H (k, n)."""
     S = H @ P @ H.T + R
     return S, np.linalg.solve(S, H @ P).T
 
 
 def locate_point(state: SlamState, z: Array, uvd: bool) -> tuple[Array, Array, Array]:
-    """A landmark (3,) as a point in the world, by eq. 21 from the estimated pose, and its Jacobians."""
+    """A landmark (3,) as a point in the world, m, by eq. 21 from the estimated pose; Jacobians (3, 3) by pose and z."""
     return PointSensor(state.problem.belief.sensor, uvd).locate(state.x[:3], z)
 
 
 def pose_of(state: SlamState) -> Gaussian:
-    """Pose of a state whose error is additive."""
+    """Pose (3,) and covariance (3, 3) of a state whose error is additive."""
     return Gaussian(state.x[:3], state.P[:3, :3])
 
 
 def map_of(state: SlamState) -> dict[int, Gaussian]:
-    """Landmarks by label of a state of world points whose error is additive, m."""
+    """Landmarks (3,) by label, m, with covariance (3, 3), of a state of world points whose error is additive."""
     blocks = {label: slice(state.at(label), state.at(label) + 3) for label in state.landmarks}
     return {label: Gaussian(state.x[at], state.P[at, at]) for label, at in blocks.items()}
 
 
 def joint_of(state: SlamState) -> Gaussian:
-    """Robot and landmarks together of a state whose error is additive."""
+    """Robot and landmarks together, (n,) and (n, n), of a state whose error is additive."""
     return Gaussian(state.x, state.P)
+
+
+class WorldPointTwin(ABC):
+    """SLAM on points in the world with an additive error; a twin adds how it predicts and how it corrects."""
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def init(self, problem: Problem) -> SlamState:
+        return start(problem)
+
+    @abstractmethod
+    def predict(self, state: SlamState, control: Control) -> SlamState: ...
+
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        return update_jointly(state, observation, self.uvd, self._correct, self._locate)
+
+    @abstractmethod
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]: ...
+
+    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        return locate_point(state, z, self.uvd)
+
+    def pose(self, state: SlamState) -> Gaussian:
+        return pose_of(state)
+
+    def map(self, state: SlamState) -> dict[int, Gaussian]:
+        return map_of(state)
+
+    def joint(self, state: SlamState) -> Gaussian:
+        return joint_of(state)
 
 
 def require_landmarks(problem: Problem, name: str) -> Array:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.filters.compiled import problem_of
+from consistency.filters.compiled import problem_for
 from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 from consistency.protocols import Filter, WholeTrial
@@ -78,7 +78,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
     Raises
     ------
     InputError
-        The filter's error is no convention, or nothing gives its covariance.
+        The filter's error is no convention, or nothing gives its covariance; it needs the truth and there is none.
     """
     T, name, error = trial.steps, name_of(filter_), error_of(filter_)
     pose, covariance = np.full((T, 3), np.nan), np.full((T, 3, 3), np.nan)
@@ -87,19 +87,20 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
     rank = _Rank(error)
     reason, step, map_ = "", 0, None
     started = time.monotonic()
+    problem = problem_for(filter_, trial, belief)
     state: Any = None
     for step in range(1, T + 1):
         try:
             if step == 1:
-                state = filter_.init(problem_of(trial, belief))
+                state = filter_.init(problem)
             state = filter_.predict(state, trial.control(step))
-            state, info = _updated(filter_.update(state, trial.observation(step)))
-            mean, given = _given(filter_, state, error)
+            state, info = _state_and_info(filter_.update(state, trial.observation(step)))
+            mean, covariances = _pose_and_covariances(filter_, state, error)
             if info is not None and len(info.innovation):
                 np.linalg.cholesky(info.S)
                 nis[step - 1], dof[step - 1] = info.nis, len(info.innovation)
-            _require_finite(mean, *given)
-            rank.require(given)
+            _require_finite(mean, *covariances)
+            rank.require(covariances)
             if timeout is not None and time.monotonic() - started > timeout:
                 raise _Unusable(f"time-out after {timeout:g} s")
             map_ = _map(filter_, state, trial) if step == T else None
@@ -107,9 +108,9 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
             reason = _reason(exception)
             nis[step - 1], dof[step - 1] = np.nan, 0
             break
-        pose[step - 1], covariance[step - 1] = mean, given[0]
+        pose[step - 1], covariance[step - 1] = mean, covariances[0]
         if own is not None:
-            own[step - 1] = given[1]
+            own[step - 1] = covariances[1]
     failure = Failure(name, trial.run, step, reason) if reason else None
     return Estimates(name, trial.run, pose, covariance, nis, dof, failure, error, own, map_)
 
@@ -122,16 +123,16 @@ def _reason(exception: Exception) -> str:
     return f"{type(exception).__name__}: {exception}".encode(errors="backslashreplace").decode()
 
 
-def _given(filter_: Filter, state: Any, error: str) -> tuple[Array, list[Array]]:
+def _pose_and_covariances(filter_: Filter, state: Any, error: str) -> tuple[Array, list[Array]]:
     """Mean (3,) of the pose and its covariance (3, 3), with that of the filter's own error where it has one."""
     estimate = filter_.pose(state)
-    mean, P = _shaped(estimate.mean, (3,)), _shaped(estimate.covariance, (3, 3))
+    mean, P = _array(estimate.mean, (3,)), _array(estimate.covariance, (3, 3))
     if error == ADDITIVE:
         return mean, [P]
-    return mean, [P, _shaped(_asked(filter_, "own_covariance", state), (3, 3), "own_covariance")]
+    return mean, [P, _array(_value_of(filter_, "own_covariance", state), (3, 3), "own_covariance")]
 
 
-def _asked(filter_: Filter, method: str, state: Any) -> Any:
+def _value_of(filter_: Filter, method: str, state: Any) -> Any:
     try:
         return getattr(filter_, method)(state)
     except np.linalg.LinAlgError as error:
@@ -144,16 +145,16 @@ class _Rank:
     def __init__(self, error: str) -> None:
         self.names, self.full = ("the pose covariance", f"the covariance of the error '{error}'"), False
 
-    def require(self, given: list[Array]) -> None:
-        """Raise for what they must not be; the last one is of the filter's own error."""
-        for name, P in zip(self.names, given, strict=False):
+    def require(self, covariances: list[Array]) -> None:
+        """Raise for covariances (3, 3) that are not as they must be; the last one is of the filter's own error."""
+        for name, P in zip(self.names, covariances, strict=False):
             if _asymmetric(P):
                 raise _Unusable(f"{name} is not symmetric")
-        rank = definiteness(given[-1])
+        rank = definiteness(covariances[-1])
         if rank < 0 or (self.full and rank == 0):
-            raise _Unusable(f"{self.names[len(given) - 1]} is not positive definite")
+            raise _Unusable(f"{self.names[len(covariances) - 1]} is not positive definite")
         self.full = self.full or rank == 1
-        if self.full and definiteness(given[0]) != 1:
+        if self.full and definiteness(covariances[0]) != 1:
             raise _Unusable(f"{self.names[0]} is not positive definite")
 
 
@@ -166,7 +167,7 @@ def _require_finite(*arrays: Array) -> None:
         raise _Unusable("the estimate is not finite")
 
 
-def _updated(value: Any) -> tuple[Any, Info | None]:
+def _state_and_info(value: Any) -> tuple[Any, Info | None]:
     if not isinstance(value, tuple) or len(value) != 2:
         raise TypeError("update must return (state, info)")
     return value
@@ -176,7 +177,7 @@ def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:
     """What ``map`` of the filter gives, sorted by label; None without that method."""
     if not callable(getattr(filter_, "map", None)):
         return None
-    landmarks = _asked(filter_, "map", state)
+    landmarks = _value_of(filter_, "map", state)
     if not isinstance(landmarks, Mapping):
         raise TypeError("map must return a dictionary of landmarks by label")
     if unknown := [label for label in landmarks if label not in range(trial.n_landmarks)]:
@@ -189,7 +190,7 @@ def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:
 
 
 def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:
-    mean, P = _shaped(estimate.mean, (3,), "map"), _shaped(estimate.covariance, (3, 3), "map")
+    mean, P = _array(estimate.mean, (3,), "map"), _array(estimate.covariance, (3, 3), "map")
     if not (np.isfinite(mean).all() and np.isfinite(P).all()):
         raise _Unusable(f"landmark {label} in the map is not finite")
     if _asymmetric(P):
@@ -197,7 +198,7 @@ def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:
     return mean, P
 
 
-def _shaped(value: Any, shape: tuple[int, ...], method: str = "pose") -> Array:
+def _array(value: Any, shape: tuple[int, ...], method: str = "pose") -> Array:
     array = np.array(value, dtype=float)
     if array.shape != shape:
         raise ValueError(f"{method}() gave an array of shape {array.shape}, not {shape}")

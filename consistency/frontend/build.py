@@ -134,10 +134,14 @@ def write_frontend_log(images: Path, out: Path, options: Options, overwrite: boo
 def trajectory_files(
     sequence: Sequence, motions: list[RelativeMotion], truth: tuple[Array, Array] | None
 ) -> dict[str, str]:
-    """Texts of trajectory.tum, covariance.txt and truth.tum, all in the first camera's frame."""
+    """Texts of trajectory.tum, covariance.txt and truth.tum, all in the first camera's frame.
+
+    ``truth`` is R (frames, 3, 3) and t (frames, 3), m; without it there is no truth.tum.
+    """
     R, t, P = trajectory(motions)
     files = {"trajectory.tum": trajectory_text(sequence.t, R, t), "covariance.txt": covariance_text(sequence.t, P)}
     if truth is not None:
-        back = truth[0][0].T
-        files["truth.tum"] = trajectory_text(sequence.t, back @ truth[0], (truth[1] - truth[1][0]) @ back.T)
+        true_R, true_t = truth
+        back = true_R[0].T
+        files["truth.tum"] = trajectory_text(sequence.t, back @ true_R, (true_t - true_t[0]) @ back.T)
     return files

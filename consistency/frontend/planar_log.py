@@ -101,15 +101,15 @@ def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
         raise InputError(f"no match has a disparity of at least {NEAR:g} of its sigmas; the scene is too far for a log")
     rows = rows.assign(piece=np.cumsum((rows["piece"].diff() != 0) | (rows["step"].diff() != 1)))
 
-    def chosen(slots: int) -> pd.DataFrame:
+    def selection_of(slots: int) -> pd.DataFrame:
         return thinned(rows, Selection(slots, MAX_AGE, MIN_LIFE, BANDS, float(width)))
 
-    low, high, best = 1, MOST_SLOTS, chosen(1)
+    low, high, best = 1, MOST_SLOTS, selection_of(1)
     if (fewest := best["landmark"].nunique()) > most:
         raise InputError(f"--max-landmarks {most}: one landmark at once makes {fewest} over the sequence; allow more")
     while low < high:  # the largest number at once
         middle = (low + high + 1) // 2
-        table = chosen(middle)
+        table = selection_of(middle)
         if table["landmark"].nunique() <= most:
             low, best = middle, table
         else:
@@ -120,7 +120,8 @@ def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
 def misfit(seen: pd.DataFrame, path: Array, mount: Mount, rig: StereoRig) -> tuple[float, float, float]:
     """Root mean square of u, v, d (px) about landmarks placed by their nearest sight along the planar path.
 
-    It holds the noise of the pixels and what the plane leaves out, roll and pitch above all. No truth is used.
+    ``path`` is (T + 1, 3). The misfit holds the noise of the pixels and what the plane leaves out, roll and pitch above
+    all. No truth is used.
     """
     f, B, packed = float(rig.K_left[0, 0]), rig.baseline, mount.packed()
     nearest = seen.loc[seen.groupby("landmark")["z2"].idxmax()].set_index("landmark")
@@ -139,8 +140,14 @@ def misfit(seen: pd.DataFrame, path: Array, mount: Mount, rig: StereoRig) -> tup
 
 
 def odometry_noise(motions: list[RelativeMotion], axes: Array, dt: Array) -> BelievedMotion:
-    """Noise of v and omega from the covariances of the motions, root mean square over the steps."""
-    forward, up = axes[0], axes[2]
+    """Noise of v and omega from the covariances of the motions, root mean square over the steps.
+
+    Parameters
+    ----------
+    axes : (3, 3), rows are forward, left and up of the robot in the camera's frame
+    dt : (T,), duration of each motion, s
+    """
+    forward, _, up = axes
     along = [forward @ m.covariance[:3, :3] @ forward for m in motions]
     turn = [up @ angular(m.pose) for m in motions]
     about = [row @ m.covariance[3:, 3:] @ row for row, m in zip(turn, motions, strict=True)]

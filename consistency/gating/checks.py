@@ -21,6 +21,21 @@ SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix; below, its inve
 
 
 @dataclass(frozen=True)
+class Arrays:
+    """The arrays that a gate is called with, unchecked; shapes as in :func:`consistency.testing.assert_consistent`."""
+
+    errors: ArrayLike | None = None  # (runs, steps, n)
+    covariances: ArrayLike | None = None  # (runs, steps, n, n)
+    nees: ArrayLike | None = None  # (runs, steps)
+    dof: int | None = None
+    nis: ArrayLike | None = None  # (runs, steps)
+    nis_dof: ArrayLike | None = None  # (runs, steps)
+    innovations: ArrayLike | None = None  # (runs, steps, m)
+    innovation_covariances: ArrayLike | None = None  # (runs, steps, m, m)
+    axes: Sequence[str] | None = None  # names of the n components
+
+
+@dataclass(frozen=True)
 class Candidate:
     """The runs of one estimator, and how it wants to be looked at."""
 
@@ -38,30 +53,29 @@ class Candidate:
     def failures(self) -> tuple[Failure, ...]:
         return self.evidence.failures
 
-    def judge(self, false_alarm: float, asked: Terms) -> Verdict:
+    def judge(self, false_alarm: float, terms: Terms) -> Verdict:
         """See :func:`consistency.diagnostics.judge`."""
         settings = Settings(
-            false_alarm, asked.detect, asked.power, asked.tolerance, asked.allow, self.method, self.subsets
+            false_alarm, terms.detect, terms.power, terms.tolerance, terms.allow, self.method, self.subsets
         )
         return judge(self.evidence, settings)
 
 
 def evidence(
     name: str,
-    errors: ArrayLike | None,
-    covariances: ArrayLike | None,
-    nees: ArrayLike | None,
-    dof: int | None,
-    nis: ArrayLike | None,
-    nis_dof: ArrayLike | None,
-    innovations: ArrayLike | None,
-    innovation_covariances: ArrayLike | None,
-    axes: Sequence[str] | None,
-    subsets: Mapping[str, Sequence[int]] | None,
-    method: str,
+    unchecked: Arrays,
+    subsets: Mapping[str, Sequence[int]] | None = None,
+    method: str = "max",
     optimal_gain: bool = False,
 ) -> Candidate:
-    """Checked arrays of one estimator; shapes and errors as :func:`consistency.testing.assert_consistent`."""
+    """One estimator with checked arrays; errors as :func:`consistency.testing.assert_consistent`."""
+    errors, covariances, nees, dof, axes = (
+        unchecked.errors,
+        unchecked.covariances,
+        unchecked.nees,
+        unchecked.dof,
+        unchecked.axes,
+    )
     arrays: dict[str, Any] = {"axes": axes}
     if (errors is None) != (covariances is None):
         there, missing = ("covariances", "errors") if errors is None else ("errors", "covariances")
@@ -83,7 +97,7 @@ def evidence(
         for key, value in (("axes", axes), ("subsets", subsets)):
             if value is not None:
                 raise ValueError(f"{key} needs errors and covariances: the nees does not know its components")
-    arrays |= _innovations(nis, nis_dof, innovations, innovation_covariances)
+    arrays |= _innovations(unchecked.nis, unchecked.nis_dof, unchecked.innovations, unchecked.innovation_covariances)
     first = next((arrays[key] for key in ("error", "nees", "nis") if key in arrays), None)
     if first is None:
         raise ValueError("nothing to judge: give errors and covariances, or nees and dof, or nis and nis_dof")

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from consistency.diagnostics import Comparison, RunSummary, compare, summary, whiten
-from consistency.gating.checks import Candidate, evidence, of_results
+from consistency.diagnostics.comparison import FailedRuns
+from consistency.gating.checks import Arrays, Candidate, evidence, of_results
 
 if TYPE_CHECKING:
     from consistency.store.results import Results
     from consistency.verdicts.comparison import Baseline
+
+
+NONE_FAILED = FailedRuns(0, 0)
 
 
 @dataclass(frozen=True)
@@ -28,12 +30,12 @@ class Sides:
     name_b: str
     axes: tuple[str, ...] | None
     paired: bool
-    failures: tuple[int, int] = (0, 0)
+    failures: FailedRuns = NONE_FAILED
 
     @property
     def failed_more(self) -> bool:
         """a has more failed runs than b on the same trials."""
-        return self.paired and self.failures[0] > self.failures[1]
+        return self.paired and self.failures.a > self.failures.b
 
     @property
     def usable_runs(self) -> int:
@@ -48,14 +50,14 @@ class Sides:
     def reasons(self, c: Comparison) -> list[str]:
         """A sentence, then each quantity of both."""
         anees = c.differences[0]
-        found = "worse" if c.worse or self.failed_more else "not worse"
+        outcome = "worse" if c.worse or self.failed_more else "not worse"
         lines = [
-            f"{found} than {self.name_b}: mean NEES {anees.a:.3g} against {anees.b:.3g}, {self.a.dof} expected; "
+            f"{outcome} than {self.name_b}: mean NEES {anees.a:.3g} against {anees.b:.3g}, {self.a.dof} expected; "
             f"its ratio to {self.a.dof} is {'farther from' if c.distance > 0 else 'nearer to'} 1 "
             f"by x{np.exp(abs(c.distance)):.3g} (p {c.p_value:.2g}, {c.runs} {'paired runs' if c.paired else 'runs'})"
         ]
         if self.failed_more:
-            lines.append(f"{self.failures[0]} runs failed, of {self.name_b} {self.failures[1]}")
+            lines.append(f"{self.failures.a} runs failed, of {self.name_b} {self.failures.b}")
         lines += [
             f"{d.name} {d.a:.4g} against {d.b:.4g}: {'difference' if 'coverage' in d.name else 'ratio'} "
             f"{d.difference:.3g} [{d.low:.3g}, {d.high:.3g}]"
@@ -64,38 +66,22 @@ class Sides:
         return lines
 
 
-def of_arrays(
-    name: str,
-    errors_a: ArrayLike | None,
-    covariances_a: ArrayLike | None,
-    errors_b: ArrayLike | None,
-    covariances_b: ArrayLike | None,
-    nees_a: ArrayLike | None,
-    nees_b: ArrayLike | None,
-    dof: int | None,
-    axes: Sequence[str] | None,
-) -> Sides:
+def of_arrays(name: str, candidate: Arrays, reference: Arrays) -> Sides:
     """Both sides from arrays, row i of both the same trial; errors as :func:`consistency.testing.assert_not_worse`."""
-    a, row_a = _side("candidate a", name, errors_a, covariances_a, nees_a, dof, axes)
-    b, row_b = _side("reference b", name, errors_b, covariances_b, nees_b, dof, axes)
+    a, row_a = _side("candidate a", name, candidate)
+    b, row_b = _side("reference b", name, reference)
     if a.runs != b.runs:
         raise ValueError(f"the candidate has {a.runs} runs and the reference {b.runs}; row i of both must be one trial")
     if a.planned_dof != b.planned_dof:
         raise ValueError(f"the errors have {a.planned_dof} and {b.planned_dof} components")
-    return Sides(a, row_a, row_b, "the reference", None if axes is None else tuple(axes), paired=True)
+    return Sides(
+        a, row_a, row_b, "the reference", None if candidate.axes is None else tuple(candidate.axes), paired=True
+    )
 
 
-def _side(
-    side: str,
-    name: str,
-    errors: ArrayLike | None,
-    covariances: ArrayLike | None,
-    nees: ArrayLike | None,
-    dof: int | None,
-    axes: Sequence[str] | None,
-) -> tuple[Candidate, RunSummary]:
+def _side(side: str, name: str, arrays: Arrays) -> tuple[Candidate, RunSummary]:
     try:
-        case = evidence(name, errors, covariances, nees, dof, None, None, None, None, axes, None, "max")
+        case = evidence(name, arrays)
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
     e, P = case.evidence.error, case.evidence.covariance
@@ -137,5 +123,5 @@ def of_filters(
         raise ValueError(f"filter '{of_b}' is not in the reference; there are: {', '.join(old.filters)}")
     paired = old is new or (None not in new.origin and new.origin == old.origin)
     label = of_b if old is new else f"{of_b} in {old.name}"
-    failures = (new.failures[of_a], old.failures[of_b])
+    failures = FailedRuns(new.failures[of_a], old.failures[of_b])
     return Sides(candidate, new.filters[of_a], old.filters[of_b], label, tuple(POSE), paired, failures)

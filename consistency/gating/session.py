@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from consistency.gating.budget import final_rate
-from consistency.gating.watch import Entry
+from consistency.gating.watch import Entry, Terms
 from consistency.gating.wording import fault_text, few_to_compare
 
 PROPERTY = "consistency"  # of a test, one a gate: JSON without the statistics
@@ -99,7 +99,9 @@ def settled(entry: Entry, rate: float, budget: float, gates: int) -> tuple[Entry
         entry = replace(entry, outcome="fault found", **entry.late)
         return entry, f"{fault_text(entry.gate, entry.name, entry.reasons)}\n{share}"
     if entry.standard_error is not None and entry.runs < needed:
-        text = few_to_compare(entry.gate, entry.name, entry.runs, needed, entry.detect, rate, entry.power)
+        text = few_to_compare(
+            entry.gate, entry.name, entry.runs, needed, Terms(rate, entry.detect, entry.power, entry.allow)
+        )
         return replace(entry, outcome="too few runs"), f"{text}\n{share}"
     return entry, ""
 

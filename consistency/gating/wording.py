@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from consistency.gating.watch import Terms
+
 
 def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
     """Gate, sentence, and what stands behind it."""
@@ -11,39 +13,27 @@ def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
     return "\n  - ".join([f"{gate}: {name} is {first}", *rest])
 
 
-def plan_command(dof: int, detect: float, false_alarm: float, power: float, allow: str | None) -> str:
+def plan_command(dof: int, terms: Terms) -> str:
     """The command that plans the same number of runs."""
     return (
-        f"consistency plan --dof {dof} --detect {detect!r} --false-alarm {false_alarm!r} --power {power!r}"
-        + (f" --allow {allow}" if allow else "")
-    )  # fmt: skip
-
-
-def undecided_text(
-    gate: str,
-    name: str,
-    sentence: str,
-    needed: int,
-    dof: int,
-    detect: float,
-    false_alarm: float,
-    power: float,
-    allow: str | None,
-) -> str:
-    """Neither a fault nor that there is none: how many runs to simulate, and where the number comes from."""
-    return (
-        f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for a larger detect; the number that is enough "
-        f"however the steps depend on each other: {plan_command(dof, detect, false_alarm, power, allow)}"
+        f"consistency plan --dof {dof} --detect {terms.detect!r} --false-alarm {terms.false_alarm!r} "
+        f"--power {terms.power!r}" + (f" --allow {terms.allow}" if terms.allow else "")
     )
 
 
-def few_to_compare(
-    gate: str, name: str, runs: int, needed: int, detect: float, false_alarm: float, power: float
-) -> str:
+def undecided_text(gate: str, name: str, sentence: str, needed: int, dof: int, terms: Terms) -> str:
+    """Neither a fault nor that there is none: how many runs to simulate, and where the number comes from."""
+    return (
+        f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for a larger detect; the number that is enough "
+        f"however the steps depend on each other: {plan_command(dof, terms)}"
+    )
+
+
+def few_to_compare(gate: str, name: str, runs: int, needed: int, terms: Terms) -> str:
     """How many runs a comparison lacks, and for what."""
     return (
         f"{gate}: {name} is not found worse, but {runs} run{'s are' if runs != 1 else ' is'} too few to pass: "
-        f"{needed} find a covariance ratio farther from 1 by x{detect:g} with power {power:g} "
-        f"at a false-alarm rate of {false_alarm:.3g}, at the spread between these runs. Simulate more runs, or ask for "
-        "a larger detect."
+        f"{needed} find a covariance ratio farther from 1 by x{terms.detect:g} with power {terms.power:g} "
+        f"at a false-alarm rate of {terms.false_alarm:.3g}, at the spread between these runs. Simulate more "
+        "runs, or ask for a larger detect."
     )

@@ -13,7 +13,7 @@ def wrap(angle: Array) -> Array:
 
 
 def pose_error(truth: Array, estimate: Array) -> Array:
-    """Truth minus estimate of planar poses, shape (..., 3), m and rad, the heading wrapped."""
+    """Truth minus estimate of planar poses, both (..., 3) -> (..., 3), m and rad, the heading wrapped to [-pi, pi)."""
     error: Array = np.asarray(truth, float) - np.asarray(estimate, float)
     error[..., 2] = wrap(error[..., 2])
     return error

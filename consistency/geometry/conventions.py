@@ -31,7 +31,7 @@ SERIES = 1e-2  # rad, below which the half-angle cotangent is a series; the next
 
 
 def planar_error(truth: Array, estimate: Array, convention: str) -> Array:
-    """Error of planar poses (x, y, heading), shape (..., 3).
+    """Error of planar poses (x, y, heading), both (..., 3) -> (..., 3), m and rad.
 
     ``left`` and ``right`` are the right- and left-minus of Solà, Deray & Atchuthan (2018), eq. 26 and 28, that is
     the invariant errors of Barrau & Bonnabel (2017), "The invariant extended Kalman filter as a stable observer",

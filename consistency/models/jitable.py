@@ -7,7 +7,10 @@ from typing import Any, TypeVar
 
 from numba.extending import register_jitable
 
+from consistency.types import Array
+
 F = TypeVar("F", bound=Callable[..., Any])
+Number = TypeVar("Number", float, Array)  # what a model takes and gives: numbers, or arrays of one shape
 
 
 def jitable(function: F) -> F:

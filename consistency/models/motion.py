@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from consistency.models.jitable import jitable
+from consistency.models.jitable import Number, jitable
 from consistency.types import Array
 
 
 @jitable
-def unicycle(x: Any, y: Any, heading: Any, dt: Any, v: Any, omega: Any) -> tuple[Any, Any, Any]:
+def unicycle(
+    x: Number, y: Number, heading: Number, dt: Number, v: Number, omega: Number
+) -> tuple[Number, Number, Number]:
     """Pose (m, m, rad) after one Euler step of eq. 18, the heading taken at its beginning."""
     return x + dt * v * np.cos(heading), y + dt * v * np.sin(heading), heading + dt * omega
 
 
 @jitable
-def unicycle_jacobian(heading: Any, dt: Any, v: Any) -> tuple[Any, Any]:
+def unicycle_jacobian(heading: Number, dt: Number, v: Number) -> tuple[Number, Number]:
     """The two entries of F = d f / d pose that differ from the identity: F[0, 2] and F[1, 2]."""
     return -dt * v * np.sin(heading), dt * v * np.cos(heading)
 
 
 @jitable
-def unicycle_noise(heading: Any, dt: Any, sigma_v: Any, sigma_omega: Any) -> tuple[Any, Any, Any, Any]:
+def unicycle_noise(
+    heading: Number, dt: Number, sigma_v: float, sigma_omega: float
+) -> tuple[Number, Number, Number, Number]:
     """G Q G' for Q = diag(sigma_v^2, sigma_omega^2): its entries xx, xy, yy and hh; the rest is 0."""
     along = (dt * sigma_v) ** 2
     c, s = np.cos(heading), np.sin(heading)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from consistency.models.jitable import jitable
+from consistency.models.jitable import Number, jitable
 
 
 class Mounting(NamedTuple):
@@ -27,32 +27,40 @@ class Mounting(NamedTuple):
 
 
 @jitable
-def to_robot(px: Any, py: Any, heading: Any, lx: Any, ly: Any, lz: Any) -> tuple[Any, Any, Any]:
+def to_robot(
+    px: Number, py: Number, heading: Number, lx: Number, ly: Number, lz: Number
+) -> tuple[Number, Number, Number]:
     """Landmark in the robot frame (x forward, y left, z up), all in m."""
     return turned_to_robot(px, py, np.cos(heading), np.sin(heading), lx, ly, lz)
 
 
 @jitable
-def turned_to_robot(px: Any, py: Any, c: Any, s: Any, lx: Any, ly: Any, lz: Any) -> tuple[Any, Any, Any]:
+def turned_to_robot(
+    px: Number, py: Number, c: Number, s: Number, lx: Number, ly: Number, lz: Number
+) -> tuple[Number, Number, Number]:
     """:func:`to_robot` for many landmarks: cosine and sine of the heading are given."""
     dx, dy = lx - px, ly - py
     return c * dx + s * dy, -s * dx + c * dy, lz
 
 
 @jitable
-def to_world(px: Any, py: Any, heading: Any, bx: Any, by: Any, bz: Any) -> tuple[Any, Any, Any]:
+def to_world(
+    px: Number, py: Number, heading: Number, bx: Number, by: Number, bz: Number
+) -> tuple[Number, Number, Number]:
     """Inverse of :func:`to_robot`."""
     return turned_to_world(px, py, np.cos(heading), np.sin(heading), bx, by, bz)
 
 
 @jitable
-def turned_to_world(px: Any, py: Any, c: Any, s: Any, bx: Any, by: Any, bz: Any) -> tuple[Any, Any, Any]:
+def turned_to_world(
+    px: Number, py: Number, c: Number, s: Number, bx: Number, by: Number, bz: Number
+) -> tuple[Number, Number, Number]:
     """Inverse of :func:`turned_to_robot`."""
     return px + c * bx - s * by, py + s * bx + c * by, bz
 
 
 @jitable
-def to_sensor(bx: Any, by: Any, bz: Any, mount: Mounting) -> tuple[Any, Any, Any]:
+def to_sensor(bx: Number, by: Number, bz: Number, mount: Mounting) -> tuple[Number, Number, Number]:
     """Robot frame to the frame of a mounted sensor."""
     dx, dy, dz = bx - mount.x, by - mount.y, bz - mount.z
     return (
@@ -63,7 +71,7 @@ def to_sensor(bx: Any, by: Any, bz: Any, mount: Mounting) -> tuple[Any, Any, Any
 
 
 @jitable
-def from_sensor(cx: Any, cy: Any, cz: Any, mount: Mounting) -> tuple[Any, Any, Any]:
+def from_sensor(cx: Number, cy: Number, cz: Number, mount: Mounting) -> tuple[Number, Number, Number]:
     """Inverse of :func:`to_sensor`."""
     return (
         mount.x + mount.xx * cx + mount.xy * cy + mount.xz * cz,

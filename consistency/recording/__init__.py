@@ -46,9 +46,9 @@ def is_recording(path: Path, **options: Any) -> bool:
     else:
         recording = path.is_file() or (path.suffix != "" and not path.exists())
     if not recording and path.exists():
-        given = [name for name, value in options.items() if value is not None]
-        if given:
-            name = {"convention": "error"}.get(given[0], given[0].replace("_", "-"))
+        keys = [name for name, value in options.items() if value is not None]
+        if keys:
+            name = {"convention": "error"}.get(keys[0], keys[0].replace("_", "-"))
             raise InputError(f"--{name}: does not go with {path}, a folder of 'consistency run'")
     return recording
 

@@ -37,19 +37,19 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
         raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")
     if kind == NEEDED[2]:
         return [_of_nees(path, arrays)]
-    covariances = _shaped(path, arrays, "covariances", 4)
+    covariances = _array(path, arrays, "covariances", 4)
     if kind == NEEDED[0]:
-        error, chosen = _shaped(path, arrays, "errors", 3), ""
+        error, error_kind = _array(path, arrays, "errors", 3), ""
     else:
-        estimates, truth = (_shaped(path, arrays, key, 3) for key in ("estimates", "truth"))
+        estimates, truth = (_array(path, arrays, key, 3) for key in ("estimates", "truth"))
         if estimates.shape != truth.shape:
             raise InputError(f"{path}: key 'truth' has shape {truth.shape}, 'estimates' {estimates.shape}")
-        chosen = convention or "vector"
+        error_kind = convention or "vector"
         n = estimates.shape[-1]
-        if chosen not in PLANAR or (chosen != "vector" and n != 3):
-            raise InputError(f"--error {chosen}: here it is 'vector', or so2, left or right for x, y, heading")
+        if error_kind not in PLANAR or (error_kind != "vector" and n != 3):
+            raise InputError(f"--error {error_kind}: here it is 'vector', or so2, left or right for x, y, heading")
         _require_truth(path, truth, estimates)
-        error = planar_error(truth, estimates, chosen) if n == 3 else truth - estimates
+        error = planar_error(truth, estimates, error_kind) if n == 3 else truth - estimates
     runs, steps, n = error.shape
     if covariances.shape != (runs, steps, n, n):
         raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {(runs, steps, n, n)}")
@@ -61,14 +61,16 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
         P = symmetric(covariances[run, :length], place.__getitem__)
         cut = (None if values is None else values[run, :length] for values in (nis, dof))
         tracks.append(Track(run, np.arange(length), place, error[run, :length], P, *cut))
-    notes = [f"error convention {chosen}: {PLANAR[chosen]}"] if chosen else []
+    notes = [f"error convention {error_kind}: {PLANAR[error_kind]}"] if error_kind else []
     return [
-        assemble(path.stem, tracks, step_times(path, arrays, steps), _axes(path, arrays, n), str(path), chosen, notes)
+        assemble(
+            path.stem, tracks, step_times(path, arrays, steps), _axes(path, arrays, n), str(path), error_kind, notes
+        )
     ]
 
 
 def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
-    """All arrays of an archive; ``keys`` says in messages which it should hold.
+    """All arrays of an archive by key, of any shape; ``keys`` says in messages which it should hold.
 
     Raises
     ------
@@ -89,7 +91,7 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
         raise InputError(f"{path}: is not a NumPy archive, {what}; write it with numpy.savez") from None
 
 
-def _shaped(path: Path, arrays: dict[str, Array], key: str, dimensions: int) -> Array:
+def _array(path: Path, arrays: dict[str, Array], key: str, dimensions: int) -> Array:
     """An array of floats; one run without its dimension gets it."""
     array = arrays[key]
     names = ("runs", "steps", "n", "n")[:dimensions]
@@ -110,7 +112,7 @@ def _require_truth(path: Path, truth: Array, estimates: Array) -> None:
 
 
 def run_lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> list[int]:
-    """Steps of each run; key ``lengths`` where they differ."""
+    """Steps of each run; those of the array ``lengths`` (runs,) where they differ."""
     if "lengths" not in arrays:
         return [steps] * runs
     lengths = np.atleast_1d(arrays["lengths"])
@@ -124,7 +126,7 @@ def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[
         return None, None
     if "nis_dof" not in arrays:
         raise InputError(f"{path}: key 'nis_dof' is missing; it is the number of measurements in each nis")
-    nis = _shaped(path, arrays, "nis", 2)
+    nis = _array(path, arrays, "nis", 2)
     if nis.shape != shape:
         raise InputError(f"{path}: key 'nis' has shape {nis.shape}, needs {shape}")
     try:
@@ -158,7 +160,7 @@ def _axes(path: Path, arrays: dict[str, Array], n: int) -> tuple[str, ...]:
 
 def _of_nees(path: Path, arrays: dict[str, Array]) -> Recording:
     """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
-    nees = _shaped(path, arrays, "nees", 2).copy()
+    nees = _array(path, arrays, "nees", 2).copy()
     dof = arrays["dof"]
     if dof.ndim or dof.dtype.kind not in "fiu" or dof < 1 or dof != round(float(dof)):
         raise InputError(f"{path}: key 'dof' must be one whole number of 1 or more, the dimension of the error")

@@ -74,6 +74,12 @@ def assemble(
 ) -> Recording:
     """Tracks on the common steps; failures found; exactly known starts left out.
 
+    Parameters
+    ----------
+    t : (steps,), s, NaN where a step has no time
+    axes : names of the components of the error
+    file : where the estimates are from, for messages
+
     Raises
     ------
     InputError
@@ -128,7 +134,10 @@ def assemble(
 
 
 def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
-    """Columns of every run and the step number of every column: the different steps, in order."""
+    """Columns of every run and the step number of every column: the different steps, in order.
+
+    (k,) step numbers for each run -> (k,) columns for each run, and (steps,) numbers.
+    """
     numbers = np.unique(np.concatenate(steps))
     return [np.searchsorted(numbers, own).astype(np.int64) for own in steps], numbers
 
@@ -136,8 +145,9 @@ def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
 def common_times(times: Sequence[Array], tolerance: float = 1e-6) -> tuple[list[Indices], Array]:
     """Columns of every run and the time of every column, from timestamps in s.
 
-    Where every run keeps to the timestamps of the longest one the columns are its timestamps. Else, as with
-    recordings of different days, estimates are counted from the first on, and no column has a time.
+    (k,) times for each run -> (k,) columns for each run, and (steps,) times. Where every run keeps to the timestamps of
+    the longest one the columns are its timestamps. Otherwise, as with recordings of different days, estimates are
+    counted from the first on, and no column has a time.
     """
     longest = max(times, key=len)
     columns = []
@@ -150,7 +160,7 @@ def common_times(times: Sequence[Array], tolerance: float = 1e-6) -> tuple[list[
 
 
 def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, Indices]:
-    """Indices of timestamps and of their nearest neighbours in ``reference``, both increasing, in s.
+    """Indices (k,) of ``times`` (N,) and of their nearest neighbours in ``reference`` (M,), both increasing, in s.
 
     Pairs further apart than ``max_dt`` are left out. Where two timestamps have the same neighbour the nearer one
     keeps it.

@@ -39,9 +39,9 @@ class Sheet:
 
     def numbers(self, column: str, finite: bool = False, whole: bool = False) -> Array:
         """A column as floats, NaN where empty; refused where it is text, or not finite or whole as asked for."""
-        given = self.data[column]
-        values: Array = pd.to_numeric(given, errors="coerce").to_numpy(float)
-        bad = np.isnan(values) & ~given.isna().to_numpy()
+        cells = self.data[column]
+        values: Array = pd.to_numeric(cells, errors="coerce").to_numpy(float)
+        bad = np.isnan(values) & ~cells.isna().to_numpy()
         what = "not a number"
         if not bad.any() and (finite or whole):
             bad, what = ~np.isfinite(values), "not a finite number"
@@ -49,7 +49,7 @@ class Sheet:
             bad, what = values != np.round(values), "not a whole number"
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
-            raise InputError(f"{self.place(row)}: column '{column}': {what} ({given.iloc[row]})")
+            raise InputError(f"{self.place(row)}: column '{column}': {what} ({cells.iloc[row]})")
         return values
 
     def rows(self, keep: Array) -> Sheet:
@@ -68,6 +68,7 @@ class Lines:
 
     @property
     def t(self) -> Array:
+        """First column, (N,), s."""
         return self.values[:, 0]
 
     def place(self, row: int) -> str:

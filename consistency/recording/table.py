@@ -145,7 +145,15 @@ def _recording(
 
 
 def row_order(sheet: Sheet, runs: Array, key: str) -> Indices:
-    """Rows by run and ``key`` (step or t). Timestamps must be in order: a jump back is another run or another clock."""
+    """Rows (N,) by run and then by ``key`` (step or t); ``runs`` (N,) has the run of each row.
+
+    Timestamps must be in order: a jump back is another run or another clock.
+
+    Raises
+    ------
+    InputError
+        A step or a timestamp is there twice, or a timestamp is less than the one before.
+    """
     values = sheet.numbers(key, finite=True, whole=key == "step")
     order = np.argsort(runs, kind="stable") if key == "t" else np.lexsort((values, runs))
     same = np.diff(runs[order]) == 0

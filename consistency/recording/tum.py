@@ -25,7 +25,7 @@ FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, 
 
 
 @dataclass(frozen=True)
-class Found:
+class Match:
     """The estimates of one run that have truth and covariance."""
 
     place: list[str]  # (k,)
@@ -61,24 +61,24 @@ def read_tum(
     split = trajectories[0].values.shape[1] == SPLIT
     if split and order == ORDERS[0]:
         raise InputError(f"--covariance-order: {trajectories[0].path} has {SPLIT} columns, rotation before translation")
-    chosen = convention or ("so3-body" if split else "so3")
+    error_kind = convention or ("so3-body" if split else "so3")
     matches = []
     for (_, true_path, P_path), own in zip(runs, trajectories, strict=True):
         if (own.values.shape[1] == SPLIT) != split:
             raise InputError(f"{own.path}: has {own.values.shape[1]} columns, {trajectories[0].path} another layout")
-        matches.append(_run(own, true_path, P_path, chosen, order or ORDERS[0], max_dt))
+        matches.append(_run(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt))
     columns, t = common_times([run.t for run in matches])
     tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, matches, strict=True))]
-    notes = _said(estimates, matches, max_dt)
+    notes = _notes(estimates, matches, max_dt)
     why = "" if convention else f"; the default of this layout, {_origin(split)}"
-    notes.append(f"error convention {chosen}: {SPATIAL[chosen]}{why}")
+    notes.append(f"error convention {error_kind}: {SPATIAL[error_kind]}{why}")
     name, file = estimates.stem, str(covariance or estimates)
     if not split:
-        return [assemble(name, tracks, t, AXES, file, chosen, notes)]
+        return [assemble(name, tracks, t, AXES, file, error_kind, notes)]
     halves = []
     for title, part in (("position", slice(0, 3)), ("rotation", slice(3, 6))):
         half = [_half(track, part) for track in tracks]
-        halves.append(assemble(f"{name} {title}", half, t, AXES[part], file, chosen, notes))
+        halves.append(assemble(f"{name} {title}", half, t, AXES[part], file, error_kind, notes))
         notes = []
     return halves
 
@@ -129,7 +129,7 @@ def _same_stem(folder: Path, path: Path, option: str) -> Path:
 
 def _run(
     own: Lines, truth_path: Path, covariance_path: Path | None, convention: str, order: str, max_dt: float | None
-) -> Found:
+) -> Match:
     """The estimates of a run that have truth and covariance."""
     tolerance = DEFAULT_DT if max_dt is None else max_dt
     truth = read_trajectory(truth_path, true=True)
@@ -153,7 +153,7 @@ def _run(
     finite = np.isfinite(estimate).all(axis=1)
     error = np.full((len(rows), 6), np.nan)
     error[finite] = spatial_error(truth.values[match][finite, 1:8], estimate[finite], convention)
-    return Found(
+    return Match(
         [own.place(int(row)) for row in rows], own.t[rows], error, P, len(own.t) - len(rows),
         *_doubts(truth, match, own.t[rows], error, P),
     )  # fmt: skip
@@ -186,7 +186,7 @@ def _doubts(truth: Lines, match: Indices, t: Array, error: Array, P: Array) -> t
     return angle, float(np.median(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else 0.0
 
 
-def _said(estimates: Path, matches: Sequence[Found], max_dt: float | None) -> list[str]:
+def _notes(estimates: Path, matches: Sequence[Match], max_dt: float | None) -> list[str]:
     """What was left out, and what looks like a matter of clocks or of conventions."""
     notes = []
     total = sum(run.left_out + len(run.t) for run in matches)

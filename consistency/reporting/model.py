@@ -118,7 +118,7 @@ class Report:
 
 
 def wide(values: list[Array]) -> bool:
-    """Whether the values above zero span more than a decade."""
+    """Whether the values above zero, in arrays of any shape, span more than a decade."""
     flat = np.concatenate([v.ravel() for v in values]) if values else np.empty(0)
     flat = flat[np.isfinite(flat) & (flat > 0)]
     return bool(flat.size) and bool(flat.max() > DECADE * flat.min())

@@ -139,7 +139,7 @@ def _column(values: Any) -> Any:
     return values.astype(np.int32 if values.dtype.kind == "i" else np.float32)
 
 
-def _chosen(columns: Columns, rows: Array) -> dict[str, Any]:
+def _columns_of(columns: Columns, rows: Array) -> dict[str, Any]:
     return {name: np.asarray(values)[rows] for name, values in columns.items()}
 
 
@@ -167,7 +167,7 @@ def _owned(owner: Owner | None, *glyphs: Any) -> None:
 
 def _line(chart: Any, mark: Line, _: Panel, limit: int) -> Any:
     rows = kept(mark, limit)
-    columns = {"x": mark.x[rows], "y": mark.y[rows]} | _chosen(mark.columns, rows)
+    columns = {"x": mark.x[rows], "y": mark.y[rows]} | _columns_of(mark.columns, rows)
     if mark.bound is not None:
         columns |= {"bound": mark.bound[rows], "below": -mark.bound[rows]}
     source = _source(**columns)
@@ -189,7 +189,7 @@ def _line(chart: Any, mark: Line, _: Panel, limit: int) -> Any:
 
 def _points(chart: Any, mark: Points, _: Panel, limit: int) -> Any:
     rows = kept(mark, limit)
-    source = _source(x=mark.x[rows], y=mark.y[rows], **_chosen(mark.columns, rows))
+    source = _source(x=mark.x[rows], y=mark.y[rows], **_columns_of(mark.columns, rows))
     dots = chart.add_glyph(source, glyphs.Scatter(x="x", y="y", **_dots(mark.look)))
     _owned(mark.owner, dots)
     return dots

@@ -168,32 +168,32 @@ def reproduce(
     InputError
         An unknown id, a number out of range, or an output folder that cannot be written.
     """
-    wanted = _wanted(experiments(), only or (), long)
+    selection = _selection(experiments(), only or (), long)
     require_free(out, overwrite, "findings")
     study, started = Study(runs, seed, jobs), time.monotonic()
-    findings = _found(study, wanted)
+    findings = _findings_of(study, selection)
     study.write(out, findings, time.monotonic() - started, overwrite)
     return findings
 
 
-def _wanted(
+def _selection(
     scripts: Mapping[str, ModuleType], only: Sequence[str], long: bool
 ) -> list[tuple[ModuleType, Sequence[str]]]:
     """The scripts to run, in order, each with the ids of its findings that are wanted."""
     known = [finding for module in scripts.values() for finding in module.FINDINGS]
     if unknown := [name for name in only if name not in known]:
         raise InputError(f"--only {unknown[0]}: no such finding; known: {', '.join(known)}")
-    chosen = [
+    pairs = [
         (module, [name for name in module.FINDINGS if not only or name in only])
         for module in scripts.values()
         if only or long or not getattr(module, "LONG", False)
     ]
-    return [(module, ids) for module, ids in chosen if ids]
+    return [(module, ids) for module, ids in pairs if ids]
 
 
-def _found(study: Study, wanted: Sequence[tuple[ModuleType, Sequence[str]]]) -> list[Finding]:
+def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[str]]]) -> list[Finding]:
     """The wanted findings in order of their scripts, whichever script ends first."""
-    apart = [module for module, _ in wanted if study.workers > 1 and getattr(module, "OWN_PROCESS", False)]
+    apart = [module for module, _ in selection if study.workers > 1 and getattr(module, "OWN_PROCESS", False)]
     pool = ProcessPoolExecutor(len(apart)) if apart else None
     futures: dict[ModuleType, Future[_Contribution]] = {}
 
@@ -205,17 +205,17 @@ def _found(study: Study, wanted: Sequence[tuple[ModuleType, Sequence[str]]]) -> 
         study.tables |= tables
         return findings
 
-    found: dict[ModuleType, list[Finding]] = {}
+    by_script: dict[ModuleType, list[Finding]] = {}
     try:
         for module in apart:
             assert pool is not None
             futures[module] = pool.submit(_contribution, module.__file__, study.runs, study.seed, study.jobs)
-        for module, ids in sorted(wanted, key=lambda pair: pair[0] in futures):  # processes are waited for last
-            found[module] = _guarded(main, module, study, ids)
+        for module, ids in sorted(selection, key=lambda pair: pair[0] in futures):  # processes are waited for last
+            by_script[module] = _guarded(main, module, study, ids)
     finally:
         if pool is not None:
             pool.shutdown(kill_workers=True)
-    return [finding for module, ids in wanted for finding in found[module] if finding.id in ids]
+    return [finding for module, ids in selection for finding in by_script[module] if finding.id in ids]
 
 
 def _contribution(path: str, runs: int, seed: int, jobs: int) -> _Contribution:

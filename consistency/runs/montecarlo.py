@@ -89,16 +89,16 @@ def run_trials(
     Interrupted
         Ctrl-C; carries what is finished, and the folder, if any, is written.
     """
-    chosen = resolve_filters(filters, scenario.belief)
+    instances = resolve_filters(filters, scenario.belief)
     _require_counts(runs, seed)
     world = require_landmarks_in_view(scenario)
-    names = [name_of(f) for f in chosen]
-    errors = _own_errors(chosen)
+    names = [name_of(f) for f in instances]
+    errors = _own_errors(instances)
     done = set() if previous is None else _same_study(previous, scenario, names, errors, seed).finished_runs(names)
     if done and max(done) >= runs:
         raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
     todo = [run for run in range(runs) if run not in done]
-    work = _Work(lambda run: world.trial(run, seed), chosen, scenario.belief, jobs, timeout)
+    work = _Work(lambda run: world.trial(run, seed), instances, scenario.belief, jobs, timeout)
     manifest_fields = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
     with _place(None if out is None else Path(out), overwrite, previous) as new:
         return _finish(
@@ -108,13 +108,17 @@ def run_trials(
 
 def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None) -> Results:
     """Put every run of a recorded log through every filter; raises as :func:`run_trials`."""
-    chosen = resolve_filters(filters, log.belief)
+    instances = resolve_filters(filters, log.belief)
     trials = {trial.run: trial for trial in log.trials}
-    work = _Work(trials.__getitem__, chosen, log.belief, jobs, timeout)
+    work = _Work(trials.__getitem__, instances, log.belief, jobs, timeout)
     manifest_fields = {"seed": None, "runs": len(trials), "log": log.name, "log_sha256": log.sha256}
     manifest_fields |= {"belief": log.belief.model_dump(mode="json")}
     results = _finish(
-        work, list(trials), Gathered([name_of(f) for f in chosen], _own_errors(chosen)), manifest_fields, log.landmarks
+        work,
+        list(trials),
+        Gathered([name_of(f) for f in instances], _own_errors(instances)),
+        manifest_fields,
+        log.landmarks,
     )
     assert isinstance(results, Results)
     return results
@@ -122,20 +126,20 @@ def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: 
 
 def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Filter]:
     """Filters by name or as they are, checked against the sensor."""
-    chosen = [get_filter(f) if isinstance(f, str) else f for f in filters]
-    if not chosen:
+    instances = [get_filter(f) if isinstance(f, str) else f for f in filters]
+    if not instances:
         raise InputError(f"no filter given; known: {', '.join(filter_names())}")
-    for filter_ in chosen:
+    for filter_ in instances:
         if isinstance(filter_, type) or not isinstance(filter_, Filter):
             hint = (
                 "give an object of it, with ()" if isinstance(filter_, type) else "it needs init, predict, update, pose"
             )
             raise InputError(f"{filter_!r} is no filter: {hint}")
-    names = [name_of(f) for f in chosen]
+    names = [name_of(f) for f in instances]
     if len(set(names)) < len(names):
         raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
     model = belief.sensor.model
-    for filter_ in chosen:
+    for filter_ in instances:
         error_of(filter_)
         sensors = getattr(filter_, "sensors", None)
         if sensors is not None and model not in sensors:
@@ -144,7 +148,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
                 f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
                 f"filters that fit: {', '.join(fitting)}"
             )
-    return chosen
+    return instances
 
 
 def worker_count(jobs: int) -> int:

@@ -68,7 +68,7 @@ def run_until_decided(
                 decided |= {name: verdict} if settled(verdict) or runs == max_runs else {}
         open_ = [name for name in open_ if name not in decided]
         if runs > done:
-            print(f"{runs} runs: {said(decided, open_)}", file=sys.stderr, flush=True)
+            print(f"{runs} runs: {progress_text(decided, open_)}", file=sys.stderr, flush=True)
         if not open_:
             break
     if results is None:
@@ -108,7 +108,7 @@ def settled(verdict: Verdict) -> bool:
     return verdict.status != "undecided"
 
 
-def said(decided: dict[str, Verdict], open_: list[str]) -> str:
+def progress_text(decided: dict[str, Verdict], open_: list[str]) -> str:
     """One line of progress."""
     parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
     return ", ".join(parts + [f"{name} open" for name in open_])

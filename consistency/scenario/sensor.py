@@ -62,7 +62,8 @@ class ImageSensor(Sensor):
         if self.principal_point is not None:
             return self.principal_point
         assert self.image is not None
-        return self.image[0] / 2.0, self.image[1] / 2.0
+        width, height = self.image
+        return width / 2.0, height / 2.0
 
 
 class BelievedSensor(StereoSensor):
@@ -124,7 +125,8 @@ class TrueSensor(ImageSensor):
 
     @model_validator(mode="after")
     def _consistent_view(self) -> TrueSensor:
-        if not 0 <= self.range[0] < self.range[1]:
+        low, high = self.range
+        if not 0 <= low < high:
             raise ValueError("range must be [low, high] with 0 <= low < high")
         if self.image is not None and self.f is None:
             raise ValueError("image needs f, the focal length in pixels")

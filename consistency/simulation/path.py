@@ -1,6 +1,8 @@
-"""Named trajectories: each is a cycle of (duration, v, omega) pieces, sampled without losing any turn."""
+"""Named trajectories: each is a cycle of pieces with constant velocities, sampled without losing any turn."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,15 +19,23 @@ from consistency.scenario import (
 from consistency.types import Array
 
 
+class Piece(NamedTuple):
+    """A part of a path that is driven with constant velocities."""
+
+    duration: float  # s
+    v: float  # m/s
+    omega: float  # rad/s
+
+
 def planned_controls(truth: Truth) -> Array:
     """Velocities along the scenario's path, shape (steps, 3): dt (s), v (m/s), omega (rad/s).
 
     A step holds the mean of v and omega over it, so that every turn is made in full.
     """
-    pieces = np.array(_pieces(truth.path))
-    ends = np.concatenate([[0.0], np.cumsum(pieces[:, 0])])
-    travelled = np.concatenate([[0.0], np.cumsum(pieces[:, 0] * pieces[:, 1])])
-    turned = np.concatenate([[0.0], np.cumsum(pieces[:, 0] * pieces[:, 2])])
+    duration, v, omega = np.array(_pieces(truth.path)).T
+    ends = np.concatenate([[0.0], np.cumsum(duration)])
+    travelled = np.concatenate([[0.0], np.cumsum(duration * v)])
+    turned = np.concatenate([[0.0], np.cumsum(duration * omega)])
     time = truth.dt * np.arange(truth.steps + 1)
     laps, phase = np.divmod(time, ends[-1])
     distance = laps * travelled[-1] + np.interp(phase, ends, travelled)
@@ -44,8 +54,8 @@ def planned_path(truth: Truth) -> Array:
     return dead_reckoning(start_pose(truth), planned_controls(truth))
 
 
-def _pieces(path: Path_) -> list[tuple[float, float, float]]:
-    """One cycle of the path as (duration, v, omega), all counter-clockwise."""
+def _pieces(path: Path_) -> list[Piece]:
+    """One cycle of the path, all counter-clockwise."""
     v = path.speed
     match path:
         case Circle():
@@ -56,38 +66,38 @@ def _pieces(path: Path_) -> list[tuple[float, float, float]]:
             corner = _arc(v, path.corner_radius, np.pi / 2)
             long = (path.length - 2 * path.corner_radius) / v
             wide = (path.width - 2 * path.corner_radius) / v
-            half = [(long / 2, v, 0.0), corner, (wide, v, 0.0), corner, (long / 2, v, 0.0)]
-            return [piece for piece in half * 2 if piece[0] > 0]
+            half = [Piece(long / 2, v, 0.0), corner, Piece(wide, v, 0.0), corner, Piece(long / 2, v, 0.0)]
+            return [piece for piece in half * 2 if piece.duration > 0]
         case Corridor():
-            straight, turn = (path.length / v, v, 0.0), _arc(v, path.turn_radius, np.pi)
+            straight, turn = Piece(path.length / v, v, 0.0), _arc(v, path.turn_radius, np.pi)
             return [straight, turn, straight, turn]
         case Waypoints():
             return _legs(path)
 
 
-def _arc(v: float, radius: float, angle: float) -> tuple[float, float, float]:
+def _arc(v: float, radius: float, angle: float) -> Piece:
     duration = abs(angle) * radius / v
-    return duration, v, angle / duration
+    return Piece(duration, v, angle / duration)
 
 
-def _legs(path: Waypoints) -> list[tuple[float, float, float]]:
+def _legs(path: Waypoints) -> list[Piece]:
     """Turn on the spot towards each point, drive there; at the end back to the start and its heading."""
-    pieces: list[tuple[float, float, float]] = []
+    pieces: list[Piece] = []
     position, heading = np.array(path.start), path.heading
 
     def turn_to(target: float) -> None:
         angle = (target - heading + np.pi) % (2 * np.pi) - np.pi
         if abs(angle) > 1e-12:
-            pieces.append((abs(angle) / path.turn_rate, 0.0, np.sign(angle) * path.turn_rate))
+            pieces.append(Piece(abs(angle) / path.turn_rate, 0.0, np.sign(angle) * path.turn_rate))
 
     for point in [*path.points, path.start]:
-        leg = np.array(point) - position
-        length = float(np.hypot(*leg))
+        dx, dy = np.array(point) - position
+        length = float(np.hypot(dx, dy))
         if length == 0.0:
             continue
-        target = float(np.arctan2(leg[1], leg[0]))
+        target = float(np.arctan2(dy, dx))
         turn_to(target)
-        pieces.append((length / path.speed, path.speed, 0.0))
+        pieces.append(Piece(length / path.speed, path.speed, 0.0))
         position, heading = np.array(point), target
     turn_to(path.heading)
     return pieces

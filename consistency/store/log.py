@@ -186,7 +186,7 @@ class _Names(NamedTuple):
     things: Indices
 
     def ids(self, numbers: pd.Series[int]) -> Indices:
-        """Place of each number in the one list and then the other; -1 where it is in neither."""
+        """Place (N,) of each of N numbers in the one list and then the other; -1 where it is in neither."""
         return pd.Index(np.concatenate(self)).get_indexer(pd.Index(numbers)).astype(np.int64)
 
 

@@ -142,8 +142,8 @@ class Results(Tables):
     def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
         rows = {"truth": self.truth, "estimates": self.estimates, "map": self.map}[table]
         if rows is not None:
-            chosen = slice(None) if filter_name is None else (rows["filter"] == filter_name).to_numpy()
-            yield {column: rows[column].to_numpy()[chosen] for column in columns}
+            selection = slice(None) if filter_name is None else (rows["filter"] == filter_name).to_numpy()
+            yield {column: rows[column].to_numpy()[selection] for column in columns}
 
     def write(self, folder: Path, overwrite: bool = False, keep_others: bool = False) -> None:
         """Write the folder at once, as :func:`write_folder`: it appears complete or not at all."""
@@ -200,14 +200,14 @@ def joined(parts: Sequence[Results]) -> Results:
     return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest, map=map_)
 
 
-def outcome_of(trial: Trial, said: Sequence[Estimates]) -> Outcome:
+def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:
     """Rows of the tables for one trial; a failed run has none from the failed step on."""
     return Outcome(
         trial.run,
-        {estimates.filter: _columns(trial, estimates) for estimates in said},
+        {e.filter: _columns(trial, e) for e in estimates},
         None if trial.truth is None else _truth_columns(trial, trial.truth),
-        tuple(estimates.failure for estimates in said if estimates.failure),
-        {e.filter: _map_columns(trial, e.map) for e in said if e.map is not None and e.failure is None},
+        tuple(e.failure for e in estimates if e.failure),
+        {e.filter: _map_columns(trial, e.map) for e in estimates if e.map is not None and e.failure is None},
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
+from consistency.diagnostics.comparison import FailedRuns
 from consistency.errors import InputError
 from consistency.store.atomic import write_whole
 from consistency.store.results import POSE, Results, read_results
@@ -39,7 +40,7 @@ class Compared:
     a: str
     b: str
     comparison: Comparison
-    failures: tuple[int, int]
+    failures: FailedRuns
     note: str = ""
 
     @property
@@ -56,7 +57,7 @@ class Compared:
         elif not c.worse:
             text += f"; {c.needed_runs(DETECT)} runs find a covariance farther off by x{DETECT:g} with power 0.95"
         if any(self.failures):
-            text += f"; failed runs {self.failures[0]}, {self.failures[1]} in the reference"
+            text += f"; failed runs {self.failures.a}, {self.failures.b} in the reference"
         return f"{text}. {self.note}".rstrip(". ") if self.note else text
 
     @property
@@ -66,7 +67,7 @@ class Compared:
     @property
     def worse(self) -> bool:
         """Less consistent, or, on the same trials, with more failed runs."""
-        return self.comparison.worse or (self.comparison.paired and self.failures[0] > self.failures[1])
+        return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
 
 
 def baseline_of(results: Results, name: str = "results") -> Baseline:
@@ -183,4 +184,4 @@ def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, 
         comparison = compare(a.filters[of_a], b.filters[of_b], false_alarm, tuple(POSE), paired)
     except ValueError as error:
         raise InputError(f"{of_a} against {of_b}: {error}") from None
-    return Compared(of_a, of_b, comparison, (a.failures[of_a], b.failures[of_b]))
+    return Compared(of_a, of_b, comparison, FailedRuns(a.failures[of_a], b.failures[of_b]))

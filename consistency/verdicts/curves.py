@@ -123,10 +123,10 @@ def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: s
     """Errors in the place of ``pose``; NaN without truth. Fills ``t`` where every run had failed."""
     known = np.zeros(pose.shape[:2], bool)
     for batch in results.batches("truth", list(COLUMNS["truth"])):
-        chosen = (batch["step"] > 0) & np.isin(batch["run"], runs)
-        row, column = np.searchsorted(runs, batch["run"][chosen]), batch["step"][chosen] - 1
-        t[column] = np.where(np.isnan(t[column]), batch["t"][chosen], t[column])
-        true = np.stack([batch[axis][chosen] for axis in POSE], axis=-1)
+        rows = (batch["step"] > 0) & np.isin(batch["run"], runs)
+        row, column = np.searchsorted(runs, batch["run"][rows]), batch["step"][rows] - 1
+        t[column] = np.where(np.isnan(t[column]), batch["t"][rows], t[column])
+        true = np.stack([batch[axis][rows] for axis in POSE], axis=-1)
         pose[row, column] = planar_error(true, pose[row, column], convention)
         known[row, column] = True
     pose[~known] = np.nan

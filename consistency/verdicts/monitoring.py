@@ -75,9 +75,9 @@ def watch(log: NisLog, monitor: Monitor) -> Watched:
         evidence[row] = monitor.evidence
     alarm, times = monitor.alarm, (math.nan, math.nan)
     if alarm is not None:
-        rows = alarm.step - 1, alarm.since - 1
-        times = float(log.t[rows[0]]), float(log.t[rows[1]])
-        alarm = replace(alarm, step=int(log.step[rows[0]]), since=int(log.step[rows[1]]))
+        row, since = alarm.step - 1, alarm.since - 1
+        times = float(log.t[row]), float(log.t[since])
+        alarm = replace(alarm, step=int(log.step[row]), since=int(log.step[since]))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(log.dof > 0, log.nis / log.dof, np.nan)
     return Watched(log.name, monitor, alarm, *times, log.step, log.t, ratio, evidence)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -128,35 +128,44 @@ def read_opencv(path: Path) -> Calibration:
 
 def read_euroc(folder: Path) -> Calibration:
     """``sensor.yaml`` of both cameras of a EuRoC / ASL folder: mav0/cam0, cam0, or cam0_sensor.yaml beside cam0."""
-    poses, K, D, sizes, files = [], [], [], [], []
-    for camera in ("cam0", "cam1"):
-        places = [folder / "mav0" / camera / "sensor.yaml", folder / camera / "sensor.yaml"]
-        places.append(folder / f"{camera}_sensor.yaml")
-        path = next((place for place in places if place.is_file()), None)
-        if path is None:
-            raise InputError(
-                f"{folder}: holds no calibration of {camera}; expected {' or '.join(map(str, places))}; a calibration "
-                "that is not EuRoC's is given as a file"
-            )
-        data = read_yaml(path)
-        for key in EUROC_KEYS:
-            if key not in data:
-                raise InputError(f"{path}: key '{key}' is missing; needed: {', '.join(EUROC_KEYS)}")
-        model = str(data["distortion_model"]).lower()
-        if model not in RADIAL_TANGENTIAL:
-            raise InputError(f"{path}: key 'distortion_model': '{model}' is not one of {', '.join(RADIAL_TANGENTIAL)}")
-        fu, fv, cu, cv = _sized(path, "intrinsics", data["intrinsics"], 4)
-        width, height = _sized(path, "resolution", data["resolution"], 2)
-        K.append(np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]))
-        D.append(_distortion(path, "distortion_coefficients", matrix(path, "D", data["distortion_coefficients"])))
-        poses.append(_sized(path, "T_BS", data["T_BS"], 16).reshape(4, 4))
-        sizes.append((int(width), int(height)))
-        files.append(str(path))
-    if sizes[0] != sizes[1]:
-        raise InputError(f"{files[1]}: key 'resolution': {sizes[1]} is not that of {files[0]}, {sizes[0]}")
-    right_from_left = np.linalg.solve(poses[1], poses[0])
+    left, right = (_euroc_camera(folder, camera) for camera in ("cam0", "cam1"))
+    if left.size != right.size:
+        raise InputError(f"{right.path}: key 'resolution': {right.size} is not that of {left.path}, {left.size}")
+    right_from_left = np.linalg.solve(right.pose, left.pose)
     R, T = right_from_left[:3, :3], right_from_left[:3, 3]
-    return _checked(Calibration(" and ".join(files), K[0], K[1], D[0], D[1], R, T, sizes[0], poses[0]))
+    source = f"{left.path} and {right.path}"
+    return _checked(Calibration(source, left.K, right.K, left.D, right.D, R, T, left.size, left.pose))
+
+
+class _Camera(NamedTuple):
+    path: Path
+    K: Array  # (3, 3), px
+    D: Array  # distortion
+    size: tuple[int, int]  # width, height, px
+    pose: Array  # (4, 4), T_BS: the camera in the body
+
+
+def _euroc_camera(folder: Path, camera: str) -> _Camera:
+    places = [folder / "mav0" / camera / "sensor.yaml", folder / camera / "sensor.yaml"]
+    places.append(folder / f"{camera}_sensor.yaml")
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        raise InputError(
+            f"{folder}: holds no calibration of {camera}; expected {' or '.join(map(str, places))}; a calibration "
+            "that is not EuRoC's is given as a file"
+        )
+    data = read_yaml(path)
+    for key in EUROC_KEYS:
+        if key not in data:
+            raise InputError(f"{path}: key '{key}' is missing; needed: {', '.join(EUROC_KEYS)}")
+    model = str(data["distortion_model"]).lower()
+    if model not in RADIAL_TANGENTIAL:
+        raise InputError(f"{path}: key 'distortion_model': '{model}' is not one of {', '.join(RADIAL_TANGENTIAL)}")
+    fu, fv, cu, cv = _sized(path, "intrinsics", data["intrinsics"], 4)
+    width, height = _sized(path, "resolution", data["resolution"], 2)
+    K = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
+    D = _distortion(path, "distortion_coefficients", matrix(path, "D", data["distortion_coefficients"]))
+    return _Camera(path, K, D, (int(width), int(height)), _sized(path, "T_BS", data["T_BS"], 16).reshape(4, 4))
 
 
 def _checked(calibration: Calibration) -> Calibration:

@@ -67,7 +67,7 @@ def grey(image: Array, name: str = "image") -> Array:
 
 
 def sift(image: Array, count: int = COUNT, name: str = "image") -> Features:
-    """The ``count`` strongest SIFT features of an image, in the order in which OpenCV finds them.
+    """The ``count`` strongest SIFT features of an image (h, w), in the order in which OpenCV finds them.
 
     ``enable_precise_upscale`` keeps the pixels of the doubled first octave where they are; without it all
     features of that octave stand 0.25 px beside their place.

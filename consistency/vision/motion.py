@@ -113,7 +113,7 @@ def relative_motion(
 def stereo_features(
     rig: StereoRig, left: Array, right: Array, settings: Settings | None = None, name: str = "pair"
 ) -> StereoFeatures:
-    """Features and stereo matches of a pair of images: what a sequence keeps for the next motion.
+    """Features and stereo matches of a pair of images (h, w): what a sequence keeps for the next motion.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def motion_between(
         )
     sigma0, sigma1 = (noise(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
     try:
-        found = _estimated(rig, uv0, uv1, sigma0, sigma1, estimator, settings.gate, rng)
+        estimate = _estimate(rig, uv0, uv1, sigma0, sigma1, estimator, settings.gate, rng)
     except ConsensusError:
         raise ConsensusError(
             f"{names[0]} to {names[1]}: too few of {len(rows)} matches through all four images agree on a motion; do "
@@ -163,15 +163,15 @@ def motion_between(
         ) from None
     except InputError as error:
         raise type(error)(f"{names[0]} to {names[1]}: {error}") from None
-    if estimator == "reprojection" and found.chi2 > MISFIT * found.dof:
+    if estimator == "reprojection" and estimate.chi2 > MISFIT * estimate.dof:
         raise ConsensusError(
-            f"{names[0]} to {names[1]}: chi2/dof of the inliers is {found.chi2 / found.dof:.1f} where 1 is right; are "
-            "the cameras swapped or badly calibrated, or is sigma_per_scale too small?"
+            f"{names[0]} to {names[1]}: chi2/dof of the inliers is {estimate.chi2 / estimate.dof:.1f} where 1 is "
+            "right; are the cameras swapped or badly calibrated, or is sigma_per_scale too small?"
         )
-    return RelativeMotion(**vars(found), uv0=uv0, uv1=uv1, sigma0=sigma0, sigma1=sigma1, rows=rows)
+    return RelativeMotion(**vars(estimate), uv0=uv0, uv1=uv1, sigma0=sigma0, sigma1=sigma1, rows=rows)
 
 
-def _estimated(
+def _estimate(
     rig: StereoRig,
     uv0: Array,
     uv1: Array,

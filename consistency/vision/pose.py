@@ -49,7 +49,7 @@ class RelativePose:
 
     @property
     def rpy(self) -> Array:
-        """Roll, pitch, yaw, rad; GimbalLockError at a pitch of +-90 degrees."""
+        """Roll, pitch, yaw, (3,) in rad; GimbalLockError at a pitch of +-90 degrees."""
         return euler_angles(self.R)
 
     @property

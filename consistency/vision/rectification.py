@@ -23,7 +23,7 @@ class Rectification:
     maps: tuple[tuple[Array, Array], tuple[Array, Array]] | None  # left and right for cv2.remap; None: nothing to do
 
     def apply(self, left: Array, right: Array) -> tuple[Array, Array]:
-        """Raw images (h, w) to rectified ones of the same size, bilinear."""
+        """Raw images (h, w) of the left and right camera -> rectified ones of the same size, bilinear."""
         if self.maps is None:
             return left, right
         cv2 = opencv()
@@ -50,7 +50,9 @@ def rectify(calibration: Calibration, image_size: tuple[int, int]) -> Rectificat
     """
     c = calibration
     if c.image_size not in (None, image_size):
-        raise InputError(f"{c.source}: is for images of {_said(c.image_size)}, but the images have {_said(image_size)}")
+        raise InputError(
+            f"{c.source}: is for images of {_size_text(c.image_size)}, but the images have {_size_text(image_size)}"
+        )
     raw = StereoRig(c.K_left, c.K_right, c.R.T, -c.R.T @ c.T, image_size)
     if not c.D_left.any() and not c.D_right.any() and is_rectified(raw):
         return Rectification(raw, np.eye(3), None)
@@ -78,5 +80,5 @@ def rectify(calibration: Calibration, image_size: tuple[int, int]) -> Rectificat
     return Rectification(rig, np.asarray(turn_left), (tuple(maps[0]), tuple(maps[1])))
 
 
-def _said(size: tuple[int, int] | None) -> str:
+def _size_text(size: tuple[int, int] | None) -> str:
     return "unknown size" if size is None else f"{size[0]} x {size[1]} px"

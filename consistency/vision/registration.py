@@ -65,10 +65,10 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
     """
     p1, p2 = matched(p1, p2)
     if directions:
-        lengths = [np.linalg.norm(p, axis=1, keepdims=True) for p in (p1, p2)]
-        if min(length.min() for length in lengths) == 0.0:
+        length1, length2 = (np.linalg.norm(p, axis=1, keepdims=True) for p in (p1, p2))
+        if min(length1.min(), length2.min()) == 0.0:
             raise DegenerateError("p1, p2: a point at the camera has no direction; leave it out")
-        v1, v2 = p1 / lengths[0], p2 / lengths[1]
+        v1, v2 = p1 / length1, p2 / length2
     else:
         v1, v2 = p1 - p1.mean(axis=0), p2 - p2.mean(axis=0)
     b, c = v2 + v1, v2 - v1
@@ -85,7 +85,7 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
 
 
 def matched(p1: Array, p2: Array) -> tuple[Array, Array]:
-    """Both clouds, checked: errors as :func:`register_svd`."""
+    """Both clouds as floats, (N, 3) and (N, 3), checked: errors as :func:`register_svd`."""
     p1, p2 = checks.rows("p1", p1, 3), checks.rows("p2", p2, 3)
     checks.same_length("p1, p2", p1, p2)
     if len(p1) < 3:

@@ -102,10 +102,10 @@ def read_sequence(
     _require_pairs(folder, files, t)
     if t is None:
         _require_no_gap(files[0])
-    known = read_calibration(calibration or home or folder, *(side[0].parent.name for side in files))
-    rectification = rectify(known, _size_of(files[0][0]))
+    cameras = read_calibration(calibration or home or folder, *(side[0].parent.name for side in files))
+    rectification = rectify(cameras, _size_of(files[0][0]))
     times = np.arange(len(files[0])) / (rate or RATE) if t is None else t
-    return Sequence(folder, kind, *files, times, t is not None, known, rectification)
+    return Sequence(folder, kind, *files, times, t is not None, cameras, rectification)
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> Array:
@@ -120,8 +120,8 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Array:
     if image is None:
         raise InputError(f"{path}: cannot be read as an image; damaged or of an unknown format")
     if size is not None and image.shape[::-1] != tuple(size):
-        wanted, found = (f"{width} x {height} px" for width, height in (size, image.shape[::-1]))
-        raise InputError(f"{path}: has {found}, other images {wanted}; all must have one size")
+        expected_size, size_there = (f"{width} x {height} px" for width, height in (size, image.shape[::-1]))
+        raise InputError(f"{path}: has {size_there}, other images {expected_size}; all must have one size")
     return np.asarray(image)
 
 
@@ -219,15 +219,15 @@ def _camera(folder: Path) -> dict[int, Path]:
         if table.is_file():
             with table.open(encoding="utf-8", newline="") as file:
                 rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-            found = {int(row[0]): images / row[1].strip() for row in rows}
+            by_time = {int(row[0]): images / row[1].strip() for row in rows}
         else:
-            found = {int(path.stem): path for path in _images(images)}
+            by_time = {int(path.stem): path for path in _images(images)}
     except (ValueError, IndexError, OSError, UnicodeDecodeError):
         raise InputError(f"{folder}: times must be whole nanoseconds, in data.csv or as the images' names") from None
-    for path in found.values():
+    for path in by_time.values():
         if not path.is_file():
             raise InputError(f"{table}: names {path.name}, which is not in {images}")
-    return dict(sorted(found.items()))
+    return dict(sorted(by_time.items()))
 
 
 def _plain(folder: Path, left: str | None, right: str | None) -> tuple[list[Path], list[Path]]:

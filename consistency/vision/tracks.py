@@ -76,7 +76,7 @@ def thinned(rows: pd.DataFrame, rule: Selection) -> pd.DataFrame:
         used = {piece for piece, _, _ in alive}
         candidates = step_rows[(step_rows["left"] >= rule.min_life) & ~step_rows["piece"].isin(used)]
         crowd = np.bincount(step_rows.loc[step_rows["piece"].isin(used), "band"], minlength=rule.bands)
-        for piece, life in _chosen(candidates, crowd, rule.slots - len(alive), rule):
+        for piece, life in _next_landmarks(candidates, crowd, rule.slots - len(alive), rule):
             alive.append((piece, started, life if life <= rule.max_age else staggered(started, rule.max_age)))
             started += 1
         picked += [(row_of[piece, step], landmark) for piece, landmark, _ in alive]
@@ -89,7 +89,7 @@ def thinned(rows: pd.DataFrame, rule: Selection) -> pd.DataFrame:
     return table[["step", "landmark", *PIXELS]].reset_index(drop=True)
 
 
-def _chosen(candidates: pd.DataFrame, crowd: Indices, free: int, rule: Selection) -> list[tuple[int, int]]:
+def _next_landmarks(candidates: pd.DataFrame, crowd: Indices, free: int, rule: Selection) -> list[tuple[int, int]]:
     """(piece, life) of the next landmarks, one column of the image after the other."""
     order = candidates.assign(life=candidates["left"].clip(upper=rule.max_age)).sort_values(
         ["life", "z2", "piece"], ascending=[False, False, True]

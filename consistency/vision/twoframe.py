@@ -74,9 +74,10 @@ class Derivatives:
 
 
 def derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) -> Derivatives:
-    """First and second derivatives of f in closed form; not ``exact``: Gauss-Newton's, without second derivatives.
+    """First and second derivatives of f in closed form at ``q`` (N, 3), the points in frame 2.
 
-    With a = R q + t and A = d a / d d = [I, R_k q], f_d = A' f_a and f_q = R' f_a + (the term of frame 2).
+    Without ``exact`` they are Gauss-Newton's, which leave out second derivatives of the measurement. With a = R q + t
+    and A = d a / d d = [I, R_k q], f_d = A' f_a and f_q = R' f_a + (the term of frame 2).
     """
     R, (R_k, R_kl) = pose.R, rotation_derivatives(pose)
     f_a, f_aa, f_az, f_z1 = _frame(frames.measure, frames.z1, frames.W1, pose.apply(q), exact)
@@ -111,12 +112,15 @@ class Points:
     """The measurement of a point is the point."""
 
     def value(self, p: Array) -> Array:
+        """The point itself, (N, 3)."""
         return p
 
     def jacobian(self, p: Array) -> Array:
+        """Identity, (N, 3, 3)."""
         return np.broadcast_to(np.eye(3), (len(p), 3, 3))
 
     def second(self, p: Array, J: Array, w: Array) -> Array:
+        """Zero, (N, 3, 3)."""
         return np.zeros((len(p), 3, 3))
 
 
@@ -131,13 +135,16 @@ class Pixels:
         self.top, self.last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
 
     def value(self, p: Array) -> Array:
+        """u, v, u', v' of points (N, 3), (N, 4), px."""
         return np.asarray((p @ self.top[:, :3].T + self.top[:, 3]) / self._depth(p))
 
     def jacobian(self, p: Array) -> Array:
+        """Derivative of :meth:`value` by the point, (N, 4, 3), px/m."""
         w_p = self.last[:, :3]
         return np.asarray((self.top[:, :3] - self.value(p)[:, :, None] * w_p) / self._depth(p)[:, :, None])
 
     def second(self, p: Array, J: Array, w: Array) -> Array:
+        """Second derivatives of the four pixels, weighted with w (N, 4) and summed, (N, 3, 3); J is (N, 4, 3)."""
         half = np.swapaxes(J * (w / self._depth(p))[:, :, None], 1, 2) @ self.last[:, :3]
         return -(half + np.swapaxes(half, 1, 2))
 

@@ -16,13 +16,24 @@ import pytest
 
 import consistency as cs
 from consistency.filters import filter_names, plain
-from consistency.filters.compiled import Compiled, problem_of
+from consistency.filters.compiled import Compiled, problem_for
 from consistency.filters.kernel.dispatch import require_fitting
 from consistency.filters.kernel.gain import linearise_seen
-from consistency.filters.kernel.slam import Slam, State, insert_error, landmark_width, place, propagate, retract
+from consistency.filters.kernel.slam import (
+    Slam,
+    State,
+    insert_error,
+    landmark_width,
+    move,
+    place,
+    propagate,
+    retract,
+    stands_apart,
+)
 from consistency.filters.kernel.work import make_work
 from consistency.filters.motion.unicycle import Unicycle
 from consistency.filters.plain import SlamState
+from consistency.filters.point.truth import AtTruth
 from consistency.filters.stepping import step_through
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Estimates, Gaussian, Info, Observation, Trial
@@ -47,11 +58,11 @@ class Bench:
     def __init__(self, name: str, scenario: cs.Scenario) -> None:
         trial = cs.simulate(scenario, run=1)
         filter_ = cs.get_filter(name)
-        problem = problem_of(trial, scenario.belief)
+        problem = problem_for(filter_, trial, scenario.belief)
         self.slam: Slam = filter_.parts(problem, np.array(trial.controls))
         self.w, self.n = landmark_width(self.slam.landmark), 3 + 2 * landmark_width(self.slam.landmark)
         self.labels, self.z, self.u = trial.landmark[:3], trial.z[:3], np.array(trial.controls[0])
-        self.work = make_work(self.slam, self.n + self.w, 3)
+        self.work = make_work(self.slam, self.n + self.w, 3, 1, trial.n_landmarks)
         self.work.label[:2], self.work.at[:2] = self.labels[:2], [3, 3 + self.w]
         self.x = np.concatenate([trial.start + np.array([0.3, -0.2, 0.1]), np.zeros(3 * self.w)])
         for i in range(2):
@@ -61,7 +72,18 @@ class Bench:
         return State(x, np.zeros((len(x), len(x))) if P is None else P, n, 0, np.zeros(200, int))
 
     def place(self, x: Array, n: int, i: int, z: Array) -> None:
-        place(self.slam.point, self.slam, self.state(x, n), 0, int(self.labels[i]), z, self.work)
+        slam, label = self.slam, int(self.labels[i])
+        self.stand(x, x)
+        place(slam.point, slam, self.state(x, n), 0, label, z, self.work)
+        if isinstance(slam.point, AtTruth):
+            slam.point.landmarks[label] = x[n : n + self.w]
+            place(slam.point, slam, self.state(x, n), 0, label, z, self.work)
+
+    def stand(self, before: Array, after: Array) -> None:
+        """A point that is not the estimate is put there, so that finite differences are the Jacobians at it."""
+        if stands_apart(self.slam.point):
+            path = self.slam.point.path if isinstance(self.slam.point, AtTruth) else self.work.notes.path
+            path[0], path[1] = before[: path.shape[1]], after[: path.shape[1]]
 
     def moved(self, x: Array, n: int, error: Array) -> Array:
         """x with an error of its first n variables."""
@@ -83,11 +105,13 @@ class Bench:
         return T
 
     def expected(self, x: Array) -> Array:
-        linearise_seen.py_func(self.slam, self.state(x, self.n), 0, 2, self.work)  # type: ignore[attr-defined]
+        linearise_seen(self.slam, self.state(x, self.n), 0, 2, self.work)
         return self.work.zhat[:6].copy()
 
     def predicted(self, x: Array, u: Array, P: Array | None = None) -> Array:
-        x = x.copy()
+        x, after = x.copy(), x.copy()
+        move(self.slam.motion, x[:3], u, after[:3])
+        self.stand(x, after)
         propagate(self.slam.error, self.slam, self.state(x, self.n, P), 0, u, np.zeros((3, 3)), self.work)
         return x
 
@@ -164,7 +188,7 @@ class TrueState:
     step: int
 
 
-class AtTruth:
+class TrueKalman:
     """The Kalman filter of the world linearised about the true path and the true landmarks."""
 
     name = "at-truth"
@@ -223,7 +247,7 @@ def scaled(scenario: cs.Scenario, scale: float) -> cs.Scenario:
 def gap(name: str, scenario: cs.Scenario) -> float:
     """Largest distance of a filter's pose from that of the Kalman filter at the truth, in standard deviations."""
     trial, filter_ = cs.simulate(scenario, run=1), cs.get_filter(name)
-    exact = step_through(AtTruth(trial, filter_.uvd), trial, scenario.belief)
+    exact = step_through(TrueKalman(trial, filter_.uvd), trial, scenario.belief)
     ours = filter_.run(trial, scenario.belief)
     assert ours.failure is None
     assert exact.failure is None
@@ -265,7 +289,7 @@ def test_kernel_equals_its_twin_over_a_trial(small: Small, name: str, tilted: di
 def test_the_map_is_that_of_the_twin(small: Small, name: str) -> None:
     scenario = small(world_of(name))
     trial, filter_ = cs.simulate(scenario, run=2), cs.get_filter(name)
-    state = filter_.init(problem_of(trial, scenario.belief))
+    state = filter_.init(problem_for(filter_, trial, scenario.belief))
     for k in range(1, trial.steps + 1):
         state, _ = filter_.update(filter_.predict(state, trial.control(k)), trial.observation(k))
     ours, twin = filter_.run(trial, scenario.belief).map, filter_.map(state)
@@ -277,5 +301,5 @@ def test_the_map_is_that_of_the_twin(small: Small, name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_combinations_fit(small: Small, name: str) -> None:
-    trial, scenario = cs.simulate(small(world_of(name))), small(world_of(name))
-    require_fitting(cs.get_filter(name).parts(problem_of(trial, scenario.belief), np.array(trial.controls)))
+    trial, scenario, filter_ = cs.simulate(small(world_of(name))), small(world_of(name)), cs.get_filter(name)
+    require_fitting(filter_.parts(problem_for(filter_, trial, scenario.belief), np.array(trial.controls)))

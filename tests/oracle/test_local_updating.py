@@ -56,6 +56,15 @@ def test_every_filter_equals_its_dense_self(monkeypatch: pytest.MonkeyPatch, nam
     assert not np.array_equal(local.covariance, dense.covariance), "nothing was updated locally"
 
 
+def test_first_estimates_are_kept_while_updating_is_local(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``dense`` is the same kernel with a bound that the state does not reach."""
+    scenario = cs.load_scenario("herath2007-xyz")
+    trial = cs.simulate(scenario, run=2)
+    local, dense = (run("fej-ekf-xyz", trial, scenario.belief, each, monkeypatch) for each in (10, 363))
+    assert gap(local, dense) < 1e-9
+    assert not np.array_equal(local.covariance, dense.covariance), "nothing was updated locally"
+
+
 def test_the_textbook_twin_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     case = growing(80, 3)
     local = run("ekf-xyz", case.trial, case.belief, 10, monkeypatch)

@@ -221,9 +221,9 @@ def test_every_filter_is_the_kalman_filter_where_the_heading_is_known(small: Sma
     kf = compiled("kf", trial, scenario.belief)
     assert np.nansum(kf.nis) > 100
     largest = kf.covariance.max(axis=(1, 2), keepdims=True)  # some variances are zero
-    for name in ("ekf-xyz", "ukf-xyz", "iekf-xyz", "ri-ekf-xyz"):
+    for name in ("ekf-xyz", "ukf-xyz", "iekf-xyz", "ri-ekf-xyz", "fej-ekf-xyz", "oc-ekf-xyz"):
         filter_, belief = cs.get_filter(name), with_xyz(scenario.belief)
         for other in (filter_.run(trial, belief), step_through(filter_.twin, trial, belief)):
             pose, _, nis = differences(other, kf)
-            assert max(pose, nis) < 1e-9
-            assert (np.abs(other.covariance - kf.covariance) / largest).max() < 1e-9
+            assert max(pose, nis) < 1e-10
+            assert (np.abs(other.covariance - kf.covariance) / largest).max() < 1e-10

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 
 import numpy as np
 import pytest
-from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import _nrt_python, rtsys
 from threadpoolctl import threadpool_info
 
 import consistency as cs
 import consistency.filters
 from consistency.filters.compiled import one_blas_thread
+from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.loop import trial_kernel
 
 
@@ -22,9 +23,12 @@ def test_no_kernel_is_a_closure() -> None:
     found = [trial_kernel.function.__qualname__]
     for module in pkgutil.walk_packages(consistency.filters.__path__, "consistency.filters."):
         names = vars(importlib.import_module(module.name))
-        found += [value.py_func.__qualname__ for value in names.values() if isinstance(value, Dispatcher)]
+        plain = [getattr(value, "py_func", value) for value in names.values()]
+        found += [value.__qualname__ for value in plain if inspect.isfunction(value)]
     assert {"run_trial", "whiten", "split"} <= set(found)
     assert not [name for name in found if "<locals>" in name]
+    with pytest.raises(TypeError, match=r"'.*<locals>.<lambda>' must stand at module level"):
+        inner(lambda x: x)
 
 
 def allocations(steps: int, scenario: cs.Scenario, name: str) -> int:

@@ -18,9 +18,8 @@ from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, Unscen
 from consistency.filters import plain
 from consistency.filters.methods.ukf import ordered_root
 from consistency.filters.plain import SlamState
-from consistency.protocols import Problem
 from consistency.scenario import Belief
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.types import Array, Control, Info
 
 
 class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -34,17 +33,14 @@ class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x = self.f(self.x)
 
 
-class FilterpyEkf:
+class FilterpyEkf(plain.WorldPointTwin):
     """EKF-SLAM with filterpy's predict and (Joseph form) update."""
 
     robot = plain.Unicycle()
 
     def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
+        super().__init__(name, uvd)
         self.sensors = ("uvd",) if uvd else ("xyz", "uvd")
-
-    def init(self, problem: Problem) -> SlamState:
-        return plain.start(problem)
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         ekf = _Ekf(state, lambda x: np.concatenate([self.robot.move(x[:3], control), x[3:]]))
@@ -55,33 +51,21 @@ class FilterpyEkf:
         ekf.predict()
         return replace(state, x=ekf.x, P=ekf.P)
 
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        return plain.update_jointly(state, observation, self.uvd, self._correct, _locate(self.uvd))
-
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         ekf = _Ekf(state, lambda x: x)
         zhat, H = plain.expect(state, seen, self.uvd)
         ekf.update(z.ravel(), HJacobian=lambda _: H, Hx=lambda _: zhat, R=plain.block_diagonal(R))
         return replace(state, x=ekf.x, P=ekf.P), Info(ekf.y, ekf.S, ekf.K)
 
-    def pose(self, state: SlamState) -> Gaussian:
-        return plain.pose_of(state)
 
-    def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return plain.map_of(state)
-
-
-class FilterpyUkf:
+class FilterpyUkf(plain.WorldPointTwin):
     """UKF-SLAM with filterpy's unscented transforms over the whole state."""
 
     robot = plain.Unicycle()
 
     def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
+        super().__init__(name, uvd)
         self.sensors = ("uvd",) if uvd else ("xyz", "uvd")
-
-    def init(self, problem: Problem) -> SlamState:
-        return plain.start(problem)
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         def f(x: Array, dt: float) -> Array:
@@ -93,9 +77,6 @@ class FilterpyUkf:
         ukf.predict()
         return replace(state, x=ukf.x, P=ukf.P)
 
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        return plain.update_jointly(state, observation, self.uvd, self._correct, _locate(self.uvd))
-
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
         sensor = plain.PointSensor(state.problem.belief.sensor, self.uvd)
@@ -104,16 +85,6 @@ class FilterpyUkf:
         ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
         ukf.update(z.ravel(), R=plain.block_diagonal(R))
         return replace(state, x=ukf.x, P=ukf.P), Info(ukf.y, ukf.S, ukf.K)
-
-    def pose(self, state: SlamState) -> Gaussian:
-        return plain.pose_of(state)
-
-    def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return plain.map_of(state)
-
-
-def _locate(uvd: bool) -> plain.Locate:
-    return lambda state, label, z: plain.locate_point(state, z, uvd)
 
 
 def _ukf(

@@ -22,7 +22,7 @@ from numba import types
 from numba.core import cgutils
 from scipy.linalg import cython_blas, cython_lapack
 
-from consistency.filters.kernel.jit import inner
+from consistency.filters.kernel.jit import routine
 
 SMALL = 512  # size up to which strips of dgemm are faster than dsyrk; measured with OpenBLAS
 ROUTINES = dict.fromkeys(("dgemm", "dgemv", "dsymm", "dsyrk", "dtrsm"), cython_blas) | {"dpotrf": cython_lapack}
@@ -132,37 +132,37 @@ def _dgemv_n(
     return _call("dgemv", b"N", (m, n, alpha, A, lda, x, incx, beta, y, incy))
 
 
-@inner
+@routine
 def _row(A: Any) -> Any:
     """Numbers from one row to the next, or from one number of a vector to the next."""
     return A.strides[0] // A.itemsize
 
 
-@inner
+@routine
 def upper_cholesky(A: Any) -> Any:
     """Upper half of A <- U with U' U = A, read from that half; False where A is not positive definite."""
     return _dpotrf_l(len(A), A, _row(A)) == 0
 
 
-@inner
+@routine
 def solve_upper(U: Any, B: Any) -> None:
     """B <- U^-1 B for the upper half U."""
     _dtrsm_rlnn(B.shape[1], len(U), 1.0, U, _row(U), B, _row(B))
 
 
-@inner
+@routine
 def product_of_transposed(A: Any, B: Any, C: Any) -> None:
     """C <- A' B."""
     _dgemm_nt(B.shape[1], A.shape[1], len(A), 1.0, B, _row(B), A, _row(A), 0.0, C, _row(C))
 
 
-@inner
+@routine
 def add_product_of_transposed(weight: float, A: Any, B: Any, C: Any) -> None:
     """C <- C + weight A' B."""
     _dgemm_nt(B.shape[1], A.shape[1], len(A), weight, B, _row(B), A, _row(A), 1.0, C, _row(C))
 
 
-@inner
+@routine
 def add_symmetric_product(weight: float, A: Any, B: Any, C: Any) -> None:
     """Upper half of C <- C + weight A' B, which is symmetric; of the lower half, anything."""
     n, width = len(C), 32 if len(C) <= SMALL else 256
@@ -171,7 +171,7 @@ def add_symmetric_product(weight: float, A: Any, B: Any, C: Any) -> None:
         add_product_of_transposed(weight, A[:, :last], B[:, first:last], C[:last, first:last])
 
 
-@inner
+@routine
 def add_gram(weight: float, A: Any, C: Any) -> None:
     """Upper half of C <- C + weight A' A; of the lower half, anything."""
     if len(C) <= SMALL:
@@ -180,7 +180,7 @@ def add_gram(weight: float, A: Any, C: Any) -> None:
         _dsyrk_ln(len(C), len(A), weight, A, _row(A), 1.0, C, _row(C))
 
 
-@inner
+@routine
 def solve_transposed(U: Any, B: Any) -> None:
     """B <- U'^-1 B for the upper half U; in strips of rows, which is faster than one dtrsm."""
     for first in range(0, len(U), 12):
@@ -191,31 +191,31 @@ def solve_transposed(U: Any, B: Any) -> None:
         _dtrsm_rltn(B.shape[1], last - first, 1.0, strip, _row(strip), B[first:last], _row(B))
 
 
-@inner
+@routine
 def add_times_transposed(weight: float, A: Any, B: Any, C: Any) -> None:
     """C <- C + weight A B'."""
     _dgemm_tn(len(B), len(A), A.shape[1], weight, B, _row(B), A, _row(A), 1.0, C, _row(C))
 
 
-@inner
+@routine
 def times_symmetric(A: Any, S: Any, C: Any) -> None:
     """C <- A S, S read from its upper half."""
     _dsymm_ll(len(S), len(A), 1.0, S, _row(S), A, _row(A), 0.0, C, _row(C))
 
 
-@inner
+@routine
 def symmetric_times(S: Any, A: Any, C: Any) -> None:
     """C <- S A, S read from its upper half."""
     _dsymm_rl(A.shape[1], len(S), 1.0, S, _row(S), A, _row(A), 0.0, C, _row(C))
 
 
-@inner
+@routine
 def product(A: Any, B: Any, C: Any) -> None:
     """C <- A B."""
     _dgemm_nn(B.shape[1], len(A), A.shape[1], 1.0, B, _row(B), A, _row(A), 0.0, C, _row(C))
 
 
-@inner
+@routine
 def add_transposed_times(A: Any, y: Any, x: Any) -> None:
     """x <- x + A' y."""
     _dgemv_n(A.shape[1], len(A), 1.0, A, _row(A), y, _row(y), 1.0, x, _row(x))

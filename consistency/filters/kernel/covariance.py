@@ -15,8 +15,14 @@ from consistency.types import Array, Indices
 
 
 @inner
+def state_index(r: int, w: int, a: int, at: Indices) -> int:
+    """Index in the state of the a-th of some variables: the robot's, then those of the landmarks at ``at``."""
+    return a if a < r else at[(a - r) // w] + (a - r) % w
+
+
+@inner
 def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Array) -> None:
-    """Whole rows of P: of the robot in rows 0..r-1, then of the ``m`` landmarks of ``w`` variables at ``at``."""
+    """``rows`` (r + w m, n) <- whole rows of P (n, n): the robot's, then those of ``m`` landmarks at ``at`` (m,)."""
     copy_matrix(P[:r, :n], rows[:r, :n])
     for i in range(m):
         o, first = at[i], r + w * i
@@ -32,7 +38,7 @@ def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Arr
 
 @inner
 def combine_rows(Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
-    """``out`` (3, width) <- H P of the i-th seen landmark, of any number of variables."""
+    """``out`` (3, width) <- H P of the i-th seen landmark, of any number of variables: Hp (3, r), Hl (3, w)."""
     r, w = Hp.shape[1], Hl.shape[1]
     fill_matrix(out, 0.0)
     for a in range(OBSERVED):
@@ -45,7 +51,7 @@ def combine_rows(Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
 
 @inner
 def definite_root(A: Array, scale: Array) -> bool:
-    """Upper half of A <- its root; False if it has none or a pivot is lost to rounding. ``scale`` <- its diagonal."""
+    """Upper half of A (n, n) <- its root, ``scale`` (n,) <- its diagonal; False where a pivot is not above rounding."""
     for i in range(len(A)):
         scale[i] = A[i, i]
     definite = upper_cholesky(A)
@@ -56,7 +62,7 @@ def definite_root(A: Array, scale: Array) -> bool:
 
 @inner
 def subtract_gram(P: Array, n: int, r: int, W: Array) -> None:
-    """P <- P - W' W."""
+    """P (n, n) <- P - W' W with W (k, n); the block of the robot, r variables, is valid as a whole."""
     add_gram(-1.0, W, P[:n, :n])
     for a in range(r):
         for b in range(a):
@@ -78,7 +84,7 @@ def replace_rows(P: Array, n: int, o: int, rows: Array, own: Array) -> None:
 
 @inner
 def append_landmark(P: Array, n: int, Jp: Array, Jz: Array, R: Array) -> None:
-    """Covariance of a landmark put at n: its own and the one with everything before it."""
+    """P[:n + w, n:n + w] <- covariance of a landmark put at n with all before it, Jp (w, r), Jz (w, 3), R (3, 3)."""
     w, r = Jp.shape
     for j in range(n):
         for a in range(w):
@@ -93,7 +99,7 @@ def append_landmark(P: Array, n: int, Jp: Array, Jz: Array, R: Array) -> None:
 
 @inner
 def _own(P: Array, n: int, Jp: Array, Jz: Array, R: Array, a: int, b: int) -> float:
-    """Entry (a, b) of Jp P_pose Jp' + Jz R Jz'."""
+    """Entry (a, b) of Jp P_pose Jp' + Jz R Jz', (w, w)."""
     r, total = Jp.shape[1], 0.0
     for c in range(max(r, OBSERVED)):
         if c < r:

@@ -32,7 +32,7 @@ Bodies = dict[tuple[type, ...], Callable[..., Any]]
 _parts: dict[str, type] = {}
 _needs: dict[type, dict[str, frozenset[str]]] = {}
 _bodies: dict[Any, Bodies] = {}
-_names: set[str] = set()
+_named_bodies: dict[str, Callable[..., Any]] = {}
 _files: set[Path] = set()  # of parts and bodies outside the package, which the cache must know too
 
 
@@ -92,7 +92,7 @@ def generic(deciding: int = 1) -> Callable[[Function], Function]:
 
 
 def implement(function: Callable[..., Any], *classes: type) -> Callable[[Function], Function]:
-    """Decorator of the body of a generic ``function`` for parts of these types.
+    """Decorator of the body of a generic ``function`` for parts of these types; one body may serve several.
 
     Raises
     ------
@@ -102,11 +102,11 @@ def implement(function: Callable[..., Any], *classes: type) -> Callable[[Functio
 
     def register(body: Function) -> Function:
         name = f"{body.__module__}.{body.__qualname__}"
-        if "<locals>" in name or (_names.intersection({name}) and body not in _bodies[function].values()):
+        if "<locals>" in name or _named_bodies.get(name, body) is not body:
             raise TypeError(f"kernel function '{name}' must stand at module level under a name of its own")
         if classes in _bodies[function]:
             raise TypeError(f"'{function.__name__}' has a body for {_named(classes)} already")
-        _names.add(name)
+        _named_bodies[name] = body
         _bodies[function][classes] = body
         _remember_file(body)
         return body

@@ -36,7 +36,10 @@ REASONS = {
 
 @inner
 def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
-    """``work.rows`` <- rows of P of the robot and the seen landmarks; behind them those of Phi, treated alike."""
+    """``work.rows`` (r + w m, n) <- rows of P of the robot and of the ``m`` seen landmarks.
+
+    The rows of Phi, which are treated alike, follow them in columns n..n + base - 1.
+    """
     r, w, n, base = robot_width(slam.motion), landmark_width(slam.landmark), state.n, state.base
     gather_rows(state.P, n, r, w, work.at, m, work.rows)
     if base > 0:
@@ -48,18 +51,18 @@ def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTup
 
 @inner
 def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTuple]) -> None:
-    """zhat, Hp, Hl <- of the seen landmarks, with respect to the error of the filter."""
+    """``work``: zhat (3 m,), Hp (m, 3, r), Hl (m, 3, w) <- h of the seen landmarks; Jacobians by the filter's error."""
     pose, w = state.x[: robot_width(slam.motion)], landmark_width(slam.landmark)
     for i in range(m):
         o, expected = work.at[i], work.zhat[OBSERVED * i : OBSERVED * i + OBSERVED]
         values = state.x[o : o + w]
-        linearise(slam, pose, values, k, work.label[i], expected, work.Hp[i], work.Hl[i])
+        linearise(slam, pose, values, k, work.label[i], expected, work.Hp[i], work.Hl[i], work)
         to_error(slam.error, pose, values, work.Hp[i], work.Hl[i])
 
 
 @inner
 def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> None:
-    """A <- H P of the gathered rows, and the upper half of S <- H P H'."""
+    """``work.A`` (3 m, n + base) <- H P from the gathered rows; upper half of ``work.S`` (3 m, 3 m) <- H P H'."""
     r, w, width = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base
     A, S, Hp, Hl = work.A, work.S, work.Hp, work.Hl
     for i in range(m):
@@ -81,7 +84,7 @@ def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> No
 
 @inner
 def innovate(state: State, data: Data, m: int, work: Work[NamedTuple]) -> Array:
-    """Innovation of the ``m`` landmarks, in the last column of A."""
+    """Innovation (3 m,) of the ``m`` landmarks, which is the last column of ``work.A``."""
     y = work.A[: OBSERVED * m, state.n + state.base]
     for i in range(m):
         for a in range(OBSERVED):
@@ -91,7 +94,7 @@ def innovate(state: State, data: Data, m: int, work: Work[NamedTuple]) -> Array:
 
 @inner
 def whiten(state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float]:
-    """S <- the root of S + R, and A and the innovation <- divided by it; a code of REASONS or 0, and the NIS."""
+    """S (3 m, 3 m) <- root of S + R; A and the innovation <- divided by it. Gives a code of REASONS or 0, and NIS."""
     rows, width = OBSERVED * m, state.n + state.base
     S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
     y, total = joined[:, width], 0.0
@@ -123,7 +126,7 @@ def divide_by_root(state: State, m: int, work: Work[NamedTuple], total: float) -
 
 @inner
 def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
-    """x <- moved by W' S^-1/2 innovation and P <- P - W' W; with the columns of Phi as ``local`` says."""
+    """x (n,) <- moved by W' S^-1/2 innovation, P (n, n) <- P - W' W; with the columns of Phi as ``local`` says."""
     rows, n, base = OBSERVED * m, state.n, state.base
     A, y = work.A[:rows, :n], work.A[:rows, n + base]
     retract(slam.error, slam, state, A, y, work)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numba
 from filelock import FileLock
+from numba.extending import register_jitable
 
 from consistency.filters.kernel.dispatch import INNER, OPTIONS, PACKAGE, Function, outside_files
 
@@ -19,8 +20,22 @@ MARK = "compiled"  # a file beside what is kept
 
 
 def inner(function: Function) -> Function:
-    """Decorator of a function that other kernels call."""
-    compiled: Any = numba.njit(**INNER)(function)
+    """Decorator of a function that kernels call; Python calls it as the plain function that it is.
+
+    Raises
+    ------
+    TypeError
+        The function is a closure.
+    """
+    if "<locals>" in function.__qualname__:
+        raise TypeError(f"kernel function '{function.__qualname__}' must stand at module level")
+    register_jitable(**INNER)(function)
+    return function
+
+
+def routine(function: Function) -> Function:
+    """Decorator of a function that calls machine code, such as BLAS: compiled where Python calls it, too."""
+    compiled: Any = numba.njit(**OPTIONS)(function)
     return compiled
 
 

@@ -14,10 +14,10 @@ ROUNDING = 1e-24  # variance (m^2, rad^2) that rounding alone leaves behind wher
 
 @jitable
 def semidefinite_cholesky(A: Any, C: Any) -> bool:
-    """Lower C with C C' = A for a positive semidefinite A; the column of a zero pivot is zero.
+    """C (n, n) <- lower root with C C' = A (n, n), positive semidefinite; the column of a zero pivot is zero.
 
-    The start of a trial is known exactly, so the first covariances are singular. Returns False for
-    an indefinite or not finite A.
+    The start of a trial is known exactly, so the first covariances are singular. Returns False for an A that is
+    indefinite or not finite.
     """
     n = A.shape[0]
     for j in range(n):
@@ -41,13 +41,13 @@ def semidefinite_cholesky(A: Any, C: Any) -> bool:
 
 @jitable
 def definiteness(P: Any) -> int:
-    """1 positive definite, 0 rank-deficient, -1 indefinite or not finite, judged on correlations."""
+    """1 where P (n, n) is positive definite, 0 rank-deficient, -1 indefinite or not finite, judged on correlations."""
     return definiteness_with(P, np.empty(P.shape))
 
 
 @jitable
 def definiteness_with(P: Any, C: Any) -> int:
-    """:func:`definiteness` with ``C``, of the shape of P, for its work."""
+    """:func:`definiteness` of P (n, n), with ``C`` (n, n) as its workspace."""
     n = P.shape[0]
     deficient = False
     for j in range(n):

@@ -98,6 +98,7 @@ def _step(
 
 @inner
 def _most_seen(first: Indices) -> int:
+    """The most landmarks seen in a step, of first (T + 1,)."""
     most = 0
     for k in range(len(first) - 1):
         most = max(most, first[k + 1] - first[k])
@@ -146,6 +147,7 @@ def _make_memory(size: int, n_landmarks: int) -> Memory:
 
 @inner
 def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
+    """Outcome of T steps, NaN everywhere."""
     return Outcome(
         np.full((T, r), np.nan),
         np.full((T, r, r), np.nan),
@@ -188,6 +190,7 @@ def _settle_new(labels: Indices, n: int, w: int, state: State, home: Indices) ->
 
 @inner
 def _forget_pose(k: int, out: Outcome) -> None:
+    """NaN in the rows of step k + 1."""
     fill(out.pose[k], np.nan)
     fill_matrix(out.covariance[k], np.nan)
     fill_matrix(out.own[k], np.nan)
@@ -203,7 +206,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     T, r, w = len(data.controls), robot_width(slam.motion), landmark_width(slam.landmark)
     size += spare_width(slam.covariance, T, data.n_landmarks)
     own_memory, own_out = _make_memory(size, data.n_landmarks), _empty_outcome(T, r, data.n_landmarks)
-    own_work = make_work(slam, size, _most_seen(data.first))
+    own_work = make_work(slam, size, _most_seen(data.first), T, data.n_landmarks)
     own_local = make_local(slam.covariance, r, w, size, T, data.n_landmarks)
     memory, work, local, out = lend(own_memory), lend(own_work), lend(own_local), lend(own_out)
     copy(data.start, memory.x[:r])

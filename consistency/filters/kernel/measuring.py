@@ -21,6 +21,7 @@ from consistency.filters.kernel.slam import (
     observation_point,
     pull_back,
     robot_frame,
+    stands_apart,
 )
 from consistency.filters.kernel.work import Work
 from consistency.models import point
@@ -29,7 +30,7 @@ from consistency.types import Array
 
 @inner
 def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
-    """z (3,) <- h."""
+    """z (3,) <- h: the landmark ``values`` (w,) as the sensor of a robot at ``frame`` sees it."""
     bx, by, bz = look(slam.landmark, frame, values)
     cx, cy, cz = point.to_sensor(bx, by, bz, slam.sensor.mount)
     z[0], z[1], z[2] = measure(slam.sensor, cx, cy, cz)
@@ -37,7 +38,7 @@ def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
 
 @inner
 def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, Hl: Array) -> None:
-    """z (3,), Hp (3, r), Hl (3, w) <- h and its Jacobians with respect to the variables of robot and landmark."""
+    """z (3,), Hp (3, r), Hl (3, w) <- h at ``frame`` and ``values`` (w,), and its Jacobians by variables of both."""
     body = look(slam.landmark, frame, values)
     mount = slam.sensor.mount
     cx, cy, cz = point.to_sensor(body[0], body[1], body[2], mount)
@@ -54,19 +55,23 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
 
 
 @inner
-def linearise(slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array) -> None:
+def linearise(
+    slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array, work: Work[NamedTuple]
+) -> None:
     """z (3,) <- h expected of (pose, values) in step k + 1; Hp (3, r), Hl (3, w) <- Jacobians at the chosen point."""
-    at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label)
+    at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label, work)
     linearise_at(slam, robot_frame(slam.motion, at), landmark, z, Hp, Hl)
     if expands(slam.point):
         for i in range(OBSERVED):
             for j in range(len(pose)):
                 z[i] += Hp[i, j] * (pose[j] - at[j]) + Hl[i, j] * (values[j] - landmark[j])
+    if stands_apart(slam.point):
+        observe(slam, robot_frame(slam.motion, pose), values, z)
 
 
 @inner
 def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[NamedTuple]) -> None:
-    """values (w,), ``work.Jp``, ``work.Jz`` <- the inverse of h at ``pose``, and its Jacobians."""
+    """values (w,), ``work.Jp`` (w, r), ``work.Jz`` (w, 3) <- inverse of h at ``pose`` (r,) for z (3,); Jacobians."""
     mount, Jb = slam.sensor.mount, work.Jb
     cx, cy, cz = locate(slam.sensor, z[0], z[1], z[2])
     body = point.from_sensor(cx, cy, cz, mount)

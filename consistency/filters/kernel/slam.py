@@ -83,43 +83,55 @@ def robot_width(motion: NamedTuple) -> int:
 
 @generic()
 def move(motion: NamedTuple, pose: Array, u: Array, out: Array) -> None:
-    """``out`` (r,) <- f of ``pose`` (r,) under the control ``u`` (dt, v, omega), without noise."""
+    """``out`` (r,) <- f of ``pose`` (r,) without noise, under the control ``u`` (3,): dt, s; v, m/s; omega, rad/s."""
     raise NotImplementedError
 
 
 @generic()
 def move_about(motion: NamedTuple, at: Array, u: Array, pose: Array) -> None:
-    """``pose`` (r,) <- f(at) + F (pose - at), f to first order about ``at`` (r,)."""
+    """``pose`` (r,) <- f(at) + F (pose - at): f to first order about ``at`` (r,), under the control ``u`` (3,)."""
     raise NotImplementedError
 
 
 @generic()
 def carry(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
-    """P <- F P F' and Phi <- F Phi with F the Jacobian of f at ``at``; of P the rows of the robot and its block."""
+    """P (n, n) <- F P F' and Phi (n, base) <- F Phi, with F (r, r) the Jacobian of f at ``at`` (r,) under ``u`` (3,).
+
+    Of both, the r rows of the robot are changed; in P the block of the robot becomes valid as a whole.
+    """
+    raise NotImplementedError
+
+
+@generic()
+def carry_by(motion: NamedTuple, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
+    """As :func:`carry`, with F the Jacobian of a motion that displaces the robot by (dx, dy) in the world, m."""
     raise NotImplementedError
 
 
 @generic()
 def add_motion_noise(motion: NamedTuple, at: Array, u: Array, P: Array) -> None:
-    """Block of the robot in P += G Q G' at ``at``."""
+    """P[:r, :r] += G Q G', with G the Jacobian of f by the noise at ``at`` (r,) under the control ``u`` (3,)."""
     raise NotImplementedError
 
 
 @generic()
 def noise_columns(motion: NamedTuple, at: Array, u: Array, G: Array) -> int:
-    """Columns of ``G`` (r, >= q) <- G Q^(1/2) at ``at``; returns q."""
+    """First q columns of ``G`` (r, >= q) <- G Q^(1/2) at ``at`` (r,) under the control ``u`` (3,); returns q."""
     raise NotImplementedError
 
 
 @generic()
 def robot_frame(motion: NamedTuple, pose: Array) -> Frame:
-    """What landmarks need to know of a pose (r,)."""
+    """Position in m and axes of the robot at ``pose`` (r,), which is all that landmarks need to know of it."""
     raise NotImplementedError
 
 
 @generic()
 def carry_root(motion: NamedTuple, P: Array, first: int, last: int, C: Array, F: Array) -> None:
-    """Columns first..last-1 of the robot's rows: P <- F C^-1 P for a lower root C (r, r); a zero pivot carries 0."""
+    """Columns first..last-1 of the robot's rows: P (r, n) <- F C^-1 P for a lower root C (r, r) and F (r, r).
+
+    A direction whose pivot in C is zero carries nothing.
+    """
     raise NotImplementedError
 
 
@@ -128,25 +140,25 @@ def carry_root(motion: NamedTuple, P: Array, first: int, last: int, C: Array, F:
 
 @generic()
 def measure(sensor: Sensor, x: float, y: float, z: float) -> Triple:
-    """Observation of a point in the frame of the sensor, in m."""
+    """Observation (m or px, as the sensor has it) of a point in the frame of the sensor, in m."""
     raise NotImplementedError
 
 
 @generic()
 def measure_jacobian(sensor: Sensor, x: float, y: float, z: float) -> Nine:
-    """Jacobian of :func:`measure` by rows."""
+    """Jacobian (3, 3) of :func:`measure` by the point, row after row."""
     raise NotImplementedError
 
 
 @generic()
 def locate(sensor: Sensor, z0: float, z1: float, z2: float) -> Triple:
-    """Inverse of :func:`measure`."""
+    """Point in the frame of the sensor, in m, that has this observation: the inverse of :func:`measure`."""
     raise NotImplementedError
 
 
 @generic()
 def locate_jacobian(sensor: Sensor, z0: float, z1: float, z2: float) -> Nine:
-    """Jacobian of :func:`locate` by rows."""
+    """Jacobian (3, 3) of :func:`locate` by the observation, row after row."""
     raise NotImplementedError
 
 
@@ -161,7 +173,7 @@ def landmark_width(landmark: NamedTuple) -> int:
 
 @generic()
 def look(landmark: NamedTuple, frame: Frame, values: Array) -> Triple:
-    """The landmark ``values`` (w,) in the frame of the robot, in m."""
+    """Position of the landmark ``values`` (w,) in the frame of the robot, in m."""
     raise NotImplementedError
 
 
@@ -169,9 +181,9 @@ def look(landmark: NamedTuple, frame: Frame, values: Array) -> Triple:
 def pull_back(
     landmark: NamedTuple, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
-    """Rows ``Hp`` (r,) and ``Hl`` (w,) <- a ``row`` d / d(point in the robot frame) through :func:`look`.
+    """Rows ``Hp`` (r,) and ``Hl`` (w,) <- derivatives by the variables of robot and landmark, through :func:`look`.
 
-    ``body`` is what :func:`look` gave.
+    ``row`` holds the derivative by the point in the frame of the robot, ``body`` that point, as :func:`look` gave it.
     """
     raise NotImplementedError
 
@@ -180,22 +192,23 @@ def pull_back(
 def insert(
     landmark: NamedTuple, frame: Frame, body: Triple, Jb: Array, mount: Mounting, values: Array, Jp: Array, Jz: Array
 ) -> None:
-    """``values`` (w,) <- a new landmark seen at ``body`` in the robot frame; Jacobians (w, r) and (w, 3).
+    """``values`` (w,) <- a new landmark seen at ``body``, m in the frame of the robot.
 
-    ``Jb`` (3, 3) is d body / d observation; ``mount`` tells from where it was seen.
+    ``Jp`` (w, r) and ``Jz`` (w, 3) <- its Jacobians by robot and observation. ``Jb`` (3, 3) is the derivative of
+    ``body`` by the observation; ``mount`` says where the sensor is on the robot.
     """
     raise NotImplementedError
 
 
 @generic()
 def world_point(landmark: NamedTuple, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array) -> None:
-    """``point`` (3,) <- position in the world, m, with Jacobians (3, r) and (3, w)."""
+    """``point`` (3,) <- position in the world, m, of ``values`` (w,); ``Dp`` (3, r), ``Dl`` (3, w) <- its Jacobians."""
     raise NotImplementedError
 
 
 @generic()
 def combine(landmark: NamedTuple, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
-    """``out`` (3, width) <- H P of the i-th seen landmark, from ``rows`` (r + w m, width) of P."""
+    """``out`` (3, width) <- H P of the i-th seen landmark: Hp (3, r), Hl (3, w) and ``rows`` (r + w m, width) of P."""
     raise NotImplementedError
 
 
@@ -204,31 +217,40 @@ def combine(landmark: NamedTuple, Hp: Array, Hl: Array, rows: Array, i: int, out
 
 @generic()
 def propagate(error: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
-    """x, P, Phi <- one step of motion; the Jacobians are those that the linearisation point asks for."""
+    """x (n,), P (n, n), Phi (n, base) <- one step of motion under the control ``u`` (3,), to step k + 1.
+
+    The Jacobians are taken where the linearisation point asks for them.
+    """
     raise NotImplementedError
 
 
 @generic()
 def to_error(error: NamedTuple, pose: Array, values: Array, Hp: Array, Hl: Array) -> None:
-    """Jacobians with respect to variables -> with respect to this error, in place: rows of ``Hp`` and ``Hl``."""
+    """Rows ``Hp`` (k, r) and ``Hl`` (k, w) <- Jacobians by this error, in place of those by the variables.
+
+    The error is that of the robot at ``pose`` (r,) and of the landmark ``values`` (w,).
+    """
     raise NotImplementedError
 
 
 @generic()
 def insert_error(error: NamedTuple, pose: Array, values: Array, Jp: Array) -> None:
-    """Jacobian (w, r) of a new landmark's variables by those of the robot -> between their errors, in place."""
+    """``Jp`` (w, r) <- Jacobian between errors, in place of the one between variables, of a new landmark by the robot.
+
+    The robot is at ``pose`` (r,), the landmark is ``values`` (w,).
+    """
     raise NotImplementedError
 
 
 @generic()
 def retract(error: NamedTuple, slam: Slam, state: State, A: Array, y: Array, work: NamedTuple) -> None:
-    """x <- x moved by the error A' y, A (k, n) and y (k,)."""
+    """x (n,) <- x moved by the error A' y, with A (k, n) and y (k,)."""
     raise NotImplementedError
 
 
 @generic()
 def pose_covariance(error: NamedTuple, x: Array, P: Array, out: Array) -> None:
-    """``out`` (r, r) <- covariance of the additive error of the robot from that of this error, P (r, r)."""
+    """``out`` (r, r) <- covariance of the additive error of the robot at x (n,), from that of this error, P (r, r)."""
     raise NotImplementedError
 
 
@@ -242,26 +264,44 @@ def expands(point: NamedTuple) -> bool:
 
 
 @generic()
+def stands_apart(point: NamedTuple) -> bool:
+    """Whether only the Jacobians are taken at the point, f and h at the estimate; a constant."""
+    raise NotImplementedError
+
+
+@generic()
+def make_notes(point: NamedTuple, r: int, w: int, steps: int, labels: int) -> NamedTuple:
+    """What the point remembers of a trial of so many steps and ids of landmarks, ``work.notes``; made once."""
+    raise NotImplementedError
+
+
+@generic()
 def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
-    """Pose (r,) at which f of step k + 1 is linearised."""
+    """Pose (r,) at which the noise of step k + 1 acts, and about which f is expanded where the point expands."""
+    raise NotImplementedError
+
+
+@generic()
+def carry_at(point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
+    """P <- F P F' and Phi <- F Phi as :func:`carry`, F of step k + 1 as the point asks; called before x moves."""
     raise NotImplementedError
 
 
 @generic()
 def observation_point(point: NamedTuple, pose: Array, k: int) -> Array:
-    """Pose (r,) at which h of step k + 1 is linearised."""
+    """Pose (r,) at which h of step k + 1 is linearised; ``pose`` (r,) is the estimate."""
     raise NotImplementedError
 
 
 @generic()
-def landmark_point(point: NamedTuple, values: Array, label: int) -> Array:
+def landmark_point(point: NamedTuple, values: Array, label: int, work: NamedTuple) -> Array:
     """Landmark (w,) at which h is linearised."""
     raise NotImplementedError
 
 
 @generic()
 def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Array, work: NamedTuple) -> None:
-    """x[n:n + w], ``work.Jp`` and ``work.Jz`` <- the inverse of h for a new landmark, and its Jacobians."""
+    """x[n:n + w], ``work.Jp`` (w, r), ``work.Jz`` (w, 3) <- a new landmark from its observation z (3,); Jacobians."""
     raise NotImplementedError
 
 
@@ -286,7 +326,10 @@ def predict(
 def correct(
     update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
 ) -> tuple[int, float]:
-    """x, P <- the joint update with the ``m`` landmarks in ``work``; returns a code of REASONS or 0, and the NIS."""
+    """x (n,), P (n, n) <- the joint update in step k + 1 with the ``m`` landmarks that ``work`` lists.
+
+    Returns a code of REASONS, 0 where all is well, and the NIS.
+    """
     raise NotImplementedError
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import OBSERVED, Slam, landmark_width, make_room, robot_width
+from consistency.filters.kernel.slam import OBSERVED, Slam, landmark_width, make_notes, make_room, robot_width
 from consistency.types import Array, Indices
 
 Room = TypeVar("Room", covariant=True)
+
+
+class NoNotes(NamedTuple):
+    """Of a linearisation point that remembers nothing."""
 
 
 class Work(NamedTuple, Generic[Room]):
@@ -33,11 +37,12 @@ class Work(NamedTuple, Generic[Room]):
     pose: Array  # (r,)
     small: Array  # (r, r)
     room: Room  # what the update alone needs
+    notes: Any  # what the linearisation point alone needs, of a type of its own
 
 
 @inner
-def make_work(slam: Slam, n: int, m: int) -> Work[NamedTuple]:
-    """Arrays for a state of up to ``n`` variables and up to ``m`` landmarks in a step."""
+def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[NamedTuple]:
+    """Arrays for a state of up to ``n`` variables, ``m`` landmarks in a step, and a trial with so many labels."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     rows = OBSERVED * m
     return Work(
@@ -58,4 +63,5 @@ def make_work(slam: Slam, n: int, m: int) -> Work[NamedTuple]:
         np.empty(r),
         np.empty((r, r)),
         make_room(slam.update, r, w, m, n),
+        make_notes(slam.point, r, w, steps, labels),
     )

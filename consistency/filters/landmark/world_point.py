@@ -28,11 +28,13 @@ class WorldPoint(NamedTuple):
 
 @implement(landmark_width, WorldPoint)
 def world_point_width(landmark: WorldPoint) -> int:
+    """3: x, y, z in m."""
     return 3
 
 
 @implement(look, WorldPoint)
 def look_at_world_point(landmark: WorldPoint, frame: Frame, values: Array) -> Triple:
+    """The point in the frame of the robot, in m, eq. 19."""
     return point.turned_to_robot(frame.x, frame.y, frame.c, frame.s, values[0], values[1], values[2])
 
 
@@ -40,6 +42,7 @@ def look_at_world_point(landmark: WorldPoint, frame: Frame, values: Array) -> Tr
 def pull_back_to_world_point(
     landmark: WorldPoint, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
+    """Hp (3,) <- by x, y, heading, Hl (3,) <- by the point in the world: the ``row`` turned by the heading."""
     c, s, d0, d1, d2 = frame.c, frame.s, row[0], row[1], row[2]
     Hl[0], Hl[1], Hl[2] = c * d0 - s * d1, s * d0 + c * d1, d2
     Hp[0], Hp[1], Hp[2] = -Hl[0], -Hl[1], d0 * body[1] - d1 * body[0]
@@ -56,6 +59,7 @@ def insert_world_point(
     Jp: Array,
     Jz: Array,
 ) -> None:
+    """values (3,) <- the inverse of eq. 19; Jp (3, 3), Jz (3, 3) <- its Jacobians."""
     c, s, bx, by = frame.c, frame.s, body[0], body[1]
     values[0], values[1], values[2] = point.turned_to_world(frame.x, frame.y, c, s, bx, by, body[2])
     fill_matrix(Jp, 0.0)
@@ -67,6 +71,7 @@ def insert_world_point(
 
 @implement(world_point, WorldPoint)
 def world_point_itself(landmark: WorldPoint, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array) -> None:
+    """point (3,) <- values (3,); Dp (3, r) <- 0, Dl (3, 3) <- 1."""
     copy(values, point)
     fill_matrix(Dp, 0.0)
     fill_matrix(Dl, 0.0)
@@ -75,6 +80,7 @@ def world_point_itself(landmark: WorldPoint, frame: Frame, values: Array, point:
 
 @implement(combine, WorldPoint)
 def combine_world_point(landmark: WorldPoint, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
+    """out (3, width) <- H P, written out for three variables each of robot and landmark."""
     p0, p1, p2 = rows[0], rows[1], rows[2]
     l0, l1, l2 = rows[3 * i + 3], rows[3 * i + 4], rows[3 * i + 5]
     for a in range(3):

@@ -47,13 +47,14 @@ def anchored_width(landmark: AnchoredInverseDepth) -> int:
 
 @inner
 def _ray(values: Array) -> Triple:
-    """Unit vector in the world."""
+    """Unit vector in the world of values (6,)."""
     c = np.cos(values[4])
     return c * np.cos(values[3]), c * np.sin(values[3]), np.sin(values[4])
 
 
 @implement(look, AnchoredInverseDepth)
 def look_at_anchored(landmark: AnchoredInverseDepth, frame: Frame, values: Array) -> Triple:
+    """The end of the ray in the frame of the robot, in m."""
     mx, my, mz = _ray(values)
     x, y, z = values[0] + mx / values[5], values[1] + my / values[5], values[2] + mz / values[5]
     return turned_to_robot(frame.x, frame.y, frame.c, frame.s, x, y, z)
@@ -63,6 +64,7 @@ def look_at_anchored(landmark: AnchoredInverseDepth, frame: Frame, values: Array
 def pull_back_to_anchored(
     landmark: AnchoredInverseDepth, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
+    """Hp (3,) <- by x, y, heading, Hl (6,) <- by the six numbers, through the point in the world."""
     c, s, d0, d1, d2 = frame.c, frame.s, row[0], row[1], row[2]
     _by_values(values, c * d0 - s * d1, s * d0 + c * d1, d2, Hl)
     Hp[0], Hp[1], Hp[2] = -Hl[0], -Hl[1], d0 * body[1] - d1 * body[0]
@@ -90,6 +92,7 @@ def insert_anchored(
     Jp: Array,
     Jz: Array,
 ) -> None:
+    """values (6,) <- anchor, direction and inverse length of the ray to ``body``; Jp (6, 3), Jz (6, 3) <- Jacobians."""
     c, s = frame.c, frame.s
     q0, q1, dz = body[0] - mount.x, body[1] - mount.y, body[2] - mount.z
     dx, dy = c * q0 - s * q1, s * q0 + c * q1
@@ -116,6 +119,7 @@ def insert_anchored(
 def anchored_world_point(
     landmark: AnchoredInverseDepth, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array
 ) -> None:
+    """point (3,) <- anchor + ray / inverse depth, m; Dp (3, r) <- 0, Dl (3, 6) <- its Jacobian."""
     m = _ray(values)
     for a in range(3):
         point[a] = values[a] + m[a] / values[5]
@@ -125,6 +129,7 @@ def anchored_world_point(
 
 @implement(combine, AnchoredInverseDepth)
 def combine_anchored(landmark: AnchoredInverseDepth, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
+    """out (3, width) <- H P, by the version for any width."""
     combine_rows(Hp, Hl, rows, i, out)
 
 

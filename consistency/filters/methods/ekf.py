@@ -15,41 +15,20 @@ from consistency.filters.point.at_estimate import AtEstimate
 from consistency.filters.update.joint import Joint
 from consistency.filters.upkeep.dense import Dense
 from consistency.protocols import Problem
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.types import Array, Control, Info
 
 
-class ExtendedKalman:
+class ExtendedKalman(plain.WorldPointTwin):
     """EKF-SLAM with the joint update of all landmarks seen in a step."""
-
-    def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
-
-    def init(self, problem: Problem) -> SlamState:
-        return plain.start(problem)
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         return plain.predict_extended(state, control)
 
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        def correct(state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-            zhat, H = plain.expect(state, seen, self.uvd)
-            innovation = z.ravel() - zhat
-            S, W = plain.gain(state.P, H, plain.block_diagonal(R))
-            return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
-
-        def locate(state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-            return plain.locate_point(state, z, self.uvd)
-
-        return plain.update_jointly(state, observation, self.uvd, correct, locate)
-
-    def pose(self, state: SlamState) -> Gaussian:
-        return plain.pose_of(state)
-
-    def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return plain.map_of(state)
-
-    def joint(self, state: SlamState) -> Gaussian:
-        return plain.joint_of(state)
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        zhat, H = plain.expect(state, seen, self.uvd)
+        innovation = z.ravel() - zhat
+        S, W = plain.gain(state.P, H, plain.block_diagonal(R))
+        return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:

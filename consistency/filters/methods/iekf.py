@@ -13,6 +13,7 @@ import numpy as np
 
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled
+from consistency.filters.kernel.covariance import state_index
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, whiten
 from consistency.filters.kernel.jit import inner
@@ -26,14 +27,14 @@ from consistency.filters.kernel.slam import (
     landmark_width,
     make_room,
     predict,
-    propagate,
     robot_width,
 )
 from consistency.filters.kernel.work import Work
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
+from consistency.filters.update.joint import predict_by_error
 from consistency.protocols import Problem
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.types import Array, Control, Info
 
 PASSES = 5  # linearisations of an update; the first is the EKF's
 
@@ -56,11 +57,7 @@ def iterated_room(update: Iterated, r: int, w: int, m: int, n: int) -> PriorRoom
     return PriorRoom(np.empty(r + w * m))
 
 
-@implement(predict, Iterated)
-def predict_iterated(
-    update: Iterated, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[PriorRoom]
-) -> None:
-    propagate(slam.error, slam, state, k, u, local.Phi, work)
+implement(predict, Iterated)(predict_by_error)
 
 
 @implement(correct, Iterated)
@@ -71,7 +68,7 @@ def correct_iterated(
     involved, first_nis = r + w * m, np.nan
     gather(slam, state, m, local, work)
     for a in range(involved):
-        work.room.prior[a] = state.x[_variable(r, w, a, work)]
+        work.room.prior[a] = state.x[state_index(r, w, a, work.at)]
     for i in range(update.passes):
         linearise_seen(slam, state, k, m, work)
         combine_seen(slam, state, m, work)
@@ -82,21 +79,15 @@ def correct_iterated(
         first_nis = nis if i == 0 else first_nis
         is_last = i == update.passes - 1
         for a in range(involved):
-            j = _variable(r, w, a, work)
+            j = state_index(r, w, a, work.at)
             state.x[j] = work.room.prior[a] + (0.0 if is_last else _shift(state, m, j, work))
     apply(slam, state, m, local, work)
     return 0, first_nis
 
 
 @inner
-def _variable(r: int, w: int, a: int, work: Work[PriorRoom]) -> int:
-    """State index of the a-th of the variables involved."""
-    return a if a < r else work.at[(a - r) // w] + (a - r) % w
-
-
-@inner
 def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[PriorRoom]) -> None:
-    """y <- z - h(x) - H (prior - x)."""
+    """y (3 m,) <- z - h(x) - H (prior - x)."""
     x, prior = state.x, work.room.prior
     for i in range(m):
         o = work.at[i]
@@ -116,42 +107,25 @@ def _shift(state: State, m: int, j: int, work: Work[PriorRoom]) -> float:
     return total
 
 
-class IteratedKalman:
+class IteratedKalman(plain.WorldPointTwin):
     """EKF-SLAM whose update is a Gauss-Newton iteration."""
 
     def __init__(self, name: str, uvd: bool, passes: int = PASSES) -> None:
-        self.name, self.uvd, self.passes = name, uvd, passes
-
-    def init(self, problem: Problem) -> SlamState:
-        return plain.start(problem)
+        super().__init__(name, uvd)
+        self.passes = passes
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         return plain.predict_extended(state, control)
 
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        def correct(state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-            x, infos = state.x, []
-            for _ in range(self.passes):
-                zhat, H = plain.expect(replace(state, x=x), seen, self.uvd)
-                innovation = z.ravel() - zhat - H @ (state.x - x)
-                S, W = plain.gain(state.P, H, plain.block_diagonal(R))
-                x = state.x + W @ innovation
-                infos.append(Info(innovation, S, W))
-            return replace(state, x=x, P=state.P - W @ S @ W.T), infos[0]
-
-        def locate(state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-            return plain.locate_point(state, z, self.uvd)
-
-        return plain.update_jointly(state, observation, self.uvd, correct, locate)
-
-    def pose(self, state: SlamState) -> Gaussian:
-        return plain.pose_of(state)
-
-    def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return plain.map_of(state)
-
-    def joint(self, state: SlamState) -> Gaussian:
-        return plain.joint_of(state)
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        x, infos = state.x, []
+        for _ in range(self.passes):
+            zhat, H = plain.expect(replace(state, x=x), seen, self.uvd)
+            innovation = z.ravel() - zhat - H @ (state.x - x)
+            S, W = plain.gain(state.P, H, plain.block_diagonal(R))
+            x = state.x + W @ innovation
+            infos.append(Info(innovation, S, W))
+        return replace(state, x=x, P=state.P - W @ S @ W.T), infos[0]
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:

@@ -49,6 +49,7 @@ class RightInvariant(NamedTuple):
 def propagate_right(
     error: RightInvariant, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
+    """x <- f(x) and P <- P + Ad G Q G' Ad': F is the identity, and the noise turns with the world, (n, q)."""
     x, P, n, G = state.x, state.P, state.n, work.small
     columns = noise_columns(slam.motion, x[:3], u, G)
     move(slam.motion, x[:3], u, x[:3])
@@ -72,6 +73,7 @@ def to_right(error: RightInvariant, pose: Array, values: Array, Hp: Array, Hl: A
 
 @implement(insert_error, RightInvariant)
 def insert_right(error: RightInvariant, pose: Array, values: Array, Jp: Array) -> None:
+    """Jp (3, 3) <- Jacobian between the errors of the robot and of a new landmark."""
     for a in range(len(Jp)):
         Jp[a, 2] += pose[0] * Jp[a, 1] - pose[1] * Jp[a, 0]
     Jp[0, 2] += values[1]
@@ -80,6 +82,7 @@ def insert_right(error: RightInvariant, pose: Array, values: Array, Jp: Array) -
 
 @implement(retract, RightInvariant)
 def retract_right(error: RightInvariant, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
+    """x (n,) <- exp(A' y) x, of the robot and of every landmark, with A (k, n) and y (k,)."""
     x, delta = state.x, work.delta[: state.n]
     fill(delta, 0.0)
     add_transposed_times(A, y, delta)

@@ -18,10 +18,10 @@ from consistency.filters.update.unscented import Unscented
 from consistency.filters.upkeep.dense import Dense
 from consistency.protocols import Problem
 from consistency.scenario import Belief
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.types import Array, Control, Info
 
 
-class UnscentedKalman:
+class UnscentedKalman(plain.WorldPointTwin):
     """UKF-SLAM over the whole state.
 
     The variables are ordered robot, landmarks seen in this step (as observed), the rest before the
@@ -31,12 +31,6 @@ class UnscentedKalman:
     """
 
     robot = plain.Unicycle()
-
-    def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
-
-    def init(self, problem: Problem) -> SlamState:
-        return plain.start(problem)
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         belief = state.problem.belief
@@ -48,12 +42,6 @@ class UnscentedKalman:
         _, G = self.robot.jacobians(state.x[:3], control)
         P[:3, :3] += plain.process_noise(G, belief)
         return replace(state, x=x, P=P)
-
-    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
-        def locate(state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-            return plain.locate_point(state, z, self.uvd)
-
-        return plain.update_jointly(state, observation, self.uvd, self._correct, locate)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
@@ -67,15 +55,6 @@ class UnscentedKalman:
         innovation = z.ravel() - zhat
         x, P = state.x + W @ innovation, state.P - W @ S @ W.T
         return replace(state, x=x, P=P), Info(innovation, S, W)
-
-    def pose(self, state: SlamState) -> Gaussian:
-        return plain.pose_of(state)
-
-    def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return plain.map_of(state)
-
-    def joint(self, state: SlamState) -> Gaussian:
-        return plain.joint_of(state)
 
 
 def sigma_points(x: Array, P: Array, involved: Array, belief: Belief) -> tuple[Array, Array, Array]:
@@ -95,7 +74,7 @@ def sigma_points(x: Array, P: Array, involved: Array, belief: Belief) -> tuple[A
 
 
 def ordered_root(P: Array, first: Array) -> Array:
-    """Root C with C C' = P, lower triangular once the variables ``first`` are put first."""
+    """Root C (n, n) with C C' = P (n, n), lower triangular once the variables ``first`` (L,) are put first."""
     order = np.concatenate([first, np.setdiff1d(np.arange(len(P)), first)])
     root = np.empty_like(P)
     root[order] = square_root(P[np.ix_(order, order)])
@@ -103,7 +82,7 @@ def ordered_root(P: Array, first: Array) -> Array:
 
 
 def square_root(P: Array) -> Array:
-    """Lower C with C C' = P for a positive semidefinite P; where a pivot vanishes so does its column.
+    """Lower C (n, n) with C C' = P (n, n), positive semidefinite; where a pivot vanishes so does its column.
 
     Raises
     ------

@@ -12,6 +12,7 @@ from consistency.filters.kernel.slam import (
     Frame,
     add_motion_noise,
     carry,
+    carry_by,
     carry_root,
     move,
     move_about,
@@ -33,18 +34,23 @@ class Unicycle(NamedTuple):
 
 @implement(robot_width, Unicycle)
 def unicycle_width(motion: Unicycle) -> int:
+    """3: x, y in m, heading in rad."""
     return 3
 
 
 @implement(move, Unicycle)
 def move_unicycle(motion: Unicycle, pose: Array, u: Array, out: Array) -> None:
-    out[0], out[1], out[2] = unicycle(pose[0], pose[1], pose[2], u[0], u[1], u[2])
+    """out (3,) <- eq. 18 without noise, Euler, at the heading before the step."""
+    dt, v, omega = u[0], u[1], u[2]
+    out[0], out[1], out[2] = unicycle(pose[0], pose[1], pose[2], dt, v, omega)
 
 
 @implement(move_about, Unicycle)
 def move_unicycle_about(motion: Unicycle, at: Array, u: Array, pose: Array) -> None:
-    fx, fy = unicycle_jacobian(at[2], u[0], u[1])
-    x, y, heading = unicycle(at[0], at[1], at[2], u[0], u[1], u[2])
+    """pose (3,) <- eq. 18 to first order about ``at`` (3,)."""
+    dt, v, omega = u[0], u[1], u[2]
+    fx, fy = unicycle_jacobian(at[2], dt, v)
+    x, y, heading = unicycle(at[0], at[1], at[2], dt, v, omega)
     turn = pose[2] - at[2]
     pose[0] = x + (pose[0] - at[0]) + fx * turn
     pose[1] = y + (pose[1] - at[1]) + fy * turn
@@ -53,7 +59,19 @@ def move_unicycle_about(motion: Unicycle, at: Array, u: Array, pose: Array) -> N
 
 @implement(carry, Unicycle)
 def carry_unicycle(motion: Unicycle, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
+    """P (n, n) <- F P F' and Phi (n, base) <- F Phi, where F (3, 3) is the identity but for its last column."""
     fx, fy = unicycle_jacobian(at[2], u[0], u[1])
+    _carry(P, n, Phi, base, fx, fy)
+
+
+@implement(carry_by, Unicycle)
+def carry_unicycle_by(motion: Unicycle, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
+    _carry(P, n, Phi, base, -dy, dx)
+
+
+@inner
+def _carry(P: Array, n: int, Phi: Array, base: int, fx: float, fy: float) -> None:
+    """P <- F P F' and Phi <- F Phi, F the identity but for F[0, 2] = fx and F[1, 2] = fy."""
     _move_rows(P, n, fx, fy)
     for i in range(3):
         P[i, 0] += fx * P[i, 2]
@@ -63,7 +81,7 @@ def carry_unicycle(motion: Unicycle, at: Array, u: Array, P: Array, n: int, Phi:
 
 @inner
 def _move_rows(P: Array, n: int, fx: float, fy: float) -> None:
-    """P <- F P where F is the identity but for F[0, 2] = fx and F[1, 2] = fy."""
+    """Rows 0 and 1 of P (3, n) <- F P, where F (3, 3) is the identity but for F[0, 2] = fx and F[1, 2] = fy."""
     p0, p1, p2 = P[0], P[1], P[2]
     for j in range(n):
         p0[j] += fx * p2[j]
@@ -72,7 +90,9 @@ def _move_rows(P: Array, n: int, fx: float, fy: float) -> None:
 
 @implement(add_motion_noise, Unicycle)
 def add_unicycle_noise(motion: Unicycle, at: Array, u: Array, P: Array) -> None:
-    xx, xy, yy, hh = unicycle_noise(at[2], u[0], motion.sigma_v, motion.sigma_omega)
+    """P[:3, :3] += G diag(sigma_v^2, sigma_omega^2) G' with G (3, 2)."""
+    dt = u[0]
+    xx, xy, yy, hh = unicycle_noise(at[2], dt, motion.sigma_v, motion.sigma_omega)
     P[0, 0] += xx
     P[0, 1] += xy
     P[1, 0] += xy
@@ -82,19 +102,23 @@ def add_unicycle_noise(motion: Unicycle, at: Array, u: Array, P: Array) -> None:
 
 @implement(noise_columns, Unicycle)
 def unicycle_noise_columns(motion: Unicycle, at: Array, u: Array, G: Array) -> int:
-    along, turn = u[0] * motion.sigma_v, u[0] * motion.sigma_omega
-    G[0, 0], G[1, 0], G[2, 0] = along * np.cos(at[2]), along * np.sin(at[2]), 0.0
+    """G[:, :2] <- dt sigma_v along the heading ``at`` and dt sigma_omega in heading; returns 2."""
+    dt, heading = u[0], at[2]
+    along, turn = dt * motion.sigma_v, dt * motion.sigma_omega
+    G[0, 0], G[1, 0], G[2, 0] = along * np.cos(heading), along * np.sin(heading), 0.0
     G[0, 1], G[1, 1], G[2, 1] = 0.0, 0.0, turn
     return 2
 
 
 @implement(robot_frame, Unicycle)
 def unicycle_frame(motion: Unicycle, pose: Array) -> Frame:
+    """Position and heading of a pose (3,)."""
     return Frame(pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]))
 
 
 @implement(carry_root, Unicycle)
 def carry_unicycle_root(motion: Unicycle, P: Array, first: int, last: int, C: Array, F: Array) -> None:
+    """P (3, n) <- F C^-1 P in columns first..last-1, by forward substitution."""
     i0, i1, i2 = _reciprocal(C[0, 0]), _reciprocal(C[1, 1]), _reciprocal(C[2, 2])
     c10, c20, c21 = C[1, 0], C[2, 0], C[2, 1]
     f00, f01, f02 = F[0, 0], F[0, 1], F[0, 2]

@@ -9,14 +9,18 @@ from consistency.filters.kernel.measuring import place_observed
 from consistency.filters.kernel.slam import (
     Slam,
     State,
+    carry,
+    carry_at,
     expands,
     landmark_point,
+    make_notes,
     motion_point,
     observation_point,
     place,
     robot_width,
+    stands_apart,
 )
-from consistency.filters.kernel.work import Work
+from consistency.filters.kernel.work import NoNotes, Work
 from consistency.types import Array
 
 
@@ -27,21 +31,41 @@ class AtEstimate(NamedTuple):
 
 @implement(expands, AtEstimate)
 def estimate_is_not_expanded(point: AtEstimate) -> bool:
+    """False: f and h are evaluated at the estimate itself."""
     return False
+
+
+@implement(stands_apart, AtEstimate)
+def estimate_stands_apart(point: AtEstimate) -> bool:
+    return False
+
+
+@implement(make_notes, AtEstimate)
+def no_notes_estimate(point: AtEstimate, r: int, w: int, steps: int, labels: int) -> NoNotes:
+    return NoNotes()
 
 
 @implement(motion_point, AtEstimate)
 def motion_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), before the step."""
     return pose
+
+
+@implement(carry_at, AtEstimate)
+def carry_at_estimate(
+    point: AtEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    carry(slam.motion, state.x[: robot_width(slam.motion)], u, state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, AtEstimate)
 def observation_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), after the prediction."""
     return pose
 
 
 @implement(landmark_point, AtEstimate)
-def landmark_at_estimate(point: AtEstimate, values: Array, label: int) -> Array:
+def landmark_at_estimate(point: AtEstimate, values: Array, label: int, work: Work[NamedTuple]) -> Array:
     return values
 
 
@@ -49,4 +73,5 @@ def landmark_at_estimate(point: AtEstimate, values: Array, label: int) -> Array:
 def place_at_estimate(
     point: AtEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
+    """x[n:n + w] <- the inverse of h at the estimated pose, with its Jacobians."""
     place_observed(slam, state.x[: robot_width(slam.motion)], z, state.x[state.n :], work)

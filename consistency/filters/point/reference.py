@@ -12,15 +12,19 @@ from consistency.filters.kernel.measuring import linearise_at
 from consistency.filters.kernel.slam import (
     Slam,
     State,
+    carry,
+    carry_at,
     expands,
     landmark_point,
+    make_notes,
     motion_point,
     observation_point,
     place,
     robot_frame,
     robot_width,
+    stands_apart,
 )
-from consistency.filters.kernel.work import Work
+from consistency.filters.kernel.work import NoNotes, Work
 from consistency.types import Array
 
 
@@ -34,21 +38,41 @@ class Reference(NamedTuple):
 
 @implement(expands, Reference)
 def reference_is_expanded(point: Reference) -> bool:
+    """True: f and h are affine functions."""
     return True
+
+
+@implement(stands_apart, Reference)
+def reference_stands_apart(point: Reference) -> bool:
+    return False
+
+
+@implement(make_notes, Reference)
+def no_notes_reference(point: Reference, r: int, w: int, steps: int, labels: int) -> NoNotes:
+    return NoNotes()
 
 
 @implement(motion_point, Reference)
 def motion_at_reference(point: Reference, pose: Array, k: int) -> Array:
+    """Reference pose (r,) of step k, before the step."""
     return point.path[k]
+
+
+@implement(carry_at, Reference)
+def carry_at_reference(
+    point: Reference, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    carry(slam.motion, point.path[k], u, state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, Reference)
 def observation_at_reference(point: Reference, pose: Array, k: int) -> Array:
+    """Reference pose (r,) of step k + 1."""
     return point.path[k + 1]
 
 
 @implement(landmark_point, Reference)
-def landmark_at_reference(point: Reference, values: Array, label: int) -> Array:
+def landmark_at_reference(point: Reference, values: Array, label: int, work: Work[NamedTuple]) -> Array:
     return point.landmarks[label]
 
 
@@ -56,6 +80,7 @@ def landmark_at_reference(point: Reference, values: Array, label: int) -> Array:
 def place_about_reference(
     point: Reference, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
+    """x[n:n + w] <- the landmark that solves the expanded h for z (3,), where w = 3; Jz = Hl^-1 and Jp = -Hl^-1 Hp."""
     pose, landmark, n = point.path[k + 1], point.landmarks[label], state.n
     r = robot_width(slam.motion)
     z0, Hp, Hl = np.empty(3), np.empty((3, r)), np.empty((3, len(landmark)))

@@ -21,19 +21,23 @@ class Uvd(NamedTuple):
 
 @implement(measure, Uvd)
 def measure_uvd(sensor: Uvd, x: float, y: float, z: float) -> Triple:
+    """(u, v, d) in px of a point in m, eq. 22."""
     return stereo.project(x, y, z, sensor.f, sensor.B)
 
 
 @implement(measure_jacobian, Uvd)
 def measure_uvd_jacobian(sensor: Uvd, x: float, y: float, z: float) -> Nine:
+    """Jacobian (3, 3) of eq. 22, px/m, row after row."""
     return stereo.project_jacobian(x, y, z, sensor.f, sensor.B)
 
 
 @implement(locate, Uvd)
 def locate_uvd(sensor: Uvd, z0: float, z1: float, z2: float) -> Triple:
+    """Point in m of (u, v, d) in px, eq. 21."""
     return stereo.triangulate(z0, z1, z2, sensor.f, sensor.B)
 
 
 @implement(locate_jacobian, Uvd)
 def locate_uvd_jacobian(sensor: Uvd, z0: float, z1: float, z2: float) -> Nine:
+    """Jacobian (3, 3) of eq. 21, m/px, row after row."""
     return stereo.triangulate_jacobian(z0, z1, z2, sensor.f, sensor.B)

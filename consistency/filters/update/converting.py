@@ -10,8 +10,8 @@ from consistency.filters.kernel.arrays import copy, fill_matrix
 from consistency.filters.kernel.blas import add_gram
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import Frame, State, make_room, move, noise_columns, place, predict
-from consistency.filters.kernel.work import Work
+from consistency.filters.kernel.slam import Frame, State, make_notes, make_room, move, noise_columns, place, predict
+from consistency.filters.kernel.work import NoNotes, Work
 from consistency.filters.landmark.inverse_range import InverseRange, carried
 from consistency.filters.motion.unicycle import Unicycle
 from consistency.filters.sensor.conversion import Pixels, add_bias, conversion_jacobian, convert
@@ -139,6 +139,11 @@ def _move_rows(P: Array, n: int, at: Indices, J: Array, count: int) -> None:
                 row[o] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
                 row[o + 1] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
                 row[o + 2] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
+
+
+@implement(make_notes, Converted)
+def no_notes_converted(point: Converted, r: int, w: int, steps: int, labels: int) -> NoNotes:
+    return NoNotes()
 
 
 @implement(place, Converted)

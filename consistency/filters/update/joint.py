@@ -27,9 +27,10 @@ def joint_room(update: Joint, r: int, w: int, m: int, n: int) -> NoRoom:
 
 
 @implement(predict, Joint)
-def predict_joint(
-    update: Joint, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[NoRoom]
+def predict_by_error(
+    update: NamedTuple, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[NamedTuple]
 ) -> None:
+    """Motion as the part ``error`` has it, for every update that linearises."""
     propagate(slam.error, slam, state, k, u, local.Phi, work)
 
 
@@ -37,6 +38,7 @@ def predict_joint(
 def correct_joint(
     update: Joint, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NoRoom]
 ) -> tuple[int, float]:
+    """One update with Jacobians at the prediction, eq. 11-13."""
     gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)
     combine_seen(slam, state, m, work)

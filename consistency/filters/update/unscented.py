@@ -19,7 +19,7 @@ import numpy as np
 
 from consistency.filters.kernel.arrays import copy, fill
 from consistency.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
-from consistency.filters.kernel.covariance import definite_root
+from consistency.filters.kernel.covariance import definite_root, state_index
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.gain import POSE, apply, gather, innovate, whiten
 from consistency.filters.kernel.jit import inner
@@ -42,7 +42,7 @@ from consistency.filters.kernel.slam import (
     robot_width,
 )
 from consistency.filters.kernel.work import Work
-from consistency.types import Array, Indices
+from consistency.types import Array
 
 
 @part(error="Additive", point="AtEstimate")
@@ -174,17 +174,11 @@ def _innovate(update: Unscented, slam: Slam, state: State, m: int, work: Work[Si
 
 
 @inner
-def _variable(r: int, w: int, a: int, at: Indices) -> int:
-    """State index of the a-th of the variables involved."""
-    return a if a < r else at[(a - r) // w] + (a - r) % w
-
-
-@inner
 def _root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
     """Upper root U = C' of the prior over the variables involved; False if it is indefinite."""
     rows, at, U = work.rows, work.at, work.room.U[:L, :L]
     for b in range(L):
-        j = _variable(r, w, b, at)
+        j = state_index(r, w, b, at)
         for a in range(b + 1):
             U[a, b] = rows[a, j]
     return definite_root(U, work.scale) or _singular_root(r, w, L, work)
@@ -195,7 +189,7 @@ def _singular_root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
     """The root of a semidefinite prior: a zero pivot has a zero row."""
     rows, at, U, block = work.rows, work.at, work.room.U[:L, :L], work.room.block[:L, :L]
     for b in range(L):
-        j = _variable(r, w, b, at)
+        j = state_index(r, w, b, at)
         for a in range(L):
             block[a, b] = rows[a, j]
     if not semidefinite_cholesky(block, U):

@@ -33,6 +33,7 @@ def make_no_factors(covariance: Dense, r: int, w: int, n: int, steps: int, n_lan
 
 @implement(prepare, Dense)
 def prepare_all(covariance: Dense, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+    """The state as it is."""
     return state
 
 
@@ -45,4 +46,4 @@ def append_nothing(
 
 @implement(settle, Dense)
 def settle_nothing(covariance: Dense, slam: Slam, whole: State, state: State, local: Factors) -> None:
-    pass
+    """Nothing to do: every step has worked on the whole state."""

@@ -35,7 +35,7 @@ from consistency.filters.kernel.blas import (
     symmetric_times,
     times_symmetric,
 )
-from consistency.filters.kernel.covariance import gather_rows
+from consistency.filters.kernel.covariance import gather_rows, state_index
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors, make_factors
@@ -91,6 +91,7 @@ def make_local_factors(covariance: Local, r: int, w: int, n: int, steps: int, n_
 
 @implement(prepare, Local)
 def prepare_active(covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+    """The active part that a step works on, settled first where that is due, and split where it begins."""
     r, w, home, offset = robot_width(slam.motion), landmark_width(slam.landmark), whole.offset, state.offset
     x, P, n, b = state.x, state.P, state.n, state.base
     if b > 0 and is_due(whole.n, n, b, w * len(labels), local):
@@ -127,19 +128,15 @@ def append_factors(
 
 @implement(settle, Local)
 def settle_active(covariance: Local, slam: Slam, whole: State, state: State, local: Factors) -> None:
+    """``whole`` <- what the active part and the factors say, if there is an active part."""
     if state.base > 0:
         join(slam, whole, state.n, state.base, local)
 
 
 @inner
 def _entry(P: Array, i: int, j: int) -> float:
+    """P[i, j] of P (n, n) whose upper half is valid."""
     return P[i, j] if i <= j else P[j, i]
-
-
-@inner
-def _place(r: int, w: int, i: int, at: Indices) -> int:
-    """Variable in the whole state of the i-th of a part: the robot, then landmarks at offsets ``at``."""
-    return i if i < r else at[(i - r) // w] + (i - r) % w
 
 
 @inner
@@ -178,16 +175,16 @@ def split(r: int, w: int, whole: State, labels: Indices, offset: Indices, local:
             offset[label] = n
             n += w
     for i in range(n):
-        p = _place(r, w, i, local.base)
+        p = state_index(r, w, i, local.base)
         local.x[i] = x[p]
         for j in range(i, n):
-            local.P[i, j] = _entry(P, p, _place(r, w, j, local.base))
+            local.P[i, j] = _entry(P, p, state_index(r, w, j, local.base))
             local.Psi[i, j] = 0.0
         fill(local.Phi[i, :n], 0.0)
         local.theta[i] = 0.0
     _raw(x, r, 0, 0, 0, local.Phi)
     for i in range(r, n, w):
-        _raw(x, w, _place(r, w, i, local.base), i, i, local.Phi)
+        _raw(x, w, state_index(r, w, i, local.base), i, i, local.Phi)
     for i in range(r):
         for j in range(i):
             local.P[i, j] = local.P[j, i]
@@ -214,12 +211,12 @@ def _activate(r: int, w: int, whole: State, n: int, b: int, more: int, local: Fa
     x0, P0, x, P, Phi, Psi = whole.x, whole.P, local.x, local.P, local.Phi, local.Psi
     D, G = local.cross[:more, :b], local.gain[:more, :b]
     for i in range(more):
-        p = _place(r, w, b + i, local.base)
+        p = state_index(r, w, b + i, local.base)
         x[n + i] = x0[p]
         for j in range(b):
-            D[i, j] = _entry(P0, p, _place(r, w, j, local.base))
+            D[i, j] = _entry(P0, p, state_index(r, w, j, local.base))
         for j in range(i, more):
-            P[n + i, n + j] = _entry(P0, p, _place(r, w, b + j, local.base))
+            P[n + i, n + j] = _entry(P0, p, state_index(r, w, b + j, local.base))
     for j in range(r, b, w):
         _relative(x0, local.base[(j - r) // w], D[:, :r], D[:, j : j + 2])
     times_symmetric(D, Psi[:b, :b], G)
@@ -261,11 +258,11 @@ def _settle(r: int, w: int, whole: State, n: int, b: int, local: Factors) -> Non
     product(local.Phi[:n, :b], local.rows[:b, : whole.n], across)
     _settle_rows(whole, r, 0, 0, across, local)
     for i in range(r, n, w):
-        _settle_rows(whole, w, i, _place(r, w, i, at), across, local)
+        _settle_rows(whole, w, i, state_index(r, w, i, at), across, local)
     for i in range(n):
-        p = _place(r, w, i, at)
+        p = state_index(r, w, i, at)
         for j in range(i, n):
-            q = _place(r, w, j, at)
+            q = state_index(r, w, j, at)
             P[min(p, q), max(p, q)] = local.P[i, j]
     copy_matrix(local.P[:r, :r], P[:r, :r])
 

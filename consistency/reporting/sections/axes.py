@@ -56,19 +56,19 @@ class ByAxis:
 
 def read(study: Study) -> ByAxis | None:
     """The intervals of the verdicts; None where no filter has any."""
-    found = forests(study)
-    return ByAxis(study, found) if found else None
+    all_forests = forests(study)
+    return ByAxis(study, all_forests) if all_forests else None
 
 
 def forests(study: Study) -> tuple[Forest, ...]:
     """Covariance ratio, bias and coverage by axis; those that no filter has are left out."""
-    made = (
+    kinds = (
         ("ratio", "covariance ratio (truth / stated)", ".3g", 1.0, _ratio_window, True, _ratios),
         ("bias", "mean error (stated sigma)", "+.2f", 0.0, _bias_window, False, _biases),
         ("coverage", "within 2 sigma (%)", ".0f", 100.0 * TWO_SIGMA, _coverage_window, False, _coverages),
     )
     result = []
-    for name, label, form, expected, window, log, intervals_of in made:
+    for name, label, form, expected, window, log, intervals_of in kinds:
         rows = _rows(study, intervals_of)
         if rows:
             intervals = [i for _, row in rows for i in row if i is not None]
@@ -83,14 +83,14 @@ def _rows(study: Study, intervals_of: Callable[[Verdict], dict[str, Interval]]) 
 
 
 def _ratios(v: Verdict) -> dict[str, Interval]:
-    found: dict[str, Interval] = {}
+    intervals: dict[str, Interval] = {}
     if v.axes is not None:
-        found |= v.axes.inflation
+        intervals |= v.axes.inflation
         if v.axes.largest is not None:
-            found[DIRECTION] = v.axes.largest
+            intervals[DIRECTION] = v.axes.largest
     if v.scale is not None:
-        found[WHOLE] = v.scale.inflation
-    return {name: interval for name, interval in found.items() if interval[0] > 0}
+        intervals[WHOLE] = v.scale.inflation
+    return {name: interval for name, interval in intervals.items() if interval[0] > 0}
 
 
 def _biases(v: Verdict) -> dict[str, Interval]:
@@ -121,15 +121,15 @@ def _coverage_window(intervals: list[Interval]) -> tuple[float, float]:
     return max(min(low for _, low, _ in intervals) - 5.0, -3.0), 103.0
 
 
-def figures(found: ByAxis) -> tuple[Figure, ...]:
+def figures(by_axis: ByAxis) -> tuple[Figure, ...]:
     """A panel for each quantity; on paper the rows of all panels stand in one line."""
-    study = found.study
-    panels = tuple(_panel(study, forest, forest.labels) for forest in found.forests)
-    aligned = tuple(_panel(study, forest, found.labels, "axis of the pose") for forest in found.forests)
+    study = by_axis.study
+    panels = tuple(_panel(study, forest, forest.labels) for forest in by_axis.forests)
+    aligned = tuple(_panel(study, forest, by_axis.labels, "axis of the pose") for forest in by_axis.forests)
     marked = tuple(replace(key, look=solid(key.look)) for key in study.keys(marked=True))
-    sheet = Sheet(aligned, 0.55 + len(found.labels) * (0.12 + 0.08 * len(study.tracks)), keys=marked)
+    sheet = Sheet(aligned, 0.55 + len(by_axis.labels) * (0.12 + 0.08 * len(study.tracks)), keys=marked)
     keys = (Key("expected", EXPECTED), *study.keys())
-    return (Figure("By axis", caption(found), panels, (sheet,), keys, layout="three", level=4),)
+    return (Figure("By axis", caption(by_axis), panels, (sheet,), keys, layout="three", level=4),)
 
 
 def _panel(study: Study, forest: Forest, labels: tuple[str, ...], share: str = "") -> Panel:
@@ -149,21 +149,21 @@ def _panel(study: Study, forest: Forest, labels: tuple[str, ...], share: str = "
 
 def _intervals(forest: Forest, labels: tuple[str, ...], track: Track, slot: int, slots: int) -> Intervals | None:
     """Intervals of the filter in one slot of each row."""
-    found = [(label, interval) for label, row in forest.rows if (interval := row[slot]) is not None]
-    if not found:
+    named_intervals = [(label, interval) for label, row in forest.rows if (interval := row[slot]) is not None]
+    if not named_intervals:
         return None
-    value, low, high = np.array([interval for _, interval in found]).T
-    y: Array = np.array([labels.index(label) for label, _ in found]) + dodge(slot, slots)
-    text = [f"{v:{forest.form}} [{a:{forest.form}}, {b:{forest.form}}]" for _, (v, a, b) in found]
+    value, low, high = np.array([interval for _, interval in named_intervals]).T
+    y: Array = np.array([labels.index(label) for label, _ in named_intervals]) + dodge(slot, slots)
+    text = [f"{v:{forest.form}} [{a:{forest.form}}, {b:{forest.form}}]" for _, (v, a, b) in named_intervals]
     tips = (("axis", "@axis"), (forest.label, "@text"))
     look = replace(track.look, size=5.0, width=1.3)
-    columns = {"axis": [label for label, _ in found], "text": text}
+    columns = {"axis": [label for label, _ in named_intervals], "text": text}
     return Intervals(y, value, low, high, look, track.owner, tips, columns)
 
 
-def caption(found: ByAxis) -> str:
+def caption(by_axis: ByAxis) -> str:
     """What the panels show."""
-    parts, tracks = {forest.name for forest in found.forests}, found.study.tracks
+    parts, tracks = {forest.name for forest in by_axis.forests}, by_axis.study.tracks
     text = "By axis of the pose. Covariance ratio: 1 is right (line), above is overconfident; log axis."
     if any(t.verdict.location is not None and t.verdict.location.since is not None for t in tracks):
         text += " Ratio and bias are those since the step that the verdict names."

@@ -64,11 +64,11 @@ def row(track: Track) -> tuple[str, ...]:
 
 
 def _nis_expected(track: Track) -> str:
-    found = track.verdict.innovations
-    if found is None or not np.isfinite(found.ratio):
+    innovations = track.verdict.innovations
+    if innovations is None or not np.isfinite(innovations.ratio):
         return "–"
-    low, high = (number(end, ".3f") for end in found.interval)
-    return f"{found.ratio:.3f} ({f'{low} to {high}' if found.judged else 'not judged'})"
+    low, high = (number(end, ".3f") for end in innovations.interval)
+    return f"{innovations.ratio:.3f} ({f'{low} to {high}' if innovations.judged else 'not judged'})"
 
 
 SECTION = Section(STUDY, read, show)

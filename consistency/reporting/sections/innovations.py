@@ -71,10 +71,14 @@ def nis_ratio(c: Curves, runs: int) -> Array:
 
 def lags(track: Track) -> Lags | None:
     """Autocorrelation of lag 1, 2, ...; None with too few innovations."""
-    found = track.verdict.innovations
-    if found is None or not len(found.autocorrelation) or not np.isfinite(found.autocorrelation).all():
+    innovations = track.verdict.innovations
+    if (
+        innovations is None
+        or not len(innovations.autocorrelation)
+        or not np.isfinite(innovations.autocorrelation).all()
+    ):
         return None
-    return Lags(found.autocorrelation, found.bound if found.judged else None)
+    return Lags(innovations.autocorrelation, innovations.bound if innovations.judged else None)
 
 
 def figures(innovations: Innovations) -> tuple[Figure, ...]:
@@ -112,18 +116,18 @@ def _sizes(study: Study, filters: Sequence[Innovation]) -> Panel:
 
 
 def _correlation(study: Study, filters: Sequence[Innovation]) -> Panel:
-    found = [(of, of.lags) for of in filters if of.lags is not None]
+    lags_of = [(of, of.lags) for of in filters if of.lags is not None]
     alt = f"Autocorrelation of the innovations of {study.name} over lags"
-    longest = max((len(of.values) for _, of in found), default=1)
+    longest = max((len(of.values) for _, of in lags_of), default=1)
     x = Axis("lag (steps)", window=(0.4, longest + 0.6), whole=True)
-    if not found:
+    if not lags_of:
         return Panel(x, Axis("autocorrelation", "correlation"), (), alt, height=240)
-    bounds = {of.bound for _, of in found if of.bound is not None}
-    reach = 1.15 * max(LEAST, *bounds, *(float(np.abs(of.values).max()) for _, of in found))
+    bounds = {of.bound for _, of in lags_of if of.bound is not None}
+    reach = 1.15 * max(LEAST, *bounds, *(float(np.abs(of.values).max()) for _, of in lags_of))
     y = Axis("autocorrelation", "correlation", window=(-reach, reach), follows=True, least=2 * LEAST)
     marks: list[Mark] = [Span("y", -bound, bound, SHADE) for bound in bounds if len(bounds) == 1]
     marks.append(Rule("y", 0.0, EXPECTED))
-    for of, values in found:
+    for of, values in lags_of:
         beside = 0.6 * dodge(of.slot, len(study.tracks)) if len(filters) > 1 else 0.0
         marks += _lags(of.track, values, beside, len(bounds) > 1)
     return Panel(x, y, tuple(marks), alt, height=240)

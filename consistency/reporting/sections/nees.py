@@ -36,8 +36,8 @@ class Distribution:
 
 def read(study: Study) -> Distribution | None:
     """The values that the verdicts hold; None where there is no NEES."""
-    found = tuple(of for track in study.tracks if (of := steps(track)) is not None)
-    return Distribution(study, found) if found else None
+    distributions = tuple(of for track in study.tracks if (of := steps(track)) is not None)
+    return Distribution(study, distributions) if distributions else None
 
 
 def steps(track: Track) -> Steps | None:

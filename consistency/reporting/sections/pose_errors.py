@@ -40,8 +40,8 @@ def read(study: Study) -> PoseErrors | None:
     """Errors of the shown run; None where the truth is not known."""
     if not study.has_truth:
         return None
-    found = (_pose_error(track, study.shown_run) for track in study.tracks)
-    return PoseErrors(study, tuple(of for of in found if of is not None))
+    by_track = (_pose_error(track, study.shown_run) for track in study.tracks)
+    return PoseErrors(study, tuple(of for of in by_track if of is not None))
 
 
 def _pose_error(track: Track, run: int) -> PoseError | None:

@@ -39,8 +39,8 @@ def read(study: Study) -> Questions:
     by_filter = [{a.question: a for a in track.verdict.answers} for track in study.tracks]
     known = list(ABOUT) + [q for answers in by_filter for q in answers if q not in ABOUT]
     names = [q for q in dict.fromkeys(known) if any(q in answers for answers in by_filter)]
-    asked = (Question(q, ABOUT.get(q, ""), tuple(answers.get(q) for answers in by_filter)) for q in names)
-    return Questions(study, tuple(asked))
+    questions = (Question(q, ABOUT.get(q, ""), tuple(answers.get(q) for answers in by_filter)) for q in names)
+    return Questions(study, tuple(questions))
 
 
 def show(questions: Questions) -> tuple[Block, ...]:

@@ -68,13 +68,13 @@ class ListedEffect(Table):
         context = {"discriminator": "'kind'", "tag": data.get("kind")}
         if "kind" not in data:
             raise PydanticCustomError("union_tag_not_found", "kind is missing", context)
-        chosen = EFFECTS.get(str(data["kind"]))
-        if chosen is None:
+        effect = EFFECTS.get(str(data["kind"]))
+        if effect is None:
             known = ", ".join(f"'{kind}'" for kind in sorted(EFFECTS)) or "the known kinds: there are none yet"
             context["expected_tags"] = known
             raise PydanticCustomError("union_tag_invalid", "'{tag}' is not one of {expected_tags}", context)
         # as a tagged union would, with the kind in the location of an error
-        effects = TypeAdapter[dict[str, ListedEffect]](dict[str, chosen])  # type: ignore[valid-type]
+        effects = TypeAdapter[dict[str, ListedEffect]](dict[str, effect])  # type: ignore[valid-type]
         return effects.validate_python({str(data["kind"]): data})[str(data["kind"])]
 
 

@@ -44,7 +44,8 @@ def _visible(context: Context, x: Array, y: Array, z: Array) -> Array:
     """Which of the points in the sensor frame are in range and in the image."""
     sensor = context.sensor
     distance = np.sqrt(x * x + y * y + z * z)
-    seen: Array = (distance >= sensor.range[0]) & (distance <= sensor.range[1])
+    nearest, farthest = sensor.range
+    seen: Array = (distance >= nearest) & (distance <= farthest)
     if sensor.image is None:
         return seen
     assert sensor.f is not None

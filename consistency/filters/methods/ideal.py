@@ -1,0 +1,116 @@
+"""EKF-SLAM with every Jacobian at the truth, Huang, Mourikis & Roumeliotis (2010), IJRR 29(5): the ideal EKF.
+
+f and h are evaluated at the estimate, as in the EKF. No robot knows where it is, so this is a bound and not a filter
+to use (``realisable`` is False): it shows what is lost by linearising at estimates, and what no choice of points would
+mend. It needs a trial whose truth is known, simulated or recorded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.filters import plain
+from consistency.filters.compiled import Compiled
+from consistency.filters.kernel.slam import Slam
+from consistency.filters.methods import ekf
+from consistency.filters.plain import SlamState
+from consistency.filters.point.truth import AtTruth
+from consistency.protocols import Problem, Truth
+from consistency.types import Array, Control, Gaussian, Info, Observation
+
+
+@dataclass(frozen=True)
+class IdealState:
+    """The state of the EKF, and the step that the truth is taken of."""
+
+    slam: SlamState
+    truth: Truth
+    step: int
+
+
+class IdealKalman:
+    """EKF-SLAM linearised at the true poses and landmarks."""
+
+    realisable = False
+    robot = plain.Unicycle()
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def init(self, problem: Problem) -> IdealState:
+        return IdealState(plain.start(problem), truth_of(problem), 0)
+
+    def predict(self, state: IdealState, control: Control) -> IdealState:
+        x, F = state.slam.x.copy(), np.eye(len(state.slam.x))
+        before, after = state.truth.path[state.step : state.step + 2]
+        _, G = self.robot.jacobians(before, control)
+        x[:3] = self.robot.move(x[:3], control)
+        F[:2, 2] = plain.quarter_turn(after[:2] - before[:2])
+        P = F @ state.slam.P @ F.T
+        P[:3, :3] += plain.process_noise(G, state.slam.problem.belief)
+        return replace(state, slam=replace(state.slam, x=x, P=P), step=state.step + 1)
+
+    def update(self, state: IdealState, observation: Observation) -> tuple[IdealState, Info]:
+        pose, landmarks = state.truth.path[state.step], state.truth.landmarks
+        sensor = plain.PointSensor(state.slam.problem.belief.sensor, self.uvd)
+
+        def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+            true = np.concatenate([pose, *(landmarks[label] for label in slam.landmarks)])
+            zhat, _ = plain.expect(slam, seen, self.uvd)
+            _, H = plain.expect(replace(slam, x=true), seen, self.uvd)
+            innovation = z.ravel() - zhat
+            S, W = plain.gain(slam.P, H, plain.block_diagonal(R))
+            return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
+
+        def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+            landmark, _, _ = plain.locate_point(slam, z, self.uvd)
+            Hp, Hl = sensor.jacobians(pose, landmarks[label])
+            Jz = np.linalg.inv(Hl)
+            return landmark, -Jz @ Hp, Jz
+
+        slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
+        return replace(state, slam=slam), info
+
+    def pose(self, state: IdealState) -> Gaussian:
+        return plain.pose_of(state.slam)
+
+    def map(self, state: IdealState) -> dict[int, Gaussian]:
+        return plain.map_of(state.slam)
+
+    def joint(self, state: IdealState) -> Gaussian:
+        return plain.joint_of(state.slam)
+
+
+def truth_of(problem: Problem) -> Truth:
+    """The truth that a problem carries.
+
+    Raises
+    ------
+    InputError
+        It carries none: measurements alone are not enough for this filter.
+    """
+    if problem.truth is None:
+        raise InputError(
+            "the ideal EKF takes its Jacobians at the truth and cannot be stepped on measurements alone; "
+            "give it a trial with truth, by run(trial, belief)"
+        )
+    return problem.truth
+
+
+def xyz_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``ideal-ekf-xyz``."""
+    truth = truth_of(problem)
+    point = AtTruth(np.array(truth.path, float), np.array(truth.landmarks, float))
+    return ekf.xyz_parts(problem, controls)._replace(point=point)
+
+
+def uvd_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``ideal-ekf-uvd``."""
+    return xyz_parts(problem, controls)._replace(sensor=ekf.uvd_parts(problem, controls).sensor)
+
+
+XYZ = Compiled(IdealKalman("ideal-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
+UVD = Compiled(IdealKalman("ideal-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)

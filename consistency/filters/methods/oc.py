@@ -1,0 +1,95 @@
+"""EKF-SLAM under observability constraints (OC), after Huang, Mourikis & Roumeliotis (2010), IJRR 29(5).
+
+As many directions stay unobserved as in SLAM, and the Jacobians are taken as near to the estimates as that allows
+(``point/observability_constrained.py`` has the derivation). First estimates keep the same directions and are far from
+the best estimates; these points follow them where robot and map move together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.filters import plain
+from consistency.filters.compiled import Compiled
+from consistency.filters.kernel.slam import Slam
+from consistency.filters.methods import ekf
+from consistency.filters.plain import SlamState
+from consistency.filters.point.observability_constrained import ObservabilityConstrained
+from consistency.protocols import Problem
+from consistency.types import Array, Control, Gaussian, Info, Observation
+
+
+@dataclass(frozen=True)
+class ConstrainedState:
+    """The state of the EKF, and the direction (J a, 1, J l_1, ...) in which it must not be observed."""
+
+    slam: SlamState
+    turned: Array  # (1 + m, 2): a, l_1, ..., l_m
+
+
+class ConstrainedKalman:
+    """EKF-SLAM with points that leave a turn of robot and map unobserved."""
+
+    robot = plain.Unicycle()
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def init(self, problem: Problem) -> ConstrainedState:
+        return ConstrainedState(plain.start(problem), problem.start[None, :2])
+
+    def predict(self, state: ConstrainedState, control: Control) -> ConstrainedState:
+        x, F, turned = state.slam.x.copy(), np.eye(len(state.slam.x)), state.turned.copy()
+        shift = np.mean(x.reshape(-1, 3)[:, :2] - turned, axis=0)
+        _, G = self.robot.jacobians(x[:3], control)
+        x[:3] = self.robot.move(x[:3], control)
+        F[:2, 2] = plain.quarter_turn(x[:2] - (turned[0] + shift))  # predicted less p*
+        turned[0] = x[:2] - shift
+        P = F @ state.slam.P @ F.T
+        P[:3, :3] += plain.process_noise(G, state.slam.problem.belief)
+        return ConstrainedState(replace(state.slam, x=x, P=P), turned)
+
+    def update(self, state: ConstrainedState, observation: Observation) -> tuple[ConstrainedState, Info]:
+        turned, predicted = list(state.turned), state.slam.x[:2]
+
+        def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+            points = slam.x.reshape(-1, 3).copy()
+            points[:, :2] = state.turned + (predicted - state.turned[0])
+            zhat, _ = plain.expect(slam, seen, self.uvd)
+            _, H = plain.expect(replace(slam, x=points.ravel()), seen, self.uvd)
+            innovation = z.ravel() - zhat
+            S, W = plain.gain(slam.P, H, plain.block_diagonal(R))
+            return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
+
+        def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+            placed = plain.locate_point(slam, z, self.uvd)
+            turned.append(turned[0] + placed[0][:2] - slam.x[:2])
+            return placed
+
+        slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
+        return ConstrainedState(slam, np.array(turned)), info
+
+    def pose(self, state: ConstrainedState) -> Gaussian:
+        return plain.pose_of(state.slam)
+
+    def map(self, state: ConstrainedState) -> dict[int, Gaussian]:
+        return plain.map_of(state.slam)
+
+    def joint(self, state: ConstrainedState) -> Gaussian:
+        return plain.joint_of(state.slam)
+
+
+def xyz_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``oc-ekf-xyz``."""
+    return ekf.xyz_parts(problem, controls)._replace(point=ObservabilityConstrained())
+
+
+def uvd_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``oc-ekf-uvd``."""
+    return ekf.uvd_parts(problem, controls)._replace(point=ObservabilityConstrained())
+
+
+XYZ = Compiled(ConstrainedKalman("oc-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
+UVD = Compiled(ConstrainedKalman("oc-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)

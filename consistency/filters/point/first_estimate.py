@@ -1,0 +1,99 @@
+"""First-estimates Jacobians, Huang, Mourikis & Roumeliotis (2010), "Observability-based rules ...", IJRR 29(5).
+
+Each variable is linearised at its first estimate: a pose p_k at the prediction p_k|k-1, a landmark where it was put.
+f and h are those of the estimate. With J the quarter turn, F of step k + 1 has in its column of the heading
+J (p_k+1|k - p_k|k-1), and H of a landmark l turns with -J (l_first - p_k+1|k): a turn of robot and map about the
+world's origin, (J p_k|k-1, 1, J l_first), is carried by F to the same with p_k+1|k, and H does not see it. A new
+landmark is treated alike: its Jacobian by the heading is J (l_first - p_k|k-1).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.filters.kernel.arrays import copy
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.measuring import place_observed
+from consistency.filters.kernel.slam import (
+    Slam,
+    State,
+    carry_at,
+    carry_by,
+    expands,
+    landmark_point,
+    make_notes,
+    motion_point,
+    move,
+    observation_point,
+    place,
+    stands_apart,
+)
+from consistency.filters.kernel.work import Work
+from consistency.types import Array
+
+
+@part(motion="Unicycle", landmark="WorldPoint", error="Additive", update="Joint")
+class FirstEstimate(NamedTuple):
+    """No parameters."""
+
+
+class FirstEstimates(NamedTuple):
+    """The first estimate of every variable."""
+
+    path: Array  # (T + 1, 3), as predicted
+    landmarks: Array  # (labels, 3)
+
+
+@implement(expands, FirstEstimate)
+def first_estimate_is_not_expanded(point: FirstEstimate) -> bool:
+    return False
+
+
+@implement(stands_apart, FirstEstimate)
+def first_estimate_stands_apart(point: FirstEstimate) -> bool:
+    return True
+
+
+@implement(make_notes, FirstEstimate)
+def note_first_estimates(point: FirstEstimate, r: int, w: int, steps: int, labels: int) -> FirstEstimates:
+    return FirstEstimates(np.empty((steps + 1, r)), np.empty((labels, w)))
+
+
+@implement(motion_point, FirstEstimate)
+def motion_about_estimate(point: FirstEstimate, pose: Array, k: int) -> Array:
+    return pose
+
+
+@implement(carry_at, FirstEstimate)
+def carry_between_first_estimates(
+    point: FirstEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    before, after = work.notes.path[k], work.notes.path[k + 1]
+    if k == 0:
+        copy(state.x[:3], before)
+    move(slam.motion, state.x[:3], u, after)
+    carry_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
+
+
+@implement(observation_point, FirstEstimate)
+def observation_at_prediction(point: FirstEstimate, pose: Array, k: int) -> Array:
+    return pose
+
+
+@implement(landmark_point, FirstEstimate)
+def landmark_at_first_estimate(point: FirstEstimate, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    first: Array = work.notes.landmarks[label]
+    return first
+
+
+@implement(place, FirstEstimate)
+def place_first_estimate(
+    point: FirstEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+) -> None:
+    pose, values, predicted = state.x[:3], state.x[state.n : state.n + 3], work.notes.path[k + 1]
+    place_observed(slam, pose, z, values, work)
+    copy(values, work.notes.landmarks[label])
+    work.Jp[0, 2] -= pose[1] - predicted[1]
+    work.Jp[1, 2] += pose[0] - predicted[0]

@@ -1,0 +1,88 @@
+"""Jacobians at the truth: a bound on what a choice of points can give, since no filter knows it.
+
+f and h are those of the estimate. F has in its column of the heading J (p_k+1 - p_k) with the true positions and J the
+quarter turn: the Jacobian of f at the true pose and the true motion. A new landmark has those of h, inverted.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.filters.kernel.arrays import copy_matrix
+from consistency.filters.kernel.dispatch import implement, part
+from consistency.filters.kernel.measuring import linearise_at, place_observed
+from consistency.filters.kernel.slam import (
+    Slam,
+    State,
+    carry_at,
+    carry_by,
+    expands,
+    landmark_point,
+    make_notes,
+    motion_point,
+    observation_point,
+    place,
+    robot_frame,
+    stands_apart,
+)
+from consistency.filters.kernel.work import NoNotes, Work
+from consistency.types import Array
+
+
+@part(motion="Unicycle", landmark="WorldPoint", error="Additive", update="Joint")
+class AtTruth(NamedTuple):
+    """Where robot and landmarks are."""
+
+    path: Array  # (T + 1, 3)
+    landmarks: Array  # (n_landmarks, 3)
+
+
+@implement(expands, AtTruth)
+def truth_is_not_expanded(point: AtTruth) -> bool:
+    return False
+
+
+@implement(stands_apart, AtTruth)
+def truth_stands_apart(point: AtTruth) -> bool:
+    return True
+
+
+@implement(make_notes, AtTruth)
+def no_notes_at_truth(point: AtTruth, r: int, w: int, steps: int, labels: int) -> NoNotes:
+    return NoNotes()
+
+
+@implement(motion_point, AtTruth)
+def motion_at_truth(point: AtTruth, pose: Array, k: int) -> Array:
+    return point.path[k]
+
+
+@implement(carry_at, AtTruth)
+def carry_at_truth(
+    point: AtTruth, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    before, after = point.path[k], point.path[k + 1]
+    carry_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
+
+
+@implement(observation_point, AtTruth)
+def observation_at_truth(point: AtTruth, pose: Array, k: int) -> Array:
+    return point.path[k + 1]
+
+
+@implement(landmark_point, AtTruth)
+def landmark_at_truth(point: AtTruth, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    return point.landmarks[label]
+
+
+@implement(place, AtTruth)
+def place_at_truth(
+    point: AtTruth, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+) -> None:
+    place_observed(slam, state.x[:3], z, state.x[state.n : state.n + 3], work)
+    expected, Hp, Hl = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    linearise_at(slam, robot_frame(slam.motion, point.path[k + 1]), point.landmarks[label], expected, Hp, Hl)
+    copy_matrix(np.linalg.inv(Hl), work.Jz)
+    copy_matrix(-np.dot(work.Jz, Hp), work.Jp)

@@ -19,6 +19,8 @@ MODULES = {
     "ekf-uvd": ("methods.ekf", "UVD"),
     "ukf-xyz": ("methods.ukf", "XYZ"),
     "ukf-uvd": ("methods.ukf", "UVD"),
+    "ckf-xyz": ("methods.ckf", "XYZ"),
+    "ckf-uvd": ("methods.ckf", "UVD"),
     "iekf-xyz": ("methods.iekf", "XYZ"),
     "iekf-uvd": ("methods.iekf", "UVD"),
     "ri-ekf-xyz": ("methods.riekf", "XYZ"),

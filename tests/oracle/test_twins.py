@@ -11,6 +11,8 @@ import pytest
 
 import consistency as cs
 from consistency.filters.kernel.loop import trial_kernel
+from consistency.filters.methods.ckf import CUBATURE
+from consistency.filters.methods.ukf import sigma_points
 from consistency.filters.stepping import step_through
 from consistency.scenario import Belief
 from consistency.simulation import planned_path
@@ -116,6 +118,26 @@ def test_sigma_points_matter(small: Small) -> None:
         compiled("ukf-uvd", trial, small("herath2007-stereo", **changes).belief) for changes in ({}, MERWE)
     )
     assert not agree(default, merwe, 1e-6)
+
+
+def test_the_cubature_filter_has_its_points_whatever_the_belief_says(small: Small) -> None:
+    trial = cs.simulate(small("herath2007-stereo"))
+    default, merwe = (small("herath2007-stereo", **changes).belief for changes in ({}, MERWE))
+    ckf = compiled("ckf-uvd", trial, merwe)
+    assert np.array_equal(ckf.pose, compiled("ukf-uvd", trial, default).pose)
+    assert agree(ckf, step_through(cs.get_filter("ckf-uvd").twin, trial, merwe))
+    assert not agree(ckf, compiled("ukf-uvd", trial, merwe), 1e-6)
+
+
+def test_cubature_points(rng: np.random.Generator) -> None:
+    """Arasaratnam & Haykin (2009): 2 L points at a distance of sqrt(L), equal weights, none for the centre."""
+    L, root = 5, np.tril(rng.normal(size=(5, 5)))
+    points, wm, wc = sigma_points(np.zeros(L), root @ root.T, np.arange(L), CUBATURE)
+    whitened = np.linalg.solve(root, points.T).T
+    assert np.allclose(np.linalg.norm(whitened[1:], axis=1), np.sqrt(L))
+    assert np.allclose(wm[1:], 1 / (2 * L))
+    assert np.allclose(wc, wm)
+    assert wm[0] == pytest.approx(0, abs=1e-15)
 
 
 def test_filters_differ_where_the_world_is_nonlinear(uvd: cs.Scenario) -> None:

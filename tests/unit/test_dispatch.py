@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 import consistency as cs
 from consistency.filters.compiled import problem_of
+from consistency.filters.kernel import jit
 from consistency.filters.kernel.dispatch import fits, generic, implement, part, require_fitting
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.methods.riekf import RightInvariant
@@ -24,6 +26,11 @@ from consistency.filters.upkeep.local import Local
 @part()
 class Doubling(NamedTuple):
     """A part of this test."""
+
+
+@part()
+class Twofold(NamedTuple):
+    """Another part of this test."""
 
 
 class Stranger(NamedTuple):
@@ -74,6 +81,18 @@ def test_bodies_must_stand_at_module_level_and_alone() -> None:
         implement(times, Doubling)(doubled)
 
 
+def test_two_bodies_of_one_name_are_refused() -> None:
+    namespace: dict[str, Any] = {"__name__": __name__}
+    exec("def doubled(rule, x):\n    return x\n", namespace)
+    with pytest.raises(TypeError, match=r"'.*test_dispatch.doubled' must .* under a name of its own"):
+        implement(times, Stranger)(namespace["doubled"])
+
+
+def test_one_body_may_serve_two_parts() -> None:
+    assert implement(times, Twofold)(doubled) is doubled
+    assert times(Twofold(), 3.0) == 6.0
+
+
 def test_a_function_without_a_body_says_what_there_is() -> None:
     assert times(Doubling(), 3.0) == 6.0
     with pytest.raises(TypeError, match="'times' has no body for Stranger; there are Doubling"):
@@ -116,21 +135,23 @@ SCRIPT = """
 import sys, time
 import numpy as np
 sys.path.insert(0, {folder!r})
-import rules
+import kinds, rules
 from consistency.filters.kernel.dispatch import outside_files
 from consistency.filters.kernel.jit import Kernel
 
 kernel = Kernel(rules.total)
+ready = 0
 for name in sys.argv[1].split():
-    rule = getattr(rules, name)()
+    rule = getattr(kinds, name)()
+    ready += kernel.is_ready(rule, 10)
     assert kernel(rule, 10) == {{"Single": 10.0, "Triple": 30.0}}[name]
     assert kernel.is_ready(rule, 10)
-assert [path.name for path in outside_files()] == ["rules.py"]
-print(kernel.loaded)
+assert [path.name for path in outside_files()] == ["kinds.py", "rules.py"]
+print(kernel.loaded, ready)
 """
-RULES = """
+KINDS = """
 from typing import NamedTuple
-from consistency.filters.kernel.dispatch import generic, implement, part
+from consistency.filters.kernel.dispatch import part
 
 @part()
 class Single(NamedTuple):
@@ -139,6 +160,11 @@ class Single(NamedTuple):
 @part()
 class Triple(NamedTuple):
     pass
+"""
+RULES = """
+from typing import NamedTuple
+from consistency.filters.kernel.dispatch import generic, implement
+from kinds import Single, Triple
 
 @generic()
 def one(rule: NamedTuple) -> float:
@@ -162,6 +188,7 @@ def total(rule, n):
 
 @pytest.fixture
 def script(tmp_path: Path) -> Path:
+    (tmp_path / "kinds.py").write_text(textwrap.dedent(KINDS), encoding="utf-8")
     (tmp_path / "rules.py").write_text(textwrap.dedent(RULES), encoding="utf-8")
     path = tmp_path / "uses_rules.py"
     path.write_text(textwrap.dedent(SCRIPT.format(folder=str(tmp_path))), encoding="utf-8")
@@ -173,10 +200,17 @@ def started(script: Path, order: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, script, order], env=environment, stdout=subprocess.PIPE, text=True)
 
 
-def hits(process: subprocess.Popen[str]) -> int:
+def loaded(process: subprocess.Popen[str], known: bool = False) -> int:
+    """Kernels read from disk; ``known`` demands that just these were ready beforehand."""
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 0
-    return int(out)
+    from_disk, ready = map(int, out.split())
+    assert ready == from_disk or not known
+    return from_disk
+
+
+def hits(process: subprocess.Popen[str]) -> int:
+    return loaded(process, known=True)
 
 
 def test_another_order_in_another_process_hits_the_cache(script: Path) -> None:
@@ -184,14 +218,38 @@ def test_another_order_in_another_process_hits_the_cache(script: Path) -> None:
     assert hits(started(script, "Triple Single")) == 2
 
 
-def test_an_edited_part_outside_the_package_is_compiled_anew(script: Path) -> None:
+@pytest.mark.parametrize("name", ["kinds.py", "rules.py"])
+def test_an_edited_part_outside_the_package_is_compiled_anew(script: Path, name: str) -> None:
     assert hits(started(script, "Single")) == 0
-    rules = script.parent / "rules.py"
-    rules.write_text(rules.read_text(encoding="utf-8") + "\n# edited\n", encoding="utf-8")
+    edited = script.parent / name
+    edited.write_text(edited.read_text(encoding="utf-8") + "\n# edited\n", encoding="utf-8")
     assert hits(started(script, "Single")) == 0
 
 
 def test_of_four_processes_that_start_at_once_one_compiles(script: Path) -> None:
-    found = [hits(process) for process in [started(script, "Single Triple") for _ in range(4)]]
+    found = [loaded(process) for process in [started(script, "Single Triple") for _ in range(4)]]
     assert sorted(found)[-1] == 2
     assert sum(found) == 6, "each of the two kernels is compiled once, and loaded by the other three"
+
+
+def test_the_key_of_the_cache_covers_every_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Text and time of each file, and the place of the package."""
+    package, outside = tmp_path / "package", tmp_path / "rules.py"
+    sources = [package / name for name in ("models/point.py", "filters/plain.py", "filters/kernel/gain.py")]
+    for path in (*sources, outside):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("before", encoding="utf-8")
+    monkeypatch.setattr(jit, "PACKAGE", package)
+    keys = [jit._digest([outside])]
+    assert jit._digest([outside]) == keys[0]
+    for path in (*sources, outside):
+        time = path.stat().st_mtime_ns
+        path.write_text("after", encoding="utf-8")
+        os.utime(path, ns=(time, time))
+        keys.append(jit._digest([outside]))
+        os.utime(path, ns=(time, time + 10**9))
+        keys.append(jit._digest([outside]))
+    shutil.copytree(package, tmp_path / "another")
+    monkeypatch.setattr(jit, "PACKAGE", tmp_path / "another")
+    keys.append(jit._digest([outside]))
+    assert len(set(keys)) == 10

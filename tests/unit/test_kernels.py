@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -16,6 +17,9 @@ import consistency.filters
 from consistency.filters.compiled import one_blas_thread
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.loop import trial_kernel
+from consistency.filters.stepping import step_through
+from consistency.models.motion import dead_reckoning
+from consistency.models.point import to_robot
 
 
 def test_no_kernel_is_a_closure() -> None:
@@ -44,6 +48,27 @@ def allocations(steps: int, scenario: cs.Scenario, name: str) -> int:
 def test_no_step_allocates(uvd: cs.Scenario, name: str) -> None:
     _nrt_python.memsys_enable_stats()
     assert 0 < allocations(20, uvd, name) == allocations(60, uvd, name)
+
+
+@pytest.mark.parametrize("name", ["ekf-xyz", "ri-ekf-xyz"])
+def test_a_covariance_that_loses_its_rank_ends_the_run(small: Callable[..., cs.Scenario], name: str) -> None:
+    """A landmark known exactly, from a pose known exactly, seen again: the pose is certain but for one direction."""
+    belief = small("herath2007-xyz", belief__sensor__sigma=(1e-13,) * 3).belief
+    controls = np.array([[0.0, 0.0, 0.0]] + 4 * [[0.1, 1.0, 0.2]])  # no time passes in step 1
+    path, landmark = dead_reckoning(np.zeros(3), controls), np.array([3.0, 1.0, 0.5])
+    z = np.array([to_robot(*path[step], *landmark) for step in (1, 4, 5)])
+    first = np.array([0, 1, 1, 1, 2, 3])
+    trial = cs.Trial(0, np.zeros(3), controls, first, np.zeros(3, int), z, 1, path, landmark[None])
+    filter_ = cs.get_filter(name)
+    ours, twin = filter_.run(trial, belief), step_through(filter_.twin, trial, belief)
+    assert ours.failure is not None
+    assert twin.failure is not None
+    assert (ours.failure.step, ours.failure.reason) == (4, "the pose covariance is not positive definite")
+    assert (twin.failure.step, twin.failure.reason.rpartition(" is ")[2]) == (4, "not positive definite")
+    assert ours.map is None
+    for array in (ours.pose, ours.covariance, ours.covariance if ours.own is None else ours.own):
+        assert np.isfinite(array[:3]).all()
+        assert np.isnan(array[3:]).all()
 
 
 def test_a_direct_run_is_that_of_run_trials(uvd: cs.Scenario) -> None:

@@ -17,7 +17,7 @@ from consistency.filters.point.at_estimate import AtEstimate
 from consistency.filters.update.unscented import Unscented
 from consistency.filters.upkeep.dense import Dense
 from consistency.protocols import Problem
-from consistency.scenario import Belief
+from consistency.scenario import SigmaPoints
 from consistency.types import Array, Control, Info
 
 
@@ -27,14 +27,19 @@ class UnscentedKalman(plain.WorldPointTwin):
     The variables are ordered robot, landmarks seen in this step (as observed), the rest before the
     Cholesky square root is taken; spread and centre weight are those of the L variables involved. New
     landmarks are initialised to first order: with a spread of sqrt(L) standard deviations a sigma point
-    of a landmark below about 2 px of disparity would lie behind the camera.
+    of a landmark below about 2 px of disparity would lie behind the camera. ``points`` are those of the belief unless
+    they are given.
     """
 
     robot = plain.Unicycle()
 
+    def __init__(self, name: str, uvd: bool, points: SigmaPoints | None = None) -> None:
+        super().__init__(name, uvd)
+        self.points = points
+
     def predict(self, state: SlamState, control: Control) -> SlamState:
         belief = state.problem.belief
-        points, wm, wc = sigma_points(state.x, state.P, np.arange(3), belief)
+        points, wm, wc = sigma_points(state.x, state.P, np.arange(3), self.points or belief.sigma_points)
         moved = points.copy()
         moved[:, :3] = [self.robot.move(p[:3], control) for p in points]
         x = wm @ moved
@@ -46,7 +51,8 @@ class UnscentedKalman(plain.WorldPointTwin):
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
         involved = np.concatenate([np.arange(3), at.ravel()])
-        points, wm, wc = sigma_points(state.x, state.P, involved, state.problem.belief)
+        set_ = self.points or state.problem.belief.sigma_points
+        points, wm, wc = sigma_points(state.x, state.P, involved, set_)
         sensor = plain.PointSensor(state.problem.belief.sensor, self.uvd)
         Z = sensor.measure(points[:, None, :3], points[:, at]).reshape(len(points), -1)
         zhat = wm @ Z
@@ -57,13 +63,13 @@ class UnscentedKalman(plain.WorldPointTwin):
         return replace(state, x=x, P=P), Info(innovation, S, W)
 
 
-def sigma_points(x: Array, P: Array, involved: Array, belief: Belief) -> tuple[Array, Array, Array]:
+def sigma_points(x: Array, P: Array, involved: Array, set_: SigmaPoints) -> tuple[Array, Array, Array]:
     """2 n + 1 points (2 n + 1, n) of the whole state, and their weights for mean and covariance.
 
     The spread alpha sqrt(L + kappa) counts the L ``involved`` variables, which come first in the square
     root. The centre weight is what makes the weights sum to one over all n.
     """
-    n, L, set_ = len(x), len(involved), belief.sigma_points
+    n, L = len(x), len(involved)
     spread2 = set_.alpha**2 * (L + set_.kappa)
     steps = np.sqrt(spread2) * ordered_root(P, involved).T
     wm = np.full(2 * n + 1, 0.5 / spread2)

@@ -104,7 +104,7 @@ def carry(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array,
 
 @generic()
 def carry_by(motion: NamedTuple, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
-    """As :func:`carry`, with F the Jacobian of a motion that displaces the robot by (dx, dy) in the world, m."""
+    """:func:`carry` of P (n, n), Phi (n, base), with F of a displacement of the robot by (dx, dy) in the world, m."""
     raise NotImplementedError
 
 
@@ -283,7 +283,10 @@ def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 @generic()
 def carry_at(point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
-    """P <- F P F' and Phi <- F Phi as :func:`carry`, F of step k + 1 as the point asks; called before x moves."""
+    """P (n, n) <- F P F' and Phi (n, base) <- F Phi as :func:`carry`, with F of step k + 1 as the point asks.
+
+    Called before x (n,) moves under the control ``u`` (3,).
+    """
     raise NotImplementedError
 
 
@@ -295,7 +298,7 @@ def observation_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 @generic()
 def landmark_point(point: NamedTuple, values: Array, label: int, work: NamedTuple) -> Array:
-    """Landmark (w,) at which h is linearised."""
+    """Landmark (w,) at which h is linearised; ``values`` (w,) is the estimate of landmark ``label``."""
     raise NotImplementedError
 
 

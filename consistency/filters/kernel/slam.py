@@ -321,7 +321,7 @@ def make_room(update: NamedTuple, r: int, w: int, m: int, n: int) -> NamedTuple:
 def predict(
     update: NamedTuple, slam: Slam, state: State, k: int, u: Array, local: NamedTuple, work: NamedTuple
 ) -> None:
-    """x, P and what ``local`` says of them <- one step of motion."""
+    """x (n,), P (n, n), and what ``local`` says of them <- one step of motion under the control ``u`` (3,)."""
     raise NotImplementedError
 
 
@@ -355,19 +355,19 @@ def make_local(covariance: NamedTuple, r: int, w: int, n: int, steps: int, n_lan
 def prepare(
     covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: NamedTuple
 ) -> State:
-    """The variables that a step works on in which ``labels`` are seen."""
+    """The variables to work on in a step in which the landmarks ``labels`` (m,) are seen: all of them, or a part."""
     raise NotImplementedError
 
 
 @generic()
 def append(covariance: NamedTuple, slam: Slam, state: State, label: int, local: NamedTuple, work: NamedTuple) -> None:
-    """``local`` <- a new landmark at the end of ``state``, with Jacobian ``work.Jp``."""
+    """``local`` <- a new landmark at the end of ``state``, with Jacobian ``work.Jp`` (w, r)."""
     raise NotImplementedError
 
 
 @generic()
 def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: NamedTuple) -> None:
-    """``whole`` <- what is known of all variables."""
+    """``whole`` <- all variables as they are after the steps so far, those outside the active part included."""
     raise NotImplementedError
 
 

@@ -58,7 +58,7 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
 def linearise(
     slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array, work: Work[NamedTuple]
 ) -> None:
-    """z (3,) <- h expected of (pose, values) in step k + 1; Hp (3, r), Hl (3, w) <- Jacobians at the chosen point."""
+    """z (3,) <- h expected of pose (r,), values (w,) in step k + 1; Hp (3, r), Hl (3, w) <- Jacobians at the point."""
     at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label, work)
     linearise_at(slam, robot_frame(slam.motion, at), landmark, z, Hp, Hl)
     if expands(slam.point):

@@ -104,7 +104,7 @@ def carry(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array,
 
 @generic()
 def carry_by(motion: NamedTuple, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
-    """As :func:`carry`, with F the Jacobian of a motion that displaces the robot by (dx, dy) in the world, m."""
+    """:func:`carry` of P (n, n), Phi (n, base), with F of a displacement of the robot by (dx, dy) in the world, m."""
     raise NotImplementedError
 
 
@@ -283,7 +283,10 @@ def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 @generic()
 def carry_at(point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
-    """P <- F P F' and Phi <- F Phi as :func:`carry`, F of step k + 1 as the point asks; called before x moves."""
+    """P (n, n) <- F P F' and Phi (n, base) <- F Phi as :func:`carry`, with F of step k + 1 as the point asks.
+
+    Called before x (n,) moves under the control ``u`` (3,).
+    """
     raise NotImplementedError
 
 
@@ -295,7 +298,7 @@ def observation_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 @generic()
 def landmark_point(point: NamedTuple, values: Array, label: int, work: NamedTuple) -> Array:
-    """Landmark (w,) at which h is linearised."""
+    """Landmark (w,) at which h is linearised; ``values`` (w,) is the estimate of landmark ``label``."""
     raise NotImplementedError
 
 
@@ -318,7 +321,7 @@ def make_room(update: NamedTuple, r: int, w: int, m: int, n: int) -> NamedTuple:
 def predict(
     update: NamedTuple, slam: Slam, state: State, k: int, u: Array, local: NamedTuple, work: NamedTuple
 ) -> None:
-    """x, P and what ``local`` says of them <- one step of motion."""
+    """x (n,), P (n, n), and what ``local`` says of them <- one step of motion under the control ``u`` (3,)."""
     raise NotImplementedError
 
 
@@ -352,19 +355,19 @@ def make_local(covariance: NamedTuple, r: int, w: int, n: int, steps: int, n_lan
 def prepare(
     covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: NamedTuple
 ) -> State:
-    """The variables that a step works on in which ``labels`` are seen."""
+    """The variables to work on in a step in which the landmarks ``labels`` (m,) are seen: all of them, or a part."""
     raise NotImplementedError
 
 
 @generic()
 def append(covariance: NamedTuple, slam: Slam, state: State, label: int, local: NamedTuple, work: NamedTuple) -> None:
-    """``local`` <- a new landmark at the end of ``state``, with Jacobian ``work.Jp``."""
+    """``local`` <- a new landmark at the end of ``state``, with Jacobian ``work.Jp`` (w, r)."""
     raise NotImplementedError
 
 
 @generic()
 def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: NamedTuple) -> None:
-    """``whole`` <- what is known of all variables."""
+    """``whole`` <- all variables as they are after the steps so far, those outside the active part included."""
     raise NotImplementedError
 
 

@@ -66,6 +66,7 @@ def carry_unicycle(motion: Unicycle, at: Array, u: Array, P: Array, n: int, Phi:
 
 @implement(carry_by, Unicycle)
 def carry_unicycle_by(motion: Unicycle, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
+    """F[0, 2] = -dy and F[1, 2] = dx: how the position turns with the heading."""
     _carry(P, n, Phi, base, -dy, dx)
 
 

@@ -55,6 +55,7 @@ def motion_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
 def carry_at_estimate(
     point: AtEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
+    """F at the estimate before the step."""
     carry(slam.motion, state.x[: robot_width(slam.motion)], u, state.P, state.n, Phi, state.base)
 
 
@@ -66,6 +67,7 @@ def observation_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
 
 @implement(landmark_point, AtEstimate)
 def landmark_at_estimate(point: AtEstimate, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    """The estimate ``values`` (w,)."""
     return values
 
 

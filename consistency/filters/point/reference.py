@@ -62,6 +62,7 @@ def motion_at_reference(point: Reference, pose: Array, k: int) -> Array:
 def carry_at_reference(
     point: Reference, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
+    """F at the reference pose before the step."""
     carry(slam.motion, point.path[k], u, state.P, state.n, Phi, state.base)
 
 
@@ -73,6 +74,7 @@ def observation_at_reference(point: Reference, pose: Array, k: int) -> Array:
 
 @implement(landmark_point, Reference)
 def landmark_at_reference(point: Reference, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    """Reference (w,) of landmark ``label``."""
     return point.landmarks[label]
 
 

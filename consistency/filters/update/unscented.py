@@ -95,6 +95,7 @@ def _weights(L: int, points: Unscented) -> tuple[float, float, float, float]:
 def predict_unscented(
     update: Unscented, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[SigmaRoom]
 ) -> None:
+    """x, P <- mean and covariance (r, r) of f over 2 r + 1 sigma points of the robot; its rows of P <- F C^-1 P."""
     x, P, r = state.x, state.P, robot_width(slam.motion)
     spread, w0m, w0c, w = _weights(r, update)
     C, F, Y = work.small, work.room.F, work.room.moved

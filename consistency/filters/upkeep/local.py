@@ -162,9 +162,9 @@ def _relative(x: Array, p: int, robot: Array, landmark: Array) -> None:
 
 @inner
 def split(r: int, w: int, whole: State, labels: Indices, offset: Indices, local: Factors) -> int:
-    """The robot and the known ones of ``labels`` become active and the base; returns their number of variables.
+    """The robot and the known ones of ``labels`` (m,) become active and the base; returns their number of variables.
 
-    ``offset`` <- that of each landmark in the active part, or -1.
+    ``offset`` (n_landmarks,) <- that of each landmark in the active part, or -1.
     """
     x, P, home = whole.x, whole.P, whole.offset
     fill(offset, -1)
@@ -193,7 +193,7 @@ def split(r: int, w: int, whole: State, labels: Indices, offset: Indices, local:
 
 @inner
 def activate(r: int, w: int, whole: State, labels: Indices, active: State, local: Factors) -> int:
-    """The passive ones of ``labels`` become active and join the base; returns by how many variables both grow."""
+    """Passive ones of ``labels`` (m,) become active and join the base; returns by how many variables both grow."""
     more, n, b, home = 0, active.n, active.base, whole.offset
     for label in labels:
         if home[label] >= 0 and active.offset[label] < 0:

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
 import pkgutil
+import re
+import subprocess
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -76,6 +80,32 @@ def test_a_direct_run_is_that_of_run_trials(uvd: cs.Scenario) -> None:
     direct = cs.get_filter("ekf-uvd").run(cs.simulate(uvd), uvd.belief)
     among = cs.run_trials(uvd, ["ekf-uvd"], runs=1, jobs=1).estimates
     assert np.array_equal(direct.pose, among[["x", "y", "heading"]].to_numpy())
+
+
+PRINTED = """
+import hashlib, sys
+import consistency as cs
+
+scenario = cs.load_scenario(sys.argv[2]).variant("short", truth__steps=200)
+said = cs.get_filter(sys.argv[1]).run(cs.simulate(scenario), scenario.belief)
+arrays = (said.pose, said.covariance, said.nis, said.map.mean, said.map.covariance)
+print(hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest())
+"""
+
+
+def test_lent_arrays_live_as_long_as_the_trial() -> None:
+    """What the loop lends it uses to the end; and a C library that overwrites what is freed changes no bit."""
+    source = inspect.getsource(trial_kernel.function)
+    lent = re.findall(r"\blend\((\w+)\)", source)
+    assert len(lent) == 6
+    end = source[source.index(" keep(") :]
+    assert [name for name in lent if not re.search(rf"\b{name}\b", end)] == []
+    found = []
+    for byte in ("0", "170"):
+        environment = os.environ | {"MALLOC_PERTURB_": byte}
+        command = [sys.executable, "-c", PRINTED, "ekf-uvd", "herath2007-stereo"]
+        found.append(subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=True))
+    assert found[0].stdout == found[1].stdout
 
 
 def test_the_limit_on_blas_threads_ends_with_the_last_trial() -> None:

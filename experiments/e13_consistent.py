@@ -9,6 +9,7 @@ import consistency as cs
 from consistency.filters.centred import Corrections
 from consistency.filters.methods.robocentric import PARKED, RobotCentredKalman, compiled
 from consistency.runs.findings import script, sibling
+from consistency.scenario import UniformLandmarks
 
 FINDINGS = ("consistent-at-9cm", "consistent-corrections")
 LONG = True
@@ -41,6 +42,7 @@ def cell(path: str, reach: float, density: float) -> cs.Scenario:
     """A world of herath2007-stereo with another path, range and number of landmarks."""
     world = cs.load_scenario("herath2007-stereo") if path == "circle" else worlds()[path][0]
     landmarks = world.truth.landmarks
+    assert isinstance(landmarks, UniformLandmarks)
     count = round(landmarks.count * density)
     return world.variant(
         f"{path}-{reach:g}m-{count}",

@@ -48,21 +48,25 @@ class FirstEstimates(NamedTuple):
 
 @implement(expands, FirstEstimate)
 def first_estimate_is_not_expanded(point: FirstEstimate) -> bool:
+    """False: f and h are evaluated at the estimate itself."""
     return False
 
 
 @implement(stands_apart, FirstEstimate)
 def first_estimate_stands_apart(point: FirstEstimate) -> bool:
+    """True: the Jacobians are taken elsewhere."""
     return True
 
 
 @implement(make_notes, FirstEstimate)
 def note_first_estimates(point: FirstEstimate, r: int, w: int, steps: int, labels: int) -> FirstEstimates:
+    """Room for the predictions of all steps and the first estimate of each landmark."""
     return FirstEstimates(np.empty((steps + 1, r)), np.empty((labels, w)))
 
 
 @implement(motion_point, FirstEstimate)
 def motion_about_estimate(point: FirstEstimate, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), before the step."""
     return pose
 
 
@@ -70,6 +74,7 @@ def motion_about_estimate(point: FirstEstimate, pose: Array, k: int) -> Array:
 def carry_between_first_estimates(
     point: FirstEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
+    """F by the displacement p_k+1|k - p_k|k-1 between first estimates; notes the prediction."""
     before, after = work.notes.path[k], work.notes.path[k + 1]
     if k == 0:
         copy(state.x[:3], before)
@@ -79,11 +84,13 @@ def carry_between_first_estimates(
 
 @implement(observation_point, FirstEstimate)
 def observation_at_prediction(point: FirstEstimate, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), after the prediction: its first."""
     return pose
 
 
 @implement(landmark_point, FirstEstimate)
 def landmark_at_first_estimate(point: FirstEstimate, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    """The first estimate (w,) of landmark ``label``."""
     first: Array = work.notes.landmarks[label]
     return first
 
@@ -92,6 +99,7 @@ def landmark_at_first_estimate(point: FirstEstimate, values: Array, label: int, 
 def place_first_estimate(
     point: FirstEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
+    """x[n:n + w] <- the inverse of h at the estimated pose, noted; its Jacobian by the heading at the prediction."""
     pose, values, predicted = state.x[:3], state.x[state.n : state.n + 3], work.notes.path[k + 1]
     place_observed(slam, pose, z, values, work)
     copy(values, work.notes.landmarks[label])

@@ -69,22 +69,26 @@ class UnobservedTurn(NamedTuple):
 
 @implement(expands, ObservabilityConstrained)
 def constrained_is_not_expanded(point: ObservabilityConstrained) -> bool:
+    """False: f and h are evaluated at the estimate itself."""
     return False
 
 
 @implement(stands_apart, ObservabilityConstrained)
 def constrained_stands_apart(point: ObservabilityConstrained) -> bool:
+    """True: the Jacobians are taken elsewhere."""
     return True
 
 
 @implement(make_notes, ObservabilityConstrained)
 def note_unobserved_turn(point: ObservabilityConstrained, r: int, w: int, steps: int, labels: int) -> UnobservedTurn:
+    """Room for the direction in all steps and of all landmarks."""
     path, landmarks = np.empty((steps + 1, 2)), np.empty((labels, 2))
     return UnobservedTurn(path, landmarks, np.empty(labels, np.int64), np.zeros(2), np.empty(w))
 
 
 @implement(motion_point, ObservabilityConstrained)
 def motion_from_estimate(point: ObservabilityConstrained, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), before the step."""
     return pose
 
 
@@ -92,6 +96,7 @@ def motion_from_estimate(point: ObservabilityConstrained, pose: Array, k: int) -
 def carry_constrained(
     point: ObservabilityConstrained, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
+    """F by the displacement p_k+1|k - p*_k|k; notes a_k+1 and e."""
     x, notes, predicted = state.x, work.notes, work.pose
     before, after, shift = notes.path[k], notes.path[k + 1], notes.shift
     move(slam.motion, x[:3], u, predicted)
@@ -109,11 +114,13 @@ def carry_constrained(
 
 @implement(observation_point, ObservabilityConstrained)
 def observation_from_prediction(point: ObservabilityConstrained, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), after the prediction, which the constraint leaves free."""
     return pose
 
 
 @implement(landmark_point, ObservabilityConstrained)
 def landmark_constrained(point: ObservabilityConstrained, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    """l*_i = l_i + e (w,) of landmark ``label``, at the height of the estimate."""
     notes = work.notes
     at: Array = notes.at
     for a in range(2):
@@ -126,6 +133,7 @@ def landmark_constrained(point: ObservabilityConstrained, values: Array, label: 
 def place_constrained(
     point: ObservabilityConstrained, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
+    """x[n:n + w] <- the inverse of h at the estimated pose, with its Jacobians; notes l_i."""
     x, n, notes = state.x, state.n, work.notes
     place_observed(slam, x[:3], z, x[n : n + 3], work)
     notes.order[(n - 3) // 3] = label

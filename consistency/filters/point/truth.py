@@ -41,21 +41,25 @@ class AtTruth(NamedTuple):
 
 @implement(expands, AtTruth)
 def truth_is_not_expanded(point: AtTruth) -> bool:
+    """False: f and h are evaluated at the estimate itself."""
     return False
 
 
 @implement(stands_apart, AtTruth)
 def truth_stands_apart(point: AtTruth) -> bool:
+    """True: the Jacobians are taken elsewhere."""
     return True
 
 
 @implement(make_notes, AtTruth)
 def no_notes_at_truth(point: AtTruth, r: int, w: int, steps: int, labels: int) -> NoNotes:
+    """Nothing: the truth is known from the start."""
     return NoNotes()
 
 
 @implement(motion_point, AtTruth)
 def motion_at_truth(point: AtTruth, pose: Array, k: int) -> Array:
+    """True pose (r,) before the step."""
     return point.path[k]
 
 
@@ -63,17 +67,20 @@ def motion_at_truth(point: AtTruth, pose: Array, k: int) -> Array:
 def carry_at_truth(
     point: AtTruth, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
+    """F by the true displacement of the robot."""
     before, after = point.path[k], point.path[k + 1]
     carry_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, AtTruth)
 def observation_at_truth(point: AtTruth, pose: Array, k: int) -> Array:
+    """True pose (r,) of step k + 1."""
     return point.path[k + 1]
 
 
 @implement(landmark_point, AtTruth)
 def landmark_at_truth(point: AtTruth, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    """True position (w,) of landmark ``label``."""
     return point.landmarks[label]
 
 
@@ -81,6 +88,7 @@ def landmark_at_truth(point: AtTruth, values: Array, label: int, work: Work[Name
 def place_at_truth(
     point: AtTruth, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
+    """x[n:n + w] <- the inverse of h at the estimated pose; Jz = Hl^-1 and Jp = -Hl^-1 Hp at the truth."""
     place_observed(slam, state.x[:3], z, state.x[state.n : state.n + 3], work)
     expected, Hp, Hl = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     linearise_at(slam, robot_frame(slam.motion, point.path[k + 1]), point.landmarks[label], expected, Hp, Hl)

@@ -130,6 +130,7 @@ def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, o
         "model": sensor["model"],
         unit: list(sensor["sigma"]),
         **{key: sensor[key] for key in ("f", "B") if key in sensor},
+        **({"disparity": list(sensor["disparity"])} if "disparity" in sensor else {}),
         **({"image": list(view[0]), "principal_point": list(view[1])} if view else {}),
         "mount": {key: list(value) for key, value in sensor["mount"].items()},
         "motion": belief.motion.model_dump(),

@@ -134,6 +134,17 @@ def predict_extended(state: SlamState, control: Control) -> SlamState:
     return replace(state, x=x, P=P)
 
 
+def predict_by(state: SlamState, control: Control, displacement: Array, at: Array) -> SlamState:
+    """Eq. 9 and 10 with F of another ``displacement`` (2,) of the robot, in m, and G at the pose ``at`` (3,)."""
+    robot, x, F = Unicycle(), state.x.copy(), np.eye(len(state.x))
+    _, G = robot.jacobians(at, control)
+    x[:3] = robot.move(x[:3], control)
+    F[:2, 2] = quarter_turn(displacement)
+    P = F @ state.P @ F.T
+    P[:3, :3] += process_noise(G, state.problem.belief)
+    return replace(state, x=x, P=P)
+
+
 class Correct(Protocol):
     """The update with landmarks already in the state: their labels, z (m, 3), R (m, 3, 3)."""
 
@@ -192,6 +203,17 @@ def gain(P: Array, H: Array, R: Array) -> tuple[Array, Array]:
     return S, np.linalg.solve(S, H @ P).T
 
 
+def correct_about(
+    state: SlamState, at: Array, seen: list[int], z: Array, R: Array, uvd: bool
+) -> tuple[SlamState, Info]:
+    """The update of an EKF whose H is that of other values ``at`` (n,) than its estimate."""
+    zhat, _ = expect(state, seen, uvd)
+    _, H = expect(replace(state, x=at), seen, uvd)
+    innovation = z.ravel() - zhat
+    S, W = gain(state.P, H, block_diagonal(R))
+    return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+
+
 def locate_point(state: SlamState, z: Array, uvd: bool) -> tuple[Array, Array, Array]:
     """A landmark (3,) as a point in the world, m, by eq. 21 from the estimated pose; Jacobians (3, 3) by pose and z."""
     return PointSensor(state.problem.belief.sensor, uvd).locate(state.x[:3], z)
@@ -211,6 +233,29 @@ def map_of(state: SlamState) -> dict[int, Gaussian]:
 def joint_of(state: SlamState) -> Gaussian:
     """Robot and landmarks together, (n,) and (n, n), of a state whose error is additive."""
     return Gaussian(state.x, state.P)
+
+
+class Noting(Protocol):
+    """A state of world points with notes beside it."""
+
+    @property
+    def slam(self) -> SlamState: ...
+
+
+class NotingTwin:
+    """What a twin says of a state that is a ``SlamState`` with notes beside it."""
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def pose(self, state: Noting) -> Gaussian:
+        return pose_of(state.slam)
+
+    def map(self, state: Noting) -> dict[int, Gaussian]:
+        return map_of(state.slam)
+
+    def joint(self, state: Noting) -> Gaussian:
+        return joint_of(state.slam)
 
 
 class WorldPointTwin(ABC):

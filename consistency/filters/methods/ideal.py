@@ -19,7 +19,7 @@ from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
 from consistency.filters.point.truth import AtTruth
 from consistency.protocols import Problem, Truth
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.types import Array, Control, Info, Observation
 
 
 @dataclass(frozen=True)
@@ -31,27 +31,19 @@ class IdealState:
     step: int
 
 
-class IdealKalman:
+class IdealKalman(plain.NotingTwin):
     """EKF-SLAM linearised at the true poses and landmarks."""
 
     realisable = False
     robot = plain.Unicycle()
 
-    def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
-
     def init(self, problem: Problem) -> IdealState:
         return IdealState(plain.start(problem), truth_of(problem), 0)
 
     def predict(self, state: IdealState, control: Control) -> IdealState:
-        x, F = state.slam.x.copy(), np.eye(len(state.slam.x))
         before, after = state.truth.path[state.step : state.step + 2]
-        _, G = self.robot.jacobians(before, control)
-        x[:3] = self.robot.move(x[:3], control)
-        F[:2, 2] = plain.quarter_turn(after[:2] - before[:2])
-        P = F @ state.slam.P @ F.T
-        P[:3, :3] += plain.process_noise(G, state.slam.problem.belief)
-        return replace(state, slam=replace(state.slam, x=x, P=P), step=state.step + 1)
+        slam = plain.predict_by(state.slam, control, after[:2] - before[:2], before)
+        return replace(state, slam=slam, step=state.step + 1)
 
     def update(self, state: IdealState, observation: Observation) -> tuple[IdealState, Info]:
         pose, landmarks = state.truth.path[state.step], state.truth.landmarks
@@ -59,11 +51,7 @@ class IdealKalman:
 
         def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
             true = np.concatenate([pose, *(landmarks[label] for label in slam.landmarks)])
-            zhat, _ = plain.expect(slam, seen, self.uvd)
-            _, H = plain.expect(replace(slam, x=true), seen, self.uvd)
-            innovation = z.ravel() - zhat
-            S, W = plain.gain(slam.P, H, plain.block_diagonal(R))
-            return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
+            return plain.correct_about(slam, true, seen, z, R, self.uvd)
 
         def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
             landmark, _, _ = plain.locate_point(slam, z, self.uvd)
@@ -73,15 +61,6 @@ class IdealKalman:
 
         slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
         return replace(state, slam=slam), info
-
-    def pose(self, state: IdealState) -> Gaussian:
-        return plain.pose_of(state.slam)
-
-    def map(self, state: IdealState) -> dict[int, Gaussian]:
-        return plain.map_of(state.slam)
-
-    def joint(self, state: IdealState) -> Gaussian:
-        return plain.joint_of(state.slam)
 
 
 def truth_of(problem: Problem) -> Truth:

@@ -7,7 +7,7 @@ the best estimates; these points follow them where robot and map move together.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
 from consistency.filters.point.observability_constrained import ObservabilityConstrained
 from consistency.protocols import Problem
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.types import Array, Control, Info, Observation
 
 
 @dataclass(frozen=True)
@@ -29,27 +29,21 @@ class ConstrainedState:
     turned: Array  # (1 + m, 2): a, l_1, ..., l_m
 
 
-class ConstrainedKalman:
+class ConstrainedKalman(plain.NotingTwin):
     """EKF-SLAM with points that leave a turn of robot and map unobserved."""
 
     robot = plain.Unicycle()
-
-    def __init__(self, name: str, uvd: bool) -> None:
-        self.name, self.uvd = name, uvd
 
     def init(self, problem: Problem) -> ConstrainedState:
         return ConstrainedState(plain.start(problem), problem.start[None, :2])
 
     def predict(self, state: ConstrainedState, control: Control) -> ConstrainedState:
-        x, F, turned = state.slam.x.copy(), np.eye(len(state.slam.x)), state.turned.copy()
+        x, turned = state.slam.x, state.turned.copy()
         shift = np.mean(x.reshape(-1, 3)[:, :2] - turned, axis=0)
-        _, G = self.robot.jacobians(x[:3], control)
-        x[:3] = self.robot.move(x[:3], control)
-        F[:2, 2] = plain.quarter_turn(x[:2] - (turned[0] + shift))  # predicted less p*
-        turned[0] = x[:2] - shift
-        P = F @ state.slam.P @ F.T
-        P[:3, :3] += plain.process_noise(G, state.slam.problem.belief)
-        return ConstrainedState(replace(state.slam, x=x, P=P), turned)
+        predicted = self.robot.move(x[:3], control)
+        slam = plain.predict_by(state.slam, control, predicted[:2] - (turned[0] + shift), x[:3])  # predicted less p*
+        turned[0] = predicted[:2] - shift
+        return ConstrainedState(slam, turned)
 
     def update(self, state: ConstrainedState, observation: Observation) -> tuple[ConstrainedState, Info]:
         turned, predicted = list(state.turned), state.slam.x[:2]
@@ -57,11 +51,7 @@ class ConstrainedKalman:
         def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
             points = slam.x.reshape(-1, 3).copy()
             points[:, :2] = state.turned + (predicted - state.turned[0])
-            zhat, _ = plain.expect(slam, seen, self.uvd)
-            _, H = plain.expect(replace(slam, x=points.ravel()), seen, self.uvd)
-            innovation = z.ravel() - zhat
-            S, W = plain.gain(slam.P, H, plain.block_diagonal(R))
-            return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
+            return plain.correct_about(slam, points.ravel(), seen, z, R, self.uvd)
 
         def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
             placed = plain.locate_point(slam, z, self.uvd)
@@ -70,15 +60,6 @@ class ConstrainedKalman:
 
         slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
         return ConstrainedState(slam, np.array(turned)), info
-
-    def pose(self, state: ConstrainedState) -> Gaussian:
-        return plain.pose_of(state.slam)
-
-    def map(self, state: ConstrainedState) -> dict[int, Gaussian]:
-        return plain.map_of(state.slam)
-
-    def joint(self, state: ConstrainedState) -> Gaussian:
-        return plain.joint_of(state.slam)
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:

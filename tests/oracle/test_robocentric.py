@@ -12,8 +12,10 @@ from scipy.stats import truncnorm
 import consistency as cs
 from consistency.filters import centred, plain
 from consistency.filters.compiled import problem_of
+from consistency.filters.kernel.slam import State
 from consistency.filters.methods import robocentric as rc
 from consistency.filters.stepping import step_through
+from consistency.filters.upkeep.parking import Parking, make_clones, unpark
 from consistency.types import Array
 
 Small = Callable[..., cs.Scenario]
@@ -167,6 +169,22 @@ def test_landmarks_are_parked_and_come_back(small: Small) -> None:
         assert len(state.x) == 3 + 3 * (len(state.places) + len(state.clones))
     assert len(parked) > 5
     assert len(back) > 5
+
+
+def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
+    clones = make_clones(Parking(50, 20), 3, 3, 12, 100, 2)
+    clones.of[:], clones.uses[0], clones.at[0] = 0, 2, 9
+    state = State(np.ones(12), np.ones((12, 12)), 12, 0, np.array([3, 6]))
+    unpark(0, state, clones)
+    assert clones.uses[0] == 1
+    assert state.P.all()
+    unpark(1, state, clones)
+    assert clones.of.tolist() == [-1, -1]
+    assert clones.uses[0] == 0
+    assert not state.P[:9, 9:].any()
+    assert not np.triu(state.P[9:, 9:]).any()
+    assert not state.x[9:].any()
+    assert state.P[:9, :9].all()
 
 
 # --- bad input -----------------------------------------------------------------------------------

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from bench_trials import Case, twin_state
 
-from consistency.filters.plain import PointSensor, Unicycle, process_noise
+from consistency.filters.plain import Unicycle, process_noise
+from consistency.filters.plain_sensors import PointSensor
 from consistency.models import point, stereo
 from consistency.scenario import Belief
 from consistency.types import Array, Control

@@ -34,7 +34,7 @@ class Observation:
     """All landmarks seen in one step; association is known."""
 
     landmarks: Indices  # (m,)
-    z: Array  # (m, 3): (x, y, z) in m or (u, v, d) in px
+    z: Array  # (m, s): (x, y, z) in m, (u, v, d) in px, (dx, dy) in m, or range in m and bearing in rad
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Trial:
     controls: Array  # (T, 3): dt, v, omega
     first: Indices  # (T + 1,)
     landmark: Indices  # (M,), id in 0..n_landmarks-1
-    z: Array  # (M, 3)
+    z: Array  # (M, s)
     n_landmarks: int  # number of ids, those of things that are no landmark included: at least N
     truth: Array | None = None  # (T + 1, 3): x, y, heading (not wrapped)
     landmarks: Array | None = None  # (N, 3), true positions in the world

@@ -17,7 +17,7 @@ from consistency.filters.kernel.dispatch import fits, require_fitting
 from consistency.filters.kernel.gain import REASONS
 from consistency.filters.kernel.loop import Outcome, trial_kernel
 from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
-from consistency.filters.plain import sensor_noise
+from consistency.filters.plain_sensors import sensor_noise
 from consistency.filters.upkeep.local import LOCAL_FROM, Local
 from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Problem, Truth
@@ -153,6 +153,19 @@ class Compiled:
         slam = local if most >= self.local_from and fits(local) else slam
         require_fitting(slam)
         return slam
+
+
+def planar(twin: Callable[..., Any], method: str, parts: Callable[[Problem, Array], Slam], **options: str) -> tuple[Compiled, Compiled]:
+    """A method on relative positions, ``METHOD-xy``, and on ranges and bearings, ``METHOD-rb``, of landmarks in a plane.
+
+    ``twin`` makes its plain twin of a name and ``uvd``, ``parts`` take sensor and landmark from the belief, and
+    ``options`` are those of :class:`Compiled`.
+    """
+    xy, rb = (twin(f"{method}-{suffix}", uvd=False) for suffix in ("xy", "rb"))
+    return (
+        Compiled(xy, parts, sensors=("relative-xy",), uvd=False, **options),
+        Compiled(rb, parts, sensors=("range-bearing",), uvd=False, **options),
+    )
 
 
 def problem_of(trial: Trial, belief: Belief) -> Problem:

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from consistency.filters.kernel.slam import Sensor
+from consistency.filters.landmark.planar_point import PlanarPoint
+from consistency.filters.landmark.world_point import WorldPoint
 from consistency.filters.motion.unicycle import Unicycle
+from consistency.filters.sensor.range_bearing import RangeBearing
+from consistency.filters.sensor.relative_xy import RelativeXy
 from consistency.filters.sensor.uvd import Uvd
 from consistency.filters.sensor.xyz import Xyz
 from consistency.scenario import Belief
+
+PLANAR = {"relative-xy": RelativeXy, "range-bearing": RangeBearing}  # sensors of landmarks in the plane, by model
 
 
 def motion_of(belief: Belief) -> Unicycle:
@@ -15,8 +21,15 @@ def motion_of(belief: Belief) -> Unicycle:
 
 
 def sensor_of(belief: Belief, uvd: bool) -> Sensor:
-    """Eq. 22 with the believed rig, or eq. 19."""
+    """Eq. 22 with the believed rig, a sensor of landmarks in the plane, or eq. 19."""
     sensor = belief.sensor
+    if sensor.model in PLANAR:
+        return PLANAR[sensor.model](sensor.mount.packed())
     if uvd:
         return Uvd(sensor.f or 0.0, sensor.B or 0.0, sensor.mount.packed())
     return Xyz(sensor.mount.packed())
+
+
+def landmark_of(belief: Belief) -> PlanarPoint | WorldPoint:
+    """A point in the world, in the plane where the sensor measures no heights."""
+    return PlanarPoint() if belief.sensor.model in PLANAR else WorldPoint()

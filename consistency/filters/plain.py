@@ -15,10 +15,12 @@ from typing import Protocol
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.models import motion, point, stereo
+from consistency.filters.plain_sensors import heading_matrix as heading_matrix
+from consistency.filters.plain_sensors import sensor_noise, view
+from consistency.models import motion
 from consistency.protocols import Problem
-from consistency.scenario import Belief, BelievedSensor
-from consistency.types import Array, Control, Gaussian, Info, Observation
+from consistency.scenario import Belief
+from consistency.types import Array, Control, Gaussian, Indices, Info, Observation
 
 
 @dataclass(frozen=True)
@@ -35,24 +37,17 @@ class SlamState:
         """Offset of a landmark in x."""
         return 3 + self.width * self.landmarks.index(landmark)
 
+    @property
+    def positions(self) -> Indices:
+        """Places in x of x and y of the robot and of each landmark, (1 + m, 2)."""
+        first = np.array([0, *range(3, len(self.x), self.width)])
+        return np.column_stack([first, first + 1])
 
-def start(problem: Problem, width: int = 3) -> SlamState:
-    """The state before step 1: the robot alone, known exactly."""
-    return SlamState(problem.start.copy(), np.zeros((3, 3)), (), problem, width)
 
-
-def sensor_noise(z: Array, sensor: BelievedSensor, converted: bool) -> tuple[Array, Array]:
-    """Observations (M, 3) and their noise (M, 3, 3), for an xyz filter on uvd data by eq. 21.
-
-    The transformed noise is J diag(sigma^2) J' with J the Jacobian of eq. 21 at the measurement.
-    """
-    variance = np.diag(np.square(sensor.sigma))
-    if not converted:
-        return z, np.broadcast_to(variance, (len(z), 3, 3)).copy()
-    f, B = sensor.f or 0.0, sensor.B or 0.0
-    u, v, d = z.T
-    J = np.stack(np.broadcast_arrays(*stereo.triangulate_jacobian(u, v, d, f, B)), axis=-1).reshape(-1, 3, 3)
-    return np.column_stack(stereo.triangulate(u, v, d, f, B)), J @ variance @ np.swapaxes(J, 1, 2)
+def start(problem: Problem, width: int | None = None) -> SlamState:
+    """The state before step 1: the robot alone, known exactly; landmarks of ``width``, or as the sensor sees them."""
+    own = view(problem.belief.sensor, uvd=False).width
+    return SlamState(problem.start.copy(), np.zeros((3, 3)), (), problem, width or own)
 
 
 class Unicycle:
@@ -68,49 +63,6 @@ class Unicycle:
         F = np.array([[1, 0, -dt * control.v * s], [0, 1, dt * control.v * c], [0, 0, 1]])
         G = np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
         return F, G
-
-
-class PointSensor:
-    """Eq. 19 (``xyz``) or eq. 22 (``uvd``) from a mounted sensor."""
-
-    def __init__(self, sensor: BelievedSensor, uvd: bool) -> None:
-        self.f, self.B, self.uvd = sensor.f or 0.0, sensor.B or 0.0, uvd
-        self.mount = sensor.mount.packed()
-        self.turn = np.reshape(self.mount[3:], (3, 3))  # sensor axes in the robot frame
-
-    def measure(self, pose: Array, landmark: Array) -> Array:
-        """h: observations (..., 3) of landmarks (..., 3), m, from poses (..., 3)."""
-        body = point.to_robot(*np.moveaxis(pose, -1, 0), *np.moveaxis(landmark, -1, 0))
-        x, y, z = point.to_sensor(*body, self.mount)
-        return np.stack(stereo.project(x, y, z, self.f, self.B) if self.uvd else (x, y, z), axis=-1)
-
-    def jacobians(self, pose: Array, landmark: Array) -> tuple[Array, Array]:
-        """Derivatives of h by the pose (3,) and by the landmark (3,), each (3, 3)."""
-        body = point.to_robot(*pose, *landmark)
-        c = point.to_sensor(*body, self.mount)
-        J = np.reshape(stereo.project_jacobian(*c, self.f, self.B), (3, 3)) if self.uvd else np.eye(3)
-        world_to_robot = heading_matrix(pose[2]).T
-        d_body = np.column_stack([-world_to_robot[:, 0], -world_to_robot[:, 1], [body[1], -body[0], 0.0]])
-        return J @ self.turn.T @ d_body, J @ self.turn.T @ world_to_robot
-
-    def locate(self, pose: Array, z: Array) -> tuple[Array, Array, Array]:
-        """Landmark (3,) in m from one observation z (3,) at ``pose`` (3,), with its Jacobians (3, 3) by pose and z."""
-        c, J = z, np.eye(3)
-        if self.uvd:
-            u, v, d = z
-            c = np.array(stereo.triangulate(u, v, d, self.f, self.B))
-            J = np.reshape(stereo.triangulate_jacobian(u, v, d, self.f, self.B), (3, 3))
-        body = point.from_sensor(c[0], c[1], c[2], self.mount)
-        robot_to_world = heading_matrix(pose[2])
-        d_heading = robot_to_world @ [-body[1], body[0], 0.0]
-        d_pose = np.column_stack([[1.0, 0, 0], [0, 1.0, 0], d_heading])
-        return np.array(point.to_world(pose[0], pose[1], pose[2], *body)), d_pose, robot_to_world @ self.turn @ J
-
-
-def heading_matrix(heading: float) -> Array:
-    """Rotation (3, 3) from the robot frame to the world."""
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
 def quarter_turn(v: Array) -> Array:
@@ -146,7 +98,7 @@ def predict_by(state: SlamState, control: Control, displacement: Array, at: Arra
 
 
 class Correct(Protocol):
-    """The update with landmarks already in the state: their labels, z (m, 3), R (m, 3, 3)."""
+    """The update with landmarks already in the state: their labels, z (m, s), R (m, s, s)."""
 
     def __call__(self, state: SlamState, seen: list[int], z: Array, R: Array, /) -> tuple[SlamState, Info]: ...
 
@@ -159,7 +111,7 @@ def update_jointly(
 ) -> tuple[SlamState, Info]:
     """One update with all landmarks in the state, then the new ones; raw (u, v, d) where ``uvd``, else eq. 21.
 
-    ``locate`` gives a new landmark (w,) and its Jacobians with respect to the robot's error (w, 3) and z (w, 3).
+    ``locate`` gives a new landmark (w,) and its Jacobians with respect to the robot's error (w, 3) and z (w, s).
     """
     sensor = state.problem.belief.sensor
     z, R = sensor_noise(observation.z, sensor, converted=sensor.model == "uvd" and not uvd)
@@ -175,7 +127,7 @@ def update_jointly(
 
 
 def augment(state: SlamState, label: int, placed: tuple[Array, Array, Array], R: Array) -> SlamState:
-    """The state with a new landmark (w,), its Jacobians (w, 3) by pose and z, and full cross-covariance; R (3, 3)."""
+    """The state with a new landmark (w,), its Jacobians by pose (w, 3) and z (w, s), and full cross-covariance."""
     landmark, Jp, Jz = placed
     n, w = len(state.x), len(landmark)
     J = np.zeros((n + w, n))
@@ -187,14 +139,20 @@ def augment(state: SlamState, label: int, placed: tuple[Array, Array, Array], R:
 
 
 def expect(state: SlamState, seen: list[int], uvd: bool) -> tuple[Array, Array]:
-    """h (3 m,) and its Jacobian H (3 m, n) at the state, landmarks as points in the world."""
-    sensor = PointSensor(state.problem.belief.sensor, uvd)
-    zhat, H = np.zeros(3 * len(seen)), np.zeros((3 * len(seen), len(state.x)))
+    """h (s m,) and its Jacobian H (s m, n) at the state, landmarks as points in the world."""
+    sensor = view(state.problem.belief.sensor, uvd)
+    s, w = sensor.size, sensor.width
+    zhat, H = np.zeros(s * len(seen)), np.zeros((s * len(seen), len(state.x)))
     for i, label in enumerate(seen):
-        rows, at = slice(3 * i, 3 * i + 3), slice(state.at(label), state.at(label) + 3)
+        rows, at = slice(s * i, s * i + s), slice(state.at(label), state.at(label) + w)
         zhat[rows] = sensor.measure(state.x[:3], state.x[at])
         H[rows, :3], H[rows, at] = sensor.jacobians(state.x[:3], state.x[at])
     return zhat, H
+
+
+def innovation_of(state: SlamState, z: Array, zhat: Array, uvd: bool) -> Array:
+    """z (m, s) less what is expected (s m,), as one vector (s m,)."""
+    return view(state.problem.belief.sensor, uvd).less(z, zhat.reshape(z.shape)).ravel()
 
 
 def gain(P: Array, H: Array, R: Array) -> tuple[Array, Array]:
@@ -209,14 +167,14 @@ def correct_about(
     """The update of an EKF whose H is that of other values ``at`` (n,) than its estimate."""
     zhat, _ = expect(state, seen, uvd)
     _, H = expect(replace(state, x=at), seen, uvd)
-    innovation = z.ravel() - zhat
+    innovation = innovation_of(state, z, zhat, uvd)
     S, W = gain(state.P, H, block_diagonal(R))
     return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
 
 
 def locate_point(state: SlamState, z: Array, uvd: bool) -> tuple[Array, Array, Array]:
-    """A landmark (3,) as a point in the world, m, by eq. 21 from the estimated pose; Jacobians (3, 3) by pose and z."""
-    return PointSensor(state.problem.belief.sensor, uvd).locate(state.x[:3], z)
+    """A landmark (w,) as a point in the world, m, seen from the estimated pose; Jacobians by pose (w, 3), z (w, s)."""
+    return view(state.problem.belief.sensor, uvd).locate(state.x[:3], z)
 
 
 def pose_of(state: SlamState) -> Gaussian:
@@ -226,8 +184,15 @@ def pose_of(state: SlamState) -> Gaussian:
 
 def map_of(state: SlamState) -> dict[int, Gaussian]:
     """Landmarks (3,) by label, m, with covariance (3, 3), of a state of world points whose error is additive."""
-    blocks = {label: slice(state.at(label), state.at(label) + 3) for label in state.landmarks}
-    return {label: Gaussian(state.x[at], state.P[at, at]) for label, at in blocks.items()}
+    w = state.width
+    blocks = {label: slice(state.at(label), state.at(label) + w) for label in state.landmarks}
+    return {label: in_space(state.x[at], state.P[at, at]) for label, at in blocks.items()}
+
+
+def in_space(mean: Array, P: Array) -> Gaussian:
+    """A landmark (w,) as a point (3,): one in the plane is known to be at height zero."""
+    missing = 3 - len(mean)
+    return Gaussian(np.pad(mean, (0, missing)), np.pad(P, (0, missing)))
 
 
 def joint_of(state: SlamState) -> Gaussian:
@@ -303,8 +268,9 @@ def require_landmarks(problem: Problem, name: str) -> Array:
 
 
 def block_diagonal(blocks: Array) -> Array:
-    """(m, 3, 3) -> (3 m, 3 m)."""
-    out = np.zeros((3 * len(blocks), 3 * len(blocks)))
+    """(m, s, s) -> (s m, s m)."""
+    m, s = blocks.shape[:2]
+    out = np.zeros((s * m, s * m))
     for i, block in enumerate(blocks):
-        out[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = block
+        out[s * i : s * i + s, s * i : s * i + s] = block
     return out

@@ -8,10 +8,13 @@ file: its keys and its ``apply``. Nothing here draws a trial; that is the simula
 from consistency.scenario.belief import Belief, BelievedMotion, SigmaPoints
 from consistency.scenario.record import Scenario, data_folder, load_scenario, scenario_names
 from consistency.scenario.sensor import (
+    PLANAR_SENSORS,
     BelievedSensor,
     LinearSensor,
     Mount,
     PicturedSensor,
+    RangeBearingSensor,
+    RelativeXySensor,
     TrueSensor,
     UvdSensor,
     XyzSensor,
@@ -29,7 +32,9 @@ from consistency.scenario.tables import (
     read_table,
 )
 from consistency.scenario.truth import (
+    AnnularLandmarks,
     Circle,
+    CircularLandmarks,
     Corridor,
     FigureOfEight,
     ListedLandmarks,
@@ -42,10 +47,13 @@ from consistency.scenario.truth import (
 )
 
 __all__ = [
+    "PLANAR_SENSORS",
+    "AnnularLandmarks",
     "Belief",
     "BelievedMotion",
     "BelievedSensor",
     "Circle",
+    "CircularLandmarks",
     "Corridor",
     "Count",
     "FigureOfEight",
@@ -58,6 +66,8 @@ __all__ = [
     "Path_",
     "PicturedSensor",
     "Positive",
+    "RangeBearingSensor",
+    "RelativeXySensor",
     "RoundedRectangle",
     "Scenario",
     "SigmaPoints",

@@ -24,6 +24,9 @@ from consistency.scenario.effects import BUILT_IN, ListedEffect
 from consistency.scenario.tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 
 
+PLANAR_SENSORS = ("relative-xy", "range-bearing")  # of landmarks in the plane, with two values each
+
+
 class Mount(Table):
     """Pose of the sensor in the robot frame; zero is the robot's origin, looking along +x."""
 
@@ -38,10 +41,36 @@ class Mount(Table):
 class Sensor(Table):
     """What is measured, with which noise and focal length, and from where on the robot."""
 
-    model: Literal["xyz", "uvd", "linear"]
-    sigma: Sigmas  # px for uvd, m otherwise
+    model: Literal["xyz", "uvd", "linear", "relative-xy", "range-bearing"]
+    sigma: Sigmas  # px for uvd, m and rad for range-bearing, m otherwise
     f: Positive | None = None  # px
     mount: Mount = Mount()
+
+    @property
+    def planar(self) -> bool:
+        """Whether it sees landmarks in the plane of the robot, and measures two values of each."""
+        return self.model in PLANAR_SENSORS
+
+    @property
+    def size(self) -> int:
+        """Values in an observation."""
+        return 2 if self.planar else 3
+
+    @model_validator(mode="after")
+    def _one_sigma_a_value(self) -> Sensor:
+        if len(self.sigma) != self.size:
+            raise ValueError(f"sigma must have {self.size} numbers for a sensor '{self.model}', got {len(self.sigma)}")
+        return self
+
+    @model_validator(mode="after")
+    def _level(self) -> Sensor:
+        roll, pitch, _ = self.mount.rotation
+        if self.planar and (self.mount.position[2], roll, pitch) != (0.0, 0.0, 0.0):
+            raise ValueError(
+                f"a sensor '{self.model}' is level in the plane of the robot: mount.position must end in 0 and "
+                "mount.rotation begin with 0, 0"
+            )
+        return self
 
 
 class StereoSensor(Sensor):
@@ -187,4 +216,18 @@ class UvdSensor(TrueSensor, StereoSensor):
         return self
 
 
-TrueSensor_ = Annotated[XyzSensor | LinearSensor | UvdSensor, Field(discriminator="model")]
+class RelativeXySensor(TrueSensor):
+    """Position of landmarks of the plane in the sensor frame, dx and dy, with Gaussian noise in m."""
+
+    model: Literal["relative-xy"]
+
+
+class RangeBearingSensor(TrueSensor):
+    """Range (m) and bearing (rad, counter-clockwise) of landmarks of the plane with Gaussian noise."""
+
+    model: Literal["range-bearing"]
+
+
+TrueSensor_ = Annotated[
+    XyzSensor | LinearSensor | UvdSensor | RelativeXySensor | RangeBearingSensor, Field(discriminator="model")
+]

@@ -18,18 +18,18 @@ UNITS = {
     **dict.fromkeys(("heading", "sigma_omega", "turn_rate", "rotation"), "_deg"),
     **dict.fromkeys(("f", "image", "principal_point", "disparity"), "_px"),
     **dict.fromkeys(("start", "radius", "length", "width", "corner_radius", "turn_radius", "points"), "_m"),
-    **dict.fromkeys(("x", "y", "z", "position", "range", "B"), "_m"),
+    **dict.fromkeys(("x", "y", "z", "position", "range", "B", "centre", "rings"), "_m"),
     "dt": "_s",
 }
 LIST_OF_KINDS = "effects"  # a list of tables, each of the kind that its key 'kind' names
-SIGMA_UNITS = {"uvd": "_px", "xyz": "_m", "linear": "_m"}
+SIGMA_UNITS = {"uvd": "_px", "xyz": "_m", "linear": "_m", "relative-xy": "_m", "range-bearing": ""}  # m and rad
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Triple = tuple[Finite, Finite, Finite]
-Sigmas = tuple[Positive, Positive, Positive]
+Sigmas = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
 Interval = tuple[Finite, Finite]
 
 
@@ -115,7 +115,7 @@ def explain(error: ValidationError, model: type[Table]) -> str:
 def _keys(location: tuple[int | str, ...]) -> list[str]:
     """Keys of the file at a location of pydantic, which inserts the tag of a tagged union: no key of the file."""
     tags = {"circle", "rounded-rectangle", "figure-of-eight", "corridor", "waypoints", "uniform", "listed"}
-    tags |= {"xyz", "uvd", "linear"}
+    tags |= {"circular", "annular", "xyz", "uvd", "linear", "relative-xy", "range-bearing"}
     behind = {i + 2 for i, part in enumerate(location) if part == LIST_OF_KINDS}  # LIST, index, tag
     return [str(part) for i, part in enumerate(location) if part not in tags and i not in behind]
 

@@ -90,7 +90,34 @@ class ListedLandmarks(Table):
     points: Annotated[list[Triple], Field(min_length=1)]
 
 
-Landmarks_ = Annotated[UniformLandmarks | ListedLandmarks, Field(discriminator="layout")]
+class CircularLandmarks(Table):
+    """``count`` landmarks at equal distances on a circle at height 0, the first in the direction of x."""
+
+    layout: Literal["circular"]
+    count: Count
+    centre: tuple[Finite, Finite]
+    radius: Positive
+
+
+class AnnularLandmarks(Table):
+    """``count`` landmarks drawn once in each of some rings at height 0, uniformly in radius and direction."""
+
+    layout: Literal["annular"]
+    count: Count
+    seed: Annotated[int, Field(ge=0, strict=True)]
+    centre: tuple[Finite, Finite]
+    rings: Annotated[list[Interval], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> AnnularLandmarks:
+        if not all(0 <= low <= high for low, high in self.rings):
+            raise ValueError("rings must be a list of [low, high] with 0 <= low <= high")
+        return self
+
+
+Landmarks_ = Annotated[
+    UniformLandmarks | ListedLandmarks | CircularLandmarks | AnnularLandmarks, Field(discriminator="layout")
+]
 
 
 class TrueMotion(Table):
@@ -122,4 +149,16 @@ class Truth(Table):
             raise ValueError("motion.model and sensor.model must be 'linear' together")
         if self.motion.model == "linear" and self.motion.noise_on != "motion":
             raise ValueError("a linear world needs motion.noise_on = 'motion'")
+        return self
+
+    @model_validator(mode="after")
+    def _landmarks_in_the_plane(self) -> Truth:
+        layout = self.landmarks
+        heights: set[float] = set()
+        if isinstance(layout, UniformLandmarks):
+            heights = set(layout.z)
+        elif isinstance(layout, ListedLandmarks):
+            heights = {z for _, _, z in layout.points}
+        if self.sensor.planar and not heights <= {0.0}:
+            raise ValueError(f"a sensor '{self.sensor.model}' measures no heights; give every landmark z = 0")
         return self

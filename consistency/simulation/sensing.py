@@ -92,8 +92,9 @@ class _NoNumbers:
 def _require_sound(label: str, observations: Observations, context: Context) -> None:
     """Refuse what a filter cannot be given: a mistake in the effect, not in the scenario."""
     step, z = observations.step, observations.z
-    if z.shape != (len(step), 3) or not np.isfinite(z).all():
-        raise ValueError(f"the effect '{label}' must give finite values of shape ({len(step)}, 3)")
+    shape = len(step), context.sensor.size
+    if z.shape != shape or not np.isfinite(z).all():
+        raise ValueError(f"the effect '{label}' must give finite values of shape {shape}")
     if len(step) and (step[0] < 1 or step[-1] > context.steps):
         raise ValueError(f"the effect '{label}' must give steps from 1 to {context.steps}")
     if (np.diff(step * observations.ids + observations.landmark) <= 0).any():

@@ -6,7 +6,14 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.models import motion
-from consistency.scenario import ListedLandmarks, Scenario, Truth, UvdSensor
+from consistency.scenario import (
+    AnnularLandmarks,
+    CircularLandmarks,
+    ListedLandmarks,
+    Scenario,
+    Truth,
+    UvdSensor,
+)
 from consistency.scenario.effects import Context, FieldOfView, Observations
 from consistency.simulation.path import planned_controls, start_pose
 from consistency.simulation.sensing import MOTION_NOISE, Chain, effects_of, generator
@@ -100,8 +107,21 @@ def draw_landmarks(truth: Truth) -> Array:
     layout = truth.landmarks
     if isinstance(layout, ListedLandmarks):
         return np.array(layout.points)
+    if isinstance(layout, CircularLandmarks):
+        angle = 2.0 * np.pi * np.arange(layout.count) / layout.count
+        return _around(layout.centre, np.full(layout.count, layout.radius), angle)
+    if isinstance(layout, AnnularLandmarks):
+        rng, (near, far) = np.random.default_rng(layout.seed), np.array(layout.rings).T
+        radius = rng.uniform(near, far, size=(layout.count, len(near))).T.ravel()
+        return _around(layout.centre, radius, rng.uniform(0.0, 2.0 * np.pi, size=len(radius)))
     low, high = np.array([layout.x, layout.y, layout.z]).T
     return np.random.default_rng(layout.seed).uniform(low, high, size=(layout.count, 3))
+
+
+def _around(centre: tuple[float, float], radius: Array, angle: Array) -> Array:
+    """Points (N, 3) at height 0 at some distances (N,) in some directions (N,) from a centre."""
+    points = centre + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.column_stack([points, np.zeros(len(points))])
 
 
 def require_landmarks_in_view(scenario: Scenario) -> World:

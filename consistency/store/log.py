@@ -15,7 +15,8 @@ import tomli_w
 
 from consistency.errors import InputError
 from consistency.scenario import Belief, BelievedMotion, Finite, PicturedSensor, SigmaPoints, Table, read_table
-from consistency.store.parquet import read_parquet
+from consistency.scenario.tables import SIGMA_UNITS
+from consistency.store.parquet import COLUMNS, read_parquet, require_table
 from consistency.store.results import POSE, controls_table, observations_table, truth_of
 from consistency.store.storage import write_folder
 from consistency.types import Array, Indices, Trial
@@ -71,7 +72,7 @@ def read_log(folder: str | Path) -> Log:
         )
     sensor = read_table(path, SensorFile)
     belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points)
-    controls, observations = read_parquet(folder, "controls"), read_parquet(folder, "observations")
+    controls, observations = read_parquet(folder, "controls"), _observations(folder, sensor)
     tables = {
         name: read_parquet(folder, name) if (folder / f"{name}.parquet").exists() else None
         for name in ("truth", "landmarks")
@@ -125,7 +126,7 @@ def _write_text(path: Path, text: str) -> None:
 
 def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, object]:
     sensor = belief.sensor.model_dump(exclude_none=True)
-    unit = "sigma_px" if belief.sensor.model == "uvd" else "sigma_m"
+    unit = f"sigma{SIGMA_UNITS[belief.sensor.model]}"
     return {
         "model": sensor["model"],
         unit: list(sensor["sigma"]),
@@ -137,6 +138,14 @@ def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, o
         "start": dict(zip(POSE, map(float, start), strict=True)),
         "sigma_points": belief.sigma_points.model_dump(),
     }
+
+
+def _observations(folder: Path, sensor: SensorFile) -> pd.DataFrame:
+    """``observations.parquet`` with as many values in a row as the sensor measures."""
+    values = [f"z{i}" for i in range(sensor.size)]
+    require_table(folder, "observations", [*COLUMNS["observations"], *values[2:]])
+    table = read_parquet(folder, "observations")
+    return table if sensor.size == 3 else table.drop(columns="z2", errors="ignore")
 
 
 def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, belief: Belief) -> None:
@@ -258,7 +267,7 @@ def _trial(
         controls[["dt", "v", "omega"]].to_numpy(float),
         np.searchsorted(rows["step"], np.arange(1, steps + 2)),
         names.ids(rows["landmark"]),
-        rows[["z0", "z1", "z2"]].to_numpy(float),
+        rows[[name for name in ("z0", "z1", "z2") if name in rows]].to_numpy(float),
         len(names.landmarks) + len(names.things),
         path,
         positions,

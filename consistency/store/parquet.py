@@ -24,7 +24,7 @@ COLUMNS: dict[str, dict[str, str]] = {
     "truth": {"run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64", "heading": "float64"},
     "controls": {"run": "int64", "step": "int64", "dt": "float64", "v": "float64", "omega": "float64"},
     "observations": {
-        "run": "int64", "step": "int64", "landmark": "int64", "z0": "float64", "z1": "float64", "z2": "float64",
+        "run": "int64", "step": "int64", "landmark": "int64", "z0": "float64", "z1": "float64",
     },
     "estimates": {
         "filter": "str", "run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64",
@@ -38,7 +38,7 @@ COLUMNS: dict[str, dict[str, str]] = {
     },
 }  # fmt: skip
 OPTIONAL = {  # columns of a table that may be missing
-    "observations": {"source": "int64"},
+    "observations": {"z2": "float64", "source": "int64"},  # z2 by sensors of three values
     "estimates": dict.fromkeys([*OWN_COVARIANCE, "own_nees"], "float64"),
 }
 NULLABLE = {"nees", "nis", *OPTIONAL["estimates"]}

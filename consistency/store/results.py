@@ -251,13 +251,20 @@ def _nees(error: Array | None, P: Array, first: int) -> Array:
     return value
 
 
+def is_flat(covariance: Array) -> bool:
+    """Whether landmarks (K, 3, 3) are in a plane: their heights are no variables."""
+    return not covariance[:, 2].any()
+
+
 def _map_columns(trial: Trial, map_: Map) -> Columns:
     """Rows of ``map.parquet``; without NEES where the id is no landmark of the world, or its place is not known."""
     ids, count = map_.landmarks, len(map_.landmarks)
     nees = np.full(count, np.nan)
     if trial.landmarks is not None:
         judged = (ids < len(trial.landmarks)) & ~np.isin(ids, trial.things)
-        w = whiten(trial.landmarks[ids[judged]] - map_.mean[judged], map_.covariance[judged])
+        n = 2 if is_flat(map_.covariance) else 3
+        error = trial.landmarks[ids[judged]] - map_.mean[judged]
+        w = whiten(error[:, :n], map_.covariance[judged, :n, :n])
         nees[judged] = np.einsum("ki,ki->k", w, w)
     return {
         "run": np.full(count, trial.run),
@@ -353,7 +360,7 @@ def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
                     "run": np.full(len(t.landmark), t.run),
                     "step": np.repeat(np.arange(1, t.steps + 1), np.diff(t.first)),
                     "landmark": t.landmark,
-                    **dict(zip(["z0", "z1", "z2"], t.z.T, strict=True)),
+                    **dict(zip(["z0", "z1", "z2"], t.z.T, strict=False)),
                     **({"source": t.landmark if t.source is None else t.source} if labelled else {}),
                 }
             )

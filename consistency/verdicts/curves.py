@@ -28,6 +28,7 @@ class Landmarks(NamedTuple):
 
     run: Indices  # (M,)
     nees: Array  # (M,), NaN where the landmark is not judged
+    dof: int  # of a landmark: 3, or 2 in the plane
 
 
 @dataclass(frozen=True)
@@ -134,9 +135,10 @@ def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: s
 
 
 def _landmarks(results: Tables, filter_name: str) -> Landmarks | None:
-    batches = list(results.batches("map", ["run", "nees"], filter_name))
-    run, nees = (np.concatenate([[], *(batch[column] for batch in batches)]) for column in ("run", "nees"))
-    return Landmarks(run.astype(np.int64), nees) if len(run) else None
+    columns = ["run", "nees", "P_zz"]
+    batches = list(results.batches("map", columns, filter_name))
+    run, nees, height = (np.concatenate([[], *(batch[column] for batch in batches)]) for column in columns)
+    return Landmarks(run.astype(np.int64), nees, 3 if height.any() else 2) if len(run) else None
 
 
 def run_means(c: Curves) -> Array:

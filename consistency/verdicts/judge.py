@@ -101,7 +101,7 @@ def with_map(verdict: Verdict, c: Curves, runs: int | None = None) -> Verdict:
     if c.landmarks is None:
         return verdict
     some = c.landmarks.run < (np.inf if runs is None else runs)
-    return replace(verdict, map=map_score(c.landmarks.run[some], c.landmarks.nees[some]))
+    return replace(verdict, map=map_score(c.landmarks.run[some], c.landmarks.nees[some], c.landmarks.dof))
 
 
 def design_of(results: Tables) -> Design | None:

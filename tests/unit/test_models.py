@@ -16,7 +16,8 @@ from consistency.filters.kernel.work import make_work
 from consistency.filters.landmark.world_point import WorldPoint
 from consistency.filters.motion import unicycle
 from consistency.filters.parts import sensor_of
-from consistency.filters.plain import PointSensor, Unicycle, sensor_noise
+from consistency.filters.plain import Unicycle
+from consistency.filters.plain_sensors import PointSensor, sensor_noise
 from consistency.filters.point.at_estimate import AtEstimate
 from consistency.filters.point.reference import Reference, place_about_reference
 from consistency.filters.update.joint import Joint

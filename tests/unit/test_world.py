@@ -13,7 +13,8 @@ import pytest
 from scipy import stats
 
 import consistency as cs
-from consistency.filters.plain import PointSensor, Unicycle
+from consistency.filters.plain import Unicycle
+from consistency.filters.plain_sensors import PointSensor
 from consistency.geometry import rotation
 from consistency.simulation import draw_landmarks, planned_controls, planned_path, require_landmarks_in_view
 from consistency.types import Array, Control, Trial

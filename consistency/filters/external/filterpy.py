@@ -18,6 +18,7 @@ from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, Unscen
 from consistency.filters import plain
 from consistency.filters.methods.ukf import ordered_root
 from consistency.filters.plain import SlamState
+from consistency.filters.plain_sensors import PointSensor
 from consistency.scenario import Belief
 from consistency.types import Array, Control, Info
 
@@ -79,7 +80,7 @@ class FilterpyUkf(plain.WorldPointTwin):
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
-        sensor = plain.PointSensor(state.problem.belief.sensor, self.uvd)
+        sensor = PointSensor(state.problem.belief.sensor, self.uvd)
         involved = np.concatenate([np.arange(3), at.ravel()])
         ukf = _ukf(state, involved, lambda x, dt: x, lambda x: sensor.measure(x[:3], x[at]).ravel(), dim_z=z.size)
         ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)

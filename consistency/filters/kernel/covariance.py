@@ -10,7 +10,6 @@ from consistency.filters.kernel.arrays import copy_matrix, fill_matrix
 from consistency.filters.kernel.blas import add_gram, upper_cholesky
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.linalg import DEFICIENT
-from consistency.filters.kernel.slam import OBSERVED
 from consistency.types import Array, Indices
 
 
@@ -38,10 +37,10 @@ def gather_rows(P: Array, n: int, r: int, w: int, at: Indices, m: int, rows: Arr
 
 @inner
 def combine_rows(Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
-    """``out`` (3, width) <- H P of the i-th seen landmark, of any number of variables: Hp (3, r), Hl (3, w)."""
+    """``out`` (s, width) <- H P of the i-th seen landmark, of any number of variables: Hp (s, r), Hl (s, w)."""
     r, w = Hp.shape[1], Hl.shape[1]
     fill_matrix(out, 0.0)
-    for a in range(OBSERVED):
+    for a in range(len(Hp)):
         for c in range(r + w):
             h = Hp[a, c] if c < r else Hl[a, c - r]
             row = rows[c] if c < r else rows[r + w * i + c - r]
@@ -84,7 +83,7 @@ def replace_rows(P: Array, n: int, o: int, rows: Array, own: Array) -> None:
 
 @inner
 def append_landmark(P: Array, n: int, Jp: Array, Jz: Array, R: Array) -> None:
-    """P[:n + w, n:n + w] <- covariance of a landmark put at n with all before it, Jp (w, r), Jz (w, 3), R (3, 3)."""
+    """P[:n + w, n:n + w] <- covariance of a landmark put at n with all before it, Jp (w, r), Jz (w, s), R (s, s)."""
     w, r = Jp.shape
     for j in range(n):
         for a in range(w):
@@ -100,11 +99,11 @@ def append_landmark(P: Array, n: int, Jp: Array, Jz: Array, R: Array) -> None:
 @inner
 def _own(P: Array, n: int, Jp: Array, Jz: Array, R: Array, a: int, b: int) -> float:
     """Entry (a, b) of Jp P_pose Jp' + Jz R Jz', (w, w)."""
-    r, total = Jp.shape[1], 0.0
-    for c in range(max(r, OBSERVED)):
+    r, s, total = Jp.shape[1], Jz.shape[1], 0.0
+    for c in range(max(r, s)):
         if c < r:
             total += P[c, n + a] * Jp[b, c]
-        if c < OBSERVED:
-            for d in range(OBSERVED):
+        if c < s:
+            for d in range(s):
                 total += Jz[a, c] * R[c, d] * Jz[b, d]
     return total

@@ -13,15 +13,16 @@ from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.measuring import linearise
 from consistency.filters.kernel.slam import (
-    OBSERVED,
     Data,
     Slam,
     State,
     combine,
     landmark_width,
+    observed_width,
     retract,
     robot_width,
     to_error,
+    unwind,
 )
 from consistency.filters.kernel.work import Work
 from consistency.types import Array
@@ -51,10 +52,10 @@ def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTup
 
 @inner
 def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTuple]) -> None:
-    """``work``: zhat (3 m,), Hp (m, 3, r), Hl (m, 3, w) <- h of the seen landmarks; Jacobians by the filter's error."""
-    pose, w = state.x[: robot_width(slam.motion)], landmark_width(slam.landmark)
+    """``work``: zhat (s m,), Hp (m, s, r), Hl (m, s, w) <- h of the seen landmarks; Jacobians by the filter's error."""
+    pose, w, s = state.x[: robot_width(slam.motion)], landmark_width(slam.landmark), observed_width(slam.sensor)
     for i in range(m):
-        o, expected = work.at[i], work.zhat[OBSERVED * i : OBSERVED * i + OBSERVED]
+        o, expected = work.at[i], work.zhat[s * i : s * i + s]
         values = state.x[o : o + w]
         linearise(slam, pose, values, k, work.label[i], expected, work.Hp[i], work.Hl[i], work)
         to_error(slam.error, pose, values, work.Hp[i], work.Hl[i])
@@ -62,15 +63,15 @@ def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTup
 
 @inner
 def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> None:
-    """``work.A`` (3 m, n + base) <- H P from the gathered rows; upper half of ``work.S`` (3 m, 3 m) <- H P H'."""
-    r, w, width = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base
-    A, S, Hp, Hl = work.A, work.S, work.Hp, work.Hl
+    """``work.A`` (s m, n + base) <- H P from the gathered rows; upper half of ``work.S`` (s m, s m) <- H P H'."""
+    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
+    A, S, Hp, Hl, width = work.A, work.S, work.Hp, work.Hl, state.n + state.base
     for i in range(m):
-        combine(slam.landmark, Hp[i], Hl[i], work.rows[:, :width], i, A[OBSERVED * i : OBSERVED * i + OBSERVED, :width])
+        combine(slam.landmark, Hp[i], Hl[i], work.rows[:, :width], i, A[s * i : s * i + s, :width])
     for i in range(m):
         o = work.at[i]
-        for row in range(OBSERVED * i + OBSERVED):
-            for a in range(OBSERVED):
+        for row in range(s * i + s):
+            for a in range(s):
                 total = 0.0
                 for c in range(max(r, w)):
                     term = 0.0
@@ -79,38 +80,42 @@ def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> No
                     if c < w:
                         term += A[row, o + c] * Hl[i, a, c]
                     total += term
-                S[row, OBSERVED * i + a] = total
+                S[row, s * i + a] = total
 
 
 @inner
-def innovate(state: State, data: Data, m: int, work: Work[NamedTuple]) -> Array:
-    """Innovation (3 m,) of the ``m`` landmarks, which is the last column of ``work.A``."""
-    y = work.A[: OBSERVED * m, state.n + state.base]
+def innovate(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> Array:
+    """Innovation (s m,) of the ``m`` landmarks, which is the last column of ``work.A``."""
+    s = observed_width(slam.sensor)
+    y = work.A[: s * m, state.n + state.base]
     for i in range(m):
-        for a in range(OBSERVED):
-            y[OBSERVED * i + a] = data.z[work.known[i], a] - work.zhat[OBSERVED * i + a]
+        measured, expected = data.z[work.known[i]], work.zhat[s * i : s * i + s]
+        unwind(slam.sensor, expected, measured)
+        for a in range(s):
+            y[s * i + a] = measured[a] - expected[a]
     return y
 
 
 @inner
-def whiten(state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float]:
-    """S (3 m, 3 m) <- root of S + R; A and the innovation <- divided by it. Gives a code of REASONS or 0, and NIS."""
-    rows, width = OBSERVED * m, state.n + state.base
+def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float]:
+    """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. Gives a code of REASONS or 0, and NIS."""
+    s = observed_width(slam.sensor)
+    rows, width = s * m, state.n + state.base
     S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
     y, total = joined[:, width], 0.0
     for i in range(m):
-        for a in range(OBSERVED):
-            r = OBSERVED * i + a
-            for c in range(OBSERVED):
-                S[r, OBSERVED * i + c] += data.R[work.known[i], a, c]
+        for a in range(s):
+            r = s * i + a
+            for c in range(s):
+                S[r, s * i + c] += data.R[work.known[i], a, c]
             total += y[r] + S[r, r:].sum()
-    return divide_by_root(state, m, work, total)
+    return divide_by_root(slam, state, m, work, total)
 
 
 @inner
-def divide_by_root(state: State, m: int, work: Work[NamedTuple], total: float) -> tuple[int, float]:
+def divide_by_root(slam: Slam, state: State, m: int, work: Work[NamedTuple], total: float) -> tuple[int, float]:
     """S <- its root, and A and the innovation <- divided by it; ``total`` is finite if all that is given is."""
-    rows, width = OBSERVED * m, state.n + state.base
+    rows, width = observed_width(slam.sensor) * m, state.n + state.base
     S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
     y = joined[:, width]
     if not definite_root(S, work.scale):
@@ -127,7 +132,7 @@ def divide_by_root(state: State, m: int, work: Work[NamedTuple], total: float) -
 @inner
 def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
     """x (n,) <- moved by W' S^-1/2 innovation, P (n, n) <- P - W' W; with the columns of Phi as ``local`` says."""
-    rows, n, base = OBSERVED * m, state.n, state.base
+    rows, n, base = observed_width(slam.sensor) * m, state.n, state.base
     A, y = work.A[:rows, :n], work.A[:rows, n + base]
     retract(slam.error, slam, state, A, y, work)
     subtract_gram(state.P, n, robot_width(slam.motion), A)

@@ -13,7 +13,6 @@ from consistency.filters.kernel.jit import Kernel, inner
 from consistency.filters.kernel.lending import keep, lend
 from consistency.filters.kernel.linalg import definiteness_with
 from consistency.filters.kernel.slam import (
-    OBSERVED,
     Data,
     Slam,
     State,
@@ -23,6 +22,7 @@ from consistency.filters.kernel.slam import (
     insert_error,
     landmark_width,
     make_local,
+    observed_width,
     place,
     pose_covariance,
     predict,
@@ -218,7 +218,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
         state = prepare(slam.covariance, slam, whole, state, labels, local)
         state, code, m, nis = _step(slam, state, data, k, local, work)
         if m > 0:
-            out.nis[k], out.nis_dof[k] = nis, OBSERVED * m
+            out.nis[k], out.nis_dof[k] = nis, observed_width(slam.sensor) * m
         if code == 0:
             rank = _keep_pose(slam, state, k, out, work)
             if rank < 0 or (full_rank and rank == 0):

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import (
-    OBSERVED,
     Frame,
     Slam,
     Triple,
@@ -19,6 +18,7 @@ from consistency.filters.kernel.slam import (
     measure,
     measure_jacobian,
     observation_point,
+    observed_width,
     pull_back,
     robot_frame,
     stands_apart,
@@ -30,21 +30,25 @@ from consistency.types import Array
 
 @inner
 def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
-    """z (3,) <- h: the landmark ``values`` (w,) as the sensor of a robot at ``frame`` sees it."""
+    """z (s,) <- h: the landmark ``values`` (w,) as the sensor of a robot at ``frame`` sees it."""
     bx, by, bz = look(slam.landmark, frame, values)
     cx, cy, cz = point.to_sensor(bx, by, bz, slam.sensor.mount)
-    z[0], z[1], z[2] = measure(slam.sensor, cx, cy, cz)
+    expected = measure(slam.sensor, cx, cy, cz)
+    for i in range(observed_width(slam.sensor)):
+        z[i] = expected[i]
 
 
 @inner
 def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, Hl: Array) -> None:
-    """z (3,), Hp (3, r), Hl (3, w) <- h at ``frame`` and ``values`` (w,), and its Jacobians by variables of both."""
+    """z (s,), Hp (s, r), Hl (s, w) <- h at ``frame`` and ``values`` (w,), and its Jacobians by variables of both."""
     body = look(slam.landmark, frame, values)
     mount = slam.sensor.mount
     cx, cy, cz = point.to_sensor(body[0], body[1], body[2], mount)
-    z[0], z[1], z[2] = measure(slam.sensor, cx, cy, cz)
+    expected = measure(slam.sensor, cx, cy, cz)
+    for i in range(observed_width(slam.sensor)):
+        z[i] = expected[i]
     J = measure_jacobian(slam.sensor, cx, cy, cz)
-    for i in range(OBSERVED):
+    for i in range(observed_width(slam.sensor)):
         j0, j1, j2 = J[3 * i], J[3 * i + 1], J[3 * i + 2]
         row: Triple = (
             j0 * mount.xx + j1 * mount.xy + j2 * mount.xz,
@@ -58,11 +62,11 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
 def linearise(
     slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array, work: Work[NamedTuple]
 ) -> None:
-    """z (3,) <- h expected of pose (r,), values (w,) in step k + 1; Hp (3, r), Hl (3, w) <- Jacobians at the point."""
+    """z (s,) <- h expected of pose (r,), values (w,) in step k + 1; Hp (s, r), Hl (s, w) <- Jacobians at the point."""
     at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label, work)
     linearise_at(slam, robot_frame(slam.motion, at), landmark, z, Hp, Hl)
     if expands(slam.point):
-        for i in range(OBSERVED):
+        for i in range(observed_width(slam.sensor)):
             for j in range(len(pose)):
                 z[i] += Hp[i, j] * (pose[j] - at[j]) + Hl[i, j] * (values[j] - landmark[j])
     if stands_apart(slam.point):
@@ -71,13 +75,13 @@ def linearise(
 
 @inner
 def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[NamedTuple]) -> None:
-    """values (w,), ``work.Jp`` (w, r), ``work.Jz`` (w, 3) <- inverse of h at ``pose`` (r,) for z (3,); Jacobians."""
-    mount, Jb = slam.sensor.mount, work.Jb
-    cx, cy, cz = locate(slam.sensor, z[0], z[1], z[2])
+    """values (w,), ``work.Jp`` (w, r), ``work.Jz`` (w, s) <- inverse of h at ``pose`` (r,) for z (s,); Jacobians."""
+    mount, Jb, s = slam.sensor.mount, work.Jb, observed_width(slam.sensor)
+    cx, cy, cz = locate(slam.sensor, z)
     body = point.from_sensor(cx, cy, cz, mount)
-    J = locate_jacobian(slam.sensor, z[0], z[1], z[2])
-    for j in range(OBSERVED):
-        Jb[0, j] = mount.xx * J[j] + mount.xy * J[3 + j] + mount.xz * J[6 + j]
-        Jb[1, j] = mount.yx * J[j] + mount.yy * J[3 + j] + mount.yz * J[6 + j]
-        Jb[2, j] = mount.zx * J[j] + mount.zy * J[3 + j] + mount.zz * J[6 + j]
+    J = locate_jacobian(slam.sensor, z)
+    for j in range(s):
+        Jb[0, j] = mount.xx * J[j] + mount.xy * J[s + j] + mount.xz * J[2 * s + j]
+        Jb[1, j] = mount.yx * J[j] + mount.yy * J[s + j] + mount.yz * J[2 * s + j]
+        Jb[2, j] = mount.zx * J[j] + mount.zy * J[s + j] + mount.zz * J[2 * s + j]
     insert(slam.landmark, robot_frame(slam.motion, pose), body, Jb, mount, values, work.Jp, work.Jz)

@@ -12,9 +12,9 @@ from consistency.filters.kernel.dispatch import generic
 from consistency.models.point import Mounting
 from consistency.types import Array, Indices
 
-OBSERVED = 3  # numbers of an observation, as in the columns z0, z1, z2 of every file
-
+Pair = tuple[float, float]
 Triple = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
@@ -43,8 +43,8 @@ class Data(NamedTuple):
     controls: Array  # (T, 3): dt, v, omega
     first: Indices  # (T + 1,)
     landmark: Indices  # (M,)
-    z: Array  # (M, 3)
-    R: Array  # (M, 3, 3), noise of each observation
+    z: Array  # (M, s)
+    R: Array  # (M, s, s), noise of each observation
     start: Array  # (r,), known exactly
     n_landmarks: int
 
@@ -139,26 +139,38 @@ def carry_root(motion: NamedTuple, P: Array, first: int, last: int, C: Array, F:
 
 
 @generic()
-def measure(sensor: Sensor, x: float, y: float, z: float) -> Triple:
-    """Observation (m or px, as the sensor has it) of a point in the frame of the sensor, in m."""
+def observed_width(sensor: Sensor) -> int:
+    """Number s of values in an observation; a constant."""
     raise NotImplementedError
 
 
 @generic()
-def measure_jacobian(sensor: Sensor, x: float, y: float, z: float) -> Nine:
-    """Jacobian (3, 3) of :func:`measure` by the point, row after row."""
+def measure(sensor: Sensor, x: float, y: float, z: float) -> Pair | Triple:
+    """Observation, s values in the units of the sensor, of a point in the frame of the sensor, in m."""
     raise NotImplementedError
 
 
 @generic()
-def locate(sensor: Sensor, z0: float, z1: float, z2: float) -> Triple:
-    """Point in the frame of the sensor, in m, that has this observation: the inverse of :func:`measure`."""
+def measure_jacobian(sensor: Sensor, x: float, y: float, z: float) -> Six | Nine:
+    """Jacobian (s, 3) of :func:`measure` by the point, row after row."""
     raise NotImplementedError
 
 
 @generic()
-def locate_jacobian(sensor: Sensor, z0: float, z1: float, z2: float) -> Nine:
-    """Jacobian (3, 3) of :func:`locate` by the observation, row after row."""
+def locate(sensor: Sensor, z: Array) -> Triple:
+    """Point in the frame of the sensor, in m, that has the observation z (s,): the inverse of :func:`measure`."""
+    raise NotImplementedError
+
+
+@generic()
+def locate_jacobian(sensor: Sensor, z: Array) -> Six | Nine:
+    """Jacobian (3, s) of :func:`locate` by the observation z (s,), row after row."""
+    raise NotImplementedError
+
+
+@generic()
+def unwind(sensor: Sensor, z: Array, about: Array) -> None:
+    """z (s,) <- the same observation, each angle in it by full turns as near as can be to that of ``about`` (s,)."""
     raise NotImplementedError
 
 
@@ -194,7 +206,7 @@ def insert(
 ) -> None:
     """``values`` (w,) <- a new landmark seen at ``body``, m in the frame of the robot.
 
-    ``Jp`` (w, r) and ``Jz`` (w, 3) <- its Jacobians by robot and observation. ``Jb`` (3, 3) is the derivative of
+    ``Jp`` (w, r) and ``Jz`` (w, s) <- its Jacobians by robot and observation. ``Jb`` (3, s) is the derivative of
     ``body`` by the observation; ``mount`` says where the sensor is on the robot.
     """
     raise NotImplementedError
@@ -208,7 +220,7 @@ def world_point(landmark: NamedTuple, frame: Frame, values: Array, point: Array,
 
 @generic()
 def combine(landmark: NamedTuple, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
-    """``out`` (3, width) <- H P of the i-th seen landmark: Hp (3, r), Hl (3, w) and ``rows`` (r + w m, width) of P."""
+    """``out`` (s, width) <- H P of the i-th seen landmark: Hp (s, r), Hl (s, w) and ``rows`` (r + w m, width) of P."""
     raise NotImplementedError
 
 
@@ -304,7 +316,7 @@ def landmark_point(point: NamedTuple, values: Array, label: int, work: NamedTupl
 
 @generic()
 def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Array, work: NamedTuple) -> None:
-    """x[n:n + w], ``work.Jp`` (w, r), ``work.Jz`` (w, 3) <- a new landmark from its observation z (3,); Jacobians."""
+    """x[n:n + w], ``work.Jp`` (w, r), ``work.Jz`` (w, s) <- a new landmark from its observation z (s,); Jacobians."""
     raise NotImplementedError
 
 
@@ -312,7 +324,7 @@ def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Ar
 
 
 @generic()
-def make_room(update: NamedTuple, r: int, w: int, m: int, n: int) -> NamedTuple:
+def make_room(update: NamedTuple, r: int, w: int, s: int, m: int, n: int) -> NamedTuple:
     """Arrays of this update for up to ``m`` landmarks in a step and a state of up to ``n`` variables."""
     raise NotImplementedError
 

@@ -30,6 +30,7 @@ from consistency.filters.kernel.slam import (
 )
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
+from consistency.filters.plain_sensors import PointSensor, heading_matrix
 from consistency.models.point import Mounting, turned_to_robot
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Gaussian, Info, Observation
@@ -149,7 +150,7 @@ class AnchoredKalman:
         return plain.update_jointly(state, observation, self.uvd, self._correct, self._locate)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-        sensor = plain.PointSensor(state.problem.belief.sensor, self.uvd)
+        sensor = PointSensor(state.problem.belief.sensor, self.uvd)
         zhat, H = np.zeros(3 * len(seen)), np.zeros((3 * len(seen), len(state.x)))
         for i, label in enumerate(seen):
             rows, at = slice(3 * i, 3 * i + 3), slice(state.at(label), state.at(label) + 6)
@@ -163,7 +164,7 @@ class AnchoredKalman:
 
     def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
         point, point_by_pose, point_by_z = plain.locate_point(state, z, self.uvd)
-        turn = plain.heading_matrix(state.x[2])
+        turn = heading_matrix(state.x[2])
         mount = np.array(state.problem.belief.sensor.mount.position)
         anchor = [*state.x[:2], 0.0] + turn @ mount
         anchor_by_pose = np.column_stack([[1.0, 0, 0], [0, 1.0, 0], turn @ [-mount[1], mount[0], 0.0]])

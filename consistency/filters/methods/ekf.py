@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from consistency.filters import plain
-from consistency.filters.compiled import Compiled
+from consistency.filters.compiled import Compiled, planar
 from consistency.filters.error.additive import Additive
 from consistency.filters.kernel.slam import Slam
-from consistency.filters.landmark.world_point import WorldPoint
-from consistency.filters.parts import motion_of, sensor_of
+from consistency.filters.parts import landmark_of, motion_of, sensor_of
 from consistency.filters.plain import SlamState
 from consistency.filters.point.at_estimate import AtEstimate
 from consistency.filters.update.joint import Joint
@@ -26,16 +25,16 @@ class ExtendedKalman(plain.WorldPointTwin):
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         zhat, H = plain.expect(state, seen, self.uvd)
-        innovation = z.ravel() - zhat
+        innovation = plain.innovation_of(state, z, zhat, self.uvd)
         S, W = plain.gain(state.P, H, plain.block_diagonal(R))
         return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ekf-xyz``."""
+    """Parts of ``ekf-xyz``, and with landmarks in the plane where the sensor has them."""
     belief = problem.belief
     sensor = sensor_of(belief, uvd=False)
-    return Slam(motion_of(belief), sensor, WorldPoint(), Additive(), AtEstimate(), Joint(), Dense())
+    return Slam(motion_of(belief), sensor, landmark_of(belief), Additive(), AtEstimate(), Joint(), Dense())
 
 
 def uvd_parts(problem: Problem, controls: Array) -> Slam:
@@ -45,3 +44,4 @@ def uvd_parts(problem: Problem, controls: Array) -> Slam:
 
 XYZ = Compiled(ExtendedKalman("ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
 UVD = Compiled(ExtendedKalman("ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XY, RB = planar(ExtendedKalman, "ekf", xyz_parts)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.filters import plain
-from consistency.filters.compiled import Compiled
+from consistency.filters.compiled import Compiled, planar
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
@@ -60,7 +60,7 @@ class FirstEstimateKalman(plain.NotingTwin):
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``fej-ekf-xyz``."""
+    """Parts of ``fej-ekf-xyz``, and with landmarks in the plane where the sensor has them."""
     return ekf.xyz_parts(problem, controls)._replace(point=FirstEstimate())
 
 
@@ -71,3 +71,4 @@ def uvd_parts(problem: Problem, controls: Array) -> Slam:
 
 XYZ = Compiled(FirstEstimateKalman("fej-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
 UVD = Compiled(FirstEstimateKalman("fej-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XY, RB = planar(FirstEstimateKalman, "fej-ekf", xyz_parts)

@@ -13,10 +13,11 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.filters import plain
-from consistency.filters.compiled import Compiled
-from consistency.filters.kernel.slam import Slam
+from consistency.filters.compiled import Compiled, planar
+from consistency.filters.kernel.slam import Slam, landmark_width
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
+from consistency.filters.plain_sensors import view
 from consistency.filters.point.truth import AtTruth
 from consistency.protocols import Problem, Truth
 from consistency.types import Array, Control, Info, Observation
@@ -46,8 +47,8 @@ class IdealKalman(plain.NotingTwin):
         return replace(state, slam=slam, step=state.step + 1)
 
     def update(self, state: IdealState, observation: Observation) -> tuple[IdealState, Info]:
-        pose, landmarks = state.truth.path[state.step], state.truth.landmarks
-        sensor = plain.PointSensor(state.slam.problem.belief.sensor, self.uvd)
+        pose, landmarks = state.truth.path[state.step], state.truth.landmarks[:, : state.slam.width]
+        sensor = view(state.slam.problem.belief.sensor, self.uvd)
 
         def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
             true = np.concatenate([pose, *(landmarks[label] for label in slam.landmarks)])
@@ -80,10 +81,11 @@ def truth_of(problem: Problem) -> Truth:
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ideal-ekf-xyz``."""
-    truth = truth_of(problem)
-    point = AtTruth(np.array(truth.path, float), np.array(truth.landmarks, float))
-    return ekf.xyz_parts(problem, controls)._replace(point=point)
+    """Parts of ``ideal-ekf-xyz``, and with landmarks in the plane where the sensor has them."""
+    truth, slam = truth_of(problem), ekf.xyz_parts(problem, controls)
+    width = landmark_width(slam.landmark)
+    point = AtTruth(np.array(truth.path, float), np.array(truth.landmarks[:, :width], float, order="C"))
+    return slam._replace(point=point)
 
 
 def uvd_parts(problem: Problem, controls: Array) -> Slam:
@@ -93,3 +95,4 @@ def uvd_parts(problem: Problem, controls: Array) -> Slam:
 
 XYZ = Compiled(IdealKalman("ideal-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
 UVD = Compiled(IdealKalman("ideal-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XY, RB = planar(IdealKalman, "ideal-ekf", xyz_parts)

@@ -12,20 +12,20 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.filters import plain
-from consistency.filters.compiled import Compiled
+from consistency.filters.compiled import Compiled, planar
 from consistency.filters.kernel.covariance import state_index
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, whiten
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.slam import (
-    OBSERVED,
     Data,
     Slam,
     State,
     correct,
     landmark_width,
     make_room,
+    observed_width,
     predict,
     robot_width,
 )
@@ -53,7 +53,7 @@ class PriorRoom(NamedTuple):
 
 
 @implement(make_room, Iterated)
-def iterated_room(update: Iterated, r: int, w: int, m: int, n: int) -> PriorRoom:
+def iterated_room(update: Iterated, r: int, w: int, s: int, m: int, n: int) -> PriorRoom:
     return PriorRoom(np.empty(r + w * m))
 
 
@@ -72,37 +72,38 @@ def correct_iterated(
     for i in range(update.passes):
         linearise_seen(slam, state, k, m, work)
         combine_seen(slam, state, m, work)
-        _relate_to_prior(r, w, state, m, innovate(state, data, m, work), work)
-        code, nis = whiten(state, data, m, work)
+        _relate_to_prior(slam, state, m, innovate(slam, state, data, m, work), work)
+        code, nis = whiten(slam, state, data, m, work)
         if code > 0:
             return code, nis
         first_nis = nis if i == 0 else first_nis
         is_last = i == update.passes - 1
         for a in range(involved):
             j = state_index(r, w, a, work.at)
-            state.x[j] = work.room.prior[a] + (0.0 if is_last else _shift(state, m, j, work))
+            state.x[j] = work.room.prior[a] + (0.0 if is_last else _shift(slam, state, m, j, work))
     apply(slam, state, m, local, work)
     return 0, first_nis
 
 
 @inner
-def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[PriorRoom]) -> None:
-    """y (3 m,) <- z - h(x) - H (prior - x)."""
+def _relate_to_prior(slam: Slam, state: State, m: int, y: Array, work: Work[PriorRoom]) -> None:
+    """y (s m,) <- z - h(x) - H (prior - x)."""
+    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
     x, prior = state.x, work.room.prior
     for i in range(m):
         o = work.at[i]
-        for a in range(OBSERVED):
+        for a in range(s):
             for c in range(r):
-                y[OBSERVED * i + a] -= work.Hp[i, a, c] * (prior[c] - x[c])
+                y[s * i + a] -= work.Hp[i, a, c] * (prior[c] - x[c])
             for c in range(w):
-                y[OBSERVED * i + a] -= work.Hl[i, a, c] * (prior[r + w * i + c] - x[o + c])
+                y[s * i + a] -= work.Hl[i, a, c] * (prior[r + w * i + c] - x[o + c])
 
 
 @inner
-def _shift(state: State, m: int, j: int, work: Work[PriorRoom]) -> float:
+def _shift(slam: Slam, state: State, m: int, j: int, work: Work[PriorRoom]) -> float:
     """By how much the whitened gain moves variable j."""
     total, y = 0.0, state.n + state.base
-    for row in range(OBSERVED * m):
+    for row in range(observed_width(slam.sensor) * m):
         total += work.A[row, j] * work.A[row, y]
     return total
 
@@ -121,7 +122,7 @@ class IteratedKalman(plain.WorldPointTwin):
         x, infos = state.x, []
         for _ in range(self.passes):
             zhat, H = plain.expect(replace(state, x=x), seen, self.uvd)
-            innovation = z.ravel() - zhat - H @ (state.x - x)
+            innovation = plain.innovation_of(state, z, zhat, self.uvd) - H @ (state.x - x)
             S, W = plain.gain(state.P, H, plain.block_diagonal(R))
             x = state.x + W @ innovation
             infos.append(Info(innovation, S, W))
@@ -129,7 +130,7 @@ class IteratedKalman(plain.WorldPointTwin):
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``iekf-xyz``."""
+    """Parts of ``iekf-xyz``, and with landmarks in the plane where the sensor has them."""
     return ekf.xyz_parts(problem, controls)._replace(update=Iterated(PASSES))
 
 
@@ -140,3 +141,4 @@ def uvd_parts(problem: Problem, controls: Array) -> Slam:
 
 XYZ = Compiled(IteratedKalman("iekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
 UVD = Compiled(IteratedKalman("iekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XY, RB = planar(IteratedKalman, "iekf", xyz_parts)

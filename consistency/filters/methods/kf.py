@@ -13,6 +13,7 @@ from consistency.filters.kernel.slam import Slam
 from consistency.filters.landmark.world_point import WorldPoint
 from consistency.filters.parts import motion_of, sensor_of
 from consistency.filters.plain import SlamState
+from consistency.filters.plain_sensors import PointSensor
 from consistency.filters.point.reference import Reference
 from consistency.filters.update.joint import Joint
 from consistency.filters.upkeep.dense import Dense
@@ -60,7 +61,7 @@ class LinearKalman:
             return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
 
         def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-            sensor = plain.PointSensor(slam.problem.belief.sensor, uvd=False)
+            sensor = PointSensor(slam.problem.belief.sensor, uvd=False)
             Hp, Hl = sensor.jacobians(reference, landmarks[label])
             Jz = np.linalg.inv(Hl)
             error = z - sensor.measure(reference, landmarks[label]) - Hp @ (slam.x[:3] - reference)

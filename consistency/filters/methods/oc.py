@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.filters import plain
-from consistency.filters.compiled import Compiled
+from consistency.filters.compiled import Compiled, planar
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
@@ -39,7 +39,7 @@ class ConstrainedKalman(plain.NotingTwin):
 
     def predict(self, state: ConstrainedState, control: Control) -> ConstrainedState:
         x, turned = state.slam.x, state.turned.copy()
-        shift = np.mean(x.reshape(-1, 3)[:, :2] - turned, axis=0)
+        shift = np.mean(x[state.slam.positions] - turned, axis=0)
         predicted = self.robot.move(x[:3], control)
         slam = plain.predict_by(state.slam, control, predicted[:2] - (turned[0] + shift), x[:3])  # predicted less p*
         turned[0] = predicted[:2] - shift
@@ -49,9 +49,9 @@ class ConstrainedKalman(plain.NotingTwin):
         turned, predicted = list(state.turned), state.slam.x[:2]
 
         def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-            points = slam.x.reshape(-1, 3).copy()
-            points[:, :2] = state.turned + (predicted - state.turned[0])
-            return plain.correct_about(slam, points.ravel(), seen, z, R, self.uvd)
+            at = slam.x.copy()
+            at[slam.positions] = state.turned + (predicted - state.turned[0])
+            return plain.correct_about(slam, at, seen, z, R, self.uvd)
 
         def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
             placed = plain.locate_point(slam, z, self.uvd)
@@ -63,7 +63,7 @@ class ConstrainedKalman(plain.NotingTwin):
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``oc-ekf-xyz``."""
+    """Parts of ``oc-ekf-xyz``, and with landmarks in the plane where the sensor has them."""
     return ekf.xyz_parts(problem, controls)._replace(point=ObservabilityConstrained())
 
 
@@ -74,3 +74,4 @@ def uvd_parts(problem: Problem, controls: Array) -> Slam:
 
 XYZ = Compiled(ConstrainedKalman("oc-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
 UVD = Compiled(ConstrainedKalman("oc-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XY, RB = planar(ConstrainedKalman, "oc-ekf", xyz_parts)

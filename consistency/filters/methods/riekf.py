@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from consistency.filters import plain
-from consistency.filters.compiled import Compiled
+from consistency.filters.compiled import Compiled, planar
 from consistency.filters.error.planar import exponential, shifted_covariance
 from consistency.filters.kernel.arrays import fill
 from consistency.filters.kernel.blas import add_gram, add_transposed_times
@@ -26,6 +26,7 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     insert_error,
+    landmark_width,
     move,
     noise_columns,
     pose_covariance,
@@ -40,7 +41,7 @@ from consistency.protocols import Problem
 from consistency.types import Array, Control, Gaussian, Info, Observation
 
 
-@part(motion="Unicycle", landmark="WorldPoint", point="AtEstimate", update="Joint", covariance="Dense")
+@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", point="AtEstimate", update="Joint", covariance="Dense")
 class RightInvariant(NamedTuple):
     """No parameters. Motion moves the error of every landmark, so updating is dense."""
 
@@ -50,15 +51,16 @@ def propagate_right(
     error: RightInvariant, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """x <- f(x) and P <- P + Ad G Q G' Ad': F is the identity, and the noise turns with the world, (n, q)."""
-    x, P, n, G = state.x, state.P, state.n, work.small
+    x, P, n, w, G = state.x, state.P, state.n, landmark_width(slam.landmark), work.small
     columns = noise_columns(slam.motion, x[:3], u, G)
     move(slam.motion, x[:3], u, x[:3])
     noise = work.rows[:columns, :n]
     for c in range(columns):
         turn = G[2, c]
         noise[c, 0], noise[c, 1], noise[c, 2] = G[0, c] + x[1] * turn, G[1, c] - x[0] * turn, turn
-        for o in range(3, n, 3):
-            noise[c, o], noise[c, o + 1], noise[c, o + 2] = x[o + 1] * turn, -x[o] * turn, 0.0
+        for o in range(3, n, w):
+            noise[c, o], noise[c, o + 1] = x[o + 1] * turn, -x[o] * turn
+            fill(noise[c, o + 2 : o + w], 0.0)
     add_gram(1.0, noise, P[:n, :n])
     for a in range(3):
         for b in range(a):
@@ -73,7 +75,7 @@ def to_right(error: RightInvariant, pose: Array, values: Array, Hp: Array, Hl: A
 
 @implement(insert_error, RightInvariant)
 def insert_right(error: RightInvariant, pose: Array, values: Array, Jp: Array) -> None:
-    """Jp (3, 3) <- Jacobian between the errors of the robot and of a new landmark."""
+    """Jp (w, 3) <- Jacobian between the errors of the robot and of a new landmark."""
     for a in range(len(Jp)):
         Jp[a, 2] += pose[0] * Jp[a, 1] - pose[1] * Jp[a, 0]
     Jp[0, 2] += values[1]
@@ -89,9 +91,11 @@ def retract_right(error: RightInvariant, slam: Slam, state: State, A: Array, y: 
     c, s, along, across = exponential(delta[2])
     _move(x, delta, 0, c, s, along, across)
     x[2] += delta[2]
-    for o in range(3, state.n, 3):
+    w = landmark_width(slam.landmark)
+    for o in range(3, state.n, w):
         _move(x, delta, o, c, s, along, across)
-        x[o + 2] += delta[o + 2]
+        for a in range(2, w):
+            x[o + a] += delta[o + a]
 
 
 @inner
@@ -124,8 +128,8 @@ class RightInvariantKalman:
         F, G = np.eye(n), np.zeros((n, 2))
         F[:3, :3], G[:3] = self.robot.jacobians(x[:3], control)
         x[:3] = self.robot.move(x[:3], control)
-        back = np.linalg.inv(additive_from_right(x))
-        F, G = back @ F @ additive_from_right(state.x), back @ G
+        back, w = np.linalg.inv(additive_from_right(x, state.width)), state.width
+        F, G = back @ F @ additive_from_right(state.x, w), back @ G
         return replace(state, x=x, P=F @ state.P @ F.T + plain.process_noise(G, state.problem.belief))
 
     def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
@@ -133,15 +137,15 @@ class RightInvariantKalman:
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         zhat, H = plain.expect(state, seen, self.uvd)
-        innovation = z.ravel() - zhat
-        S, W = plain.gain(state.P, H @ additive_from_right(state.x), plain.block_diagonal(R))
-        moved = moved_by_right(state.x, W @ innovation)
+        innovation = plain.innovation_of(state, z, zhat, self.uvd)
+        S, W = plain.gain(state.P, H @ additive_from_right(state.x, state.width), plain.block_diagonal(R))
+        moved = moved_by_right(state.x, W @ innovation, state.width)
         return replace(state, x=moved, P=state.P - W @ S @ W.T), Info(innovation, S, W)
 
     def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
         landmark, Jp, Jz = plain.locate_point(state, z, self.uvd)
         Jp = Jp @ additive_from_right(state.x[:3])
-        Jp[:, 2] -= [-landmark[1], landmark[0], 0.0]
+        Jp[:2, 2] -= plain.quarter_turn(landmark[:2])
         return landmark, Jp, Jz
 
     def pose(self, state: SlamState) -> Gaussian:
@@ -156,30 +160,30 @@ class RightInvariantKalman:
         return plain.map_of(replace(state, P=self.joint(state).covariance))
 
     def joint(self, state: SlamState) -> Gaussian:
-        T = additive_from_right(state.x)
+        T = additive_from_right(state.x, state.width)
         return Gaussian(state.x, T @ state.P @ T.T)
 
 
-def additive_from_right(x: Array) -> Array:
-    """T (n, n) with additive error = T right-invariant error, at the state x (n,)."""
+def additive_from_right(x: Array, width: int = 3) -> Array:
+    """T (n, n) with additive error = T right-invariant error, at the state x (n,), landmarks of ``width``."""
     T = np.eye(len(x))
-    for o in (0, *range(3, len(x), 3)):
+    for o in (0, *range(3, len(x), width)):
         T[o, 2], T[o + 1, 2] = -x[o + 1], x[o]
     T[2, 2] = 1.0
     return T
 
 
-def moved_by_right(x: Array, xi: Array) -> Array:
+def moved_by_right(x: Array, xi: Array, width: int = 3) -> Array:
     """Exp(xi) X: state (n,) moved by a right-invariant error (n,), each point by an exponential of SE(2)."""
-    moved = x + np.where(np.arange(len(x)) % 3 == 2, xi, 0.0)  # heading and heights are additive
-    for o in range(0, len(x), 3):
+    moved = x + xi  # heading and heights are additive
+    for o in (0, *range(3, len(x), width)):
         E = expm(np.array([[0.0, -xi[2], xi[o]], [xi[2], 0.0, xi[o + 1]], [0.0, 0.0, 0.0]]))
         moved[o : o + 2] = (E @ [x[o], x[o + 1], 1.0])[:2]
     return moved
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ri-ekf-xyz``."""
+    """Parts of ``ri-ekf-xyz``, and with landmarks in the plane where the sensor has them."""
     return ekf.xyz_parts(problem, controls)._replace(error=RightInvariant())
 
 
@@ -192,3 +196,4 @@ XYZ = Compiled(
     RightInvariantKalman("ri-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False, error="right"
 )
 UVD = Compiled(RightInvariantKalman("ri-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True, error="right")
+XY, RB = planar(RightInvariantKalman, "ri-ekf", xyz_parts, error="right")

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.filters import plain
-from consistency.filters.compiled import Compiled
+from consistency.filters.compiled import Compiled, planar
 from consistency.filters.error.additive import Additive
 from consistency.filters.kernel.slam import Slam
-from consistency.filters.landmark.world_point import WorldPoint
-from consistency.filters.parts import motion_of, sensor_of
+from consistency.filters.parts import landmark_of, motion_of, sensor_of
 from consistency.filters.plain import SlamState
+from consistency.filters.plain_sensors import view
 from consistency.filters.point.at_estimate import AtEstimate
 from consistency.filters.update.unscented import Unscented
 from consistency.filters.upkeep.dense import Dense
@@ -49,16 +49,17 @@ class UnscentedKalman(plain.WorldPointTwin):
         return replace(state, x=x, P=P)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-        at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
+        at = np.array([state.at(label) for label in seen])[:, None] + np.arange(state.width)
         involved = np.concatenate([np.arange(3), at.ravel()])
         set_ = self.points or state.problem.belief.sigma_points
         points, wm, wc = sigma_points(state.x, state.P, involved, set_)
-        sensor = plain.PointSensor(state.problem.belief.sensor, self.uvd)
-        Z = sensor.measure(points[:, None, :3], points[:, at]).reshape(len(points), -1)
+        sensor = view(state.problem.belief.sensor, self.uvd)
+        Z = sensor.measure(points[:, None, :3], points[:, at])
+        Z = (Z[0] + sensor.less(Z, Z[0])).reshape(len(points), -1)
         zhat = wm @ Z
         S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + plain.block_diagonal(R)
         W = np.linalg.solve(S, (Z - zhat).T @ (wc[:, None] * (points - state.x))).T
-        innovation = z.ravel() - zhat
+        innovation = plain.innovation_of(state, z, zhat, self.uvd)
         x, P = state.x + W @ innovation, state.P - W @ S @ W.T
         return replace(state, x=x, P=P), Info(innovation, S, W)
 
@@ -107,11 +108,11 @@ def square_root(P: Array) -> Array:
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
-    """Parts of ``ukf-xyz``."""
+    """Parts of ``ukf-xyz``, and with landmarks in the plane where the sensor has them."""
     belief = problem.belief
     points = Unscented(belief.sigma_points.alpha, belief.sigma_points.beta, belief.sigma_points.kappa)
     sensor = sensor_of(belief, uvd=False)
-    return Slam(motion_of(belief), sensor, WorldPoint(), Additive(), AtEstimate(), points, Dense())
+    return Slam(motion_of(belief), sensor, landmark_of(belief), Additive(), AtEstimate(), points, Dense())
 
 
 def uvd_parts(problem: Problem, controls: Array) -> Slam:
@@ -121,3 +122,4 @@ def uvd_parts(problem: Problem, controls: Array) -> Slam:
 
 XYZ = Compiled(UnscentedKalman("ukf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
 UVD = Compiled(UnscentedKalman("ukf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)
+XY, RB = planar(UnscentedKalman, "ukf", xyz_parts)

@@ -23,6 +23,7 @@ from consistency.filters.kernel.slam import (
     carry_by,
     expands,
     landmark_point,
+    landmark_width,
     make_notes,
     motion_point,
     move,
@@ -34,7 +35,7 @@ from consistency.filters.kernel.work import Work
 from consistency.types import Array
 
 
-@part(motion="Unicycle", landmark="WorldPoint", error="Additive", update="Joint")
+@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", error="Additive", update="Joint")
 class FirstEstimate(NamedTuple):
     """No parameters."""
 
@@ -43,7 +44,7 @@ class FirstEstimates(NamedTuple):
     """The first estimate of every variable."""
 
     path: Array  # (T + 1, 3), as predicted
-    landmarks: Array  # (labels, 3)
+    landmarks: Array  # (labels, w)
 
 
 @implement(expands, FirstEstimate)
@@ -100,7 +101,8 @@ def place_first_estimate(
     point: FirstEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
     """x[n:n + w] <- the inverse of h at the estimated pose, noted; its Jacobian by the heading at the prediction."""
-    pose, values, predicted = state.x[:3], state.x[state.n : state.n + 3], work.notes.path[k + 1]
+    w = landmark_width(slam.landmark)
+    pose, values, predicted = state.x[:3], state.x[state.n : state.n + w], work.notes.path[k + 1]
     place_observed(slam, pose, z, values, work)
     copy(values, work.notes.landmarks[label])
     work.Jp[0, 2] -= pose[1] - predicted[1]

@@ -41,6 +41,7 @@ from consistency.filters.kernel.slam import (
     carry_by,
     expands,
     landmark_point,
+    landmark_width,
     make_notes,
     motion_point,
     move,
@@ -52,7 +53,7 @@ from consistency.filters.kernel.work import Work
 from consistency.types import Array, Indices
 
 
-@part(motion="Unicycle", landmark="WorldPoint", error="Additive", update="Joint", covariance="Dense")
+@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", error="Additive", update="Joint", covariance="Dense")
 class ObservabilityConstrained(NamedTuple):
     """No parameters. The points depend on the estimates of the whole map, so updating is dense."""
 
@@ -64,7 +65,7 @@ class UnobservedTurn(NamedTuple):
     landmarks: Array  # (labels, 2), l by label
     order: Indices  # (labels,), label of the i-th landmark of the state
     shift: Array  # (2,), e
-    at: Array  # (3,), the point of the landmark asked for last
+    at: Array  # (w,), the point of the landmark asked for last
 
 
 @implement(expands, ObservabilityConstrained)
@@ -97,16 +98,16 @@ def carry_constrained(
     point: ObservabilityConstrained, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """F by the displacement p_k+1|k - p*_k|k; notes a_k+1 and e."""
-    x, notes, predicted = state.x, work.notes, work.pose
+    x, notes, predicted, w = state.x, work.notes, work.pose, landmark_width(slam.landmark)
     before, after, shift = notes.path[k], notes.path[k + 1], notes.shift
     move(slam.motion, x[:3], u, predicted)
-    count = (state.n - 3) // 3
+    count = (state.n - 3) // w
     for a in range(2):
         if k == 0:
             before[a] = x[a]
         total = x[a] - before[a]
         for i in range(count):
-            total += x[3 + 3 * i + a] - notes.landmarks[notes.order[i], a]
+            total += x[3 + w * i + a] - notes.landmarks[notes.order[i], a]
         shift[a] = total / (1 + count)
         after[a] = predicted[a] - shift[a]
     carry_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
@@ -125,7 +126,8 @@ def landmark_constrained(point: ObservabilityConstrained, values: Array, label: 
     at: Array = notes.at
     for a in range(2):
         at[a] = notes.landmarks[label, a] + notes.shift[a]
-    at[2] = values[2]
+    for a in range(2, len(values)):
+        at[a] = values[a]
     return at
 
 
@@ -134,8 +136,8 @@ def place_constrained(
     point: ObservabilityConstrained, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
     """x[n:n + w] <- the inverse of h at the estimated pose, with its Jacobians; notes l_i."""
-    x, n, notes = state.x, state.n, work.notes
-    place_observed(slam, x[:3], z, x[n : n + 3], work)
-    notes.order[(n - 3) // 3] = label
+    x, n, notes, w = state.x, state.n, work.notes, landmark_width(slam.landmark)
+    place_observed(slam, x[:3], z, x[n : n + w], work)
+    notes.order[(n - 3) // w] = label
     for a in range(2):
         notes.landmarks[label, a] = notes.path[k + 1, a] + x[n + a] - x[a]

@@ -20,9 +20,11 @@ from consistency.filters.kernel.slam import (
     carry_by,
     expands,
     landmark_point,
+    landmark_width,
     make_notes,
     motion_point,
     observation_point,
+    observed_width,
     place,
     robot_frame,
     stands_apart,
@@ -31,12 +33,12 @@ from consistency.filters.kernel.work import NoNotes, Work
 from consistency.types import Array
 
 
-@part(motion="Unicycle", landmark="WorldPoint", error="Additive", update="Joint")
+@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", error="Additive", update="Joint")
 class AtTruth(NamedTuple):
     """Where robot and landmarks are."""
 
     path: Array  # (T + 1, 3)
-    landmarks: Array  # (n_landmarks, 3)
+    landmarks: Array  # (n_landmarks, w)
 
 
 @implement(expands, AtTruth)
@@ -89,8 +91,9 @@ def place_at_truth(
     point: AtTruth, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
 ) -> None:
     """x[n:n + w] <- the inverse of h at the estimated pose; Jz = Hl^-1 and Jp = -Hl^-1 Hp at the truth."""
-    place_observed(slam, state.x[:3], z, state.x[state.n : state.n + 3], work)
-    expected, Hp, Hl = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
+    place_observed(slam, state.x[:3], z, state.x[state.n : state.n + w], work)
+    expected, Hp, Hl = np.empty(s), np.empty((s, 3)), np.empty((s, w))
     linearise_at(slam, robot_frame(slam.motion, point.path[k + 1]), point.landmarks[label], expected, Hp, Hl)
     copy_matrix(np.linalg.inv(Hl), work.Jz)
     copy_matrix(-np.dot(work.Jz, Hp), work.Jp)

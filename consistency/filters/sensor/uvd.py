@@ -5,9 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.slam import Nine, Triple, locate, locate_jacobian, measure, measure_jacobian
+from consistency.filters.kernel.slam import (
+    Nine,
+    Triple,
+    locate,
+    locate_jacobian,
+    measure,
+    measure_jacobian,
+    observed_width,
+    unwind,
+)
 from consistency.models import stereo
 from consistency.models.point import Mounting
+from consistency.types import Array
 
 
 @part()
@@ -17,6 +27,17 @@ class Uvd(NamedTuple):
     f: float
     B: float
     mount: Mounting
+
+
+@implement(observed_width, Uvd)
+def uvd_width(sensor: Uvd) -> int:
+    """3: u, v, d in px."""
+    return 3
+
+
+@implement(unwind, Uvd)
+def uvd_has_no_angle(sensor: Uvd, z: Array, about: Array) -> None:
+    """Nothing to do: pixels do not wrap."""
 
 
 @implement(measure, Uvd)
@@ -32,12 +53,12 @@ def measure_uvd_jacobian(sensor: Uvd, x: float, y: float, z: float) -> Nine:
 
 
 @implement(locate, Uvd)
-def locate_uvd(sensor: Uvd, z0: float, z1: float, z2: float) -> Triple:
+def locate_uvd(sensor: Uvd, z: Array) -> Triple:
     """Point in m of (u, v, d) in px, eq. 21."""
-    return stereo.triangulate(z0, z1, z2, sensor.f, sensor.B)
+    return stereo.triangulate(z[0], z[1], z[2], sensor.f, sensor.B)
 
 
 @implement(locate_jacobian, Uvd)
-def locate_uvd_jacobian(sensor: Uvd, z0: float, z1: float, z2: float) -> Nine:
+def locate_uvd_jacobian(sensor: Uvd, z: Array) -> Nine:
     """Jacobian (3, 3) of eq. 21, m/px, row after row."""
-    return stereo.triangulate_jacobian(z0, z1, z2, sensor.f, sensor.B)
+    return stereo.triangulate_jacobian(z[0], z[1], z[2], sensor.f, sensor.B)

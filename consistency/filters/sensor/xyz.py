@@ -5,8 +5,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.slam import Nine, Triple, locate, locate_jacobian, measure, measure_jacobian
+from consistency.filters.kernel.slam import (
+    Nine,
+    Triple,
+    locate,
+    locate_jacobian,
+    measure,
+    measure_jacobian,
+    observed_width,
+    unwind,
+)
 from consistency.models.point import Mounting
+from consistency.types import Array
 
 
 @part()
@@ -14,6 +24,17 @@ class Xyz(NamedTuple):
     """Where the sensor is mounted."""
 
     mount: Mounting
+
+
+@implement(observed_width, Xyz)
+def xyz_width(sensor: Xyz) -> int:
+    """3: x, y, z in m."""
+    return 3
+
+
+@implement(unwind, Xyz)
+def xyz_has_no_angle(sensor: Xyz, z: Array, about: Array) -> None:
+    """Nothing to do: lengths do not wrap."""
 
 
 @implement(measure, Xyz)
@@ -29,12 +50,12 @@ def measure_xyz_jacobian(sensor: Xyz, x: float, y: float, z: float) -> Nine:
 
 
 @implement(locate, Xyz)
-def locate_xyz(sensor: Xyz, z0: float, z1: float, z2: float) -> Triple:
+def locate_xyz(sensor: Xyz, z: Array) -> Triple:
     """The observation itself, in m."""
-    return z0, z1, z2
+    return z[0], z[1], z[2]
 
 
 @implement(locate_jacobian, Xyz)
-def locate_xyz_jacobian(sensor: Xyz, z0: float, z1: float, z2: float) -> Nine:
+def locate_xyz_jacobian(sensor: Xyz, z: Array) -> Nine:
     """Identity (3, 3), row after row."""
     return 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0

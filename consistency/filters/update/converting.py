@@ -68,7 +68,7 @@ class ConvertingRoom(NamedTuple):
 
 
 @implement(make_room, Converting)
-def converting_room(update: Converting, r: int, w: int, m: int, n: int) -> ConvertingRoom:
+def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) -> ConvertingRoom:
     return ConvertingRoom(
         np.empty(2 * m, np.int64), np.empty(m, np.int64), np.empty((3 + 6 * m, n)),
         np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)),

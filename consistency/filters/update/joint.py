@@ -22,7 +22,7 @@ class NoRoom(NamedTuple):
 
 
 @implement(make_room, Joint)
-def joint_room(update: Joint, r: int, w: int, m: int, n: int) -> NoRoom:
+def joint_room(update: Joint, r: int, w: int, s: int, m: int, n: int) -> NoRoom:
     return NoRoom()
 
 
@@ -42,8 +42,8 @@ def correct_joint(
     gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)
     combine_seen(slam, state, m, work)
-    innovate(state, data, m, work)
-    code, nis = whiten(state, data, m, work)
+    innovate(slam, state, data, m, work)
+    code, nis = whiten(slam, state, data, m, work)
     if code == 0:
         apply(slam, state, m, local, work)
     return code, nis

@@ -5,7 +5,7 @@ With the variables ordered robot, seen landmarks (as observed), the rest, the Ch
 it projects onto the mean: such points add nothing to S or to the cross-covariance, and their weight counts
 as weight of the centre. What is left is 2 L + 1 points over the L = r + w m variables involved; the rest of
 the state follows through G = P_rest,involved C'^-1, so that Cov(z, x) = Cov(z, C-coordinates) C^-1 P_involved,x
-and M = Cov(z, C-coordinates) C^-1, of size 3 m x L, is all that sees the whole state.
+and M = Cov(z, C-coordinates) C^-1, of size s m x L, is all that sees the whole state.
 
 C is lower triangular. The points of column j of the i-th seen landmark leave the robot and the landmarks
 before i where they are, bit by bit; only what comes from i on is projected again.
@@ -27,7 +27,6 @@ from consistency.filters.kernel.linalg import semidefinite_cholesky
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.measuring import observe
 from consistency.filters.kernel.slam import (
-    OBSERVED,
     Data,
     Slam,
     State,
@@ -37,9 +36,11 @@ from consistency.filters.kernel.slam import (
     landmark_width,
     make_room,
     move,
+    observed_width,
     predict,
     robot_frame,
     robot_width,
+    unwind,
 )
 from consistency.filters.kernel.work import Work
 from consistency.types import Array
@@ -61,22 +62,22 @@ class SigmaRoom(NamedTuple):
     moved: Array  # (2 r + 1, r) sigma points of the robot
     U: Array  # (L, L) upper root of the prior of the variables involved
     block: Array  # (L, L) that prior, where it is singular
-    Z: Array  # (2 L + 1, 3 m) projected sigma points
-    Mt: Array  # (L, 3 m) transposed statistical linearisation
+    Z: Array  # (2 L + 1, s m) projected sigma points
+    Mt: Array  # (L, s m) transposed statistical linearisation
     pose: Array  # (r,)
     landmark: Array  # (w,)
 
 
 @implement(make_room, Unscented)
-def sigma_room(update: Unscented, r: int, w: int, m: int, n: int) -> SigmaRoom:
+def sigma_room(update: Unscented, r: int, w: int, s: int, m: int, n: int) -> SigmaRoom:
     L = r + w * m
     return SigmaRoom(
         np.empty((r, r)),
         np.empty((2 * r + 1, r)),
         np.empty((L, L)),
         np.empty((L, L)),
-        np.empty((2 * L + 1, OBSERVED * m)),
-        np.empty((L, OBSERVED * m)),
+        np.empty((2 * L + 1, s * m)),
+        np.empty((L, s * m)),
         np.empty(r),
         np.empty(w),
     )
@@ -134,8 +135,8 @@ def correct_unscented(
     gather(slam, state, m, local, work)
     if not _innovate(update, slam, state, m, work):
         return POSE, np.nan
-    innovate(state, data, m, work)
-    code, nis = whiten(state, data, m, work)
+    innovate(slam, state, data, m, work)
+    code, nis = whiten(slam, state, data, m, work)
     if code == 0:
         apply(slam, state, m, local, work)
     return code, nis
@@ -144,8 +145,8 @@ def correct_unscented(
 @inner
 def _innovate(update: Unscented, slam: Slam, state: State, m: int, work: Work[SigmaRoom]) -> bool:
     """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite."""
-    r, w, width, rows = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base, OBSERVED * m
-    L = r + w * m
+    r, w, width = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base
+    L, rows = r + w * m, observed_width(slam.sensor) * m
     spread, w0m, w0c, weight = _weights(L, update)
     if not _root(r, w, L, work):
         return False
@@ -204,7 +205,7 @@ def _singular_root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
 @inner
 def _project(slam: Slam, x: Array, m: int, spread: float, work: Work[SigmaRoom]) -> None:
     """Z <- h of the sigma points, in pairs along the rows of U; the last row is h of the mean."""
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
     L = r + w * m
     at, U, Z, pose, landmark = work.at, work.room.U, work.room.Z, work.room.pose, work.room.landmark
     for j in range(L):
@@ -212,11 +213,11 @@ def _project(slam: Slam, x: Array, m: int, spread: float, work: Work[SigmaRoom])
         fill(U[j, first:j], 0.0)  # the lower half holds anything, and the variables of a part are moved together
     mean = robot_frame(slam.motion, x[:r])
     for i in range(m):
-        observe(slam, mean, x[at[i] : at[i] + w], Z[2 * L, OBSERVED * i : OBSERVED * i + OBSERVED])
+        observe(slam, mean, x[at[i] : at[i] + w], Z[2 * L, s * i : s * i + s])
     for k in range(2 * L):
         j, step = k // 2, spread if k % 2 == 0 else -spread
         first = 0 if j < r else (j - r) // w
-        copy(Z[2 * L, : OBSERVED * first], Z[k, : OBSERVED * first])
+        copy(Z[2 * L, : s * first], Z[k, : s * first])
         frame = mean
         if j < r:
             for a in range(r):
@@ -225,4 +226,6 @@ def _project(slam: Slam, x: Array, m: int, spread: float, work: Work[SigmaRoom])
         for i in range(first, m):
             for a in range(w):
                 landmark[a] = x[at[i] + a] + step * U[j, r + w * i + a]
-            observe(slam, frame, landmark, Z[k, OBSERVED * i : OBSERVED * i + OBSERVED])
+            projected = Z[k, s * i : s * i + s]
+            observe(slam, frame, landmark, projected)
+            unwind(slam.sensor, projected, Z[2 * L, s * i : s * i + s])

@@ -37,7 +37,7 @@ class ListedEffect(Table):
     different names, because the random numbers of an effect depend on seed, run and name, and on nothing else.
     """
 
-    models: ClassVar[tuple[str, ...]] = ("xyz", "uvd", "linear")  # sensors that it works on
+    models: ClassVar[tuple[str, ...]] = ("xyz", "uvd", "linear", "relative-xy", "range-bearing")  # that it works on
     draws: ClassVar[bool] = True  # whether it needs random numbers
     before_noise: ClassVar[bool] = False  # whether it is applied before the sensor's noise or after it
 

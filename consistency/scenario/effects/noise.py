@@ -17,11 +17,11 @@ class Noise:
     label: ClassVar[str] = "noise"
     draws: ClassVar[bool] = True
 
-    sigma: tuple[float, float, float]  # px for uvd, m otherwise
+    sigma: tuple[float, ...]  # px for uvd, m and rad for range-bearing, m otherwise
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
         """All rows, with noise."""
-        z = rng.standard_normal((len(observations), 3))
+        z = rng.standard_normal((len(observations), len(self.sigma)))
         z *= self.sigma
         z += observations.z
         return observations.with_z(z)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.models import point, stereo
+from consistency.models import planar, point, stereo
 from consistency.types import Array, Indices
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ class Observations:
     landmark : (M,)
         Ids as a filter is told them: 0..N-1 are the landmarks of the world, those from N on are things that are
         no landmark.
-    z : (M, 3), or what gives it for (step, landmark)
-        (x, y, z) in m or (u, v, d) in px.
+    z : (M, s), or what gives it for (step, landmark)
+        (x, y, z) in m, (u, v, d) in px, (dx, dy) in m, or range in m and bearing in rad.
     ids : int
         Ids in use so far: 0..ids-1.
     source : (M,), optional
@@ -52,7 +52,7 @@ class Observations:
 
     @property
     def z(self) -> Array:
-        """Measured values, shape (M, 3); those of the ideal observation are worked out when first asked for."""
+        """Measured values, shape (M, s); those of the ideal observation are worked out when first asked for."""
         if callable(self._z):
             self._z = self._z(self.step, self.landmark)
         return self._z
@@ -69,7 +69,7 @@ class Observations:
         return Observations(self.step[chosen], self.landmark[chosen], z, self.ids, source)
 
     def with_z(self, z: Array, source: Indices | None = None) -> Observations:
-        """The same rows with other values ``z`` (M, 3), and another ``source`` (M,) where one is given."""
+        """The same rows with other values ``z`` (M, s), and another ``source`` (M,) where one is given."""
         return Observations(self.step, self.landmark, z, self.ids, self.source if source is None else source)
 
     def add(self, step: Indices, thing: Indices, z: Array) -> Observations:
@@ -81,7 +81,7 @@ class Observations:
             Steps 1..T.
         thing : (K,)
             Number of the thing, from 0: rows of one number are a track, one landmark to a filter.
-        z : (K, 3)
+        z : (K, s)
             What is measured of it.
         """
         if len(step) == 0:
@@ -138,14 +138,16 @@ class Context:
         return Observations(step, landmark, self.measure, len(self.landmarks))
 
     def measure(self, step: Indices, landmark: Indices) -> Array:
-        """Ideal measurements (M, 3) of landmarks in steps 1..T: (x, y, z) in m or (u, v, d) in px.
+        """Ideal measurements (M, s) of landmarks in steps 1..T, in the units of the sensor.
 
         Herath et al. (2007) eq. 19 and 22, or eq. 19 to first order about the planned path.
         """
         points = self._linearised(step, landmark) if self.linear else self.points(step, landmark)
         if self.sensor.rig is not None:
             points = stereo.project(*points, *self.sensor.rig)
-        return np.stack(points, axis=-1)
+        if self.sensor.model == "range-bearing":
+            return np.stack(planar.range_bearing(*points[:2]), axis=-1)
+        return np.stack(points[: self.sensor.size], axis=-1)
 
     def points(self, step: Indices, landmark: Indices) -> tuple[Array, Array, Array]:
         """True x, y, z of landmarks in the sensor frame in steps 1..T, m, each (M,)."""

@@ -1,0 +1,165 @@
+"""Are planar filters consistent on real robots, UTIAS MRCLAM with odometry and range and bearing of landmarks?
+
+    python experiments/e15_mrclam.py --data DIR --out DIR [--jobs J] [--overwrite]
+
+DIR of ``--data`` holds folders MRCLAM_DatasetN (Leung et al. 2011, public research data of UTIAS: not shipped). How a
+recording becomes a log: docs/planar.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+import consistency as cs
+from consistency.runs.findings import command_line, sibling
+from consistency.runs.montecarlo import run_log
+from consistency.store.log import Log, write_log
+from consistency.store.storage import manifest_of, require_free
+from consistency.terminal.table import print_findings
+from consistency.verdicts.curves import curves
+
+if TYPE_CHECKING:
+    import mrclam_log as conversion
+else:
+    conversion = sibling(__file__, "mrclam_log")
+
+FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
+
+ORIGIN, LICENCE = "UTIAS MRCLAM (Leung et al. 2011)", "none stated, public research data"
+FILTERS = ("ekf-rb", "ukf-rb", "iekf-rb", "fej-ekf-rb", "oc-ekf-rb", "ri-ekf-rb", "ideal-ekf-rb")
+ROBOTS = range(1, conversion.ROBOTS + 1)
+CLAIM = "a planar filter is consistent on a real robot once the scale of its odometry is calibrated"
+
+
+class Drive(NamedTuple):
+    """The log of a robot, and how it was made."""
+
+    log: Log
+    found: conversion.Calibration
+    dropped: conversion.Dropped
+
+
+def main(study: cs.Study) -> list[cs.Finding]:
+    """Are planar filters consistent on MRCLAM? Needs the data in the folder CONSISTENCY_DATA."""
+    folder = os.environ.get("CONSISTENCY_DATA")
+    if not folder:
+        print("mrclam: set CONSISTENCY_DATA to the folder that holds mrclam", file=sys.stderr)
+        return []
+    return measure(study, drives(Path(folder) / "mrclam"))
+
+
+def drives(folder: Path) -> dict[str, Drive]:
+    """All robots of all data sets in ``folder``, by name.
+
+    Raises
+    ------
+    InputError
+        There is no data set, or a file of one cannot be used.
+    """
+    sets = sorted(folder.glob("MRCLAM_Dataset*"))
+    if not sets:
+        raise cs.InputError(f"{folder}: holds no folder MRCLAM_DatasetN; get the data from UTIAS")
+    made = {}
+    for dataset in sets:
+        for robot in ROBOTS:
+            name = f"mrclam-{dataset.name.removeprefix('MRCLAM_Dataset')}-{robot}"
+            trial, belief, found, dropped = conversion.log_of(conversion.read_robot(dataset, robot))
+            table = pd.DataFrame(trial.landmarks, columns=["x", "y", "z"])
+            table.insert(0, "landmark", np.arange(len(table)))
+            made[name] = Drive(Log(name, [trial], belief, table), found, dropped)
+    return made
+
+
+def measure(study: cs.Study, logs: dict[str, Drive]) -> list[cs.Finding]:
+    """Every filter on every robot: a finding for each robot, and all numbers in a table."""
+    rows, findings = [], []
+    for name, drive in logs.items():
+        print(f"{name}: {', '.join(FILTERS)}", file=sys.stderr, flush=True)
+        results = study.kept[name] = run_log(drive.log, FILTERS, study.jobs)
+        verdicts = cs.analyse(results)
+        here = [row(name, filter_, verdicts[filter_], curves(results, filter_)) for filter_ in FILTERS]
+        rows += here
+        findings.append(finding(study, name, drive, here))
+    study.tables["mrclam"] = pd.DataFrame(rows)
+    return findings
+
+
+class Row(NamedTuple):
+    """What a filter said of one drive."""
+
+    log: str
+    filter: str
+    status: str
+    nees: float  # mean over the steps, over 3; infinite where the filter failed
+    nis: float  # over its degrees of freedom
+    position: float  # RMSE, m
+    heading: float  # RMSE, rad
+
+
+def row(name: str, filter_: str, verdict: cs.Verdict, c: cs.verdicts.curves.Curves) -> Row:
+    """Averages over one drive."""
+    assert c.error is not None
+    assert c.nees is not None
+    nees = np.inf if c.failures else float(np.nanmean(c.nees)) / 3
+    square = np.square(c.error[0])
+    nis = float(np.nansum(c.nis) / c.nis_dof[np.isfinite(c.nis)].sum())
+    position, heading = np.sqrt(np.nanmean(square[:, :2].sum(axis=1))), np.sqrt(np.nanmean(square[:, 2]))
+    return Row(name, filter_, verdict.status, nees, nis, float(position), float(heading))
+
+
+def finding(study: cs.Study, name: str, drive: Drive, rows: Sequence[Row]) -> cs.Finding:
+    """What all filters said of one robot."""
+    found, trial = drive.found, drive.log.trials[0]
+    each = "; ".join(
+        f"{r.filter} {r.status}, NEES/3 {r.nees:.2f}, NIS/dof {r.nis:.2f}, RMSE {r.position:.2f} m" for r in rows
+    )
+    text = study.finding(
+        all(r.status == "consistent" for r in rows),
+        scenario=name,
+        id=name,
+        source="this project, on UTIAS MRCLAM (Leung et al. 2011)",
+        claim=CLAIM,
+        statistic="verdict, NEES, NIS and RMSE of one drive",
+        published="none",
+        measured=f"odometry reads {1.0 / found.scale_v - 1.0:.1%} high, {trial.steps} steps, {drive.dropped.kept} "
+        f"measurements, {drive.dropped.gross} wrong barcodes dropped: {each}",
+        accept="every filter consistent",
+    )
+    return replace(text, runs=1)
+
+
+def command(arguments: Sequence[str] | None = None) -> None:
+    """Write OUT as `consistency reproduce` does, and the logs themselves as OUT/logs/NAME."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for key, text in (("--data", "folder with MRCLAM_DatasetN"), ("--out", "folder to write")):
+        parser.add_argument(key, type=Path, required=True, help=text)
+    parser.add_argument("--jobs", type=int, default=-1, help="workers; -1 is one a core")
+    parser.add_argument("--overwrite", action="store_true", help="replace an output folder of this bench")
+    given = parser.parse_args(arguments)
+    require_free(given.out, given.overwrite, "findings")
+    study, started = cs.Study(runs=1, seed=0, jobs=given.jobs), time.monotonic()
+    logs = drives(given.data)
+    manifest = manifest_of(
+        kind="log", seed=None, runs=1, wall=time.monotonic() - started, complete=True, failures=0, origin=ORIGIN,
+        licence=LICENCE,
+    )  # fmt: skip
+    findings = measure(study, logs)
+    study.write(given.out, findings, time.monotonic() - started, given.overwrite)
+    for name, drive in logs.items():
+        write_log(given.out / "logs" / name, drive.log.trials, drive.log.belief, drive.log.landmarks, manifest)
+    print_findings(findings)
+    print(f"results in {given.out}, the logs in its folder logs; next: consistency report {given.out}")
+
+
+if __name__ == "__main__":
+    command_line(command)

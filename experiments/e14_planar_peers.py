@@ -75,7 +75,11 @@ def main(study: cs.Study) -> list[cs.Finding]:
     tables = {peer: compared(study, peer) for peer in PEERS}
     study.tables["planar_peers"] = pd.concat(tables.values(), ignore_index=True)
     names = {ESDE: "planar-esde", IEKF: "planar-iekf-slam", OCEKF: "planar-ocekf-slam"}
-    return [*(agreement(study, peer, names[peer], table) for peer, table in tables.items()), theory(study), limit(study)]
+    return [
+        *(agreement(study, peer, names[peer], table) for peer, table in tables.items()),
+        theory(study),
+        limit(study),
+    ]
 
 
 def worlds(name: str) -> list[cs.Scenario]:
@@ -135,7 +139,7 @@ def compared(study: cs.Study, peer: str) -> pd.DataFrame:
 
 def agreement(study: cs.Study, peer: str, name: str, table: pd.DataFrame) -> cs.Finding:
     """Whether all numbers of a peer are ours, within their sampling errors."""
-    far, worst = int((~(table["z"].abs() <= LIMIT)).sum()), table.loc[table["z"].abs().idxmax()]
+    far, worst = int((~(table["z"].abs() <= LIMIT)).sum()), table.iloc[int(table["z"].abs().argmax())]
     nees = table[table["number"] == "nees"]
     each = "; ".join(
         f"{r.world} {r.filter} {r.ours:.2f} +- {r.our_error:.2f} ({r.theirs:.2f} +- {r.their_error:.2f})"
@@ -156,11 +160,17 @@ def agreement(study: cs.Study, peer: str, name: str, table: pd.DataFrame) -> cs.
     )
 
 
+def said(name: str, verdict: cs.Verdict) -> str:
+    """Status and average NEES over 3."""
+    assert verdict.scale is not None
+    return f"{name} {verdict.status}, ANEES {verdict.scale.mean_anees:.2f}"
+
+
 def theory(study: cs.Study) -> cs.Finding:
     """Whether the filters that theory calls consistent are, where the EKF is not."""
     world = worlds("ocekf-slam-xy")[0]
     status = {name: study.judged(world, name)[0] for name in ("ekf-xy", *SOUND)}
-    each = "; ".join(f"{name} {v.status}, ANEES {v.scale.mean_anees:.2f}" for name, v in status.items())
+    each = "; ".join(said(name, v) for name, v in status.items())
     return study.finding(
         status["ekf-xy"].status == "overconfident" and all(status[name].status == "consistent" for name in SOUND),
         scenario=world.name,
@@ -179,7 +189,7 @@ def limit(study: cs.Study) -> cs.Finding:
     world = worlds("esde-xy-0.03")[0]
     names = ("oc-ekf-xy", "fej-ekf-xy", "ri-ekf-xy")
     status = {name: study.judged(world, name)[0] for name in names}
-    each = "; ".join(f"{name} {v.status}, ANEES {v.scale.mean_anees:.2f}" for name, v in status.items())
+    each = "; ".join(said(name, v) for name, v in status.items())
     return study.finding(
         all(v.status == "consistent" for v in status.values()),
         scenario=world.name,

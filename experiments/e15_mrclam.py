@@ -26,7 +26,7 @@ from consistency.runs.montecarlo import run_log
 from consistency.store.log import Log, write_log
 from consistency.store.storage import manifest_of, require_free
 from consistency.terminal.table import print_findings
-from consistency.verdicts.curves import curves
+from consistency.verdicts.curves import Curves, curves
 
 if TYPE_CHECKING:
     import mrclam_log as conversion
@@ -106,7 +106,7 @@ class Row(NamedTuple):
     heading: float  # RMSE, rad
 
 
-def row(name: str, filter_: str, verdict: cs.Verdict, c: cs.verdicts.curves.Curves) -> Row:
+def row(name: str, filter_: str, verdict: cs.Verdict, c: Curves) -> Row:
     """Averages over one drive."""
     assert c.error is not None
     assert c.nees is not None

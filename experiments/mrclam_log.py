@@ -50,7 +50,7 @@ class Recording:
         return np.column_stack([np.interp(t, self.truth[:, 0], column) for column in self.truth[:, 1:].T])
 
     def travelled(self, t: Array) -> Array:
-        """Way along the heading in m and heading in rad by odometry at stamps (T,), as it is; a value holds to the next."""
+        """Way along the heading in m and heading in rad by raw odometry at stamps (T,); a value holds to the next."""
         stamp, rates = self.odometry[:, 0], self.odometry[:, 1:]
         total = np.vstack([np.zeros(2), np.cumsum(rates[:-1] * np.diff(stamp)[:, None], axis=0)])
         return np.column_stack([np.interp(t, stamp, column) for column in total.T])
@@ -155,9 +155,7 @@ def calibrate(data: Recording) -> Calibration:
     per_step = np.sqrt(DT * WINDOW)
     motion = BelievedMotion(sigma_v=driven / per_step, sigma_omega=turned / per_step)
     spread = misfits.std(axis=0)
-    return Calibration(
-        lag, along, scale, bias, misfits.mean(axis=0), motion, (float(spread[0]), float(spread[1]))
-    )
+    return Calibration(lag, along, scale, bias, misfits.mean(axis=0), motion, (float(spread[0]), float(spread[1])))
 
 
 def _true_motion(data: Recording, ends: Array) -> Array:

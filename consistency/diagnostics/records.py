@@ -226,9 +226,9 @@ class Location:
 
 @dataclass(frozen=True)
 class MapScore:
-    """Landmarks in the map after the last step, each with 3 degrees of freedom, or 2 in the plane. It is shown and not judged."""
+    """Landmarks in the map after the last step, with 3 degrees of freedom, or 2 in the plane. Shown and not judged."""
 
-    ratio: Interval  # mean over runs of the mean NEES over its degrees of freedom, with its 95 % interval from the spread between runs
+    ratio: Interval  # mean over runs of the mean NEES over its degrees of freedom, 95 % by the spread between runs
     runs: int  # with a landmark that has a NEES
     landmarks: int  # that have one, of all runs
     left_out: int  # that have none: no landmark of the world, not known where, or covariance not positive definite

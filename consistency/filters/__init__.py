@@ -41,12 +41,17 @@ MODULES = {
     "filterpy-ukf-uvd": ("external.filterpy", "UKF_UVD"),
 }
 PLANAR = {  # methods on landmarks in the plane, by their file: METHOD-xy (relative-xy), METHOD-rb (range-bearing)
-    "ekf": "ekf", "ukf": "ukf", "iekf": "iekf", "ri-ekf": "riekf", "fej-ekf": "fej", "oc-ekf": "oc", "ideal-ekf": "ideal",
+    "ekf": "ekf", "ukf": "ukf", "iekf": "iekf", "ri-ekf": "riekf", "fej-ekf": "fej", "oc-ekf": "oc",
+    "ideal-ekf": "ideal",
 }  # fmt: skip
 MODULES |= {
-    f"{method}-{suffix}": (f"methods.{file}", suffix.upper()) for method, file in PLANAR.items() for suffix in ("xy", "rb")
+    f"{method}-{suffix}": (f"methods.{file}", suffix.upper())
+    for method, file in PLANAR.items()
+    for suffix in ("xy", "rb")
 }
-BOUNDS = frozenset(name for name in MODULES if name.startswith("ideal-ekf-"))  # told the truth: ``realisable`` of these is False
+BOUNDS = frozenset(
+    name for name in MODULES if name.startswith("ideal-ekf-")
+)  # told the truth: ``realisable`` of these is False
 
 
 def filter_names() -> list[str]:

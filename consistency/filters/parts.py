@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from consistency.filters.kernel.slam import Sensor
 from consistency.filters.landmark.planar_point import PlanarPoint
 from consistency.filters.landmark.world_point import WorldPoint
@@ -10,9 +12,13 @@ from consistency.filters.sensor.range_bearing import RangeBearing
 from consistency.filters.sensor.relative_xy import RelativeXy
 from consistency.filters.sensor.uvd import Uvd
 from consistency.filters.sensor.xyz import Xyz
+from consistency.models.point import Mounting
 from consistency.scenario import Belief
 
-PLANAR = {"relative-xy": RelativeXy, "range-bearing": RangeBearing}  # sensors of landmarks in the plane, by model
+PLANAR: dict[str, Callable[[Mounting], Sensor]] = {
+    "relative-xy": RelativeXy,
+    "range-bearing": RangeBearing,
+}  # sensors of landmarks in the plane, by model
 
 
 def motion_of(belief: Belief) -> Unicycle:

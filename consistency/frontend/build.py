@@ -51,7 +51,7 @@ class Summary:
     distance: float  # m along the path
     inliers: float  # median of the motions
     noise_ratio: float  # chi2/dof of all motions: measured variance of the pixels over the stated one
-    sigma_px: tuple[float, float, float]  # u, v, d
+    sigma_px: tuple[float, ...]  # u, v, d
     sigma_v: float  # m/s
     sigma_omega: float  # rad/s
     timed: bool  # whether images had timestamps

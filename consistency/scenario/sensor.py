@@ -23,7 +23,6 @@ from consistency.models.point import Mounting
 from consistency.scenario.effects import BUILT_IN, ListedEffect
 from consistency.scenario.tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 
-
 PLANAR_SENSORS = ("relative-xy", "range-bearing")  # of landmarks in the plane, with two values each
 
 

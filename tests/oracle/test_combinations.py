@@ -187,7 +187,9 @@ def test_a_new_landmark_has_the_jacobians_of_its_error(bench: Bench) -> None:
     Jp, Jz = bench.work.Jp.copy(), bench.work.Jz.copy()
     back = np.linalg.inv(bench.additive_from_own(after, n + w))
     by_error = back @ bench.along_errors(lambda x: augmented(x, z), n)
-    by_z = back @ np.column_stack([augmented(bench.x, z + d) - augmented(bench.x, z - d) for d in STEP * np.eye(bench.s)])
+    by_z = back @ np.column_stack(
+        [augmented(bench.x, z + d) - augmented(bench.x, z - d) for d in STEP * np.eye(bench.s)]
+    )
     assert close(Jp, by_error[n:, :3])
     assert np.abs(by_error[n:, 3:]).max() < 1e-6  # other landmarks have no part in it
     assert close(Jz, by_z[n:] / (2.0 * STEP))

@@ -109,13 +109,13 @@ def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple])
             for c in range(s):
                 S[r, s * i + c] += data.R[work.known[i], a, c]
             total += y[r] + S[r, r:].sum()
-    return divide_by_root(slam, state, m, work, total)
+    return divide_by_root(state, rows, work, total)
 
 
 @inner
-def divide_by_root(slam: Slam, state: State, m: int, work: Work[NamedTuple], total: float) -> tuple[int, float]:
+def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float) -> tuple[int, float]:
     """S <- its root, and A and the innovation <- divided by it; ``total`` is finite if all that is given is."""
-    rows, width = observed_width(slam.sensor) * m, state.n + state.base
+    width = state.n + state.base
     S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
     y = joined[:, width]
     if not definite_root(S, work.scale):

@@ -283,7 +283,8 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
     def parts(problem: Problem, controls: Array) -> Slam:
         sensor = problem.belief.sensor
         low, high = searched(sensor, twin.name) if which.truncation else (0.0, 0.0)
-        pixels = Pixels(*sensor.sigma, low, high, which.truncation, which.debiasing)
+        su, sv, sd = sensor.sigma
+        pixels = Pixels(su, sv, sd, low, high, which.truncation, which.debiasing)
         every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),

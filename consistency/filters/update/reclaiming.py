@@ -45,7 +45,7 @@ def correct_converted(
         if passes > 1:
             _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), room)
         total = _innovate(state, m, work)
-        code, nis = divide_by_root(slam, state, m, work, total)
+        code, nis = divide_by_root(state, 3 * m, work, total)
         if code > 0:
             return code, nis
         fill(room.delta[:n], 0.0)

@@ -173,7 +173,7 @@ def test_landmarks_are_parked_and_come_back(small: Small) -> None:
 
 def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
     clones = make_clones(Parking(50, 20), 3, 3, 12, 100, 2)
-    clones.of[:], clones.uses[0], clones.at[0] = 0, 2, 9
+    clones.of[:], clones.uses[0], clones.here[0] = 0, 2, 9
     state = State(np.ones(12), np.ones((12, 12)), 12, 0, np.array([3, 6]))
     unpark(0, state, clones)
     assert clones.uses[0] == 1

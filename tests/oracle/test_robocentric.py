@@ -155,6 +155,29 @@ def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any
     assert (left_out == "nothing") == bool(np.array_equal(ours.pose, whole.pose))  # each correction does something
 
 
+@pytest.mark.parametrize("local_from", [10, 40])
+def test_updating_locally_changes_no_number_round_a_loop(
+    monkeypatch: pytest.MonkeyPatch, small: Small, local_from: int
+) -> None:
+    """Clones are called back, freed and taken again while the rest is passive."""
+    scenario = small("herath2007-stereo", **CLOSING)
+    filter_ = rc.compiled(rc.RobotCentredKalman("trial", centred.Corrections()))
+    for run in range(3):
+        trial = cs.simulate(scenario, run=run)
+        said = []
+        for each in (local_from, 10**9):
+            monkeypatch.setattr(filter_, "local_from", each)
+            said.append(filter_.run(trial, scenario.belief))
+        local, dense = said
+        size = np.abs(dense.covariance).max(axis=(1, 2), keepdims=True)
+        assert np.abs(local.pose - dense.pose).max() < 1e-10
+        assert (np.abs(local.covariance - dense.covariance) / size).max() < 1e-9
+        assert np.nanmax(np.abs(local.nis - dense.nis) / np.maximum(dense.nis, 1.0)) < 1e-9
+        assert np.allclose(local.map.mean, dense.map.mean, rtol=1e-9, atol=1e-11)
+        assert np.allclose(local.map.covariance, dense.map.covariance, rtol=1e-7, atol=1e-12)
+        assert not np.array_equal(local.covariance, dense.covariance), "nothing was updated locally"
+
+
 def test_landmarks_are_parked_and_come_back(small: Small) -> None:
     scenario = small("herath2007-stereo", **CLOSING)
     trial, filter_ = cs.simulate(scenario, run=3), rc.RobotCentredKalman("trial", centred.Corrections())

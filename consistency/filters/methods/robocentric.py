@@ -190,7 +190,7 @@ def _shifts(state: CentredState) -> Array:
 
 
 def _tangent(state: CentredState, delta: Array) -> Array:
-    """(n, n), d xi of the pose about the moved state / d error about ``state``, at the error ``delta``; else identity."""
+    """(n, n), d xi of the pose about the moved state / d error about ``state``, at ``delta``; else the identity."""
     T = _shifts(state)
     T[:3, :3] = left_jacobian(T[:3, :3] @ delta[:3]) @ T[:3, :3]
     return T

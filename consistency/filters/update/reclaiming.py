@@ -192,7 +192,7 @@ def _temper(m: int, factor: float, room: ConvertingRoom) -> None:
 def _innovate(rows: Array, width: int, at: Indices, m: int, work: Work[ConvertingRoom]) -> float:
     """A (3 m, width) <- H P of the gathered ``rows``, its next column z - h + H delta, and S <- H P H' + R.
 
-    ``at`` says where the landmarks, and then their clones, are among the columns. Returns a sum, finite if all of it is.
+    ``at`` says where the landmarks, and then their clones, are among the columns. Returns a sum, finite if all is.
     """
     room, A, S, delta, finite = work.room, work.A, work.S, work.room.delta, 0.0
     for j in range(m):

@@ -23,7 +23,7 @@ from consistency.types import Array
 
 @generic()
 def start_rows(covariance: NamedTuple, x: Array, width: int, p: int, i: int, j: int, Phi: Array) -> None:
-    """Rows i.. of Phi, zero so far, <- the ``width`` variables at ``p`` of the whole state, in columns j.. of the base."""
+    """Rows i.. of Phi, zero so far, <- the ``width`` variables at ``p`` of the whole, in columns j.. of the base."""
     raise NotImplementedError
 
 
@@ -85,7 +85,7 @@ def take_out(covariance: NamedTuple, r: int, w: int, whole: State, n: int, local
 
 @inner
 def wake(covariance: NamedTuple, r: int, w: int, whole: State, n: int, b: int, more: int, local: Factors) -> None:
-    """The last ``more`` variables that ``local.base`` lists join, at ``n`` in the active part and at ``b`` in the base."""
+    """The last ``more`` variables that ``local.base`` lists join, at ``n`` in the active part, ``b`` in the base."""
     x0, P0, x, P, Phi, Psi = whole.x, whole.P, local.x, local.P, local.Phi, local.Psi
     D, G = local.cross[:more, :b], local.gain[:more, :b]
     for i in range(more):

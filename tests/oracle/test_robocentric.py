@@ -134,7 +134,7 @@ CLOSING = {  # a lap in 150 steps: what was parked is seen again
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("left_out", ["nothing", "parking", "turning", "truncation", "debiasing", "iteration"])
+@pytest.mark.parametrize("left_out", ["nothing", *centred.Corrections._fields])
 def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any], left_out: str) -> None:
     changes = {"truth__sensor__mount": tilted, "belief__sensor__mount": tilted}
     scenario = small("herath2007-stereo", **CLOSING, **changes)

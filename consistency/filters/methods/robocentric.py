@@ -13,7 +13,8 @@ M(p+)^-1 J_l(xi) M(p-). That is done to the pose; for a clone T stays where it w
 
 Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
 its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not
-the conversion of the mean, to second order in the noise of u and v.
+the conversion of the mean, to second order in the noise of u and v. The noise of the conversion is taken where the
+observation is predicted: taken where it was measured, it would give more weight to errors of one sign.
 """
 
 from __future__ import annotations
@@ -293,7 +294,7 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
     def parts(problem: Problem, controls: Array) -> Slam:
         sensor = problem.belief.sensor
         low, high = searched(sensor, twin.name) if which.truncation else (0.0, 0.0)
-        pixels = Pixels(*sensor.sigma, low, high, which.truncation, which.debiasing)
+        pixels = Pixels(*sensor.sigma, low, high, which.truncation, which.debiasing, which.prediction)
         every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),

@@ -27,6 +27,7 @@ ALL = [
     ("ukf-xyz", "herath2007-xyz"),
     ("ukf-uvd", "herath2007-stereo"),
     ("ekf-xy", "esde-xy"),
+    ("parked-ekf-uvd", "herath2007-stereo"),
 ]
 
 

@@ -132,10 +132,18 @@ def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float
 @inner
 def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
     """x (n,) <- moved by W' S^-1/2 innovation, P (n, n) <- P - W' W; with the columns of Phi as ``local`` says."""
-    rows, n, base = observed_width(slam.sensor) * m, state.n, state.base
-    A, y = work.A[:rows, :n], work.A[:rows, n + base]
+    rows, n = observed_width(slam.sensor) * m, state.n
+    A, y = work.A[:rows, :n], work.A[:rows, n + state.base]
     retract(slam.error, slam, state, A, y, work)
     subtract_gram(state.P, n, robot_width(slam.motion), A)
+    apply_beyond(state, rows, local, work)
+
+
+@inner
+def apply_beyond(state: State, rows: int, local: Factors, work: Work[NamedTuple]) -> None:
+    """Phi, Psi and theta <- what a correction of the active part says of the rest."""
+    n, base = state.n, state.base
+    A, y = work.A[:rows, :n], work.A[:rows, n + base]
     if base > 0:
         beyond = work.A[:rows, n : n + base]
         add_product_of_transposed(-1.0, A, beyond, local.Phi[:n, :base])

@@ -16,7 +16,7 @@ import consistency as cs
 from consistency.scenario import data_folder
 
 EXPECTED = {
-    "herath2007-optimistic", "herath2007-stereo", "herath2007-wide-baseline", "herath2007-xyz", "linear-gaussian",
+    "esde-xy", "iekf-slam-xy", "ocekf-slam-xy", "range-bearing", "herath2007-optimistic", "herath2007-stereo", "herath2007-wide-baseline", "herath2007-xyz", "linear-gaussian",
     "long-loop",
 }  # fmt: skip
 Edit = Callable[[dict], None]
@@ -292,5 +292,5 @@ def test_missing_file(tmp_path: Path) -> None:
 def test_unknown_name_with_a_suggestion() -> None:
     with pytest.raises(cs.InputError, match=r"unknown scenario 'herath2007-stero' \(did you mean 'herath2007-stereo'"):
         cs.load_scenario("herath2007-stero")
-    with pytest.raises(cs.InputError, match="unknown scenario 'zzz'; known: herath2007-optimistic, "):
+    with pytest.raises(cs.InputError, match="unknown scenario 'zzz'; known: esde-xy, herath2007-optimistic, "):
         cs.load_scenario("zzz")

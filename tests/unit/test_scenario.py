@@ -16,7 +16,8 @@ import consistency as cs
 from consistency.scenario import data_folder
 
 EXPECTED = {
-    "esde-xy", "iekf-slam-xy", "ocekf-slam-xy", "range-bearing", "herath2007-optimistic", "herath2007-stereo", "herath2007-wide-baseline", "herath2007-xyz", "linear-gaussian",
+    "esde-xy", "iekf-slam-xy", "ocekf-slam-xy", "range-bearing",
+    "herath2007-optimistic", "herath2007-stereo", "herath2007-wide-baseline", "herath2007-xyz", "linear-gaussian",
     "long-loop",
 }  # fmt: skip
 Edit = Callable[[dict], None]

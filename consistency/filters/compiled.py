@@ -161,7 +161,7 @@ class Compiled:
 def planar(
     twin: Callable[..., Any], method: str, parts: Callable[[Problem, Array], Slam], **options: str
 ) -> tuple[Compiled, Compiled]:
-    """A method on landmarks in the plane, by relative positions (``METHOD-xy``) and ranges and bearings (``METHOD-rb``).
+    """A method on landmarks in the plane, by relative positions (``METHOD-xy``) or range and bearing (``METHOD-rb``).
 
     ``twin`` makes its plain twin of a name and ``uvd``, ``parts`` take sensor and landmark from the belief, and
     ``options`` are those of :class:`Compiled`.

@@ -18,7 +18,7 @@ class NoNotes(NamedTuple):
 
 
 class Work(NamedTuple, Generic[Room]):
-    """``m``: the most landmarks seen in a step, ``n``: final size of the state, ``L`` = r + w m, s as in ``measure``."""
+    """``m``: the most landmarks seen in a step, ``n``: final size of the state, ``L`` = r + w m, s: of ``measure``."""
 
     known: Indices  # (m,) rows of the observations whose landmark is in the state
     at: Indices  # (m,) and its offset there

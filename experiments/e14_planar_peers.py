@@ -78,11 +78,9 @@ def main(study: cs.Study) -> list[cs.Finding]:
     tables = {peer: compared(study, peer) for peer in PEERS if study.wants(names[peer])}
     if tables:
         study.tables["planar_peers"] = pd.concat(tables.values(), ignore_index=True)
-    return [
-        *(agreement(study, peer, names[peer], table) for peer, table in tables.items()),
-        theory(study),
-        limit(study),
-    ]
+    found = [agreement(study, peer, names[peer], table) for peer, table in tables.items()]
+    asked = {"planar-theory": theory, "planar-limit": limit}
+    return [*found, *(question(study) for name, question in asked.items() if study.wants(name))]
 
 
 def worlds(name: str) -> list[cs.Scenario]:

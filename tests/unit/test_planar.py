@@ -17,6 +17,7 @@ from consistency.filters.kernel.slam import locate, locate_jacobian, measure, me
 from consistency.filters.parts import sensor_of
 from consistency.filters.stepping import step_through
 from consistency.models import planar
+from consistency.runs.findings import sibling
 from consistency.simulation import draw_landmarks
 from consistency.store.log import read_log, write_log
 from consistency.store.results import is_flat
@@ -176,3 +177,23 @@ def test_a_landmark_of_the_plane_has_two_degrees_of_freedom() -> None:
     assert is_flat(P)
     P[1, 2, 2] = 1e-9
     assert not is_flat(P)
+
+
+# --- peers -----------------------------------------------------------------------------------------
+
+PEERS = sibling(str(Path(__file__).parents[2] / "experiments" / "e13_consistent.py"), "e14_planar_peers")
+
+
+@pytest.mark.parametrize("s", [0.01, 0.02, 0.03])
+def test_the_worlds_of_esde_have_its_noise(s: float) -> None:
+    (world,) = PEERS.worlds(f"esde-xy-{s}")
+    for table in (world.truth.motion, world.belief.motion):
+        assert table.sigma_v == pytest.approx(s / np.sqrt(2.0))
+        assert table.sigma_omega == pytest.approx(2.0 * np.sqrt(2.0) * s)
+    assert s != 0.02 or world.truth.motion == cs.load_scenario("esde-xy").truth.motion
+
+
+def test_a_number_between_those_of_maps_is_no_distance_away() -> None:
+    assert PEERS.distance(pd.Series([-2.0, 0.5, 3.0])) == 0.0
+    assert PEERS.distance(pd.Series([2.0, 0.5, 3.0])) == 0.5
+    assert PEERS.distance(pd.Series([-4.0])) == -4.0

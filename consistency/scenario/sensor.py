@@ -13,6 +13,7 @@ from pydantic import (
     Field,
     SerializeAsAny,
     SerializerFunctionWrapHandler,
+    ValidationInfo,
     field_validator,
     model_serializer,
     model_validator,
@@ -24,6 +25,11 @@ from consistency.scenario.effects import BUILT_IN, ListedEffect
 from consistency.scenario.tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 
 PLANAR_SENSORS = ("relative-xy", "range-bearing")  # of landmarks in the plane, with two values each
+
+
+def _size(model: str | None) -> int:
+    """Values in an observation of a sensor."""
+    return 2 if model in PLANAR_SENSORS else 3
 
 
 class Mount(Table):
@@ -53,13 +59,16 @@ class Sensor(Table):
     @property
     def size(self) -> int:
         """Values in an observation."""
-        return 2 if self.planar else 3
+        return _size(self.model)
 
-    @model_validator(mode="after")
-    def _one_sigma_a_value(self) -> Sensor:
-        if len(self.sigma) != self.size:
-            raise ValueError(f"sigma must have {self.size} numbers for a sensor '{self.model}', got {len(self.sigma)}")
-        return self
+    @field_validator("sigma")
+    @classmethod
+    def _one_sigma_a_value(cls, sigma: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
+        model = info.data.get("model")
+        size = _size(model)
+        if model is not None and len(sigma) != size:
+            raise ValueError(f"sigma must have {size} numbers for a sensor '{model}', got {len(sigma)}")
+        return sigma
 
     @model_validator(mode="after")
     def _level(self) -> Sensor:

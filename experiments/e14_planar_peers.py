@@ -128,8 +128,8 @@ def compared(study: cs.Study, peer: str) -> pd.DataFrame:
             error, their_error = spread / np.sqrt(runs), spread / np.sqrt(row.runs)
             their_error[0] = row.spread
             z = (value - theirs) / np.hypot(error, their_error)
-            columns = zip(NUMBERS, theirs, their_error, value, error, z, strict=True)
-            rows += [(peer, world.name, row.filter, *numbers) for numbers in columns]
+            lines = zip(NUMBERS, theirs, their_error, value, error, z, strict=True)
+            rows += [(peer, world.name, row.filter, *line) for line in lines]
     columns = ["peer", "world", "filter", "number", "theirs", "their_error", "ours", "our_error", "z"]
     return pd.DataFrame(rows, columns=columns)
 

@@ -219,7 +219,7 @@ def test_linear_world_needs_its_landmarks(linear: cs.Scenario, tmp_path: Path) -
 
 SENSOR: dict[str, tuple[dict[str, object], str]] = {
     "unknown key": ({"colour": 1}, r"key 'colour': unknown key; allowed here: model, sigma"),
-    "unknown model": ({"model": "lidar"}, r".*model.*'xyz', 'uvd' or 'linear'"),
+    "unknown model": ({"model": "lidar"}, r".*model.*'xyz', 'uvd', 'linear', 'relative-xy' or 'range-bearing'"),
     "no baseline": ({"B": None}, r".*needs f \(px\) and B \(m\)"),
     "no noise": ({"sigma_px": None}, r"key 'sigma': missing"),
     "negative noise": ({"sigma_px": [1.0, -1.0, 1.0]}, r"key 'sigma\.1'"),

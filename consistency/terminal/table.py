@@ -30,7 +30,8 @@ COLOURS = {
 }  # fmt: skip
 
 
-def _console() -> Console:
+def open_console() -> Console:
+    """Standard output: coloured on a terminal, plain and wide elsewhere."""
     # pipes and files get plain wide lines, so that nothing is cut
     return Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False)
 
@@ -54,7 +55,7 @@ def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
         if verdict.world is not None:
             status, anees, ratio, *_ = _cells(verdict.world)
             table.add_row("", f"{ADDITIVE}, beside it", status, anees, ratio)
-    console = _console()
+    console = open_console()
     console.print(table)
     for line in _below(verdicts):
         console.print(line, markup=False, soft_wrap=not console.is_terminal)
@@ -102,7 +103,7 @@ def print_findings(findings: Sequence[Finding]) -> None:
         colour = COLOURS[finding.verdict]
         texts = (escape(text) for text in (finding.id, finding.published, finding.measured))
         table.add_row(*texts, f"[{colour}]{finding.verdict}[/{colour}]")
-    _console().print(table)
+    open_console().print(table)
 
 
 def verdicts_json(verdicts: dict[str, Verdict]) -> str:
@@ -136,7 +137,7 @@ def print_plan(planned: dict[str, Any]) -> None:
 
 def print_comparisons(compared: Sequence[Compared]) -> None:
     """One table a pair: both values, their ratio or difference with its interval, and a sentence."""
-    console = _console()
+    console = open_console()
     for each in compared:
         c = each.comparison
         table = RichTable(box=None, pad_edge=False)
@@ -177,7 +178,7 @@ def print_watched(watched: Watched) -> None:
     table.add_row(
         *cells, *(f"{value:.3g}" for value in (monitor.evidence, monitor.largest)), f"{monitor.threshold:.4g}"
     )
-    console = _console()
+    console = open_console()
     console.print(table)
     console.print(f"\n{_sentence(watched)}", markup=False, soft_wrap=not console.is_terminal)
 

@@ -81,8 +81,8 @@ def method(regime: Regime) -> str:
         f"Each filter runs in each cell until it is decided, with at most {rule.max_runs} runs. A filter that is right "
         f"is called faulty in {100 * rule.false_alarm:g} % of the cells, by chance; {wrong} {rule.detect:g} or "
         f"1/{rule.detect:g} is called consistent in {100 * (1 - rule.power):g} % at most. Trials of different cells "
-        "are independent; all filters of a cell have the same trials. The cost is the CPU time of a step, in one thread, "
-        f"against that of {regime.sweep.reference} on the same trial."
+        "are independent; all filters of a cell have the same trials. The cost is the CPU time of a step, in one "
+        f"thread, against that of {regime.sweep.reference} on the same trial."
     )
 
 
@@ -120,7 +120,7 @@ def _rigs(regime: Regime) -> Table:
 
 
 def _values(regime: Regime, shown: list[grid.Axis], cell: GridCell) -> list[str]:
-    return [axis.say(cell.at[regime.sweep.axes.index(axis)]) for axis in shown]
+    return [axis.say(cell.indices[regime.sweep.axes.index(axis)]) for axis in shown]
 
 
 def _trusted(regime: Regime, cell: GridCell) -> Cell:
@@ -165,7 +165,9 @@ def _by_facet(regime: Regime, facets: list[grid.Axis]) -> list[tuple[str, list[G
     places = [regime.sweep.axes.index(axis) for axis in facets]
     groups = []
     for at in itertools.product(*(range(len(axis.values)) for axis in facets)):
-        cells = [cell for cell in regime.sweep.cells if all(cell.at[p] == i for p, i in zip(places, at, strict=True))]
+        cells = [
+            cell for cell in regime.sweep.cells if all(cell.indices[p] == i for p, i in zip(places, at, strict=True))
+        ]
         groups.append((", ".join(f"{_short(a.key)} {a.say(i)}" for a, i in zip(facets, at, strict=True)), cells))
     return groups
 
@@ -201,9 +203,9 @@ def _pair(regime: Regime, name: str, shown: list[grid.Axis], title: str, cells: 
     """The panel of verdicts and the panel of RMSE for one set of cells."""
     places = [regime.sweep.axes.index(axis) for axis in shown]
     found = [(cell, regime.results[cell.number, name]) for cell in cells if (cell.number, name) in regime.results]
-    x = np.array([shown[0].values[cell.at[places[0]]] for cell, _ in found], float)
+    x = np.array([shown[0].values[cell.indices[places[0]]] for cell, _ in found], float)
     second = shown[1] if len(shown) > 1 else None
-    rows = np.array([cell.at[places[1]] if second else 0 for cell, _ in found], int)
+    rows = np.array([cell.indices[places[1]] if second else 0 for cell, _ in found], int)
     y = np.array(second.values, float)[rows] if second else np.zeros(len(found))
     x_axis = _axis(shown[0])
     words = f" with {title}" if title else ""

@@ -97,12 +97,14 @@ def result_of(verdict: Verdict, cost: float = np.nan, step_us: float = np.nan) -
 
 
 def runs_table(found: Curves) -> pd.DataFrame:
-    """One row a run: mean NEES, RMSE of position (m) and heading (rad), and where and why it failed."""
+    """One row a run: mean NEES, RMSE of position (m) and heading (rad) in judged steps, and where and why it failed."""
     assert found.error is not None
+    assert found.judged.nees is not None
     failed = {failure.run: failure for failure in found.failures}
+    square = np.where(np.isfinite(found.judged.nees)[..., None], found.error**2, np.nan)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Mean of empty slice")  # a run without an estimate
-        mean = np.nanmean(found.error**2, axis=1)
+        mean = np.nanmean(square, axis=1)
     steps = [failed[run].step if run in failed else None for run in found.runs]
     reasons = [failed[run].reason if run in failed else None for run in found.runs]
     position = np.sqrt(mean[:, 0] + mean[:, 1])

@@ -15,7 +15,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-import consistency
 from consistency.errors import InputError
 from consistency.scenario import Scenario
 from consistency.store.atomic import write_whole
@@ -33,7 +32,7 @@ CODE = ("diagnostics", "filters", "geometry", "models", "scenario", "simulation"
 @functools.cache
 def code_digest() -> str:
     """Hash of the sources that the numbers of a cell depend on."""
-    root = Path(consistency.__file__).parent
+    root = Path(__file__).parents[1]
     paths = (
         path for name in CODE for path in ((root / name).rglob("*.py") if (root / name).is_dir() else (root / name,))
     )

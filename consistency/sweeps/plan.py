@@ -76,7 +76,7 @@ class Cell:
     """One point of the grid."""
 
     number: int  # 0, 1, ... in the order of the grid, the last axis fastest
-    at: tuple[int, ...]  # place on each axis
+    indices: tuple[int, ...]  # place on each axis
     name: str  # of its folder
     text: str  # "baseline 0.09 m, range 4 m"
     scenario: Scenario

@@ -166,4 +166,4 @@ def _elsewhere(regime: Regime, places: tuple[Place, ...]) -> str:
     if found is None:
         return ""
     _, cell, trusted = found
-    return f"{text_of(regime.sweep.axes, cell.at)}: {', '.join(name for name, _ in trusted)}"
+    return f"{text_of(regime.sweep.axes, cell.indices)}: {', '.join(name for name, _ in trusted)}"

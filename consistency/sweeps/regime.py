@@ -52,7 +52,7 @@ class Regime:
     def table(self) -> pd.DataFrame:
         """One row a cell and filter: the value on each axis, the filter, and the fields of :class:`CellResult`."""
         rows = [
-            [*(_text(axis.values[i]) for axis, i in zip(self.sweep.axes, cell.at, strict=True)), name,
+            [*(_text(axis.values[i]) for axis, i in zip(self.sweep.axes, cell.indices, strict=True)), name,
              *(getattr(result, field) for field in FIELDS)]
             for cell in self.sweep.cells for name, result in self.at(cell).items()
         ]  # fmt: skip

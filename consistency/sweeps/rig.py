@@ -178,7 +178,7 @@ def place_on(axis: Axis, value: Any) -> Place:
 
 def distance(places: tuple[Place, ...], cell: Cell) -> float:
     """Grid steps from a rig to a cell."""
-    return float(np.linalg.norm([i - place.position for i, place in zip(cell.at, places, strict=True)]))
+    return float(np.linalg.norm([i - place.position for i, place in zip(cell.indices, places, strict=True)]))
 
 
 def differences(rig: Scenario, sweep: Sweep) -> list[str]:

@@ -48,17 +48,19 @@ def _main(
 
 @app.command("list")
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
-    """Scenarios, filters and experiments."""
+    """Scenarios, filters, experiments and sweeps."""
     from consistency.filters import BOUNDS, filter_names
     from consistency.runs.findings import experiment_summaries
     from consistency.scenario import load_scenario, scenario_names
+    from consistency.sweeps.plan import sweep_summaries
 
     scenarios = {name: load_scenario(name).summary for name in scenario_names()}
-    experiments = experiment_summaries()
+    experiments, sweeps = experiment_summaries(), sweep_summaries()
     if as_json:
-        print(json.dumps({"scenarios": scenarios, "filters": filter_names(), "experiments": experiments}, indent=2))
+        names = {"scenarios": scenarios, "filters": filter_names(), "experiments": experiments, "sweeps": sweeps}
+        print(json.dumps(names, indent=2))
         return
-    for title, entries in (("Scenarios", scenarios), ("Experiments", experiments)):
+    for title, entries in (("Scenarios", scenarios), ("Experiments", experiments), ("Sweeps", sweeps)):
         print(title)
         width = max((len(name) for name in entries), default=0)
         for name, summary in entries.items():

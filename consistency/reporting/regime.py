@@ -214,8 +214,7 @@ def _pair(regime: Regime, name: str, shown: list[grid.Axis], title: str, cells: 
         f"Verdicts on {name}{words}", height=300, title=title or "verdict", empty="no cell is there yet",
     )  # fmt: skip
     rmse = Panel(
-        x_axis, Axis("RMSE of the position (m)", "RMSE (m)", log=True, digits=(1, 2, 5)),
-        _rmse(x, rows, [r for _, r in found]),
+        x_axis, _rmse_axis([r for _, r in found]), _rmse(x, rows, [r for _, r in found]),
         f"RMSE of {name}{words}", height=300, title=f"RMSE{', ' if title else ''}{title}", empty="no cell is there yet",
     )  # fmt: skip
     return verdicts, rmse
@@ -230,6 +229,12 @@ def _axis(axis: grid.Axis) -> Axis:
     window = values[0] / ROOM, values[-1] * ROOM
     short = _short(axis.key) + (f" ({axis.unit})" if axis.unit else "")
     return Axis(axis.label, short, log=True, window=window, digits=(1, 2, 3, 5))
+
+
+def _rmse_axis(results: list[CellResult]) -> Axis:
+    """Logarithmic where there is a value."""
+    log = any(r.rmse_position > 0.0 for r in results)
+    return Axis("RMSE of the position (m)", "RMSE (m)", log=log, digits=(1, 2, 5) if log else ())
 
 
 def _columns(results: list[CellResult], rows: Array) -> dict[str, Array | list[str]]:

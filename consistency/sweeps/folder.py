@@ -16,6 +16,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from consistency.errors import InputError
+from consistency.runs.montecarlo import worker_count
 from consistency.scenario import Scenario
 from consistency.store.atomic import write_whole
 from consistency.store.storage import manifest_of, read_manifest, write_folder
@@ -244,12 +245,13 @@ def run_sweep(
     Raises
     ------
     InputError
-        The folder is something else's, or holds cells that were made with other inputs.
+        The folder is something else's, or holds cells that were made with other inputs; a number out of range.
     KeyboardInterrupt
         Ctrl-C; what is finished is kept.
     """
     if not 1 <= part <= parts:
         raise InputError(f"--share {part}/{parts}: must be I/N with I from 1 to N")
+    worker_count(jobs)
     folder = SweepFolder(sweep, Path(out))
     folder.require_usable(overwrite)
     share = folder.all_work(part, parts)

@@ -93,6 +93,7 @@ def test_list_names_everything(folder: Path) -> None:
     assert {"herath2007-stereo", "linear-gaussian", "long-loop"} <= set(listed["scenarios"])
     assert {"kf", "ukf-uvd", "filterpy-ukf-xyz"} <= set(listed["filters"])
     assert "e04_stereo" in listed["experiments"]
+    assert {"regime", "small"} <= set(listed["sweeps"])
 
 
 def test_reproduce_writes_findings(folder: Path) -> None:

@@ -279,9 +279,8 @@ def test_bad_sensors_and_options(regime: Regime, tmp_path: Path) -> None:
 
 
 def test_a_map_with_a_hole_is_refused_there(regime: Regime) -> None:
-    hole = replace(
-        regime, results={key: r for key, r in regime.results.items() if key[0] != advise(regime).nearest.number}
-    )
+    here = advise(regime).nearest.number
+    hole = replace(regime, results={key: found for key, found in regime.results.items() if key[0] != here})
     with pytest.raises(InputError, match=r"the map has nothing of baseline 0\.09 m"):
         advise(hole)
 

@@ -350,6 +350,7 @@ def test_only_consistent_filters_are_trusted() -> None:
 
 def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
     from consistency.reporting.html import render_html
+    from consistency.reporting.pdf import render_pdf
     from consistency.reporting.regime import LOOKS, compose_regime
 
     sweep = load_sweep("small")
@@ -367,6 +368,7 @@ def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
     assert page.count(">0.5 m<") == 2
     looks = {(look.colour, look.marker, look.edge) for look in LOOKS.values()}
     assert len({marker for _, marker, _ in looks}) == len(LOOKS) - 1  # only undecided shares a shape, hollow
+    assert render_pdf(document).startswith(b"%PDF")
     unfinished = compose_regime(Regime(sweep, dict(list(results.items())[:3]), {"kind": "map"}))
     assert "not finished: 5 of 8" in unfinished.answer
 

@@ -35,7 +35,7 @@ class Candidate:
     filter: str
     nearest: CellResult  # in the cell nearest to the rig
     agreeing: int  # cells around the rig in which it is consistent
-    around: int  # cells around the rig that are on the map
+    around: int  # cells around the rig; one that the map does not have yet does not agree
     verdict: Verdict | None = None  # of the confirming runs
     sure: str = ""  # one of SURENESS; empty: not to be trusted by the map
 
@@ -134,7 +134,7 @@ def candidates_of(regime: Regime, nearest: Cell, around: Sequence[Cell]) -> list
     found = []
     for name, result in ranked(here):
         near = [results[name].status == "consistent" for results in cells if name in results]
-        found.append(Candidate(name, result, sum(near), len(near)))
+        found.append(Candidate(name, result, sum(near), len(cells)))
     return sorted(found, key=lambda c: (c.nearest.status != "consistent", c.agreeing < c.around))
 
 

@@ -133,6 +133,13 @@ def test_a_filter_at_the_edge_of_its_region_comes_second(regime: Regime) -> None
     assert [(c.filter, c.agreeing) for c in found] == [("parked-ekf-uvd", 2), ("ekf-uvd", 1), ("ukf-uvd", 0)]
 
 
+def test_a_cell_that_is_missing_does_not_agree(regime: Regime) -> None:
+    other = next(c.number for c in regime.sweep.cells if c.indices == (1, 1, 2, 1))
+    rest = {key: found for key, found in regime.results.items() if key[0] != other}
+    best = advise(replace(regime, results=rest)).candidates[0]
+    assert (best.agreeing, best.around) == (1, 2)
+
+
 def test_outside_the_map_nothing_is_sure(regime: Regime) -> None:
     advice = advise(regime, range=30.0)
     assert not advice.inside

@@ -111,14 +111,15 @@ def test_a_cell_depends_on_nothing_but_itself(at: Path) -> None:
     assert replace(whole, seed=4).seed_of(same) != whole.seed_of(same)
 
 
-@pytest.mark.parametrize("parts", [1, 2, 3, 7])
+@pytest.mark.parametrize("parts", [1, 2, 3, 6, 7])
 def test_shares_cover_the_grid_once(at: Path, parts: int) -> None:
     sweep = load_sweep("regime")
     shares = [sweep.share(part, parts) for part in range(1, parts + 1)]
     assert sorted(c.number for share in shares for c in share) == list(range(150))
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
-    # no share has all the slow cells, those of the longest range
+    # no share has all the slow cells, those of the longest range, or one noise alone
     assert all(0 < sum(c.indices[1] == 4 for c in share) < len(share) for share in shares)
+    assert all({c.indices[3] for c in share} == {0, 1} for share in shares)
 
 
 def test_built_in_sweeps_are_fine() -> None:
@@ -289,6 +290,16 @@ def test_a_cell_that_raises_is_a_result(at: Path) -> None:
     assert len(broken) == 2
     assert all("no landmark comes into view" in r.diagnosis and r.runs == 0 for r in broken)
     assert np.isnan(broken[0].rmse_position)
+
+
+def test_any_exception_is_a_result(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def breaks(*_: Any, **__: Any) -> Any:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr(cells, "run_until_decided", breaks)
+    folder, missing = run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+    assert missing == 0
+    assert {r.diagnosis for r in folder.results().values()} == {"failed: ZeroDivisionError: by nothing"}
 
 
 def test_a_damaged_cell_is_named(at: Path) -> None:

@@ -23,6 +23,7 @@ from consistency.store.storage import manifest_of, read_manifest, write_folder
 from consistency.sweeps.axes import Axis
 from consistency.sweeps.cell import CellResult, Outcome, plain_numbers, result_from, run_cell
 from consistency.sweeps.plan import Cell, Rule, Sweep
+from consistency.sweeps.stopping import remembered
 
 KIND, CELL_KIND = "sweep", "cell"
 CELLS = "cells"  # folder of the cells in that of the sweep
@@ -260,12 +261,15 @@ def run_sweep(
     if len(todo) < len(share):
         print(f"{len(share) - len(todo)} of {len(share)} are there already", file=sys.stderr, flush=True)
     started = time.monotonic()
-    for count, work in enumerate(todo, 1):
-        begun = time.monotonic()
-        outcome = run_cell(folder.sweep, work.cell, work.filter, jobs)
-        folder.write(work, outcome, time.monotonic() - begun)
-        left = (time.monotonic() - started) / count * (len(todo) - count)
-        print(f"{count} of {len(todo)}: {work.text}: {_said(outcome.result)}{_left(left)}", file=sys.stderr, flush=True)
+    with remembered() as stopped:
+        for count, work in enumerate(todo, 1):
+            begun = time.monotonic()
+            outcome = run_cell(folder.sweep, work.cell, work.filter, jobs)
+            if stopped():  # and the cell took it for an error of its own
+                raise KeyboardInterrupt
+            folder.write(work, outcome, time.monotonic() - begun)
+            left = _left((time.monotonic() - started) / count * (len(todo) - count))
+            print(f"{count} of {len(todo)}: {work.text}: {_said(outcome.result)}{left}", file=sys.stderr, flush=True)
     missing = sum(_is_missing(folder, work) for work in folder.all_work())
     return folder, missing
 

@@ -88,9 +88,9 @@ def map_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
     """Are the maps consistent of all realisable filters whose pose is?"""
     right = table[(table["status"] == "consistent") & (table["realisable"] == "yes")]
     parts = [
-        f"{r.filter}: pose {r.anees / 3.0:.2f}, map {r.map_status}, landmarks {r.map_nees:.2f}, together "
-        f"{r.joint_nees:.3f} [{r.joint_low:.3f}, {r.joint_high:.3f}]"
-        for r in right.itertuples()
+        f"{r['filter']}: pose {r['anees'] / 3.0:.2f}, map {r['map_status']}, landmarks {r['map_nees']:.2f}, together "
+        f"{r['joint_nees']:.3f} [{r['joint_low']:.3f}, {r['joint_high']:.3f}]"
+        for r in right.to_dict("records")
     ]
     return study.finding(
         len(right) > 0 and bool((right["map_status"] == "consistent").all()),
@@ -110,7 +110,9 @@ def map_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
 def cost_finding(study: cs.Study, table: pd.DataFrame) -> cs.Finding:
     """Does a consistent pose cost much more than the EKF?"""
     right = table[(table["status"] == "consistent") & (table["realisable"] == "yes")].sort_values("cost")
-    parts = [f"{r.filter} {r.cost:.2f} times {REFERENCE}, RMSE {r.rmse:.3f} m" for r in right.itertuples()]
+    parts = [
+        f"{r['filter']} {r['cost']:.2f} times {REFERENCE}, RMSE {r['rmse']:.3f} m" for r in right.to_dict("records")
+    ]
     return study.finding(
         len(right) > 0 and bool(right["cost"].iloc[0] <= COST),
         scenario=WORLD,

@@ -149,12 +149,13 @@ def _joint(slam: Slam, state: State, local: NamedTuple) -> Array:
         to_error(slam.error, pose, values, D[i, :, :r], D[i, :, r:])
         for a in range(r + w):
             at[i, a] = pose_at + a if a < r else o + a - r
-    joint, rows = np.empty((3 * count, 3 * count)), np.empty((3, state.n))
+    n = at.max() + 1
+    joint, rows = np.empty((3 * count, 3 * count)), np.empty((3, n))
     for i in range(count):
         fill_matrix(rows, 0.0)
         for b in range(r + w):
             p = at[i, b]
-            for q in range(state.n):
+            for q in range(n):
                 value = P[min(p, q), max(p, q)]
                 for a in range(3):
                     rows[a, q] += D[i, a, b] * value
@@ -253,7 +254,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     full_rank, step, code = False, 0, 0
     for k in range(T):
         labels = data.landmark[data.first[k] : data.first[k + 1]]
-        state = prepare(slam.covariance, slam, whole, state, labels, local)
+        whole, state = prepare(slam.covariance, slam, whole, state, labels, local)
         state, code, m, nis = _step(slam, state, data, k, local, work)
         if m > 0:
             out.nis[k], out.nis_dof[k] = nis, OBSERVED * m

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from consistency.diagnostics import Interval, Verdict
+from consistency.diagnostics import Interval, MapScore, Verdict
 from consistency.diagnostics.export import map_text
 from consistency.diagnostics.monitor import CAVEAT, accepted_scales
 from consistency.diagnostics.wording import short
@@ -88,10 +88,22 @@ def _below(verdicts: dict[str, Verdict]) -> list[str]:
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
-    maps = [f"{name} {map_text(v.map)}" for name, v in verdicts.items() if v.map is not None and v.map.landmarks]
+    maps = {name: v.map for name, v in verdicts.items() if v.map is not None and v.map.landmarks}
     if maps:
-        lines.append(f"map after the last step, mean NEES / 3, not judged: {', '.join(maps)}")
+        judged = "" if any(m.verdict is not None for m in maps.values()) else ", not judged"
+        scores = "; ".join(f"{name} {_map_cells(m)}" for name, m in maps.items())
+        lines.append(f"map after the last step, mean NEES / 3{judged}: {scores}")
     return lines
+
+
+def _map_cells(m: MapScore) -> str:
+    """NEES of landmarks over 3, and the verdict on the map with the ratio of pose and map together."""
+    text = map_text(m)
+    if m.verdict is None:
+        return text
+    joint = m.verdict.joint
+    together = "" if joint is None or not joint.runs else f" (together with the pose {short(joint.both.value)})"
+    return f"{m.verdict.status}, {text}{together}"
 
 
 def print_findings(findings: Sequence[Finding]) -> None:

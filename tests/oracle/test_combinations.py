@@ -297,6 +297,10 @@ def test_the_map_is_that_of_the_twin(small: Small, name: str) -> None:
     for label, mean, P in zip(ours.landmarks, ours.mean, ours.covariance, strict=True):
         assert close(mean, twin[label].mean, 1e-10)
         assert np.abs(P - twin[label].covariance).max() <= 1e-10 * np.abs(P).max()
+    joint, rows = filter_.twin.joint(state), np.append(0, 1 + np.argsort(list(twin)))
+    rows = (3 * rows[:, None] + np.arange(3)).ravel()
+    assert close(joint.mean[rows], np.append(filter_.pose(state).mean, ours.mean), 1e-10)
+    assert np.abs(ours.joint - joint.covariance[np.ix_(rows, rows)]).max() <= 1e-10 * np.abs(ours.joint).max()
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -49,23 +49,23 @@ def _main(
 @app.command("list")
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
     """Scenarios, filters and experiments."""
-    from consistency.filters import BOUNDS, filter_names
+    from consistency.filters import BOUNDS, filter_summaries
     from consistency.runs.findings import experiment_summaries
     from consistency.scenario import load_scenario, scenario_names
 
     scenarios = {name: load_scenario(name).summary for name in scenario_names()}
-    experiments = experiment_summaries()
+    experiments, filters = experiment_summaries(), filter_summaries()
     if as_json:
-        print(json.dumps({"scenarios": scenarios, "filters": filter_names(), "experiments": experiments}, indent=2))
+        listed = {"scenarios": scenarios, "filters": list(filters), "experiments": experiments}
+        print(json.dumps(listed | {"filter_summaries": filters}, indent=2))
         return
-    for title, entries in (("Scenarios", scenarios), ("Experiments", experiments)):
+    marked = {name: f"{text}{' (not realisable)' * (name in BOUNDS)}" for name, text in filters.items()}
+    for title, entries in (("Scenarios", scenarios), ("Experiments", experiments), ("Filters", marked)):
         print(title)
         width = max((len(name) for name in entries), default=0)
         for name, summary in entries.items():
             print(f"  {name:<{width}}  {summary}")
         print()
-    marked = (f"{name}  (a bound, not realisable)" if name in BOUNDS else name for name in filter_names())
-    print("Filters\n  " + "\n  ".join(marked))
 
 
 @app.command()

@@ -51,6 +51,7 @@ MODULES: dict[str, tuple[str, str, str]] = {
         "PARKED",
         "robot-centred map, with landmarks out of sight parked at clones of the pose",
     ),
+    "eqf-uvd": ("methods.equivariant", "FILTER", "Equivariant filter: robot-centred map with polar errors, on pixels"),
     "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ", "EKF of the library filterpy, on points"),
     "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD", "EKF of the library filterpy, on pixels"),
     "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ", "UKF of the library filterpy, on points"),

@@ -52,6 +52,8 @@ MODULES: dict[str, tuple[str, str, str]] = {
         "robot-centred map, with landmarks out of sight parked at clones of the pose",
     ),
     "eqf-uvd": ("methods.equivariant", "FILTER", "Equivariant filter: robot-centred map with polar errors, on pixels"),
+    "submap-ekf-xyz": ("methods.submaps", "XYZ", "EKF in small maps that are joined, on points"),
+    "submap-ekf-uvd": ("methods.submaps", "UVD", "EKF in small maps that are joined, on pixels"),
     "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ", "EKF of the library filterpy, on points"),
     "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD", "EKF of the library filterpy, on pixels"),
     "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ", "UKF of the library filterpy, on points"),

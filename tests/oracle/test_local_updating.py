@@ -28,6 +28,7 @@ ALL = [
     ("ukf-uvd", "herath2007-stereo"),
     ("debiased-ekf-xyz", "herath2007-stereo"),
     ("ispkf-uvd", "herath2007-stereo"),
+    ("parked-ekf-uvd", "herath2007-stereo"),
 ]
 
 

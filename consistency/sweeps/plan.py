@@ -145,14 +145,18 @@ def _folder_name(axes: Sequence[Axis], at: Sequence[int]) -> str:
 # --- reading ----------------------------------------------------------------------------------------
 
 
+def _shipped() -> Path:
+    return data_folder("experiments") / "sweeps"
+
+
 def sweep_names() -> list[str]:
     """Names of the built-in sweeps."""
-    return sorted(path.stem for path in data_folder("sweeps").glob("*.toml"))
+    return sorted(path.stem for path in _shipped().glob("*.toml"))
 
 
 def sweep_summaries() -> dict[str, str]:
     """What each built-in sweep is for."""
-    return {name: read_table(data_folder("sweeps") / f"{name}.toml", SweepFile).summary for name in sweep_names()}
+    return {name: read_table(_shipped() / f"{name}.toml", SweepFile).summary for name in sweep_names()}
 
 
 def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
@@ -169,7 +173,7 @@ def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
     """
     path = Path(name)
     if str(name) in sweep_names():
-        path = data_folder("sweeps") / f"{name}.toml"
+        path = _shipped() / f"{name}.toml"
     elif path.suffix != ".toml":
         near = difflib.get_close_matches(str(name), sweep_names(), n=1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""

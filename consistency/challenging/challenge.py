@@ -26,7 +26,7 @@ from consistency.verdicts.judge import analyse, refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
 SIZE_QUESTIONS = (*SCALE, "outliers")  # what a confirmation needs a fault in: errors that are too large
-SEARCH, GO_ON, SHRINK = 0.5, 0.8, 0.8  # of the budget, spent when these end; going on if nothing is clearly wrong
+SEARCH, GO_ON, SHRINK = 0.4, 0.8, 0.8  # of the budget, spent when these end; going on if nothing is clearly wrong
 CONFIRM = 0.15  # of the time, the most that the confirmation may take in a world that is searched
 CHECKS = (6, 12, 24)  # trials after which a smaller world is given up or kept
 SURE = 2.0  # standard errors from the limit
@@ -117,7 +117,7 @@ def is_overconfident(verdict: Verdict) -> bool:
     any question with probability ``false_alarm`` or less if the covariance is right. A breakdown is a fact and needs no
     test.
     """
-    if verdict.status == "failed":
+    if verdict.failures or verdict.status == "failed":
         return True
     return verdict.statistic > len(POSE) and any(question in SIZE_QUESTIONS for question in verdict.faults)
 
@@ -187,6 +187,7 @@ class _Campaign:
         self.slowest = np.inf if seconds is None else CONFIRM * seconds * bench.workers / plan.runs  # for one trial
         self.tried: dict[Point, Candidate] = {}
         self.checked: dict[Point, list[float]] = {}
+        self.unusable = set[Point]()
         self.told = time.monotonic()
 
     def run(self) -> Challenge:
@@ -199,11 +200,10 @@ class _Campaign:
         world = self.space.world(point, f"challenge-{name}")
         results = run_trials(world, [self.bench.filter], plan.runs, self.confirm_seed, plan.jobs)
         verdict = analyse(results, settings=Settings(plan.false_alarm))[name]
-        unusable = sum(not candidate.usable for candidate in self.tried.values())
         return Challenge(
             name, plan, self.space, worst, np.exp(np.mean(self.checked.get(worst) or self.tried[worst].scores)),
-            limit is not None, point, world, verdict, len(self.tried) - unusable, self.budget.used, unusable,
-            self.budget.elapsed,
+            limit is not None, point, world, verdict, len({*self.tried, *self.checked} - self.unusable),
+            self.budget.used, len(self.unusable), self.budget.elapsed,
         )  # fmt: skip
 
     def search(self) -> tuple[Point, float | None]:
@@ -229,16 +229,21 @@ class _Campaign:
         ready = []
         for candidate in candidates:
             world = scenario_of(self.space, candidate.point)
-            candidate.usable = world is not None
+            self._mark(candidate, world is not None)
             ready += [] if world is None else [(candidate, (world, range(len(candidate.scores), trials)))]
         until = self.budget.until(GO_ON)
         for (candidate, _), done in zip(
             ready, self.bench([job for _, job in ready], self.search_seed, until), strict=True
         ):
-            candidate.usable = done is not None and done.seconds <= self.slowest
+            self._mark(candidate, done is not None and done.seconds <= self.slowest)
             candidate.scores += [] if done is None else done.scores
             self.budget.used += 0 if done is None else len(done.scores)
         self.tell("searching")
+
+    def _mark(self, candidate: Candidate, usable: bool) -> None:
+        candidate.usable = usable
+        if not usable:
+            self.unusable.add(candidate.point)
 
     def check(self, point: Point, trials: int) -> list[float]:
         """Scores of a point on trials that the search has not seen, up to this number or the end of the time."""
@@ -247,6 +252,8 @@ class _Campaign:
         if world is not None and len(scores) < trials:
             jobs = self.bench.split(world, range(len(scores), trials))
             for done in self.bench(jobs, self.shrink_seed, self.budget.until(SHRINK)):
+                if done is None or done.seconds > self.slowest:
+                    self.unusable.add(point)
                 scores += [] if done is None else done.scores
                 self.budget.used += 0 if done is None else len(done.scores)
         return scores
@@ -256,7 +263,7 @@ class _Campaign:
         for trials in CHECKS:
             scores = self.check(point, trials)
             self.tell("shrinking")
-            if len(scores) < trials:
+            if len(scores) < trials or point in self.unusable:
                 return False
             error = SURE * standard_error(scores)
             if np.mean(scores) + error < limit:

@@ -2,9 +2,12 @@
 
 Points come in batches. The first batch, and a quarter of each later one, fills the unit cube evenly (Halton's
 sequence); the rest varies the best points so far by differential mutation and crossover (Storn & Price 1997). A batch
-is raced by successive halving (Jamieson & Talwalkar 2016): two trials for each point, twice as many for the better half,
-and so on. Awad, Mallik & Hutter (2021) combine the two likewise. Mixed dimensions need nothing of their own: all are places in the
-unit cube. Optimisers of SciPy know neither noise nor partial evaluations, and Hypothesis' ``target`` has no time limit.
+is raced by successive halving (Jamieson & Talwalkar 2016): two trials for each point, twice as many for the better
+half, and so on. Awad, Mallik & Hutter (2021) combine the two likewise. Mixed dimensions need nothing of their own: all
+are places in the unit cube.
+
+The sampler is SciPy's. Its optimisers know neither noise nor evaluations that are broken off, and Hypothesis'
+``target`` has no time limit.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from consistency.types import Array
 
 BATCH = 16  # points raced against each other
 RUNGS = (2, 4, 8, 16)  # trials of a point in all, at each of which the worse half is left behind
+HOPELESS = 8 * BATCH  # points none of which is usable: there will be no other
 ELITE = 8  # points that are varied
 EVEN = 4  # points of a batch that fill the space
 STEP, CROSSOVER, JITTER = 0.7, 0.5, 0.05  # of the variation; the first two within the usual ranges of the method
@@ -97,6 +101,8 @@ def search(
             break
         tried |= {candidate.point: candidate for candidate in batch}
         _race(batch, evaluate, left)
+        if len(tried) >= HOPELESS and not any(candidate.usable for candidate in tried.values()):
+            break
 
 
 def ranked(candidates: Iterable[Candidate]) -> list[Candidate]:

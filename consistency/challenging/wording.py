@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from consistency.challenging.challenge import Challenge
+from consistency.diagnostics.wording import p_text
 from consistency.errors import InputError
 from consistency.scenario import scenario_text
 from consistency.store.atomic import write_whole
@@ -32,7 +33,7 @@ def lines(outcome: Challenge, out: Path) -> list[str]:
     rate += "" if outcome.clear else "; not shrunk, for its trials were not clear enough"
     return [
         f"{outcome.filter} is overconfident in {outcome.space.text(outcome.point)}",
-        f"  confirmed: {tested}, {_p_text(outcome.p_value)}; {rate}",
+        f"  confirmed: {tested}, {p_text(outcome.p_value)}; {rate}",
         f"  worst: {worst}",
         f"  searched: {searched}",
         f"  {out} has the world; again: {command(outcome, out)}",
@@ -112,10 +113,6 @@ def write_scenario(outcome: Challenge, out: Path) -> None:
         write_whole(out, text.encode("utf-8"))
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written ({error.strerror})") from None
-
-
-def _p_text(p_value: float) -> str:
-    return f"p = {p_value:.2g}" if not p_value < 1e-12 else "p < 1e-12"
 
 
 def _duration(seconds: float) -> str:

@@ -291,7 +291,7 @@ def _landmarks(truth: Truth, values: Mapping[str, Value]) -> dict[str, Any]:
 
 def _path(shape: str, truth: Truth) -> Path_:
     """A path of another shape, as long as that of the base and about the same centre, with sides of 8 to 5."""
-    length, (x, y) = lap_length(truth.path), np.round(_extent(truth).mean(axis=1), 2)
+    length, (x, y) = lap_length(truth.path), np.round(_extent(truth).mean(axis=1), 1)
     speed = truth.path.speed
     if shape == "circle":
         radius = round(length / (2 * np.pi), 2)

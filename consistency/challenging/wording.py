@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from consistency.challenging.challenge import Challenge
 from consistency.diagnostics.wording import p_text
 from consistency.errors import InputError
@@ -29,11 +31,12 @@ def lines(outcome: Challenge, out: Path) -> list[str]:
             f"  that world: {tested}",
             f"  searched: {searched}; no proof that there is no such world",
         ]
+    p = f", p {p_text(outcome.p_value)}" if np.isfinite(outcome.p_value) else ""
     rate = f"a right filter is found so in at most {plan.false_alarm:.3g} of challenges"
     rate += "" if outcome.clear else "; not shrunk, for its trials were not clear enough"
     return [
         f"{outcome.filter} is overconfident in {outcome.space.text(outcome.point)}",
-        f"  confirmed: {tested}, {p_text(outcome.p_value)}; {rate}",
+        f"  confirmed: {tested}{p}; {rate}",
         f"  worst: {worst}",
         f"  searched: {searched}",
         f"  {out} has the world; again: {command(outcome, out)}",

@@ -148,7 +148,7 @@ def challenge(
     space = space_of(scenario, within)
     with Bench(instance, plan.jobs) as bench:
         bench.compile(corners(space))
-        return _Campaign(bench, space, plan).run()
+        return Campaign(bench, space, plan).run()
 
 
 def base_of(filter_: Filter) -> Scenario:
@@ -176,7 +176,7 @@ def scenario_of(space: Space, point: Point) -> Scenario | None:
         return None
 
 
-class _Campaign:
+class Campaign:
     """One challenge: the counts, and the phases in order."""
 
     def __init__(self, bench: Bench, space: Space, plan: Plan) -> None:

@@ -27,7 +27,7 @@ from consistency.verdicts.judge import analyse, refused
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
 SIZE_QUESTIONS = (*SCALE, "outliers")  # what a confirmation needs a fault in: errors that are too large
 SEARCH, GO_ON, SHRINK = 0.4, 0.8, 0.8  # of the budget, spent when these end; going on if nothing is clearly wrong
-CONFIRM = 0.15  # of the time, the most that the confirmation may take in a world that is searched
+CONFIRM = 0.2  # of the time, the most that the confirmation may take in a world that is searched
 CHECKS = (6, 12, 24)  # trials after which a smaller world is given up or kept
 SURE = 2.0  # standard errors from the limit
 KEPT = 0.5  # of the worst world's score that a smaller one has to keep

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class Plan:
     """
 
     minutes: float | None = 5.0  # None: ``trials`` count instead
-    trials: int | None = None  # of search and shrinking together
+    trials: int | None = None  # of search and shrinking together, at most
     seed: int = 0
     jobs: int = -1
     false_alarm: float = 0.05  # chance that a challenge finds a right filter overconfident
@@ -195,7 +196,7 @@ class Campaign:
         point, limit = worst, _ = self.search()
         if limit is not None:
             self.tell("shrinking", now=True)
-            point = shrink(self.space, worst, lambda p: self.holds(p, limit), lambda: self.budget.left(SHRINK))
+            point = shrink(self.space, worst, lambda p: self.holds(p, limit), partial(self.budget.left, SHRINK))
         self.tell(f"confirming on {plan.runs} fresh runs", now=True)
         world = self.space.world(point, f"challenge-{name}")
         results = run_trials(world, [self.bench.filter], plan.runs, self.confirm_seed, plan.jobs)
@@ -210,7 +211,7 @@ class Campaign:
         """The worst point, and the mean score that smaller ones must keep; None if it is not clearly overconfident."""
         rng = np.random.default_rng(self.search_seed)
         for share in (SEARCH, GO_ON):  # nothing clearly wrong: more search is worth more than shrinking
-            search(self.space, self.evaluate, lambda end=share: self.budget.left(end), rng, self.tried)  # type: ignore[misc]
+            search(self.space, self.evaluate, partial(self.budget.left, share), rng, self.tried)
             usable = ranked(self.tried.values())
             if not usable:
                 raise InputError(

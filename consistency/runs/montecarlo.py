@@ -164,6 +164,15 @@ def worker_count(jobs: int) -> int:
     return jobs if jobs > 0 else int(joblib.cpu_count())
 
 
+def compile_for(filters: Sequence[Filter], trial: Trial, belief: Belief) -> None:
+    """Compile what the filters need for ``trial`` and is not yet compiled, and say so."""
+    for filter_ in filters:
+        if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, belief):
+            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, KERNELS) as advance:
+                filter_.compile(trial, belief)
+                advance(1)
+
+
 # --- the work --------------------------------------------------------------------------------------
 
 
@@ -187,12 +196,7 @@ class _Work:
 
     def compile(self, run: int) -> None:
         """Compile what a run needs and is not yet compiled, and say so."""
-        trial = self.make_trial(run)
-        for filter_ in self.filters:
-            if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, self.belief):
-                with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, KERNELS) as advance:
-                    filter_.compile(trial, self.belief)
-                    advance(1)
+        compile_for(self.filters, self.make_trial(run), self.belief)
 
     def outcomes(self, runs: list[int]) -> Outcomes:
         """In order of the runs, whoever does them; BLAS has one thread in each worker, for the bits depend on it."""

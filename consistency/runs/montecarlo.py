@@ -26,7 +26,7 @@ from consistency.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.store.log import Log, write_log
 from consistency.store.results import Outcome, Results, StoredResults, Tables, outcome_of
 from consistency.store.storage import NewFolder, manifest_of, require_free
-from consistency.terminal.progress import progress
+from consistency.terminal.progress import KERNELS, progress
 from consistency.types import Trial
 
 Outcomes = Generator[Outcome, None, None]
@@ -168,7 +168,7 @@ def compile_for(filters: Sequence[Filter], trial: Trial, belief: Belief) -> None
     """Compile what the filters need for ``trial`` and is not yet compiled, and say so."""
     for filter_ in filters:
         if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, belief):
-            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
+            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, KERNELS) as advance:
                 filter_.compile(trial, belief)
                 advance(1)
 

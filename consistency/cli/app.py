@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import typer
 
-from consistency.cli.challenging import challenge
 from consistency.errors import InputError
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
@@ -512,9 +511,6 @@ def monitor(
         print_watched(watched)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
-
-
-app.command()(challenge)
 
 
 def main(arguments: list[str] | None = None) -> Any:

@@ -49,7 +49,7 @@ def _main(
 @app.command("list")
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
     """Scenarios, filters and experiments."""
-    from consistency.filters import BOUNDS, filter_names
+    from consistency.filters import BOUNDS, SMOOTHERS, filter_names
     from consistency.runs.findings import experiment_summaries
     from consistency.scenario import load_scenario, scenario_names
 
@@ -64,8 +64,10 @@ def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")]
         for name, summary in entries.items():
             print(f"  {name:<{width}}  {summary}")
         print()
-    marked = (f"{name}  (a bound, not realisable)" if name in BOUNDS else name for name in filter_names())
-    print("Filters\n  " + "\n  ".join(marked))
+    marks = dict.fromkeys(BOUNDS, "  (a bound, not realisable)") | dict.fromkeys(
+        SMOOTHERS, "  (a bound, all data at once)"
+    )
+    print("Filters\n  " + "\n  ".join(name + marks.get(name, "") for name in filter_names()))
 
 
 @app.command()

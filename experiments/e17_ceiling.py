@@ -62,8 +62,8 @@ def judged(study: cs.Study, path: str, reach: float, density: float) -> list[tup
     last = results.estimates[results.estimates["step"] == results.estimates["step"].max()]
     last = last.merge(results.truth, on=["run", "step"], suffixes=("", "_true"))
     last["squared"] = (last["x"] - last["x_true"]) ** 2 + (last["y"] - last["y_true"]) ** 2
-    squared = last.pivot(index="run", columns="filter", values="squared").dropna()
-    nees = last.pivot(index="run", columns="filter", values="nees").loc[squared.index]
+    squared = last.pivot_table("squared", "run", "filter").dropna()
+    nees = last.pivot_table("nees", "run", "filter").loc[squared.index]
     failed = results.failures["filter"].value_counts()
     best = squared[CEILING].to_numpy()
     return [

@@ -27,6 +27,7 @@ class Corrections(NamedTuple):
     turning: bool = True
     truncation: bool = True
     debiasing: bool = True
+    prediction: bool = True  # noise of what is observed taken where it is predicted, not where it was measured
     iteration: bool = True
 
 
@@ -175,7 +176,7 @@ def observed(z: Array, expected: Array, sensor: BelievedSensor, which: Correctio
     if which.truncation:
         range_ = searched(sensor, "robot-centred")
         z[:, 2], variance[:, 2] = untruncated(z[:, 2], at[:, 2], sensor.sigma[2], range_)
-    y, J = converted(z, sensor)[0], converted(at, sensor)[1]
+    y, J = converted(z, sensor)[0], converted(at if which.prediction else z, sensor)[1]
     if which.debiasing:
         y -= bias(z, sensor)
     return y, (J * variance[:, None]) @ np.swapaxes(J, 1, 2)

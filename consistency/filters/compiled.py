@@ -19,6 +19,7 @@ from consistency.filters.kernel.loop import Outcome, trial_kernel
 from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
 from consistency.filters.plain import sensor_noise
 from consistency.filters.upkeep.local import LOCAL_FROM, Local
+from consistency.filters.upkeep.parking import Parking
 from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Problem, Truth
 from consistency.scenario import Belief
@@ -149,6 +150,8 @@ class Compiled:
 
     def _with_upkeep(self, slam: Slam, most: int) -> Slam:
         """Local updating, which takes longer to compile, only in a world in which the state may grow so large."""
+        if isinstance(slam.covariance, Parking):
+            slam = slam._replace(covariance=slam.covariance._replace(start=self.local_from))
         local = slam._replace(covariance=Local(self.local_from))
         slam = local if most >= self.local_from and fits(local) else slam
         require_fitting(slam)

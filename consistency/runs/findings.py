@@ -37,6 +37,7 @@ class Study:
     Parameters
     ----------
     runs, seed, jobs : as in :func:`consistency.run_trials`
+    only : ids of the findings that are wanted; none for all of them
 
     Raises
     ------
@@ -44,12 +45,16 @@ class Study:
         ``jobs`` is out of range.
     """
 
-    def __init__(self, runs: int = 50, seed: int = 0, jobs: int = -1) -> None:
-        self.runs, self.seed, self.jobs = runs, seed, jobs
+    def __init__(self, runs: int = 50, seed: int = 0, jobs: int = -1, *, only: Sequence[str] = ()) -> None:
+        self.runs, self.seed, self.jobs, self.only = runs, seed, jobs, only
         self.workers = worker_count(jobs)
         self.kept: dict[str, Results] = {}
         self.tables: dict[str, pd.DataFrame] = {}
         self._judged: dict[tuple[str, str], tuple[Verdict, Curves]] = {}
+
+    def wants(self, finding: str) -> bool:
+        """Whether a finding is asked for; one that takes long and is not need not be worked out."""
+        return not self.only or finding in self.only
 
     def results(self, scenario: str | Scenario, filters: Sequence[str]) -> Results:
         """Results of all ``filters`` so far on a scenario; only those not yet run are run."""
@@ -170,7 +175,7 @@ def reproduce(
     """
     selection = _selection(experiments(), only or (), long)
     require_free(out, overwrite, "findings")
-    study, started = Study(runs, seed, jobs), time.monotonic()
+    study, started = Study(runs, seed, jobs, only=only or ()), time.monotonic()
     findings = _findings_of(study, selection)
     study.write(out, findings, time.monotonic() - started, overwrite)
     return findings

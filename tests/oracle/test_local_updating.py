@@ -26,6 +26,7 @@ ALL = [
     ("ekf-uvd", "herath2007-stereo"),
     ("ukf-xyz", "herath2007-xyz"),
     ("ukf-uvd", "herath2007-stereo"),
+    ("parked-ekf-uvd", "herath2007-stereo"),
 ]
 
 

@@ -134,7 +134,7 @@ CLOSING = {  # a lap in 150 steps: what was parked is seen again
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("left_out", ["nothing", "parking", "turning", "truncation", "debiasing", "iteration"])
+@pytest.mark.parametrize("left_out", ["nothing", *centred.Corrections._fields])
 def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any], left_out: str) -> None:
     changes = {"truth__sensor__mount": tilted, "belief__sensor__mount": tilted}
     scenario = small("herath2007-stereo", **CLOSING, **changes)
@@ -155,6 +155,29 @@ def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any
     assert (left_out == "nothing") == bool(np.array_equal(ours.pose, whole.pose))  # each correction does something
 
 
+@pytest.mark.parametrize("local_from", [10, 40])
+def test_updating_locally_changes_no_number_round_a_loop(
+    monkeypatch: pytest.MonkeyPatch, small: Small, local_from: int
+) -> None:
+    """Clones are called back, freed and taken again while the rest is passive."""
+    scenario = small("herath2007-stereo", **CLOSING)
+    filter_ = rc.compiled(rc.RobotCentredKalman("trial", centred.Corrections()))
+    for run in range(3):
+        trial = cs.simulate(scenario, run=run)
+        said = []
+        for each in (local_from, 10**9):
+            monkeypatch.setattr(filter_, "local_from", each)
+            said.append(filter_.run(trial, scenario.belief))
+        local, dense = said
+        size = np.abs(dense.covariance).max(axis=(1, 2), keepdims=True)
+        assert np.abs(local.pose - dense.pose).max() < 1e-10
+        assert (np.abs(local.covariance - dense.covariance) / size).max() < 1e-9
+        assert np.nanmax(np.abs(local.nis - dense.nis) / np.maximum(dense.nis, 1.0)) < 1e-9
+        assert np.allclose(local.map.mean, dense.map.mean, rtol=1e-9, atol=1e-11)
+        assert np.allclose(local.map.covariance, dense.map.covariance, rtol=1e-7, atol=1e-12)
+        assert not np.array_equal(local.covariance, dense.covariance), "nothing was updated locally"
+
+
 def test_landmarks_are_parked_and_come_back(small: Small) -> None:
     scenario = small("herath2007-stereo", **CLOSING)
     trial, filter_ = cs.simulate(scenario, run=3), rc.RobotCentredKalman("trial", centred.Corrections())
@@ -173,7 +196,7 @@ def test_landmarks_are_parked_and_come_back(small: Small) -> None:
 
 def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
     clones = make_clones(Parking(50, 20), 3, 3, 12, 100, 2)
-    clones.of[:], clones.uses[0], clones.at[0] = 0, 2, 9
+    clones.of[:], clones.uses[0], clones.here[0] = 0, 2, 9
     state = State(np.ones(12), np.ones((12, 12)), 12, 0, np.array([3, 6]))
     unpark(0, state, clones)
     assert clones.uses[0] == 1

@@ -131,6 +131,14 @@ def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTupl
     A, y = work.A[:rows, :n], work.A[:rows, n + base]
     retract(slam.error, slam, state, A, y, work)
     subtract_gram(state.P, n, robot_width(slam.motion), A)
+    apply_beyond(state, m, local, work)
+
+
+@inner
+def apply_beyond(state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
+    """Phi, Psi and theta <- what a correction of the active part says of the rest."""
+    rows, n, base = OBSERVED * m, state.n, state.base
+    A, y = work.A[:rows, :n], work.A[:rows, n + base]
     if base > 0:
         beyond = work.A[:rows, n : n + base]
         add_product_of_transposed(-1.0, A, beyond, local.Phi[:n, :base])

@@ -215,7 +215,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     full_rank, step, code = False, 0, 0
     for k in range(T):
         labels = data.landmark[data.first[k] : data.first[k + 1]]
-        state = prepare(slam.covariance, slam, whole, state, labels, local)
+        whole, state = prepare(slam.covariance, slam, whole, state, labels, local)
         state, code, m, nis = _step(slam, state, data, k, local, work)
         if m > 0:
             out.nis[k], out.nis_dof[k] = nis, OBSERVED * m

@@ -354,8 +354,11 @@ def make_local(covariance: NamedTuple, r: int, w: int, n: int, steps: int, n_lan
 @generic()
 def prepare(
     covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: NamedTuple
-) -> State:
-    """The variables to work on in a step in which the landmarks ``labels`` (m,) are seen: all of them, or a part."""
+) -> tuple[State, State]:
+    """The whole state, and the variables to work on in a step that sees the landmarks ``labels`` (m,): all, or a part.
+
+    The whole may grow by what is neither robot nor landmark.
+    """
     raise NotImplementedError
 
 

@@ -9,11 +9,12 @@ a clone of the pose, and is carried over at once, by an iterated update, when it
 
 The error of pose and clones in that update is right-invariant, T_true = Exp(xi) T. With M(p) the matrix that takes
 (dp, dheading) to xi, and J_l the left Jacobian of SE(2), a covariance about T holds about Exp(xi) T after a turn by
-M(p+)^-1 J_l(xi) M(p-).
+M(p+)^-1 J_l(xi) M(p-). That is done to the pose; for a clone T stays where it was, and xi is in the state.
 
 Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
 its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not
-the conversion of the mean, to second order in the noise of u and v.
+the conversion of the mean, to second order in the noise of u and v. The noise of the conversion is taken where the
+observation is predicted: taken where it was measured, it would give more weight to errors of one sign.
 """
 
 from __future__ import annotations
@@ -58,14 +59,15 @@ TEMPERED = 2.0  # decades by which the noise of parked landmarks is raised in th
 class CentredState:
     """Pose and blocks of three: clones of the pose, and landmarks, active or parked at a clone."""
 
-    x: Array  # (n,)
-    P: Array  # (n, n), of dp, dheading; xi of a clone; a, e, rho of a landmark
+    x: Array  # (n,), the pose; xi of a clone; a, e, rho of a landmark
+    P: Array  # (n, n), of dp, dheading; and of the errors of these
     problem: Problem
     step: int = 0
     places: dict[int, int] = field(default_factory=dict)  # offset of each landmark by label
     seen: dict[int, int] = field(default_factory=dict)  # step at which each was seen last
     parked: dict[int, int] = field(default_factory=dict)  # number of the clone at which a landmark is parked, by label
     clones: dict[int, int] = field(default_factory=dict)  # offset of each clone by number
+    origins: dict[int, Array] = field(default_factory=dict)  # pose T (3,) of each, which is Exp(xi) T
 
 
 class RobotCentredKalman:
@@ -120,7 +122,7 @@ class RobotCentredKalman:
 
     def _correct(self, state: CentredState, seen: list[int], z: Array) -> tuple[CentredState, Info]:
         delta, shifts = np.zeros(len(state.x)), _shifts(state)
-        deviation = np.sqrt(np.diag(shifts @ state.P @ shifts.T))
+        deviation, involved = np.sqrt(np.diag(shifts @ state.P @ shifts.T)), _involved(state, seen)
         is_parked = np.array([label in state.parked for label in seen])
         is_iterated = self.which.iteration and bool(is_parked.any())
         expected = np.zeros((len(seen), 3))
@@ -137,13 +139,12 @@ class RobotCentredKalman:
             innovation = gap.ravel() + H @ delta
             S, W = plain.gain(state.P, H, plain.block_diagonal(R))
             before, delta = delta, W @ innovation
-            if i >= 2 * TEMPERED and np.all(np.abs(shifts @ (delta - before)) <= SETTLED * deviation):
+            if i >= 2 * TEMPERED and np.all((np.abs(shifts @ (delta - before)) <= SETTLED * deviation)[involved]):
                 break
         after = _moved_by(state, delta)
         P = state.P - W @ S @ W.T
         if self.which.turning:
-            turned = state if is_parked.any() else replace(state, clones={})
-            T = np.linalg.inv(_shifts(after)) @ _tangent(turned, delta)
+            T = np.linalg.inv(_shifts(after)) @ _tangent(state, delta)
             P = T @ P @ T.T
         after = replace(after, P=P)
         return _activated(after, [label for label in seen if label in state.parked]), Info(innovation, S, W)
@@ -169,12 +170,17 @@ def _block(at: int) -> slice:
 
 
 def _moved_by(state: CentredState, delta: Array) -> CentredState:
-    """The state moved by an error (n,): pose and clones by Exp, landmarks by a sum."""
+    """The state moved by an error (n,): the pose by Exp, all else by a sum."""
     x = state.x + delta
     x[:3] = moved(state.x[:3], shift_matrix(state.x[:3]) @ delta[:3])
-    for at in state.clones.values():
-        x[_block(at)] = moved(state.x[_block(at)], delta[_block(at)])
     return replace(state, x=x)
+
+
+def _involved(state: CentredState, seen: list[int]) -> Array:
+    """Indices of the pose, of the landmarks ``seen``, and of the clones of those that are parked."""
+    starts = [0, *(state.places[label] for label in seen)]
+    starts += [state.clones[state.parked[label]] for label in seen if label in state.parked]
+    return np.unique(np.add.outer(starts, np.arange(3)))
 
 
 def _shifts(state: CentredState) -> Array:
@@ -185,25 +191,29 @@ def _shifts(state: CentredState) -> Array:
 
 
 def _tangent(state: CentredState, delta: Array) -> Array:
-    """(n, n), d xi about the moved state / d error about ``state``, at the error ``delta``."""
+    """(n, n), d xi of the pose about the moved state / d error about ``state``, at ``delta``; else the identity."""
     T = _shifts(state)
     T[:3, :3] = left_jacobian(T[:3, :3] @ delta[:3]) @ T[:3, :3]
-    for at in state.clones.values():
-        T[_block(at), _block(at)] = left_jacobian(delta[_block(at)])
     return T
 
 
+def _clone(state: CentredState, number: int) -> tuple[slice, Array, Array]:
+    """Where a clone is in the state, its pose (3,), and d xi about that pose / d xi about its origin (3, 3)."""
+    at = _block(state.clones[number])
+    return at, moved(state.origins[number], state.x[at]), left_jacobian(state.x[at])
+
+
 def _expected(state: CentredState, seen: list[int]) -> tuple[Array, Array]:
-    """What is expected of landmarks, (m, 3), and its Jacobian (3 m, n) with respect to xi of pose and clones."""
+    """What is expected of landmarks, (m, 3), and its Jacobian (3 m, n), by xi of the pose about this state."""
     h, H = np.zeros((len(seen), 3)), np.zeros((3 * len(seen), len(state.x)))
     for i, label in enumerate(seen):
         rows, at = _block(3 * i), _block(state.places[label])
         if label not in state.parked:
             h[i], H[rows, at] = state.x[at], np.eye(3)
             continue
-        clone = _block(state.clones[state.parked[label]])
-        h[i], H[rows, at], by_shift = _seen_from(state, state.x[clone], state.x[at])
-        H[rows, clone], H[rows, :3] = by_shift, -by_shift
+        clone, pose, J = _clone(state, state.parked[label])
+        h[i], H[rows, at], by_shift = _seen_from(state, pose, state.x[at])
+        H[rows, clone], H[rows, :3] = by_shift @ J, -by_shift
     return h, H
 
 
@@ -225,9 +235,9 @@ def _activated(state: CentredState, labels: list[int]) -> CentredState:
     x, T = state.x.copy(), np.eye(len(state.x))
     M = shift_matrix(x[:3])
     for label in labels:
-        at, clone = _block(state.places[label]), _block(state.clones[state.parked[label]])
-        x[at], T[at, at], by_shift = _seen_from(state, state.x[clone], state.x[at])
-        T[at, clone], T[at, :3] = by_shift, -by_shift @ M
+        at, (clone, pose, J) = _block(state.places[label]), _clone(state, state.parked[label])
+        x[at], T[at, at], by_shift = _seen_from(state, pose, state.x[at])
+        T[at, clone], T[at, :3] = by_shift @ J, -by_shift @ M
     parked = {label: number for label, number in state.parked.items() if label not in labels}
     state = replace(state, x=x, P=T @ state.P @ T.T, parked=parked)
     for number in set(state.clones) - set(parked.values()):
@@ -255,24 +265,25 @@ def _parked(state: CentredState) -> CentredState:
     T = np.vstack([np.eye(n), np.zeros((3, n))])
     T[n:, :3] = shift_matrix(state.x[:3])
     return replace(
-        state, x=np.append(state.x, state.x[:3]), P=T @ state.P @ T.T,
+        state, x=np.append(state.x, np.zeros(3)), P=T @ state.P @ T.T,
         parked=state.parked | dict.fromkeys(labels, number), clones=state.clones | {number: n},
+        origins=state.origins | {number: state.x[:3]},
     )  # fmt: skip
 
 
 def _world_point(state: CentredState, label: int) -> Gaussian:
     """A landmark as a point in the world, m, to first order."""
-    at = _block(state.places[label])
-    frame = slice(0, 3) if label not in state.parked else _block(state.clones[state.parked[label]])
-    pose, mount = state.x[frame], state.problem.belief.sensor.mount.packed()
+    at, frame, pose, to_shift = _block(state.places[label]), slice(0, 3), state.x[:3], shift_matrix(state.x[:3])
+    if label in state.parked:
+        frame, pose, to_shift = _clone(state, state.parked[label])
+    mount = state.problem.belief.sensor.mount.packed()
     offset, axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
     (m,), (dm,) = rays(state.x[at][None])
     rho, R = state.x[at][2], plain.heading_matrix(pose[2])
     point = R @ (axes @ m / rho + offset) + np.array([*pose[:2], 0.0])
     D = np.zeros((3, len(state.x)))
     D[:, at] = R @ axes @ np.column_stack([dm / rho, -m / rho**2])
-    by_shift = np.column_stack([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-point[1], point[0], 0.0]])
-    D[:, frame] = by_shift if label in state.parked else by_shift @ shift_matrix(pose)
+    D[:, frame] = np.column_stack([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-point[1], point[0], 0.0]]) @ to_shift
     return Gaussian(point, D @ state.P @ D.T)
 
 
@@ -283,7 +294,7 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
     def parts(problem: Problem, controls: Array) -> Slam:
         sensor = problem.belief.sensor
         low, high = searched(sensor, twin.name) if which.truncation else (0.0, 0.0)
-        pixels = Pixels(*sensor.sigma, low, high, which.truncation, which.debiasing)
+        pixels = Pixels(*sensor.sigma, low, high, which.truncation, which.debiasing, which.prediction)
         every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),

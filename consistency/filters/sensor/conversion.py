@@ -26,6 +26,7 @@ class Pixels(NamedTuple):
     high: float
     truncation: bool
     debiasing: bool
+    prediction: bool
 
 
 @inner
@@ -85,14 +86,15 @@ def observe_range(
 ) -> None:
     """``y`` (3,) <- the observation z where ``expected`` (3,) is predicted, ``R`` (3, 3) <- its noise."""
     ca, ce = np.cos(expected[0]), np.cos(expected[1])
-    u, v, d, variance = z[0], z[1], z[2], pixels.sd * pixels.sd
+    u, v, d, measured, variance = z[0], z[1], z[2], z[2], pixels.sd * pixels.sd
     if ca > BESIDE and ce > BESIDE:
         u = -sensor.f * np.tan(expected[0])
         v = -sensor.f * np.tan(expected[1]) / ca
         d = expected[2] * sensor.f * sensor.B / (ce * ca)
-    measured = z[2]
     if pixels.truncation:
         measured, variance = untruncated(pixels, measured, d)
+    if not pixels.prediction:
+        u, v, d = z[0], z[1], measured
     convert(sensor, z[0], z[1], measured, y)
     if pixels.debiasing:
         add_bias(sensor, pixels, (z[0], z[1], measured), -1.0, around, y)

@@ -51,30 +51,33 @@ class ConvertingRoom(NamedTuple):
 
     at: Indices  # (2 m,) offsets of the seen landmarks, then of the clones of those that are parked
     clone: Indices  # (m,) which of these clones a landmark has, or -1
-    rows: Array  # (3 + 6 m, n) rows of P of the robot and of all these
+    rows: Array  # (3 + 6 m, n) rows of P, and behind them of Phi, of the robot and of all these
+    among: Array  # (3 + 6 m, 3 + 6 m) their columns of these alone
+    place: Indices  # (2 m,) their offsets there
     own: Array  # (m, 3, 3) Jacobian with respect to the landmark
     shift: Array  # (m, 3, 3) and to xi of its clone less that of the pose, about the moved state
-    by_clone: Array  # (m, 3, 3) and to xi of its clone about the state before
-    by_pose: Array  # (m, 3, 3)
+    by_clone: Array  # (m, 3, 3) and to xi of its clone
+    by_pose: Array  # (m, 3, 3) and to xi of the pose about the state before
     y: Array  # (m, 3) converted observations
     h: Array  # (m, 3) what is expected
     R: Array  # (m, 3, 3)
-    delta: Array  # (n,)
-    before: Array  # (n,)
+    delta: Array  # (3 + 6 m,) a correction of the robot and of all these
+    before: Array  # (3 + 6 m,)
     moving: Indices  # (n / 3,) offsets of the landmarks that move
     J: Array  # (n / 3, 3, 3) how
     three: Array  # (4, 3, 3)
-    poses: Array  # (3, 3)
+    poses: Array  # (4, 3)
 
 
 @implement(make_room, Converting)
 def converting_room(update: Converting, r: int, w: int, m: int, n: int) -> ConvertingRoom:
+    most = 3 + 6 * m
     return ConvertingRoom(
-        np.empty(2 * m, np.int64), np.empty(m, np.int64), np.empty((3 + 6 * m, n)),
+        np.empty(2 * m, np.int64), np.empty(m, np.int64), np.empty((most, n)), np.empty((most, most)),
+        3 + 3 * np.arange(2 * m),
         np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)),
-        np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3, 3)),
-        np.empty(n), np.empty(n), np.empty(n // 3, np.int64), np.empty((n // 3, 3, 3)),
-        np.empty((4, 3, 3)), np.empty((3, 3)),
+        np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3, 3)), np.empty(most), np.empty(most),
+        np.empty(n // 3, np.int64), np.empty((n // 3, 3, 3)), np.empty((4, 3, 3)), np.empty((4, 3)),
     )  # fmt: skip
 
 
@@ -112,6 +115,7 @@ def predict_centred(
             room.moving[moving] = o
             moving += 1
     _move_rows(P, n, room.moving, room.J, moving)
+    _move_beyond(local.factors.Phi, state.base, room.moving, room.J, moving)
     add_gram(1.0, noise, P[:n, :n])
     for a in range(3):
         for b in range(a):
@@ -139,6 +143,19 @@ def _move_rows(P: Array, n: int, at: Indices, J: Array, count: int) -> None:
                 row[o] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
                 row[o + 1] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
                 row[o + 2] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
+
+
+@inner
+def _move_beyond(Phi: Array, base: int, at: Indices, J: Array, count: int) -> None:
+    """Phi <- F Phi, with F as in :func:`_move_rows`."""
+    for i in range(count if base > 0 else 0):
+        o, F = at[i], J[i]
+        p0, p1, p2 = Phi[o], Phi[o + 1], Phi[o + 2]
+        for j in range(base):
+            v0, v1, v2 = p0[j], p1[j], p2[j]
+            p0[j] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
+            p1[j] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
+            p2[j] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
 
 
 @implement(make_notes, Converted)

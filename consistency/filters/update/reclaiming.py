@@ -7,9 +7,9 @@ import numpy as np
 from consistency.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.filters.kernel.arrays import copy, fill, fill_matrix
 from consistency.filters.kernel.blas import add_transposed_times
-from consistency.filters.kernel.covariance import gather_rows, replace_rows, subtract_gram
+from consistency.filters.kernel.covariance import gather_rows, replace_rows, state_index, subtract_gram
 from consistency.filters.kernel.dispatch import implement
-from consistency.filters.kernel.gain import divide_by_root
+from consistency.filters.kernel.gain import apply_beyond, divide_by_root
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import Data, Frame, State, correct, robot_frame
 from consistency.filters.kernel.work import Work
@@ -17,7 +17,7 @@ from consistency.filters.landmark.inverse_range import carried
 from consistency.filters.sensor.conversion import observe_range
 from consistency.filters.update.converting import CentredSlam, Converting, ConvertingRoom
 from consistency.filters.upkeep.parking import Clones, unpark
-from consistency.types import Array
+from consistency.types import Array, Indices
 
 SETTLED = 1e-3  # change in standard deviations that ends an iteration
 TEMPERED = 2.0  # decades by which the noise of parked landmarks is raised in the first pass; half a decade less in each
@@ -34,46 +34,85 @@ def correct_converted(
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> tuple[int, float]:
-    P, n, room = state.P, state.n, work.room
+    room, width = work.room, state.n + state.base
     parked = _gather(state, m, local, work)
-    fill(room.delta[:n], 0.0)
-    passes = update.passes if parked > 0 else 1
-    A, nis = work.A[: 3 * m, :n], np.nan
-    for i in range(passes):
-        copy(room.delta[:n], room.before[:n])
-        _expect(update, slam, state, data, i, m, local, work)
-        if passes > 1:
-            _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), room)
-        total = _innovate(state, m, work)
-        code, nis = divide_by_root(state, m, work, total)
+    if parked > 0:
+        code = _iterate(update, slam, state, data, m, parked, local, work)
         if code > 0:
-            return code, nis
-        fill(room.delta[:n], 0.0)
-        add_transposed_times(A, work.A[: 3 * m, n], room.delta[:n])
-        if i >= 2.0 * TEMPERED and _is_settled(P, n, room):
-            break
-    subtract_gram(P, n, 3, A)
-    _move(update, state, parked, local, work)
-    for i in range(m):
-        if room.clone[i] >= 0:
-            _activate(slam, state, work.label[i], local, work)
-    return 0, nis
+            return code, np.nan
+    else:
+        fill(room.delta[: 3 + 3 * m], 0.0)
+        _expect(update, slam, state, data, True, m, local, work)
+    total = _innovate(room.rows, width, room.at, m, work)
+    code, nis = divide_by_root(state, m, work, total)
+    if code == 0:
+        _move(update, state, m, work)
+        apply_beyond(state, m, local.factors, work)
+        _turn(state, local, work)
+        for i in range(m):
+            if room.clone[i] >= 0:
+                _reclaim(slam, state, work.label[i], local, work)
+    return code, nis
 
 
 @inner
 def _gather(state: State, m: int, local: Clones, work: Work[ConvertingRoom]) -> int:
-    """Rows of P of all that the update involves; returns how many of the landmarks are parked."""
-    room, parked = work.room, 0
+    """Rows of P and Phi of all that the update involves; returns how many clones of parked landmarks that is."""
+    n, base, room, Phi, clones = state.n, state.base, work.room, local.factors.Phi, 0
     for i in range(m):
-        room.at[i] = work.at[i]
+        room.at[i], room.clone[i] = work.at[i], -1
         number = local.of[work.label[i]]
-        room.clone[i] = -1
         if number >= 0:
-            room.clone[i] = parked
-            room.at[m + parked] = local.at[number]
-            parked += 1
-    gather_rows(state.P, state.n, 3, 3, room.at, m + parked, room.rows)
-    return parked
+            o = local.here[number]
+            for c in range(clones):
+                if room.at[m + c] == o:
+                    room.clone[i] = c
+            if room.clone[i] < 0:
+                room.clone[i], room.at[m + clones] = clones, o
+                clones += 1
+    count = m + clones
+    gather_rows(state.P, n, 3, 3, room.at, count, room.rows)
+    if base > 0:
+        for i in range(3 + 3 * count):
+            copy(Phi[state_index(3, 3, i, room.at), :base], room.rows[i, n : n + base])
+    if clones > 0:
+        for i in range(3 + 3 * count):
+            for j in range(3 + 3 * count):
+                room.among[i, j] = room.rows[i, state_index(3, 3, j, room.at)]
+    return clones
+
+
+@inner
+def _iterate(
+    update: Converting,
+    slam: CentredSlam,
+    state: State,
+    data: Data,
+    m: int,
+    clones: int,
+    local: Clones,
+    work: Work[ConvertingRoom],
+) -> int:
+    """Gauss-Newton on what the update involves; ``room`` has the last linearisation, ``delta`` where it was made."""
+    room, size = work.room, 3 + 3 * (m + clones)
+    alone = State(state.x, room.among, size, 0, state.offset)
+    delta = room.delta[:size]
+    fill(delta, 0.0)
+    for i in range(update.passes):
+        copy(delta, room.before[:size])
+        _expect(update, slam, state, data, i == 0, m, local, work)
+        if update.passes > 1:
+            _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), room)
+        total = _innovate(room.among, size, room.place, m, work)
+        code, _ = divide_by_root(alone, m, work, total)
+        if code > 0:
+            return code
+        fill(delta, 0.0)
+        add_transposed_times(work.A[: 3 * m, :size], work.A[: 3 * m, size], delta)
+        if i >= 2.0 * TEMPERED and _is_settled(size, room):
+            break
+    copy(room.before[:size], delta)
+    return 0
 
 
 @inner
@@ -100,30 +139,33 @@ def _expect(
     slam: CentredSlam,
     state: State,
     data: Data,
-    i: int,
+    is_first: bool,
     m: int,
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> None:
-    """h and its Jacobians where ``delta`` leads, and the observations there; those of active landmarks once."""
-    x, room = state.x, work.room
-    D, turn, around, pose, clone = room.three[0], room.three[1], room.poses[0], room.poses[1], room.poses[2]
-    move_pose(x[:3], room.delta[:3], pose)
+    """h and its Jacobians where ``delta`` leads, and the observations there; those of landmarks in use once."""
+    x, room, delta = state.x, work.room, work.room.delta
+    D, turn = room.three[0], room.three[1]
+    around, pose, clone, xi = room.poses[0], room.poses[1], room.poses[2], room.poses[3]
+    move_pose(x[:3], delta[:3], pose)
     for j in range(m):
         o, h = work.at[j], room.h[j]
         for a in range(3):
-            h[a] = x[o + a] + room.delta[o + a]
+            h[a] = x[o + a] + delta[3 + 3 * j + a]
         is_parked = room.clone[j] >= 0
         if is_parked:
             copy(h, around)
-            q = room.at[m + room.clone[j]]
-            move_pose(x[q : q + 3], room.delta[q : q + 3], clone)
+            q, p = room.at[m + room.clone[j]], 3 + 3 * (m + room.clone[j])
+            for a in range(3):
+                xi[a] = x[q + a] + delta[p + a]
+            move_pose(local.origin[local.of[work.label[j]]], xi, clone)
             _seen_from(slam, clone, pose, around, h, room.own[j], room.shift[j], D)
-            left_jacobian(room.delta[q : q + 3], turn)
+            left_jacobian(xi, turn)
             _times(1.0, room.shift[j], turn, room.by_clone[j])
-            left_jacobian(room.delta[:3], turn)
+            left_jacobian(delta[:3], turn)
             _times(-1.0, room.shift[j], turn, room.by_pose[j])
-        if is_parked or i == 0:
+        if is_parked or is_first:
             z = data.z[work.known[j]]
             observe_range(slam.sensor, update.pixels, z, h, room.y[j], room.R[j], D, around)
 
@@ -147,48 +189,49 @@ def _temper(m: int, factor: float, room: ConvertingRoom) -> None:
 
 
 @inner
-def _innovate(state: State, m: int, work: Work[ConvertingRoom]) -> float:
-    """A <- H P, its last column z - h + H delta, and S <- H P H' + R; returns a sum, finite if all of it is."""
-    n, room, A, S = state.n, work.room, work.A, work.S
-    rows, delta, finite = room.rows, room.delta, 0.0
+def _innovate(rows: Array, width: int, at: Indices, m: int, work: Work[ConvertingRoom]) -> float:
+    """A (3 m, width) <- H P of the gathered ``rows``, its next column z - h + H delta, and S <- H P H' + R.
+
+    ``at`` says where the landmarks, and then their clones, are among the columns. Returns a sum, finite if all is.
+    """
+    room, A, S, delta, finite = work.room, work.A, work.S, work.room.delta, 0.0
     for j in range(m):
         p = 3 + 3 * j
+        q = 3 + 3 * (m + room.clone[j])
         for a in range(3):
             gap = room.y[j, a] - room.h[j, a]
             if a == 0:
                 gap = (gap + np.pi) % (2.0 * np.pi) - np.pi
             out = A[3 * j + a]
             if room.clone[j] < 0:
-                copy(rows[p + a, :n], out[:n])
-                gap += delta[work.at[j] + a]
+                copy(rows[p + a, :width], out[:width])
+                gap += delta[p + a]
             else:
-                q = 3 + 3 * m + 3 * room.clone[j]
-                o, at = work.at[j], room.at[m + room.clone[j]]
                 for c in range(3):
-                    gap += room.own[j, a, c] * delta[o + c]
-                    gap += room.by_clone[j, a, c] * delta[at + c] + room.by_pose[j, a, c] * delta[c]
+                    gap += room.own[j, a, c] * delta[p + c]
+                    gap += room.by_clone[j, a, c] * delta[q + c] + room.by_pose[j, a, c] * delta[c]
                 l0, l1, l2 = room.own[j, a, 0], room.own[j, a, 1], room.own[j, a, 2]
                 q0, q1, q2 = room.by_clone[j, a, 0], room.by_clone[j, a, 1], room.by_clone[j, a, 2]
                 p0, p1, p2 = room.by_pose[j, a, 0], room.by_pose[j, a, 1], room.by_pose[j, a, 2]
-                for i in range(n):
+                for i in range(width):
                     out[i] = (
                         l0 * rows[p, i] + l1 * rows[p + 1, i] + l2 * rows[p + 2, i]
                         + q0 * rows[q, i] + q1 * rows[q + 1, i] + q2 * rows[q + 2, i]
                         + p0 * rows[0, i] + p1 * rows[1, i] + p2 * rows[2, i]
                     )  # fmt: skip
-            out[n] = gap
+            out[width] = gap
             finite += gap
     for j in range(m):
-        o = work.at[j]
+        o = at[j]
         for row in range(3 * j + 3):
             for a in range(3):
                 total = 0.0
                 if room.clone[j] < 0:
                     total = A[row, o + a]
                 else:
-                    at = room.at[m + room.clone[j]]
+                    q = at[m + room.clone[j]]
                     for c in range(3):
-                        total += A[row, o + c] * room.own[j, a, c] + A[row, at + c] * room.by_clone[j, a, c]
+                        total += A[row, o + c] * room.own[j, a, c] + A[row, q + c] * room.by_clone[j, a, c]
                         total += A[row, c] * room.by_pose[j, a, c]
                 S[row, 3 * j + a] = total + (room.R[j, row - 3 * j, a] if row >= 3 * j else 0.0)
                 finite += S[row, 3 * j + a]
@@ -196,23 +239,23 @@ def _innovate(state: State, m: int, work: Work[ConvertingRoom]) -> float:
 
 
 @inner
-def _is_settled(P: Array, n: int, room: ConvertingRoom) -> bool:
+def _is_settled(size: int, room: ConvertingRoom) -> bool:
     settled = True
-    for j in range(n):
-        settled = settled and abs(room.delta[j] - room.before[j]) <= SETTLED * np.sqrt(P[j, j])
+    for j in range(size):
+        settled = settled and abs(room.delta[j] - room.before[j]) <= SETTLED * np.sqrt(room.among[j, j])
     return settled
 
 
 @inner
-def _move(update: Converting, state: State, parked: int, local: Clones, work: Work[ConvertingRoom]) -> None:
-    """x <- moved by ``delta``, and P <- about where that is."""
-    x, room = state.x, work.room
-    delta, turn, pose = room.delta, room.three[1], room.poses[1]
-    for label in range(len(state.offset)):
-        o = state.offset[label]
-        if o >= 0:
-            for a in range(3):
-                x[o + a] += delta[o + a]
+def _move(update: Converting, state: State, m: int, work: Work[ConvertingRoom]) -> None:
+    """x <- moved by A' y, P <- P - A' A; ``three[1]`` <- what turns the pose, about where it is now."""
+    x, n, room = state.x, state.n, work.room
+    A, delta, turn, pose = work.A[: 3 * m, :n], work.delta[:n], room.three[1], room.poses[1]
+    fill(delta, 0.0)
+    add_transposed_times(A, work.A[: 3 * m, n + state.base], delta)
+    subtract_gram(state.P, n, 3, A)
+    for i in range(3, n):
+        x[i] += delta[i]
     move_pose(x[:3], delta[:3], pose)
     left_jacobian(delta[:3], turn)
     if not update.turning:  # as if the additive error of the pose were moved along
@@ -220,59 +263,61 @@ def _move(update: Converting, state: State, parked: int, local: Clones, work: Wo
         turn[0, 0] = turn[1, 1] = turn[2, 2] = 1.0
         turn[0, 2], turn[1, 2] = pose[1] - x[1], x[0] - pose[0]
     copy(pose, x[:3])
-    _turn(state, 0, work)
-    for number in range(len(local.at)):
-        if local.uses[number] > 0:
-            o = local.at[number]
-            move_pose(x[o : o + 3], delta[o : o + 3], pose)
-            copy(pose, x[o : o + 3])
-            if parked > 0 and update.turning:
-                left_jacobian(delta[o : o + 3], turn)
-                _turn(state, o, work)
 
 
 @inner
-def _turn(state: State, o: int, work: Work[ConvertingRoom]) -> None:
-    """Rows and columns of P at ``o`` <- those of the pose there, turned by ``three[1]``."""
-    P, n, room = state.P, state.n, work.room
-    T, own, rows = room.three[1], room.three[2], room.rows
-    work.room.at[0] = o
-    gather_rows(P, n, 3, 3, room.at, 0 if o == 0 else 1, rows)
-    first = 0 if o == 0 else 3
-    for i in range(n):
-        v0, v1, v2 = rows[first, i], rows[first + 1, i], rows[first + 2, i]
-        for a in range(3):
-            rows[first + a, i] = T[a, 0] * v0 + T[a, 1] * v1 + T[a, 2] * v2
+def _turn(state: State, local: Clones, work: Work[ConvertingRoom]) -> None:
+    """Rows and columns of the pose in P, and its rows in Phi, turned by ``three[1]``."""
+    P, T, own = state.P, work.room.three[1], work.room.three[2]
+    _turn_rows(P, 3, state.n, T)
+    _turn_rows(local.factors.Phi, 0, state.base, T)
     for a in range(3):
         for b in range(3):
-            own[a, b] = (
-                rows[first + a, o] * T[b, 0] + rows[first + a, o + 1] * T[b, 1] + rows[first + a, o + 2] * T[b, 2]
-            )
-    replace_rows(P, n, o, rows[first : first + 3], own)
+            own[a, b] = T[a, 0] * P[0, b] + T[a, 1] * P[1, b] + T[a, 2] * P[2, b]
+    for a in range(3):
+        for b in range(a, 3):
+            P[a, b] = P[b, a] = own[a, 0] * T[b, 0] + own[a, 1] * T[b, 1] + own[a, 2] * T[b, 2]
 
 
 @inner
-def _activate(slam: CentredSlam, state: State, label: int, local: Clones, work: Work[ConvertingRoom]) -> None:
+def _turn_rows(A: Array, first: int, last: int, T: Array) -> None:
+    """Rows 0 to 2 of A <- T times them, in columns first..last-1."""
+    for j in range(first, last):
+        v0, v1, v2 = A[0, j], A[1, j], A[2, j]
+        for a in range(3):
+            A[a, j] = T[a, 0] * v0 + T[a, 1] * v1 + T[a, 2] * v2
+
+
+@inner
+def _reclaim(slam: CentredSlam, state: State, label: int, local: Clones, work: Work[ConvertingRoom]) -> None:
     """A landmark that was parked, in the frame of the sensor again."""
-    x, P, n, room = state.x, state.P, state.n, work.room
-    J, shift, D, own, there = room.three[0], room.three[1], room.three[2], room.three[3], room.poses[0]
-    o, q = state.offset[label], local.at[local.of[label]]
-    _seen_from(slam, x[q : q + 3], x[:3], x[o : o + 3], there, J, shift, D)
+    x, P, n, base, room, Phi = state.x, state.P, state.n, state.base, work.room, local.factors.Phi
+    J, shift, D, turned = room.three[0], room.three[1], room.three[2], room.three[3]
+    there, clone = room.poses[0], room.poses[1]
+    number, o = local.of[label], state.offset[label]
+    q = local.here[number]
+    move_pose(local.origin[number], x[q : q + 3], clone)
+    _seen_from(slam, clone, x[:3], x[o : o + 3], there, J, shift, D)
     copy(there, x[o : o + 3])
+    left_jacobian(x[q : q + 3], D)
+    _times(1.0, shift, D, turned)
     room.at[0], room.at[1] = o, q
     gather_rows(P, n, 3, 3, room.at, 2, room.rows)
-    rows = room.rows
-    for i in range(n):
+    for i in range(9):
+        copy(Phi[state_index(3, 3, i, room.at), :base], room.rows[i, n : n + base])
+    rows, out = room.rows, work.rows
+    for i in range(n + base):
         for a in range(3):
             total = 0.0
             for c in range(3):
-                total += J[a, c] * rows[3 + c, i] + shift[a, c] * (rows[6 + c, i] - rows[c, i])
-            work.rows[a, i] = total
+                total += J[a, c] * rows[3 + c, i] + turned[a, c] * rows[6 + c, i] - shift[a, c] * rows[c, i]
+            out[a, i] = total
     for a in range(3):
+        copy(out[a, n : n + base], Phi[o + a, :base])
         for b in range(3):
             total = 0.0
             for c in range(3):
-                total += J[b, c] * work.rows[a, o + c] + shift[b, c] * (work.rows[a, q + c] - work.rows[a, c])
-            own[a, b] = total
-    replace_rows(P, n, o, work.rows, own)
+                total += J[b, c] * out[a, o + c] + turned[b, c] * out[a, q + c] - shift[b, c] * out[a, c]
+            D[a, b] = total
+    replace_rows(P, n, o, out, D)
     unpark(label, state, local)

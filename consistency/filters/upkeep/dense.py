@@ -32,9 +32,11 @@ def make_no_factors(covariance: Dense, r: int, w: int, n: int, steps: int, n_lan
 
 
 @implement(prepare, Dense)
-def prepare_all(covariance: Dense, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+def prepare_all(
+    covariance: Dense, slam: Slam, whole: State, state: State, labels: Indices, local: Factors
+) -> tuple[State, State]:
     """The state as it is."""
-    return state
+    return whole, state
 
 
 @implement(append, Dense)

@@ -26,16 +26,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
-from consistency.filters.kernel.blas import (
-    add_symmetric_product,
-    add_times_transposed,
-    add_transposed_times,
-    product,
-    symmetric_times,
-    times_symmetric,
-)
-from consistency.filters.kernel.covariance import gather_rows, state_index
+from consistency.filters.kernel.arrays import copy, fill
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors, make_factors
@@ -52,6 +43,7 @@ from consistency.filters.kernel.slam import (
     spare_width,
 )
 from consistency.filters.kernel.work import Work
+from consistency.filters.upkeep.splitting import add_label, append_rows, join, start_rows, take_out, to_base, wake
 from consistency.types import Array, Indices
 
 LOCAL_FROM = 100  # variables in the state from which local updating is tried; measured, as the next three
@@ -90,7 +82,9 @@ def make_local_factors(covariance: Local, r: int, w: int, n: int, steps: int, n_
 
 
 @implement(prepare, Local)
-def prepare_active(covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors) -> State:
+def prepare_active(
+    covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors
+) -> tuple[State, State]:
     """The active part that a step works on, settled first where that is due, and split where it begins."""
     r, w, home, offset = robot_width(slam.motion), landmark_width(slam.landmark), whole.offset, state.offset
     x, P, n, b = state.x, state.P, state.n, state.base
@@ -100,30 +94,21 @@ def prepare_active(covariance: Local, slam: Slam, whole: State, state: State, la
         x, P, n, b = whole.x, whole.P, whole.n, 0
         copy(home, offset)
     if b == 0 and n >= covariance.start and may_split(r, w, len(labels), local):
-        n = split(r, w, whole, labels, offset, local)
+        n = split(covariance, r, w, whole, labels, offset, local)
         start_counting(n, local)
         x, P, b = local.x, local.P, n
     if b > 0:
-        more = activate(r, w, whole, labels, State(x, P, n, b, offset), local)
+        more = activate(covariance, r, w, whole, labels, State(x, P, n, b, offset), local)
         n, b = n + more, b + more
         count(whole.n, n, b, more, w * len(labels), local)
-    return State(x, P, n, b, offset)
+    return whole, State(x, P, n, b, offset)
 
 
 @implement(append, Local)
 def append_factors(
     covariance: Local, slam: Slam, state: State, label: int, local: Factors, work: Work[NamedTuple]
 ) -> None:
-    r, w, n, base, Phi = robot_width(slam.motion), landmark_width(slam.landmark), state.n, state.base, local.Phi
-    if base == 0:
-        return
-    for a in range(w):
-        for j in range(base):
-            total = 0.0
-            for c in range(r):
-                total += work.Jp[a, c] * Phi[c, j]
-            Phi[n + a, j] = total
-    local.label[(n - r) // w] = label
+    append_rows(slam, state, label, local, work.Jp)
 
 
 @implement(settle, Local)
@@ -133,15 +118,8 @@ def settle_active(covariance: Local, slam: Slam, whole: State, state: State, loc
         join(slam, whole, state.n, state.base, local)
 
 
-@inner
-def _entry(P: Array, i: int, j: int) -> float:
-    """P[i, j] of P (n, n) whose upper half is valid."""
-    return P[i, j] if i <= j else P[j, i]
-
-
-@inner
-def _raw(x: Array, width: int, p: int, i: int, j: int, Phi: Array) -> None:
-    """Adds to rows i.. of Phi the robot, or the landmark at ``p`` of the whole state, in columns of the base."""
+@implement(start_rows, Local)
+def start_raw_rows(covariance: Local, x: Array, width: int, p: int, i: int, j: int, Phi: Array) -> None:
     for a in range(width):
         Phi[i + a, j + a] += 1.0
     if p > 0:
@@ -151,9 +129,9 @@ def _raw(x: Array, width: int, p: int, i: int, j: int, Phi: Array) -> None:
         Phi[i + 1, 2] += x[p] - x[0]
 
 
-@inner
-def _relative(x: Array, p: int, robot: Array, landmark: Array) -> None:
-    """Columns of the landmark at ``p``, x and y, become those of the base, relative to the columns of the ``robot``."""
+@implement(to_base, Local)
+def to_relative_base(covariance: Local, x: Array, p: int, robot: Array, landmark: Array) -> None:
+    """x and y of a landmark relative to the robot."""
     dx, dy = x[p] - x[0], x[p + 1] - x[1]
     for i in range(len(landmark)):
         landmark[i, 0] -= robot[i, 0] - dy * robot[i, 2]
@@ -161,121 +139,34 @@ def _relative(x: Array, p: int, robot: Array, landmark: Array) -> None:
 
 
 @inner
-def split(r: int, w: int, whole: State, labels: Indices, offset: Indices, local: Factors) -> int:
+def split(covariance: Local, r: int, w: int, whole: State, labels: Indices, offset: Indices, local: Factors) -> int:
     """The robot and the known ones of ``labels`` (m,) become active and the base; returns their number of variables.
 
     ``offset`` (n_landmarks,) <- that of each landmark in the active part, or -1.
     """
-    x, P, home = whole.x, whole.P, whole.offset
     fill(offset, -1)
     n = r
     for label in labels:
-        if home[label] >= 0:
-            local.label[(n - r) // w], local.base[(n - r) // w] = label, home[label]
+        if whole.offset[label] >= 0:
+            add_label(label, whole.offset[label], n, n, r, w, local)
             offset[label] = n
             n += w
-    for i in range(n):
-        p = state_index(r, w, i, local.base)
-        local.x[i] = x[p]
-        for j in range(i, n):
-            local.P[i, j] = _entry(P, p, state_index(r, w, j, local.base))
-            local.Psi[i, j] = 0.0
-        fill(local.Phi[i, :n], 0.0)
-        local.theta[i] = 0.0
-    _raw(x, r, 0, 0, 0, local.Phi)
-    for i in range(r, n, w):
-        _raw(x, w, state_index(r, w, i, local.base), i, i, local.Phi)
-    for i in range(r):
-        for j in range(i):
-            local.P[i, j] = local.P[j, i]
+    take_out(covariance, r, w, whole, n, local)
     return n
 
 
 @inner
-def activate(r: int, w: int, whole: State, labels: Indices, active: State, local: Factors) -> int:
+def activate(covariance: Local, r: int, w: int, whole: State, labels: Indices, active: State, local: Factors) -> int:
     """Passive ones of ``labels`` (m,) become active and join the base; returns by how many variables both grow."""
     more, n, b, home = 0, active.n, active.base, whole.offset
     for label in labels:
         if home[label] >= 0 and active.offset[label] < 0:
-            local.label[(n + more - r) // w], local.base[(b + more - r) // w] = label, home[label]
+            add_label(label, home[label], n + more, b + more, r, w, local)
             active.offset[label] = n + more
             more += w
     if more > 0:
-        _activate(r, w, whole, n, b, more, local)
+        wake(covariance, r, w, whole, n, b, more, local)
     return more
-
-
-@inner
-def _activate(r: int, w: int, whole: State, n: int, b: int, more: int, local: Factors) -> None:
-    """The last ``more`` variables of the base, at ``n`` in the active part and at ``b`` in the base."""
-    x0, P0, x, P, Phi, Psi = whole.x, whole.P, local.x, local.P, local.Phi, local.Psi
-    D, G = local.cross[:more, :b], local.gain[:more, :b]
-    for i in range(more):
-        p = state_index(r, w, b + i, local.base)
-        x[n + i] = x0[p]
-        for j in range(b):
-            D[i, j] = _entry(P0, p, state_index(r, w, j, local.base))
-        for j in range(i, more):
-            P[n + i, n + j] = _entry(P0, p, state_index(r, w, b + j, local.base))
-    for j in range(r, b, w):
-        _relative(x0, local.base[(j - r) // w], D[:, :r], D[:, j : j + 2])
-    times_symmetric(D, Psi[:b, :b], G)
-    fill_matrix(P[:n, n : n + more], 0.0)
-    add_times_transposed(1.0, Phi[:n, :b], D, P[:n, n : n + more])
-    add_times_transposed(-1.0, G, D, P[n : n + more, n : n + more])
-    for i in range(more):
-        for j in range(b):
-            x[n + i] += D[i, j] * local.theta[j]
-            Phi[n + i, j] = -G[i, j]
-    fill_matrix(Phi[: n + more, b : b + more], 0.0)
-    fill_matrix(Psi[: b + more, b : b + more], 0.0)
-    fill(local.theta[b : b + more], 0.0)
-    for i in range(0, more, w):
-        _raw(x0, w, local.base[(b + i - r) // w], n + i, b + i, Phi)
-
-
-@inner
-def join(slam: Slam, whole: State, n: int, b: int, local: Factors) -> None:
-    """x, P of the ``whole`` <- what the active part and the factors say; the passive part is settled."""
-    r, w, x = robot_width(slam.motion), landmark_width(slam.landmark), whole.x
-    x0 = local.rows[:b, : whole.n]
-    gather_rows(whole.P, whole.n, r, w, local.base, (b - r) // w, x0)
-    owed = local.owed[:b, : whole.n]
-    for j in range(r, b, w):
-        _relative(x, local.base[(j - r) // w], x0[:r].T, x0[j : j + 2].T)
-    symmetric_times(local.Psi[:b, :b], x0, owed)
-    add_symmetric_product(-1.0, x0, owed, whole.P[: whole.n, : whole.n])
-    add_transposed_times(x0, local.theta[:b], x[: whole.n])
-    _settle(r, w, whole, n, b, local)
-
-
-@inner
-def _settle(r: int, w: int, whole: State, n: int, b: int, local: Factors) -> None:
-    """Rows and columns of the active variables in the whole state."""
-    P, at, across = whole.P, local.label, local.owed[:n, : whole.n]
-    for i in range((n - r) // w):
-        at[i] = whole.offset[at[i]]
-    product(local.Phi[:n, :b], local.rows[:b, : whole.n], across)
-    _settle_rows(whole, r, 0, 0, across, local)
-    for i in range(r, n, w):
-        _settle_rows(whole, w, i, state_index(r, w, i, at), across, local)
-    for i in range(n):
-        p = state_index(r, w, i, at)
-        for j in range(i, n):
-            q = state_index(r, w, j, at)
-            P[min(p, q), max(p, q)] = local.P[i, j]
-    copy_matrix(local.P[:r, :r], P[:r, :r])
-
-
-@inner
-def _settle_rows(whole: State, width: int, i: int, p: int, across: Array, local: Factors) -> None:
-    """Those of the ``width`` variables at ``i`` of the active part and ``p`` of the whole."""
-    for j in range(p):
-        for a in range(width):
-            whole.P[j, p + a] = across[i + a, j]
-    for a in range(width):
-        copy(across[i + a, p + a :], whole.P[p + a, p + a : whole.n])
-        whole.x[p + a] = local.x[i + a]
 
 
 # --- when ----------------------------------------------------------------------------------------

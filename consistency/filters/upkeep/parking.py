@@ -1,4 +1,10 @@
-"""Landmarks that have not been seen for a while stay in the frame of a clone of the pose."""
+"""Landmarks that have not been seen for a while stay in the frame of a clone of the pose.
+
+Nothing moves them there, so that they and the clones are the passive part of a state that is updated locally
+(:mod:`consistency.filters.upkeep.local`): the active part is the robot, the landmarks in use, and what was seen again
+since the split. A clone is Exp(xi) T with the pose T at which it was made and xi in the state, so that what a step
+says of it is a sum.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +12,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.filters.kernel.arrays import copy, fill_matrix
-from consistency.filters.kernel.covariance import replace_rows
+from consistency.filters.error.invariant_pose import left_jacobian, move_pose
+from consistency.filters.kernel.arrays import copy, fill, fill_matrix
+from consistency.filters.kernel.covariance import gather_rows, replace_rows
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
+from consistency.filters.kernel.local_state import Factors, make_factors
 from consistency.filters.kernel.slam import Slam, State, append, held_at, make_local, prepare, settle, spare_width
 from consistency.filters.kernel.work import Work
+from consistency.filters.upkeep.local import LOCAL_FROM
+from consistency.filters.upkeep.splitting import add_label, append_rows, join, start_rows, take_out, to_base, wake
 from consistency.types import Array, Indices
+
+WORTH = 1.1  # variables of the whole state for each of active part and base from which updating is local; measured
 
 
 @part(landmark="InverseRange", error="InvariantPose", update="Converting")
 class Parking(NamedTuple):
-    """Steps between two rounds of parking, 0 for none, and without a sight before a landmark is parked."""
+    """Steps between two rounds of parking, 0 for none, and without a sight before a landmark is parked.
+
+    ``start`` is the number of variables in the state from which updates are local.
+    """
 
     every: int
     unseen: int
+    start: int = LOCAL_FROM
 
 
 class Clones(NamedTuple):
@@ -28,10 +44,13 @@ class Clones(NamedTuple):
 
     of: Indices  # (n_landmarks,) number of the clone at which each is parked, or -1
     seen: Indices  # (n_landmarks,) step at which each was seen last
-    at: Indices  # (clones,) offset of each clone in the state, 0 where it has none yet
+    at: Indices  # (clones,) offset of each clone in the whole state, 0 where it has none yet
+    here: Indices  # (clones,) and in the variables of a step, 0 where it is in the passive rest
     uses: Indices  # (clones,) landmarks parked at each
+    origin: Array  # (clones, 3) pose T of each
     step: Indices  # (1,) steps so far
-    rows: Array  # (3, n)
+    rows: Array  # (9, n)
+    factors: Factors
 
 
 @inner
@@ -47,84 +66,109 @@ def clones_width(covariance: Parking, steps: int, n_landmarks: int) -> int:
 @implement(make_local, Parking)
 def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landmarks: int) -> Clones:
     most = _most_clones(covariance, steps, n_landmarks)
+    is_local = most > 0 and n >= covariance.start
+    c = max(n // (2 * w), 1) * w if is_local else r
     return Clones(
         np.full(n_landmarks, -1),
         np.zeros(n_landmarks, np.int64),
         np.zeros(most, np.int64),
         np.zeros(most, np.int64),
+        np.zeros(most, np.int64),
+        np.zeros((most, 3)),
         np.zeros(1, np.int64),
-        np.zeros((3, n)),
+        np.zeros((9, n)),
+        make_factors(c, n if is_local else r, c // w),
     )
+
+
+# --- a step --------------------------------------------------------------------------------------
 
 
 @implement(prepare, Parking)
 def prepare_parked(
     covariance: Parking, slam: Slam, whole: State, state: State, labels: Indices, local: Clones
-) -> State:
+) -> tuple[State, State]:
+    """Parks first where that is due; settles the active part before that, or where it has grown too large."""
     step = local.step[0]
     local.step[0] = step + 1
     due = covariance.every > 0 and step > 0 and step % covariance.every == 0
-    if due and _is_any_idle(covariance, state, step, local):
-        state = _park(covariance, state, step, local)
+    due = due and _is_any_idle(covariance, whole, step, local)
+    if state.base > 0 and (due or _is_crowded(whole, state, labels, local)):
+        join(slam, whole, state.n, state.base, local.factors)
+        copy(whole.offset, state.offset)
+        copy(local.at, local.here)
+        state = State(whole.x, whole.P, whole.n, 0, state.offset)
+    if due:
+        whole = _park(covariance, whole, step, local)
+        state = State(whole.x, whole.P, whole.n, 0, state.offset)
+    if state.base == 0 and whole.n >= covariance.start and _is_worth_it(whole, local):
+        state = _split(covariance, whole, state.offset, local)
+    if state.base > 0:
+        state = _call_back(covariance, whole, state, labels, local)
     for label in labels:
         local.seen[label] = step + 1
-    return state
-
-
-@inner
-def _is_idle(covariance: Parking, state: State, label: int, step: int, local: Clones) -> bool:
-    return state.offset[label] >= 0 and local.of[label] < 0 and step - local.seen[label] >= covariance.unseen
-
-
-@inner
-def _is_any_idle(covariance: Parking, state: State, step: int, local: Clones) -> bool:
-    idle = False
-    for label in range(len(local.of)):
-        idle = idle or _is_idle(covariance, state, label, step, local)
-    return idle
-
-
-@inner
-def _park(covariance: Parking, state: State, step: int, local: Clones) -> State:
-    """Idle landmarks at a clone of the pose that has none; the state grows where there is no old place for it."""
-    x, P, n = state.x, state.P, state.n
-    number = 0
-    while local.uses[number] > 0:
-        number += 1
-    o = local.at[number]
-    if o == 0:
-        o = local.at[number] = n
-        n += 3
-    for label in range(len(local.of)):
-        if _is_idle(covariance, state, label, step, local):
-            local.of[label] = number
-            local.uses[number] += 1
-    copy(x[:3], x[o : o + 3])
-    for a in range(3):
-        copy(P[a, :n], local.rows[a, :n])
-    replace_rows(P, n, o, local.rows, P[:3, :3])
-    return State(x, P, n, state.base, state.offset)
-
-
-@inner
-def unpark(label: int, state: State, local: Clones) -> None:
-    """A landmark is active again; a clone that no landmark needs is left as a place for the next."""
-    number = local.of[label]
-    local.of[label] = -1
-    local.uses[number] -= 1
-    if local.uses[number] == 0:
-        o = local.at[number]
-        fill_matrix(local.rows[:, : state.n], 0.0)
-        replace_rows(state.P, state.n, o, local.rows, local.rows[:, :3])
-        for a in range(3):
-            state.x[o + a] = 0.0
+    return whole, state
 
 
 @implement(append, Parking)
 def append_active(
     covariance: Parking, slam: Slam, state: State, label: int, local: Clones, work: Work[NamedTuple]
 ) -> None:
-    pass
+    append_rows(slam, state, label, local.factors, work.Jp)
+
+
+# --- parking -------------------------------------------------------------------------------------
+
+
+@inner
+def _is_idle(covariance: Parking, whole: State, label: int, step: int, local: Clones) -> bool:
+    return whole.offset[label] >= 0 and local.of[label] < 0 and step - local.seen[label] >= covariance.unseen
+
+
+@inner
+def _is_any_idle(covariance: Parking, whole: State, step: int, local: Clones) -> bool:
+    idle = False
+    for label in range(len(local.of)):
+        idle = idle or _is_idle(covariance, whole, label, step, local)
+    return idle
+
+
+@inner
+def _park(covariance: Parking, whole: State, step: int, local: Clones) -> State:
+    """Idle landmarks at a clone of the pose that has none; the state grows where there is no old place for it."""
+    x, P, n = whole.x, whole.P, whole.n
+    number = 0
+    while local.uses[number] > 0:
+        number += 1
+    o = local.at[number]
+    if o == 0:
+        o = n
+        n += 3
+    local.at[number] = local.here[number] = o
+    for label in range(len(local.of)):
+        if _is_idle(covariance, whole, label, step, local):
+            local.of[label] = number
+            local.uses[number] += 1
+    copy(x[:3], local.origin[number])
+    fill(x[o : o + 3], 0.0)
+    for a in range(3):
+        copy(P[a, :n], local.rows[a, :n])
+    replace_rows(P, n, o, local.rows, P[:3, :3])
+    return State(x, P, n, whole.base, whole.offset)
+
+
+@inner
+def unpark(label: int, state: State, local: Clones) -> None:
+    """A landmark is in use again; a clone that no landmark needs is left as a place for the next."""
+    number = local.of[label]
+    local.of[label] = -1
+    local.uses[number] -= 1
+    if local.uses[number] == 0:
+        o = local.here[number]
+        fill_matrix(local.rows[:3, : state.n], 0.0)
+        replace_rows(state.P, state.n, o, local.rows, local.rows[:, :3])
+        fill(state.x[o : o + 3], 0.0)
+        fill_matrix(local.factors.Phi[o : o + 3, : state.base], 0.0)
 
 
 @implement(held_at, Parking)
@@ -132,6 +176,96 @@ def held_at_clone(covariance: Parking, label: int, local: Clones) -> int:
     return local.at[local.of[label]] if local.of[label] >= 0 else 0
 
 
+# --- local updating ------------------------------------------------------------------------------
+
+
+@implement(start_rows, Parking)
+def start_plain_rows(covariance: Parking, x: Array, width: int, p: int, i: int, j: int, Phi: Array) -> None:
+    for a in range(width):
+        Phi[i + a, j + a] += 1.0
+
+
+@implement(to_base, Parking)
+def to_plain_base(covariance: Parking, x: Array, p: int, robot: Array, landmark: Array) -> None:
+    """The map is relative to the robot already."""
+
+
+@inner
+def _is_worth_it(whole: State, local: Clones) -> bool:
+    """Whether an active part of robot and landmarks in use, with a base as large, is small beside the whole."""
+    n = 3
+    for label in range(len(local.of)):
+        if whole.offset[label] >= 0 and local.of[label] < 0:
+            n += 3
+    return n <= len(local.factors.x) and 2.0 * WORTH * n <= whole.n
+
+
+@inner
+def _is_crowded(whole: State, state: State, labels: Indices, local: Clones) -> bool:
+    """Whether the next step has no room in the active part, or would cost more than one on the whole."""
+    back = new = 0
+    for label in labels:
+        if whole.offset[label] < 0:
+            new += 3
+        elif state.offset[label] < 0:
+            back += 6 if local.here[local.of[label]] == 0 else 3
+    n = state.n + back
+    return n + new > len(local.factors.x) or n + state.base + back > whole.n
+
+
+@inner
+def _split(covariance: Parking, whole: State, offset: Indices, local: Clones) -> State:
+    """The robot and the landmarks in use become active; ``offset`` (n_landmarks,) <- that of each there, or -1."""
+    f, n = local.factors, 3
+    fill(offset, -1)
+    fill(local.here, 0)
+    for label in range(len(local.of)):
+        o = whole.offset[label]
+        if o >= 0 and local.of[label] < 0:
+            add_label(label, o, n, n, 3, 3, f)
+            offset[label] = n
+            n += 3
+    take_out(covariance, 3, 3, whole, n, f)
+    return State(f.x, f.P, n, n, offset)
+
+
+@inner
+def _call_back(covariance: Parking, whole: State, active: State, labels: Indices, local: Clones) -> State:
+    """Passive ones of ``labels`` (m,), and their clones, become active and join the base."""
+    f, n, b, more = local.factors, active.n, active.base, 0
+    for label in labels:
+        if whole.offset[label] >= 0 and active.offset[label] < 0:
+            number = local.of[label]
+            if local.here[number] == 0:
+                add_label(-1 - local.at[number], local.at[number], n + more, b + more, 3, 3, f)
+                local.here[number] = n + more
+                more += 3
+            add_label(label, whole.offset[label], n + more, b + more, 3, 3, f)
+            active.offset[label] = n + more
+            more += 3
+    if more > 0:
+        wake(covariance, 3, 3, whole, n, b, more, f)
+    return State(active.x, active.P, n + more, b + more, active.offset)
+
+
 @implement(settle, Parking)
-def settle_no_clone(covariance: Parking, slam: Slam, whole: State, state: State, local: Clones) -> None:
-    pass
+def settle_clones(covariance: Parking, slam: Slam, whole: State, state: State, local: Clones) -> None:
+    """``whole`` <- all variables; a clone <- its pose, with the covariance of the error about that."""
+    if state.base > 0:
+        join(slam, whole, state.n, state.base, local.factors)
+    x, P, n, rows = whole.x, whole.P, whole.n, local.rows
+    turn, own, at = np.empty((3, 3)), np.empty((3, 3)), np.empty(1, np.int64)
+    for number in range(len(local.at)):
+        if local.uses[number] > 0:
+            o = at[0] = local.at[number]
+            left_jacobian(x[o : o + 3], turn)
+            gather_rows(P, n, 3, 3, at, 1, rows[3:])
+            for i in range(n):
+                for a in range(3):
+                    rows[a, i] = turn[a, 0] * rows[6, i] + turn[a, 1] * rows[7, i] + turn[a, 2] * rows[8, i]
+            for a in range(3):
+                for b in range(3):
+                    own[a, b] = turn[b, 0] * rows[a, o] + turn[b, 1] * rows[a, o + 1] + turn[b, 2] * rows[a, o + 2]
+            replace_rows(P, n, o, rows, own)
+            move_pose(local.origin[number], x[o : o + 3], turn[0])
+            copy(turn[0], x[o : o + 3])

@@ -12,7 +12,7 @@ from consistency.types import Array
 FINDINGS = ("map-ceiling",)
 LONG = True
 
-cell = sibling(__file__, "e13_consistent").cell
+Cell = sibling(__file__, "e13_consistent").Cell
 
 SPARSE = (("rectangle", 4.0, 0.25), ("rectangle", 3.0, 0.5), ("circle", 3.0, 0.25))  # path, range in m, density
 CEILING, OURS, OTHER = "gtsam-map-uvd", "parked-ekf-uvd", "ekf-uvd"
@@ -32,7 +32,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     table = study.tables["map_ceiling"] = pd.DataFrame(rows, columns=columns)
     ours, failures = table[table["filter"] == OURS], table[table["filter"] != OTHER]["failures"].sum()
     measured = "; ".join(
-        f"{r.path} {r.range:g} m, density {r.density:g}: {r.filter} RMSE {1e3 * r.rmse:.0f} mm, NEES {r.nees:.2f}"
+        f"{r.path} {r.range:g} m, density {r.density:g}: {r.filter} RMSE {r.rmse:.3f} m, NEES {r.nees:.2f}"
         + (f", ratio {r.ratio:.2f} [{r.low:.2f}, {r.high:.2f}]" if r.filter != CEILING else "")
         for r in table.itertuples()
     )
@@ -58,7 +58,7 @@ def finding(study: cs.Study, holds: bool, measured: str) -> cs.Finding:
 def judged(study: cs.Study, path: str, reach: float, density: float) -> list[tuple[object, ...]]:
     """Each filter's last pose in the runs that all of them finished."""
     names = (CEILING, OURS, OTHER)
-    results = cs.run_trials(cell(path, reach, density), names, study.runs, study.seed, study.jobs)
+    results = cs.run_trials(Cell(path, reach, density).scenario(), names, study.runs, study.seed, study.jobs)
     last = results.estimates[results.estimates["step"] == results.estimates["step"].max()]
     last = last.merge(results.truth, on=["run", "step"], suffixes=("", "_true"))
     last["squared"] = (last["x"] - last["x_true"]) ** 2 + (last["y"] - last["y_true"]) ** 2

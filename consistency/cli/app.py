@@ -49,7 +49,7 @@ def _main(
 @app.command("list")
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
     """Scenarios, filters, experiments and sweeps."""
-    from consistency.filters import BOUNDS, filter_summaries
+    from consistency.filters import BOUNDS, SMOOTHERS, filter_summaries
     from consistency.runs.findings import experiment_summaries
     from consistency.scenario import load_scenario, scenario_names
     from consistency.sweeps.plan import sweep_summaries
@@ -60,7 +60,8 @@ def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")]
         listed = {"scenarios": scenarios, "filters": list(filters), "experiments": experiments, "sweeps": sweeps}
         print(json.dumps(listed | {"filter_summaries": filters}, indent=2))
         return
-    marked = {name: f"{text}{' (not realisable)' * (name in BOUNDS)}" for name, text in filters.items()}
+    marks = dict.fromkeys(BOUNDS, " (not realisable)") | dict.fromkeys(SMOOTHERS, " (all data at once)")
+    marked = {name: text + marks.get(name, "") for name, text in filters.items()}
     named = {"Scenarios": scenarios, "Experiments": experiments, "Sweeps": sweeps, "Filters": marked}
     for title, entries in named.items():
         print(title)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import importlib.util
 from typing import Any
 
 from consistency.errors import InputError
@@ -58,8 +59,13 @@ MODULES: dict[str, tuple[str, str, str]] = {
     "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD", "EKF of the library filterpy, on pixels"),
     "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ", "UKF of the library filterpy, on points"),
     "filterpy-ukf-uvd": ("external.filterpy", "UKF_UVD", "UKF of the library filterpy, on pixels"),
+    "gtsam-batch-uvd": ("external.gtsam", "BATCH_UVD", "Smoother of gtsam, each pose by all data up to its step"),
+    "gtsam-lag-uvd": ("external.gtsam", "LAG_UVD", "Smoother of gtsam over the last steps"),
+    "gtsam-map-uvd": ("external.gtsam", "MAP_UVD", "Batch maximum a posteriori of gtsam: a bound"),
 }
 BOUNDS = frozenset({"ideal-ekf-xyz", "ideal-ekf-uvd"})  # told the truth: ``realisable`` of these is False
+SMOOTHERS = frozenset({"gtsam-map-uvd"})  # each pose by the data of the whole trial: ``causal`` of these is False
+EXTRAS = {"external.gtsam": ("gtsam", "smoothing")}  # module -> the package it needs, and the extra that has it
 
 
 def filter_names() -> list[str]:
@@ -72,13 +78,18 @@ def filter_summaries() -> dict[str, str]:
     return {name: summary for name, (_, _, summary) in MODULES.items()}
 
 
+def usable_names() -> list[str]:
+    """Names of the built-in filters whose libraries are installed."""
+    return [name for name, (module, _, _) in MODULES.items() if _missing(module) is None]
+
+
 def get_filter(name: str) -> Any:
     """Built-in filter by name.
 
     Raises
     ------
     InputError
-        Unknown name.
+        Unknown name, or a filter of a library that is not installed.
     """
     if name not in MODULES:
         if "," in name:
@@ -87,4 +98,13 @@ def get_filter(name: str) -> Any:
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"unknown filter '{name}'{hint}; known: {', '.join(MODULES)}")
     module, attribute, _ = MODULES[name]
+    if (missing := _missing(module)) is not None:
+        package, extra = missing
+        raise InputError(f"filter '{name}' needs {package}: pip install 'filter-consistency[{extra}]'")
     return getattr(importlib.import_module(f"consistency.filters.{module}"), attribute)
+
+
+def _missing(module: str) -> tuple[str, str] | None:
+    """Package that a module needs and that is not installed, and the extra that has it."""
+    needed = EXTRAS.get(module)
+    return needed if needed is not None and importlib.util.find_spec(needed[0]) is None else None

@@ -15,7 +15,7 @@ import joblib
 import pandas as pd
 
 from consistency.errors import InputError
-from consistency.filters import filter_names, get_filter
+from consistency.filters import filter_names, get_filter, usable_names
 from consistency.filters.compiled import one_blas_thread
 from consistency.filters.stepping import error_of, name_of, optimal_gain, run_filter
 from consistency.geometry.conventions import ADDITIVE
@@ -143,7 +143,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
         error_of(filter_)
         sensors = getattr(filter_, "sensors", None)
         if sensors is not None and model not in sensors:
-            fitting = [name for name in filter_names() if model in getattr(get_filter(name), "sensors", (model,))]
+            fitting = [name for name in usable_names() if model in getattr(get_filter(name), "sensors", (model,))]
             raise InputError(
                 f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
                 f"filters that fit: {', '.join(fitting)}"

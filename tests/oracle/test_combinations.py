@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters import filter_names, plain
+from consistency.filters import plain, usable_names
 from consistency.filters.compiled import Compiled, problem_for
 from consistency.filters.kernel.dispatch import require_fitting
 from consistency.filters.kernel.gain import linearise_seen
@@ -38,7 +38,7 @@ from consistency.protocols import Problem
 from consistency.types import Array, Control, Estimates, Gaussian, Info, Observation, Trial
 
 Small = Callable[..., cs.Scenario]
-NAMES = [name for name in filter_names() if isinstance(cs.get_filter(name), Compiled)]
+NAMES = [name for name in usable_names() if isinstance(cs.get_filter(name), Compiled)]
 WORLDS = {"linear": "linear-gaussian", "xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline"}
 TRIANGULATED = ("predicted-ekf-xyz", "debiased-ekf-xyz")  # take points that a stereo sensor's pixels are turned into
 KNOWN_BIAS = "debiased-ekf-xyz"  # what it subtracts of the first view of a landmark is taken as known

@@ -15,7 +15,7 @@ import joblib
 import pandas as pd
 
 from consistency.errors import InputError
-from consistency.filters import filter_names, get_filter
+from consistency.filters import filter_names, get_filter, usable_names
 from consistency.filters.compiled import one_blas_thread
 from consistency.filters.stepping import error_of, name_of, optimal_gain, run_filter
 from consistency.geometry.conventions import ADDITIVE
@@ -26,7 +26,7 @@ from consistency.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.store.log import Log, write_log
 from consistency.store.results import Outcome, Results, StoredResults, Tables, outcome_of
 from consistency.store.storage import NewFolder, manifest_of, require_free
-from consistency.terminal.progress import progress
+from consistency.terminal.progress import KERNELS, progress
 from consistency.types import Trial
 
 Outcomes = Generator[Outcome, None, None]
@@ -143,7 +143,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
         error_of(filter_)
         sensors = getattr(filter_, "sensors", None)
         if sensors is not None and model not in sensors:
-            fitting = [name for name in filter_names() if model in getattr(get_filter(name), "sensors", (model,))]
+            fitting = [name for name in usable_names() if model in getattr(get_filter(name), "sensors", (model,))]
             raise InputError(
                 f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
                 f"filters that fit: {', '.join(fitting)}"
@@ -162,6 +162,15 @@ def worker_count(jobs: int) -> int:
     if jobs == 0 or jobs < -1:
         raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
     return jobs if jobs > 0 else int(joblib.cpu_count())
+
+
+def compile_for(filters: Sequence[Filter], trial: Trial, belief: Belief) -> None:
+    """Compile what the filters need for ``trial`` and is not yet compiled, and say so."""
+    for filter_ in filters:
+        if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, belief):
+            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, KERNELS) as advance:
+                filter_.compile(trial, belief)
+                advance(1)
 
 
 # --- the work --------------------------------------------------------------------------------------
@@ -187,12 +196,7 @@ class _Work:
 
     def compile(self, run: int) -> None:
         """Compile what a run needs and is not yet compiled, and say so."""
-        trial = self.make_trial(run)
-        for filter_ in self.filters:
-            if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, self.belief):
-                with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
-                    filter_.compile(trial, self.belief)
-                    advance(1)
+        compile_for(self.filters, self.make_trial(run), self.belief)
 
     def outcomes(self, runs: list[int]) -> Outcomes:
         """In order of the runs, whoever does them; BLAS has one thread in each worker, for the bits depend on it."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters import BOUNDS, filter_names
+from consistency.filters import BOUNDS, usable_names
 from consistency.filters.compiled import is_realisable, problem_for, problem_of
 from consistency.filters.stepping import run_filter, step_through
 from consistency.runs.montecarlo import run_log, simulate_log
@@ -17,7 +17,7 @@ from consistency.store.log import read_log
 
 
 def test_only_the_ideal_filters_are_marked() -> None:
-    assert {name for name in filter_names() if not is_realisable(cs.get_filter(name))} == BOUNDS
+    assert {name for name in usable_names() if not is_realisable(cs.get_filter(name))} == BOUNDS
 
 
 def test_no_other_filter_is_told_the_truth(uvd: cs.Scenario) -> None:

@@ -75,6 +75,51 @@ def test_labels_of_a_map_are_sorted(uvd: cs.Scenario) -> None:
     np.testing.assert_array_equal(turned.mean, plain.mean)
 
 
+class WithJoint(Invariant):
+    """Gives the joint Gaussian of pose and map too."""
+
+    def joint(self, state: Any) -> Any:
+        return self.twin.joint(state)
+
+
+def test_the_joint_covariance_is_sorted_as_the_map_is(uvd: cs.Scenario) -> None:
+    class Backwards(WithJoint):
+        def map(self, state: Any) -> dict[int, cs.Gaussian]:
+            return dict(reversed(super().map(state).items()))
+
+        def joint(self, state: Any) -> cs.Gaussian:
+            given = super().joint(state)
+            rows = np.arange(len(given.mean)).reshape(-1, 3)
+            rows[1:] = rows[:0:-1]
+            return cs.Gaussian(given.mean[rows.ravel()], given.covariance[np.ix_(rows.ravel(), rows.ravel())])
+
+    trial = cs.simulate(uvd)
+    compiled = cs.get_filter("ekf-uvd").run(trial, uvd.belief).map.joint
+    for filter_ in (WithJoint(), Backwards()):
+        np.testing.assert_allclose(run_filter(filter_, trial, uvd.belief).map.joint, compiled, atol=1e-9)
+    assert run_filter(Invariant(), trial, uvd.belief).map.joint is None
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda P: P[1:, 1:], "ValueError: joint() gave an array of shape"),
+        (lambda P: np.where(P[0, 0] == P, np.nan, P), "the joint covariance of pose and map is not finite"),
+        (lambda P: P + np.eye(len(P), k=2), "the joint covariance of pose and map is not symmetric"),
+    ],
+)
+def test_a_joint_covariance_that_cannot_be(uvd: cs.Scenario, spoil: Any, reason: str) -> None:
+    class Breaks(WithJoint):
+        def joint(self, state: Any) -> cs.Gaussian:
+            given = super().joint(state)
+            return cs.Gaussian(given.mean, spoil(given.covariance))
+
+    said = run_filter(Breaks(), cs.simulate(uvd), uvd.belief)
+    assert said.failure is not None
+    assert said.failure.reason.startswith(reason)
+    assert said.map is None
+
+
 def test_a_filter_without_map_has_none(uvd: cs.Scenario) -> None:
     class Mapless(Invariant):
         map = None  # type: ignore[assignment]
@@ -309,7 +354,10 @@ def of_map(labels_in_map: list[int], **changes: Any) -> pd.DataFrame:
         z=np.ones((3, 3)), n_landmarks=5, truth=np.zeros((2, 3)), landmarks=np.diag([1.0, 2.0, 3.0]),
         source=np.array([0, -1, 2]),
     )  # fmt: skip
-    map_ = Map(np.array(labels_in_map), np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
+    joint = np.eye(3 + 3 * count)
+    joint[0, 3] = joint[3, 0] = 0.5  # pose and first landmark, in x
+    blocks = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
+    map_ = Map(np.array(labels_in_map), np.zeros((count, 3)), blocks, joint)
     said = Estimates("f", 3, np.zeros((1, 3)), np.eye(3)[None], np.full(1, np.nan), np.zeros(1, np.int64), map=map_)
     broken = replace(said, filter="g", failure=Failure("g", 3, 1, "NaN"))
     outcome = outcome_of(replace(trial, **changes), [said, broken])
@@ -321,9 +369,11 @@ def test_labels_that_are_no_landmark_have_no_nees() -> None:
     """Id 4 is none in the world; id 1 is one that was never seen as itself; id 2 is only seen under another id."""
     rows = of_map([0, 1, 2, 4])
     np.testing.assert_array_equal(rows["nees"], [1.0, np.nan, 9.0, np.nan])
+    np.testing.assert_allclose(rows["joint_nees"], [4.0 / 3.0, np.nan, 9.0, np.nan])
     assert list(rows["run"]) == [3] * 4
     np.testing.assert_array_equal(of_map([0, 1, 2], source=None)["nees"], [1.0, 4.0, 9.0])
-    assert of_map([0, 1], landmarks=None)["nees"].isna().all()
+    assert of_map([0, 1], landmarks=None)[["nees", "joint_nees"]].isna().all(axis=None)
+    assert of_map([0, 1], truth=None)["joint_nees"].isna().all()
     assert list(of_map([0, 4], labels=np.array([10, 11, 12, 13, 77]))["landmark"]) == [10, 77]
 
 

@@ -66,6 +66,7 @@ class SigmaRoom(NamedTuple):
     Mt: Array  # (L, s m) transposed statistical linearisation
     pose: Array  # (r,)
     landmark: Array  # (w,)
+    prior: Array  # (L,) mean of that prior, for an update that iterates
 
 
 @implement(make_room, Unscented)
@@ -80,6 +81,7 @@ def sigma_room(update: Unscented, r: int, w: int, s: int, m: int, n: int) -> Sig
         np.empty((L, s * m)),
         np.empty(r),
         np.empty(w),
+        np.empty(L),
     )
 
 
@@ -133,7 +135,7 @@ def correct_unscented(
     update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
-    if not _innovate(update, slam, state, m, work):
+    if not innovate_by_points(update, slam, state, m, work):
         return POSE, np.nan
     innovate(slam, state, data, m, work)
     code, nis = whiten(slam, state, data, m, work)
@@ -143,8 +145,11 @@ def correct_unscented(
 
 
 @inner
-def _innovate(update: Unscented, slam: Slam, state: State, m: int, work: Work[SigmaRoom]) -> bool:
-    """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite."""
+def innovate_by_points(update: Unscented, slam: Slam, state: State, m: int, work: Work[SigmaRoom]) -> bool:
+    """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite.
+
+    The points lie about ``state.x`` (n,), which need not be the mean of P; the linearisation is ``work.room.Mt``.
+    """
     r, w, width = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base
     L, rows = r + w * m, observed_width(slam.sensor) * m
     spread, w0m, w0c, weight = _weights(L, update)

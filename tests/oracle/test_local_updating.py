@@ -26,7 +26,6 @@ ALL = [
     ("ekf-uvd", "herath2007-stereo"),
     ("ukf-xyz", "herath2007-xyz"),
     ("ukf-uvd", "herath2007-stereo"),
-    ("ekf-xy", "esde-xy"),
     ("parked-ekf-uvd", "herath2007-stereo"),
 ]
 

@@ -28,7 +28,6 @@ ALL = [
     ("ukf-uvd", "herath2007-stereo"),
     ("debiased-ekf-xyz", "herath2007-stereo"),
     ("ispkf-uvd", "herath2007-stereo"),
-    ("ekf-xy", "esde-xy"),
     ("parked-ekf-uvd", "herath2007-stereo"),
 ]
 

@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: reproduce calibrate calibrate-quick test test-all bench lint format clean
+.PHONY: reproduce calibrate calibrate-quick regime test test-all bench lint format clean
 
 .venv/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -23,6 +23,10 @@ calibrate: .venv/.done
 
 calibrate-quick: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --quick
+
+regime: .venv/.done
+	OPENBLAS_NUM_THREADS=1 $(BIN)/consistency sweep regime --out reports/regime
+	cp reports/regime/map.json reports/reference/regime.json
 
 bench: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/bench.py

@@ -37,7 +37,11 @@ from consistency.verdicts.curves import curves
 BATCH = 25  # gates handed to a worker at once
 CHUNK = 2000  # runs of the Kalman filter in memory at once
 POOLED, QUICK_POOLED = 54_000, 6_000  # of them in all: as many as the false alarms at 1 % take
-MODULES = ("calibration_monitor", "calibration_compare")  # each: rows(quick, seed), and ABOUT, its worlds and questions
+MODULES = (
+    "calibration_monitor",
+    "calibration_compare",
+    "calibration_map",
+)  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 
 

@@ -43,9 +43,10 @@ class Filter(Protocol):
     on trials whose truth is known, and on no other. ``causal = False`` marks another: a smoother, which gives each pose
     by the data of the whole trial. It has ``run`` (:class:`WholeTrial`) and refuses to be stepped.
 
-    Two more methods are optional. ``map(state)`` gives the landmarks in the state by label, as points (3,) in the
-    world with their covariance (3, 3); it is asked after the last step, for the NEES of the map. ``joint(state)``
-    gives robot and landmarks as one Gaussian; no verdict asks for it.
+    Two more methods are optional, and asked after the last step, for the NEES of the map. ``map(state)`` gives the
+    landmarks in the state by label, as points (3,) in the world with their covariance (3, 3). ``joint(state)`` gives
+    the pose and these K points, in the order of ``map``, as one Gaussian, (3 + 3 K,) and (3 + 3 K, 3 + 3 K), of the
+    additive errors.
     """
 
     def init(self, problem: Problem) -> Any: ...

@@ -131,6 +131,7 @@ class Map:
     landmarks: Indices  # (K,), sorted
     mean: Array  # (K, 3)
     covariance: Array  # (K, 3, 3)
+    joint: Array | None = None  # (3 + 3 K, 3 + 3 K), of the additive errors of pose and landmarks; None if not given
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from consistency.cli.challenging import challenge
 from consistency.errors import InputError
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
@@ -48,26 +49,26 @@ def _main(
 
 @app.command("list")
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
-    """Scenarios, filters and experiments."""
-    from consistency.filters import BOUNDS, SMOOTHERS, filter_names
+    """Scenarios, filters, experiments and sweeps."""
+    from consistency.filters import BOUNDS, SMOOTHERS, filter_summaries
     from consistency.runs.findings import experiment_summaries
     from consistency.scenario import load_scenario, scenario_names
+    from consistency.sweeps.plan import sweep_summaries
 
     scenarios = {name: load_scenario(name).summary for name in scenario_names()}
-    experiments = experiment_summaries()
+    experiments, sweeps, filters = experiment_summaries(), sweep_summaries(), filter_summaries()
     if as_json:
-        print(json.dumps({"scenarios": scenarios, "filters": filter_names(), "experiments": experiments}, indent=2))
+        listed = {"scenarios": scenarios, "filters": list(filters), "experiments": experiments, "sweeps": sweeps}
+        print(json.dumps(listed | {"filter_summaries": filters}, indent=2))
         return
-    for title, entries in (("Scenarios", scenarios), ("Experiments", experiments)):
+    marked = {name: f"{text}{' (not realisable)' * (name in BOUNDS | SMOOTHERS)}" for name, text in filters.items()}
+    named = {"Scenarios": scenarios, "Experiments": experiments, "Sweeps": sweeps, "Filters": marked}
+    for title, entries in named.items():
         print(title)
         width = max((len(name) for name in entries), default=0)
         for name, summary in entries.items():
             print(f"  {name:<{width}}  {summary}")
         print()
-    marks = dict.fromkeys(BOUNDS, "  (a bound, not realisable)") | dict.fromkeys(
-        SMOOTHERS, "  (a bound, all data at once)"
-    )
-    print("Filters\n  " + "\n  ".join(name + marks.get(name, "") for name in filter_names()))
 
 
 @app.command()
@@ -511,6 +512,9 @@ def monitor(
         print_watched(watched)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
+
+
+app.command()(challenge)
 
 
 def main(arguments: list[str] | None = None) -> Any:

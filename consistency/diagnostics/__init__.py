@@ -21,7 +21,16 @@ from consistency.diagnostics.normality import Normality, normality
 from consistency.diagnostics.outliers import Outlier, outliers
 from consistency.diagnostics.planning import PilotPlan, detectable_ratio, gate_runs, pilot_plan, power_of, required_runs
 from consistency.diagnostics.questions import answers
-from consistency.diagnostics.records import Answer, Equivalence, Evidence, Interval, MapScore, Settings, Verdict
+from consistency.diagnostics.records import (
+    Answer,
+    Equivalence,
+    Evidence,
+    Interval,
+    JointNees,
+    MapScore,
+    Settings,
+    Verdict,
+)
 from consistency.diagnostics.scale import MeanTest, mean_test, ratio_interval
 from consistency.diagnostics.sequential import Design, follow, look, sequential_design, speaks
 from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
@@ -40,6 +49,7 @@ __all__ = [
     "Evidence",
     "Hotelling",
     "Interval",
+    "JointNees",
     "Largest",
     "MapScore",
     "MeanTest",

@@ -37,12 +37,17 @@ def pit(nees: Array, dof: int, false_alarm: float = 0.05) -> Pit:
     steps = spread_steps(np.isfinite(nees))
     rows = np.flatnonzero(steps >= 0)
     u = np.sort(stats.chi2.cdf(nees[rows, steps[rows]], dof))
-    N = len(u)
-    if N == 0:
+    if len(u) == 0:
         return Pit(u, float("nan"), float("nan"), float("nan"))
+    return Pit(u, _half_width(false_alarm, len(u)), *kolmogorov(u))
+
+
+def kolmogorov(u: Array) -> tuple[float, float]:
+    """Kolmogorov's distance of independent values (N,) from the uniform distribution on [0, 1], and its p value."""
+    u, N = np.sort(u), len(u)
     grid = np.arange(N + 1) / N
     distance = float(max((grid[1:] - u).max(), (u - grid[:-1]).max()))
-    return Pit(u, _half_width(false_alarm, N), distance, float(stats.kstwo.sf(distance, N)))
+    return distance, float(stats.kstwo.sf(distance, N))
 
 
 @lru_cache

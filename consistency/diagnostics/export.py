@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.diagnostics.wording import p_text, plural, short
+from consistency.diagnostics.wording import p_text, plural, question_text, short
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def flat(v: Verdict) -> dict[str, Any]:
         "failures": [[f.run, f.step, f.reason] for f in v.failures],
         "answers": [vars(a) for a in v.answers], "p_value": v.p_value, "left_out_steps": list(v.left_out_steps),
     }  # fmt: skip
-    for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy, _map):
+    for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy, _map, _joint):
         s |= part(v)
     if v.convention is not None or v.notes:
         s |= {"convention": v.convention, "notes": list(v.notes)}
@@ -119,9 +119,23 @@ def _accuracy(v: Verdict) -> dict[str, Any]:
 def _map(v: Verdict) -> dict[str, Any]:
     if (m := v.map) is None:
         return {}
-    return {
+    s: dict[str, Any] = {
         "map_ratio": m.ratio.value, "map_ratio_interval": tuple(m.ratio[1:]), "map_runs": m.runs,
         "map_landmarks": m.landmarks, "map_left_out": m.left_out,
+    }  # fmt: skip
+    if m.verdict is not None:
+        s["map"] = {"status": m.verdict.status, "reasons": m.verdict.reasons, "statistics": flat(m.verdict)}
+    return s
+
+
+def _joint(v: Verdict) -> dict[str, Any]:
+    s: dict[str, Any] = {} if v.landmarks is None else {"landmarks": list(v.landmarks)}
+    if (j := v.joint) is None:
+        return s
+    return s | {
+        "joint_ratio": j.both.value, "joint_ratio_interval": tuple(j.both[1:]), "joint_pose": tuple(j.pose),
+        "joint_map": tuple(j.map), "joint_runs": j.runs, "joint_dof": j.dof,
+        "joint_chief": list(j.chief), "joint_not_definite": list(j.not_definite),
     }  # fmt: skip
 
 
@@ -130,7 +144,7 @@ def _map(v: Verdict) -> dict[str, Any]:
 
 def figures(v: Verdict) -> list[tuple[str, str]]:
     """The numbers that matter, with their names."""
-    rows = [("evidence", f"{plural(v.runs, 'run')} of {plural(v.steps, 'step')}")]
+    rows = [("evidence", f"{plural(v.runs, 'run')} of {plural(v.steps, v.places[:-1])}")]
     if v.scale is not None and v.scale.judged_steps:
         s, shown = v.scale, v.scale.equivalence
         low, high = s.accepted
@@ -145,13 +159,18 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
     if v.innovations is not None and np.isfinite(v.innovations.ratio):
         judged = "" if v.innovations.judged else ", not judged"
         rows.append(("NIS / dof", f"{v.innovations.ratio:.3f}{judged}"))
+    if v.joint is not None and v.joint.runs:
+        value, low, high = v.joint.both
+        rows.append(("pose and map", f"NEES / dof {short(value)} [{short(low)}, {short(high)}]"))
     if v.world is not None:
         rows.insert(0, ("error", f"{v.convention}: {PLANAR[v.convention or ADDITIVE]}"))
         rows.append(("in the world", _in_world(v.world)))
     if v.map is not None:
-        rows.append(("map NEES / 3", f"{map_text(v.map)}, after the last step; not judged"))
+        rows.append(("map NEES / 3", f"{map_text(v.map)}, after the last step{_map_status(v.map)}"))
     rows.append(("failed runs", f"{len({f.run for f in v.failures})} of {v.runs}"))
-    faults = [f"{a.question} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated]
+    faults = [
+        f"{question_text(v, a.question)} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated
+    ]
     rows.append(("faults", f"{', '.join(faults) or 'none'} of {plural(len(v.answers), 'question')}"))
     return rows
 
@@ -159,6 +178,10 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
 def _in_world(v: Verdict) -> str:
     mean = f", mean NEES {short(v.scale.mean_anees)}" if v.scale is not None and v.scale.judged_steps else ""
     return f"{v.status}{mean} (additive error, '{ADDITIVE}')"
+
+
+def _map_status(m: MapScore) -> str:
+    return "; not judged" if m.verdict is None else f"; the map is {m.verdict.reasons[0]}"
 
 
 def map_text(m: MapScore) -> str:

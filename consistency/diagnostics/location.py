@@ -37,13 +37,13 @@ SURE = 0.04  # false-alarm rate of naming an axis, or a beginning, that does not
 Answers = Mapping[str, Answer]
 
 
-def location_of(sample: Sample, band: Band, answers: Answers) -> Location:
-    """Steps outside the band, since when, and which axes."""
+def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = True) -> Location:
+    """Steps outside the band, since when, and which axes; a fault of what is not ``ordered`` in time begins nowhere."""
     outside = band.outside
     first = int(np.argmax(outside)) if outside.any() else None
     faulty = first is not None and _any(answers, (STEP,))
     since, lasting = None, False
-    if first is not None and faulty:
+    if first is not None and faulty and ordered:
         sign = 1 if band.above[first] else -1
         lasting = _lasting(sample, first, sign)
         since = first + 1 if lasting and _absent_before(sample, first, sign) else None

@@ -14,6 +14,8 @@ BIAS = ("bias", "bias in some step")
 SHAPE = ("shape", "shape in some step")
 TAILS = ("outliers", "distribution")
 INNOVATIONS = ("innovation scale", "innovation whiteness")
+JOINT, JOINT_DISTRIBUTION = "scale of pose and map", "distribution of pose and map"
+OF_MAP = (JOINT, JOINT_DISTRIBUTION)  # asked of maps alone
 # Share of the false-alarm rate of each question; those that are asked share what the main one leaves. Half goes to
 # the mean over the trajectory, so that the number of runs planned for a covariance ratio does not depend on what
 # else is asked.
@@ -30,6 +32,8 @@ SHARES = {
     "distribution": 0.025,
     "innovation scale": 0.025,
     "innovation whiteness": 0.025,
+    JOINT: 0.1,
+    JOINT_DISTRIBUTION: 0.025,
 }
 ABOUT = {
     MAIN: "mean NEES of whole trajectories against its degrees of freedom",
@@ -44,6 +48,8 @@ ABOUT = {
     "distribution": "Kolmogorov's distance of the NEES from chi-square, one step a run",
     "innovation scale": "total NIS against its degrees of freedom",
     "innovation whiteness": "portmanteau test of the autocorrelation over steps",
+    JOINT: "NEES of pose and all landmarks together against its degrees of freedom",
+    JOINT_DISTRIBUTION: "Kolmogorov's distance of that NEES from chi-square, one value a run",
 }
 
 

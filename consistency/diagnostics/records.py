@@ -37,6 +37,19 @@ class Interval(NamedTuple):
 
 
 @dataclass(frozen=True)
+class JointNees:
+    """NEES of pose and map together, in two independent parts of which it is the sum; N runs.
+
+    NaN where a run has none, infinite where its joint covariance is not positive definite.
+    """
+
+    pose: Array  # (N,), chi-square with 3 degrees of freedom if the covariance is right
+    map: Array  # (N,), of all landmarks given the pose, chi-square with ``dof``
+    dof: Indices  # (N,), 3 a landmark
+    landmarks: Array | None = None  # (N, L), ``map`` by landmark, each given the pose and the landmarks before it
+
+
+@dataclass(frozen=True)
 class Evidence:
     """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them."""
 
@@ -53,6 +66,8 @@ class Evidence:
     failures: tuple[Failure, ...] = ()
     axes: Sequence[str] | None = None  # names of the n components
     run_numbers: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
+    landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
+    joint: JointNees | None = None  # of a map
 
 
 @dataclass(frozen=True)
@@ -225,13 +240,27 @@ class Location:
 
 
 @dataclass(frozen=True)
+class JointScore:
+    """NEES of pose and map together over its degrees of freedom, 1 if right, with 95 % intervals from the runs."""
+
+    both: Interval
+    pose: Interval  # part of the pose alone
+    map: Interval  # and of the landmarks given the pose: the map as the robot sees it
+    runs: int
+    dof: int  # of all runs
+    chief: tuple[int, ...] = ()  # landmarks whose part is beyond chance
+    not_definite: tuple[int, ...] = ()  # runs whose joint covariance is not positive definite, left out
+
+
+@dataclass(frozen=True)
 class MapScore:
-    """Landmarks in the map after the last step, each with 3 degrees of freedom. It is shown and not judged."""
+    """Landmarks in the map after the last step, each with 3 degrees of freedom."""
 
     ratio: Interval  # mean over runs of the mean NEES over 3, with its 95 % interval from the spread between runs
     runs: int  # with a landmark that has a NEES
     landmarks: int  # that have one, of all runs
     left_out: int  # that have none: no landmark of the world, not known where, or covariance not positive definite
+    verdict: Verdict | None = None  # on the map, landmarks in the place of steps; None where it is not judged
 
 
 @dataclass(frozen=True)
@@ -277,6 +306,8 @@ class Verdict:
     notes: tuple[str, ...] = ()  # of whoever read the files
     world: Verdict | None = None  # the same runs in the additive error of the world, where the filter has another
     map: MapScore | None = None
+    landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
+    joint: JointScore | None = None  # of the verdict on a map
 
     @property
     def in_world(self) -> Verdict:
@@ -286,6 +317,15 @@ class Verdict:
     @property
     def consistent(self) -> bool:
         return self.status == "consistent"
+
+    def place(self, step: int) -> str:
+        """Name of step 1..T: "step 3", or "landmark 17" where landmarks stand in the place of steps."""
+        return f"step {step}" if self.landmarks is None else f"landmark {self.landmarks[step - 1]}"
+
+    @property
+    def places(self) -> str:
+        """What stands in the place of steps."""
+        return "steps" if self.landmarks is None else "landmarks"
 
     @property
     def faults(self) -> tuple[str, ...]:

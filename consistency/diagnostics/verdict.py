@@ -13,9 +13,21 @@ from consistency.diagnostics.band import simultaneous_band
 from consistency.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import chi2_mean_interval
+from consistency.diagnostics.joint import JointTest, joint_test, near
 from consistency.diagnostics.location import accuracy_of, axes_of, bias_of, location_of, shape_of, tails_of
 from consistency.diagnostics.nees import anees
-from consistency.diagnostics.questions import AXIS, BIAS, DIRECTION, INNOVATIONS, MAIN, SHARES, STEP, answers
+from consistency.diagnostics.questions import (
+    AXIS,
+    BIAS,
+    DIRECTION,
+    INNOVATIONS,
+    JOINT,
+    MAIN,
+    SCALE,
+    SHARES,
+    STEP,
+    answers,
+)
 from consistency.diagnostics.records import Answer, Equivalence, Evidence, Innovations, Settings, Verdict
 from consistency.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.diagnostics.sample import shape_of as shape_of_arrays
@@ -49,6 +61,9 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     Innovations are judged where an optimal gain is declared, otherwise they are reported: only those of an optimal gain
     are white. Without truth they are judged alone.
 
+    A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
+    pose and map together, where it is given.
+
     Raises
     ------
     ValueError
@@ -57,6 +72,10 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     runs, steps = shape_of_arrays(evidence)
     innovations, p_values = _innovations(evidence, settings)
     sample = sample_of(evidence, settings)
+    joint = None
+    if evidence.joint is not None:
+        joint = joint_test(evidence.joint, settings, evidence.run_numbers, evidence.landmarks)
+    p_values |= {} if joint is None else joint.p_values
     tests = None
     if sample is not None:
         tests = ask(sample, settings, p_values, look.scale if look else None)
@@ -64,15 +83,15 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)
-    near = {"innovation scale"} if innovations is not None and _near(innovations, settings) else set()
+    excused = {"innovation scale"} if innovations is not None and _near(innovations, settings) else set()
+    excused |= {JOINT} if joint is not None and near(joint, settings) else set()
     verdict = Verdict(
-        evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), near), evidence.failures,
-        innovations=innovations,
+        evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,
+        innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
     )  # fmt: skip
     if sample is not None and tests is not None:
         verdict = _with_records(verdict, evidence, sample, tests, look)
-    status = _status(verdict, sample, tests)
-    verdict = replace(verdict, status=status)
+    verdict = replace(verdict, status=_status(verdict, sample, tests, joint))
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 
 
@@ -120,7 +139,7 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
     if step is not None and step.found and not band.outside.any():  # found by what Holm's correction left over
         rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
         band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
-    location = location_of(sample, band, by_question)
+    location = location_of(sample, band, by_question, ordered=evidence.landmarks is None)
     scale = scale_of(sample, tests, settings, location, shown)
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
         return replace(verdict, scale=scale, location=location, tails=tails_of(tests, None))
@@ -181,24 +200,37 @@ def _tolerated(sample: Sample, tests: Tests, settings: Settings) -> set[str]:
 # --- status ------------------------------------------------------------------------------------------
 
 
-def _status(verdict: Verdict, sample: Sample | None, tests: Tests | None) -> str:
+def _status(verdict: Verdict, sample: Sample | None, tests: Tests | None, joint: JointTest | None) -> str:
     if verdict.scale is not None and verdict.scale.judged_steps == 0:
         return "failed"
     if verdict.scale is None and not (verdict.innovations is not None and verdict.innovations.dof):
         return "failed"
     faults = set(verdict.faults)
     if not faults:
-        if verdict.failures or verdict.impossible:
+        if verdict.failures or verdict.impossible or (joint is not None and joint.score.not_definite):
             return "failed"
         shown = verdict.equivalence
         return "consistent" if shown is not None and shown.shown else "undecided"
     if sample is None or tests is None:
         return _by_innovations(verdict, faults)
     if not faults & set(BIAS):
-        return _by_errors(verdict.settings, faults, sample, tests)
+        return _with_joint(verdict.settings, faults, sample, tests, joint)
     sample, tests, rest = _without_bias(verdict, sample)
     status = _by_errors(verdict.settings, rest, sample, tests) if rest else "biased"
     return "biased" if status == "heavy-tailed" else status  # a few errors explain less than the mean of all
+
+
+def _with_joint(settings: Settings, faults: set[str], sample: Sample, tests: Tests, joint: JointTest | None) -> str:
+    """Which headline: that of the landmarks, of pose and map together, or neither where they contradict each other."""
+    if joint is None or JOINT not in faults:
+        return _by_errors(settings, faults, sample, tests)
+    together = "overconfident" if joint.score.both.value > 1.0 else "conservative"
+    if not _robust(joint.means, joint.dof, 1, settings, 1):
+        together = "heavy-tailed"
+    if not faults & set(SCALE):
+        return together
+    apart = _by_errors(settings, faults, sample, tests)
+    return "inconsistent" if {apart, together} == {"overconfident", "conservative"} else apart
 
 
 def _by_innovations(verdict: Verdict, faults: set[str]) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from consistency.diagnostics.coverage import TWO_SIGMA
-from consistency.diagnostics.questions import BIAS, DIRECTION, MAIN, SCALE, SHAPE, STEP
-from consistency.diagnostics.records import Answer, Axes, Equivalence, Interval, Scale, Verdict
+from consistency.diagnostics.questions import BIAS, DIRECTION, JOINT, JOINT_DISTRIBUTION, MAIN, SCALE, SHAPE, STEP
+from consistency.diagnostics.records import Answer, Axes, Equivalence, Interval, JointScore, Scale, Verdict
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 NOTABLE = 0.3  # difference of correlations that stands out in one step
@@ -29,7 +29,7 @@ def reasons(v: Verdict) -> list[str]:
     lines: list[str] = []
     if judged:
         assert v.scale is not None
-        lines = [_sentence(v, faults), *_level(v), *_coverage(v)]
+        lines = [_sentence(v, faults), *_level(v), *_together(v), *_coverage(v)]
     elif v.scale is not None:
         lines = ["no step has a covariance of full rank to judge"]
     elif v.innovations is not None and v.innovations.dof:
@@ -101,7 +101,12 @@ def _failures(v: Verdict) -> list[str]:
         count = len({r for r, _ in v.impossible})
         lines.append(
             f"{count} of {v.runs} runs {'has' if count == 1 else 'have'} an infinite error or a covariance with a "
-            f"negative variance, first run {row} in step {step}; those steps are left out"
+            f"negative variance, first run {row} in {v.place(step)}; those {v.places} are left out"
+        )
+    if v.joint is not None and v.joint.not_definite:
+        lines.append(
+            f"the joint covariance of pose and map is not positive definite in {len(v.joint.not_definite)} of {v.runs} "
+            f"runs, first run {v.joint.not_definite[0]}"
         )
     return lines
 
@@ -127,10 +132,14 @@ def _sentence(v: Verdict, faults: Faults) -> str:
         parts += [_shape(v, faults)] if any(q in faults for q in SHAPE) else []
     if "outliers" in faults:
         assert v.tails is not None
-        where = f"run {v.tails.run} lies {short(v.tails.distance)} sigma from the other runs in step {v.tails.step}"
+        where = f"run {v.tails.run} lies {short(v.tails.distance)} sigma from the other runs in {v.place(v.tails.step)}"
         parts.insert(0 if v.status == "heavy-tailed" else len(parts), f"heavy tails: {where}")
     elif v.status == "heavy-tailed":
         parts.insert(0, "heavy tails: the runs differ more than Gaussian errors would")
+    if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
+        parts.append(_joint_scale(v.joint))
+    if JOINT_DISTRIBUTION in faults and len(faults) == 1:
+        parts.append("the NEES of pose and map together does not follow the chi-square distribution")
     if "distribution" in faults and len(faults) == 1:
         parts.append("the NEES does not follow the chi-square distribution")
     if "innovation scale" in faults and v.innovations is not None:
@@ -180,11 +189,12 @@ def _scale(v: Verdict, faults: Faults) -> str:
     if MAIN not in faults and STEP not in faults:
         return _one_axis(v)
     if about and v.status != ("overconfident" if inflation.value > 1.0 else "conservative"):
-        return f"covariance{about} too {'small' if v.status == 'overconfident' else 'large'} in some steps"
+        return f"covariance{about} too {'small' if v.status == 'overconfident' else 'large'} in some {v.places}"
     if not where.lasting and MAIN not in faults:
         count = where.above + where.below
         side = "too small" if where.above else "too large"
-        return f"covariance {side} in {count} of {v.scale.judged_steps} steps, first in step {where.first_step}"
+        first = "" if where.first_step is None else f", first in {v.place(where.first_step)}"
+        return f"covariance {side} in {count} of {v.scale.judged_steps} {v.places}{first}"
     text = f"covariance{about} {off_by(inflation)}"
     if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
         size = short(max(inflation.value, 1.0 / inflation.value))
@@ -233,7 +243,7 @@ def _bias(v: Verdict, in_steps: bool) -> str:
     if v.bias.inflation_without is not None and v.status == "biased":
         rest = f"; without the bias the covariance ratio is {plain(v.bias.inflation_without)}"
     if in_steps:
-        where = f"in step {v.bias.step}, mainly {v.bias.axis}"
+        where = f"in {v.place(v.bias.step or 1)}, mainly {v.bias.axis}"
         return f"{where}{rest}" if v.status == "biased" else f"biased {where}"
     prefix = "" if v.status == "biased" else "biased: "
     sure = {axis: interval for axis, interval in v.bias.by_axis.items() if not interval.holds(0.0)}
@@ -249,7 +259,7 @@ def _sigmas(value: float) -> str:
 def _shape(v: Verdict, faults: Faults) -> str:
     assert v.shape is not None
     assert v.axes is not None
-    where = "" if "shape" in faults else f" in step {v.shape.step}"
+    where = "" if "shape" in faults else f" in {v.place(v.shape.step or 1)}"
     text = f"covariance of the wrong shape{where}"
     gap = abs(v.shape.actual - v.shape.stated)
     if v.shape.pair is not None and gap > (VISIBLE if "shape" in faults else NOTABLE):
@@ -271,7 +281,7 @@ def _level(v: Verdict) -> list[str]:
     if s.judged_steps > 1:
         counts = {"above": v.location.above, "below": v.location.below}
         where = [f"{count} {side}" for side, count in counts.items() if count]
-        text += f"; steps outside the simultaneous band: {' and '.join(where) if where else 'none'}"
+        text += f"; {v.places} outside the simultaneous band: {' and '.join(where) if where else 'none'}"
         text += f" of {s.judged_steps}"
     tolerated = [a.question for a in v.answers if a.tolerated]
     lines = [text]
@@ -280,6 +290,29 @@ def _level(v: Verdict) -> list[str]:
             f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"
         )
     return lines
+
+
+def _joint_scale(joint: JointScore) -> str:
+    """What pose and map together say, and which of the two parts stands out, or which landmarks."""
+    pose, map_ = (not part.holds(1.0) for part in (joint.pose, joint.map))
+    part = "" if pose == map_ else f", mainly {'the pose' if pose else 'the map given the pose'}"
+    if joint.chief and not pose:
+        labels = ", ".join(str(label) for label in joint.chief[:MOST])
+        more = f" and {len(joint.chief) - MOST} more" if len(joint.chief) > MOST else ""
+        part += f" (most in landmark{'s' * (len(joint.chief) > 1)} {labels}{more})"
+    return f"pose and map together: covariance {off_by(joint.both)}{part}"
+
+
+def _together(v: Verdict) -> list[str]:
+    if v.landmarks is None:
+        return []
+    if v.joint is None or not v.joint.runs:
+        return ["the joint covariance of pose and map was not kept: each landmark is judged by itself"]
+    j = v.joint
+    return [
+        f"NEES of pose and map together over its degrees of freedom {plain(j.both)}: of the pose {plain(j.pose)}, "
+        f"of the map given the pose {plain(j.map)}"
+    ]
 
 
 def _coverage(v: Verdict) -> list[str]:
@@ -333,5 +366,11 @@ def _questions(v: Verdict, faults: Faults) -> str:
     text = f"{plural(count, 'question')} at a false-alarm rate of {rate:.3g}{' together' if count > 1 else ''}"
     if not faults:
         least = min(v.answers, key=lambda a: a.adjusted)
-        return f"{text}; nearest to a fault: {least.question} (corrected p {p_text(least.adjusted)})"
-    return f"{text}; found: " + ", ".join(f"{q} (p {p_text(a.adjusted)})" for q, a in faults.items())
+        return f"{text}; nearest to a fault: {question_text(v, least.question)} (corrected p {p_text(least.adjusted)})"
+    found = (f"{question_text(v, q)} (p {p_text(a.adjusted)})" for q, a in faults.items())
+    return f"{text}; found: {', '.join(found)}"
+
+
+def question_text(v: Verdict, question: str) -> str:
+    """A question as it is called: of a map, "in some landmark" in the place of "in some step"."""
+    return question if v.landmarks is None else question.replace("some step", "some landmark")

@@ -13,36 +13,55 @@ from typing import Any
 
 from consistency.errors import InputError
 
-# name -> module of this folder and the attribute in it; imported when asked for
-MODULES = {
-    "kf": ("methods.kf", "FILTER"),
-    "ekf-xyz": ("methods.ekf", "XYZ"),
-    "ekf-uvd": ("methods.ekf", "UVD"),
-    "ukf-xyz": ("methods.ukf", "XYZ"),
-    "ukf-uvd": ("methods.ukf", "UVD"),
-    "ckf-xyz": ("methods.ckf", "XYZ"),
-    "ckf-uvd": ("methods.ckf", "UVD"),
-    "iekf-xyz": ("methods.iekf", "XYZ"),
-    "iekf-uvd": ("methods.iekf", "UVD"),
-    "ri-ekf-xyz": ("methods.riekf", "XYZ"),
-    "ri-ekf-uvd": ("methods.riekf", "UVD"),
-    "fej-ekf-xyz": ("methods.fej", "XYZ"),
-    "fej-ekf-uvd": ("methods.fej", "UVD"),
-    "oc-ekf-xyz": ("methods.oc", "XYZ"),
-    "oc-ekf-uvd": ("methods.oc", "UVD"),
-    "ideal-ekf-xyz": ("methods.ideal", "XYZ"),
-    "ideal-ekf-uvd": ("methods.ideal", "UVD"),
-    "anchored-ekf-xyz": ("methods.anchored", "XYZ"),
-    "anchored-ekf-uvd": ("methods.anchored", "UVD"),
-    "robocentric-ekf-uvd": ("methods.robocentric", "ROBOCENTRIC"),
-    "parked-ekf-uvd": ("methods.robocentric", "PARKED"),
-    "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ"),
-    "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD"),
-    "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ"),
-    "filterpy-ukf-uvd": ("external.filterpy", "UKF_UVD"),
-    "gtsam-batch-uvd": ("external.gtsam", "BATCH_UVD"),
-    "gtsam-lag-uvd": ("external.gtsam", "LAG_UVD"),
-    "gtsam-map-uvd": ("external.gtsam", "MAP_UVD"),
+# name -> module of this folder, the attribute in it, imported when asked for, and what the filter is
+MODULES: dict[str, tuple[str, str, str]] = {
+    "kf": ("methods.kf", "FILTER", "Kalman filter of a linear world, exact: the positive control"),
+    "ekf-xyz": ("methods.ekf", "XYZ", "Extended Kalman filter on points in m"),
+    "ekf-uvd": ("methods.ekf", "UVD", "Extended Kalman filter on pixels and disparity"),
+    "predicted-ekf-xyz": (
+        "methods.triangulated",
+        "PREDICTED",
+        "EKF on triangulated points, with their noise at the prediction",
+    ),
+    "debiased-ekf-xyz": (
+        "methods.triangulated",
+        "DEBIASED",
+        "EKF on triangulated points, with noise and bias at the prediction",
+    ),
+    "ukf-xyz": ("methods.ukf", "XYZ", "Unscented Kalman filter on points"),
+    "ukf-uvd": ("methods.ukf", "UVD", "Unscented Kalman filter on pixels"),
+    "ckf-xyz": ("methods.ckf", "XYZ", "Cubature Kalman filter on points"),
+    "ckf-uvd": ("methods.ckf", "UVD", "Cubature Kalman filter on pixels"),
+    "iekf-xyz": ("methods.iekf", "XYZ", "EKF with an iterated update, on points"),
+    "iekf-uvd": ("methods.iekf", "UVD", "EKF with an iterated update, on pixels"),
+    "ispkf-xyz": ("methods.ispkf", "XYZ", "UKF with an iterated update, on points"),
+    "ispkf-uvd": ("methods.ispkf", "UVD", "UKF with an iterated update, on pixels"),
+    "ri-ekf-xyz": ("methods.riekf", "XYZ", "EKF of a right-invariant error, on points"),
+    "ri-ekf-uvd": ("methods.riekf", "UVD", "EKF of a right-invariant error, on pixels"),
+    "fej-ekf-xyz": ("methods.fej", "XYZ", "EKF with first-estimates Jacobians, on points"),
+    "fej-ekf-uvd": ("methods.fej", "UVD", "EKF with first-estimates Jacobians, on pixels"),
+    "oc-ekf-xyz": ("methods.oc", "XYZ", "Observability-constrained EKF, on points"),
+    "oc-ekf-uvd": ("methods.oc", "UVD", "Observability-constrained EKF, on pixels"),
+    "ideal-ekf-xyz": ("methods.ideal", "XYZ", "EKF with Jacobians at the truth, on points: a bound"),
+    "ideal-ekf-uvd": ("methods.ideal", "UVD", "EKF with Jacobians at the truth, on pixels: a bound"),
+    "anchored-ekf-xyz": ("methods.anchored", "XYZ", "EKF with anchored inverse depths, on points"),
+    "anchored-ekf-uvd": ("methods.anchored", "UVD", "EKF with anchored inverse depths, on pixels"),
+    "robocentric-ekf-uvd": ("methods.robocentric", "ROBOCENTRIC", "Robot-centred map of inverse ranges"),
+    "parked-ekf-uvd": (
+        "methods.robocentric",
+        "PARKED",
+        "robot-centred map, with landmarks out of sight parked at clones of the pose",
+    ),
+    "eqf-uvd": ("methods.equivariant", "FILTER", "Equivariant filter: robot-centred map with polar errors, on pixels"),
+    "submap-ekf-xyz": ("methods.submaps", "XYZ", "EKF in small maps that are joined, on points"),
+    "submap-ekf-uvd": ("methods.submaps", "UVD", "EKF in small maps that are joined, on pixels"),
+    "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ", "EKF of the library filterpy, on points"),
+    "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD", "EKF of the library filterpy, on pixels"),
+    "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ", "UKF of the library filterpy, on points"),
+    "filterpy-ukf-uvd": ("external.filterpy", "UKF_UVD", "UKF of the library filterpy, on pixels"),
+    "gtsam-batch-uvd": ("external.gtsam", "BATCH_UVD", "Smoother of all data so far, by gtsam's iSAM2"),
+    "gtsam-lag-uvd": ("external.gtsam", "LAG_UVD", "Smoother of the last 50 poses and all landmarks, by gtsam"),
+    "gtsam-map-uvd": ("external.gtsam", "MAP_UVD", "Smoother of the whole trial, by gtsam: a bound"),
 }
 BOUNDS = frozenset({"ideal-ekf-xyz", "ideal-ekf-uvd"})  # told the truth: ``realisable`` of these is False
 SMOOTHERS = frozenset({"gtsam-map-uvd"})  # each pose by the data of the whole trial: ``causal`` of these is False
@@ -56,7 +75,12 @@ def filter_names() -> list[str]:
 
 def usable_names() -> list[str]:
     """Names of the built-in filters whose libraries are installed."""
-    return [name for name, (module, _) in MODULES.items() if _missing(module) is None]
+    return [name for name, (module, _, _) in MODULES.items() if _missing(module) is None]
+
+
+def filter_summaries() -> dict[str, str]:
+    """What each built-in filter is, in a few words, by name."""
+    return {name: summary for name, (_, _, summary) in MODULES.items()}
 
 
 def get_filter(name: str) -> Any:
@@ -73,7 +97,7 @@ def get_filter(name: str) -> Any:
         near = difflib.get_close_matches(name, MODULES, n=1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"unknown filter '{name}'{hint}; known: {', '.join(MODULES)}")
-    module, attribute = MODULES[name]
+    module, attribute, _ = MODULES[name]
     if (missing := _missing(module)) is not None:
         package, extra = missing
         raise InputError(f"filter '{name}' needs {package}: pip install 'filter-consistency[{extra}]'")

@@ -131,7 +131,7 @@ class Compiled:
         failure = Failure(self.name, trial.run, out.step, REASONS[out.code]) if out.step else None
         own = None if self.error == ADDITIVE else out.own
         labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
-        map_ = Map(labels, out.points[labels], out.spread[labels]) if out.code == 0 else None
+        map_ = Map(labels, out.points[labels], out.spread[labels], out.joint) if out.code == 0 else None
         return Estimates(
             self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_
         )

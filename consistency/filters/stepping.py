@@ -72,8 +72,8 @@ class _Unusable(Exception):
 def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float | None = None) -> Estimates:
     """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``.
 
-    ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``map`` after the last
-    step.
+    ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``map`` and ``joint``
+    after the last step.
 
     Raises
     ------
@@ -186,7 +186,27 @@ def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:
     mean, covariance = np.empty((len(labels), 3)), np.empty((len(labels), 3, 3))
     for i, label in enumerate(labels):
         mean[i], covariance[i] = _landmark(label, landmarks[label])
-    return Map(np.array(labels, np.int64), mean, covariance)
+    return Map(
+        np.array(labels, np.int64), mean, covariance, _joint(filter_, state, [int(label) for label in landmarks])
+    )
+
+
+def _joint(filter_: Filter, state: Any, labels: list[int]) -> Array | None:
+    """Covariance of pose and landmarks, these sorted by label; ``labels`` in the order of ``map``.
+
+    None without a method ``joint``.
+    """
+    if not callable(getattr(filter_, "joint", None)):
+        return None
+    n = 3 + 3 * len(labels)
+    P = _array(_value_of(filter_, "joint", state).covariance, (n, n), "joint")
+    if not np.isfinite(P).all():
+        raise _Unusable("the joint covariance of pose and map is not finite")
+    if _asymmetric(P):
+        raise _Unusable("the joint covariance of pose and map is not symmetric")
+    order = np.append(0, 1 + np.argsort(labels))
+    rows = (3 * order[:, None] + np.arange(3)).ravel()
+    return P[np.ix_(rows, rows)]
 
 
 def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:

@@ -45,12 +45,46 @@ def planar_error(truth: Array, estimate: Array, convention: str) -> Array:
     if convention == "so2":
         return error
     # est^-1 truth = (R^' (p - p^), h - h^);  truth est^-1 = (p - R R^' p^, h - h^)
-    shift = error[..., :2]
-    if convention == "left":
-        shift = _turn(shift, -estimate[..., 2])
-    else:
-        shift = shift + estimate[..., :2] - _turn(estimate[..., :2], error[..., 2])
+    shift = _shift(error[..., :2], estimate[..., :2], convention, error[..., 2], estimate[..., 2])
     return se2_log(np.concatenate([shift, error[..., 2:]], axis=-1))
+
+
+def _shift(gap: Array, point: Array, convention: str, turn: Array, heading: Array) -> Array:
+    """Translation of a point (..., 2) that is off by ``gap``, by the pose whose heading is off by ``turn`` (...)."""
+    if convention == "left":
+        return _turn(gap, -heading)
+    return gap + point - _turn(point, turn)
+
+
+def planar_map_error(
+    true_pose: Array, true_points: Array, pose: Array, points: Array, covariance: Array, convention: str
+) -> tuple[Array, Array]:
+    """Joint error of a pose (3,) and K points (K, 3) in the world, m and rad, with its covariance.
+
+    ``left`` and ``right`` are those of SE_2(2) in x and y, the group of a pose and points (Barrau & Bonnabel 2015, "An
+    EKF-SLAM algorithm with consistency properties"): each point moves as the position does. Heights are additive.
+
+    Parameters
+    ----------
+    covariance : (3 + 3 K, 3 + 3 K), of the additive errors
+
+    Returns
+    -------
+    (3 + 3 K,) error, pose first, and (3 + 3 K, 3 + 3 K) its covariance, carried over to first order
+    """
+    gap, error = np.asarray(true_points - points, float), planar_error(true_pose, pose, convention)
+    if convention in ("so2", "vector"):
+        return np.append(error, gap), np.array(covariance, float)
+    turn, T = error[2], np.eye(len(covariance))
+    shift = _shift(gap[:, :2], points[:, :2], convention, turn, pose[2])
+    moved = se2_log(np.column_stack([shift, np.full(len(points), turn)]))[:, :2]
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    for at, (x, y) in zip(range(0, len(T), 3), (pose[:2], *points[:, :2]), strict=True):
+        if convention == "left":
+            T[at : at + 2, at : at + 2] = [[c, s], [-s, c]]
+        else:
+            T[at : at + 2, 2] = y, -x
+    return np.append(error, np.column_stack([moved, gap[:, 2]])), T @ covariance @ T.T
 
 
 def spatial_error(truth: Array, estimate: Array, convention: str) -> Array:

@@ -16,9 +16,11 @@ from consistency.errors import InputError
 from consistency.store.atomic import write_whole
 
 if TYPE_CHECKING:
+    from consistency.reporting.blocks import Document
+    from consistency.sweeps.regime import Regime
     from consistency.verdicts.monitoring import Watched
 
-__all__ = ["require_plot", "write_monitor_plot", "write_reports"]
+__all__ = ["require_plot", "write_monitor_plot", "write_regime_reports", "write_reports"]
 
 KINDS = (".png", ".pdf", ".svg")  # of a plot
 
@@ -50,10 +52,33 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     for path in targets:
         _require_writable(path, overwrite)
     from consistency.reporting.build import build_report, compose
+
+    _write_document(compose(build_report(Path(folder))), html, pdf)
+    return targets
+
+
+def write_regime_reports(regime: Regime, folder: Path) -> list[Path]:
+    """``report.html`` and ``report.pdf`` of a map in the folder of its sweep; those of before are replaced.
+
+    Raises
+    ------
+    InputError
+        A file cannot be written.
+    """
+    targets = [folder / "report.html", folder / "report.pdf"]
+    for path in targets:
+        _require_writable(path, overwrite=True)
+    from consistency.reporting.regime import compose_regime
+
+    _write_document(compose_regime(regime), *targets)
+    return targets
+
+
+def _write_document(document: Document, html: Path | None, pdf: Path | None) -> None:
+    """The document in both formats, each file whole or not at all; None leaves one out."""
     from consistency.reporting.html import render_html
     from consistency.reporting.pdf import pdf_beside
 
-    document = compose(build_report(Path(folder)))
     contents: list[tuple[Path, bytes]] = []
     with pdf_beside(document) if pdf is not None else nullcontext(bytes) as finished:
         if html is not None:
@@ -62,7 +87,6 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
             contents.append((pdf, finished()))
     for path, content in contents:
         _write(path, content)
-    return targets
 
 
 def require_plot(path: Path, overwrite: bool) -> None:

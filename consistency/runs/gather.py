@@ -137,7 +137,7 @@ class Gathered:
         with new.writing():
             self._write(new, "estimates", self._of, OWN_NUMBERS if self.errors else NUMBERS)
             if any(next(self._map_of(name), None) is not None for name in self.filters):
-                self._write(new, "map", self._map_of)
+                self._write(new, "map", self._map_of, MAP_NUMBERS)
             true = self._true()
             if (first := next(true, None)) is not None:
                 with Writer(new.path / "truth.parquet", "truth") as writer:
@@ -166,7 +166,7 @@ class Gathered:
         return self._merged(self._estimates_before(filter_name), self._estimates[filter_name])
 
     def _map_of(self, filter_name: str) -> Iterator[Columns]:
-        return self._merged(self._before("map", MAP_NUMBERS, filter_name), self._maps[filter_name])
+        return self._merged(self._maps_before(filter_name), self._maps[filter_name])
 
     def _true(self) -> Iterator[Columns]:
         return self._merged(self._true_before(), self._truth)
@@ -180,11 +180,15 @@ class Gathered:
     def _require_readable(self) -> None:
         for name in self.filters:
             deque(self._estimates_before(name), maxlen=0)
-            deque(self._before("map", MAP_NUMBERS, name), maxlen=0)
+            deque(self._maps_before(name), maxlen=0)
         deque(self._true_before(), maxlen=0)
 
     def _estimates_before(self, filter_name: str) -> Iterator[tuple[int, Columns]]:
         return self._before("estimates", OWN_NUMBERS if filter_name in self.errors else NUMBERS, filter_name)
+
+    def _maps_before(self, filter_name: str) -> Iterator[tuple[int, Columns]]:
+        columns = [] if self.previous is None else self.previous.map_numbers
+        return self._before("map", columns, filter_name)
 
     def _true_before(self) -> Iterator[tuple[int, Columns]]:
         return self._before("truth", list(COLUMNS["truth"]))

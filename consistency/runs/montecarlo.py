@@ -26,7 +26,7 @@ from consistency.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.store.log import Log, write_log
 from consistency.store.results import Outcome, Results, StoredResults, Tables, outcome_of
 from consistency.store.storage import NewFolder, manifest_of, require_free
-from consistency.terminal.progress import progress
+from consistency.terminal.progress import KERNELS, progress
 from consistency.types import Trial
 
 Outcomes = Generator[Outcome, None, None]
@@ -164,6 +164,15 @@ def worker_count(jobs: int) -> int:
     return jobs if jobs > 0 else int(joblib.cpu_count())
 
 
+def compile_for(filters: Sequence[Filter], trial: Trial, belief: Belief) -> None:
+    """Compile what the filters need for ``trial`` and is not yet compiled, and say so."""
+    for filter_ in filters:
+        if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, belief):
+            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, KERNELS) as advance:
+                filter_.compile(trial, belief)
+                advance(1)
+
+
 # --- the work --------------------------------------------------------------------------------------
 
 
@@ -187,12 +196,7 @@ class _Work:
 
     def compile(self, run: int) -> None:
         """Compile what a run needs and is not yet compiled, and say so."""
-        trial = self.make_trial(run)
-        for filter_ in self.filters:
-            if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, self.belief):
-                with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, "kernels") as advance:
-                    filter_.compile(trial, self.belief)
-                    advance(1)
+        compile_for(self.filters, self.make_trial(run), self.belief)
 
     def outcomes(self, runs: list[int]) -> Outcomes:
         """In order of the runs, whoever does them; BLAS has one thread in each worker, for the bits depend on it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,6 +12,7 @@ from consistency.protocols import Filter
 from consistency.runs.montecarlo import Interrupted, run_trials
 from consistency.scenario import Scenario
 from consistency.store.results import POSE, Results, Tables
+from consistency.terminal.progress import say
 from consistency.verdicts.curves import curves
 from consistency.verdicts.judge import beside, evidence_of, refused
 
@@ -68,7 +68,7 @@ def run_until_decided(
                 decided |= {name: verdict} if settled(verdict) or runs == max_runs else {}
         open_ = [name for name in open_ if name not in decided]
         if runs > done:
-            print(f"{runs} runs: {progress_text(decided, open_)}", file=sys.stderr, flush=True)
+            say(f"{runs} runs: {progress_text(decided, open_)}")
         if not open_:
             break
     if results is None:

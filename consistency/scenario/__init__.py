@@ -1,8 +1,8 @@
 """Scenarios: a TOML file becomes a frozen record of what is true and what the filter believes.
 
 ``tables`` reads files, ``sensor`` has the one definition of a sensor, ``truth`` and ``belief`` the two halves of a
-scenario, ``record`` puts them together. ``effects`` holds what a sensor does to an ideal observation, one effect a
-file: its keys and its ``apply``. Nothing here draws a trial; that is the simulation's.
+scenario, ``record`` puts them together, ``writing`` makes a file of one. ``effects`` holds what a sensor does to an
+ideal observation, one effect a file: its keys and its ``apply``. Nothing here draws a trial; that is the simulation's.
 """
 
 from consistency.scenario.belief import Belief, BelievedMotion, SigmaPoints
@@ -40,6 +40,7 @@ from consistency.scenario.truth import (
     UniformLandmarks,
     Waypoints,
 )
+from consistency.scenario.writing import scenario_text
 
 __all__ = [
     "Belief",
@@ -76,4 +77,5 @@ __all__ = [
     "load_scenario",
     "read_table",
     "scenario_names",
+    "scenario_text",
 ]

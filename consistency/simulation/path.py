@@ -54,6 +54,11 @@ def planned_path(truth: Truth) -> Array:
     return dead_reckoning(start_pose(truth), planned_controls(truth))
 
 
+def lap_length(path: Path_) -> float:
+    """Length in m of the path until it is back at its start; turns on the spot have none."""
+    return sum(piece.duration * piece.v for piece in _pieces(path))
+
+
 def _pieces(path: Path_) -> list[Piece]:
     """One cycle of the path, all counter-clockwise."""
     v = path.speed

@@ -40,8 +40,10 @@ COLUMNS: dict[str, dict[str, str]] = {
 OPTIONAL = {  # columns of a table that may be missing
     "observations": {"source": "int64"},
     "estimates": dict.fromkeys([*OWN_COVARIANCE, "own_nees"], "float64"),
+    "map": {"joint_nees": "float64"},
 }
-NULLABLE = {"nees", "nis", *OPTIONAL["estimates"]}
+NULLABLE = {"nees", "nis", *OPTIONAL["estimates"], *OPTIONAL["map"]}
+UNBOUNDED = {"joint_nees"}  # infinite where the joint covariance of a run is not positive definite
 BY_FILTER = {"estimates", "map"}  # tables whose row groups hold one filter each
 REPEATED = {"t", "dt"}  # floating-point columns of few different values
 ROWS = 65_536  # of a row group, and of a batch that is read
@@ -194,6 +196,11 @@ def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
     return file
 
 
+def columns_of(folder: Path, name: str) -> list[str]:
+    """Names of the columns of a table; refused as :func:`require_table` does."""
+    return list(require_table(folder, name).schema_arrow.names)
+
+
 @contextmanager
 def _refusals(path: Path) -> Iterator[None]:
     try:
@@ -222,7 +229,7 @@ def _check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0)
     """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
     values = pd.to_numeric(column, errors="coerce").to_numpy(float)
     if column.name in NULLABLE:
-        values = np.where(column.isna(), 0.0, values)
+        values = np.where(column.isna() | (values == np.inf) & (column.name in UNBOUNDED), 0.0, values)
     if not np.isfinite(values).all():
         row = int(np.flatnonzero(~np.isfinite(values))[0])
         raise InputError(f"{path}: column '{column.name}', row {first + row}: not a finite number ({column.iloc[row]})")

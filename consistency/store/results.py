@@ -13,11 +13,13 @@ import numpy as np
 import pandas as pd
 from pydantic import ValidationError
 
+from consistency.diagnostics.landmarks import joint_nees
 from consistency.diagnostics.whitening import whiten
 from consistency.errors import InputError
+from consistency.filters.compiled import one_blas_thread
 from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry import pose_error
-from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
+from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error, planar_map_error
 from consistency.scenario import Scenario, explain
 from consistency.store.parquet import (
     COLUMNS,
@@ -26,6 +28,7 @@ from consistency.store.parquet import (
     OWN_COVARIANCE,
     POINT_COVARIANCE,
     Columns,
+    columns_of,
     read_batches,
     read_parquet,
     require_table,
@@ -36,7 +39,8 @@ from consistency.types import Array, Estimates, Failure, Indices, Map, Trial
 POSE = ["x", "y", "heading"]
 NUMBERS = [column for column in COLUMNS["estimates"] if column != "filter"]
 OWN_NUMBERS = [*NUMBERS, *OPTIONAL["estimates"]]  # of a filter whose error is not the additive one
-MAP_NUMBERS = [column for column in COLUMNS["map"] if column != "filter"]
+JOINT = "joint_nees"  # of a landmark, given the pose and the landmarks above it in the map of its run
+MAP_NUMBERS = [*(column for column in COLUMNS["map"] if column != "filter"), JOINT]
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,16 @@ class Tables(ABC):
     @property
     @abstractmethod
     def has_truth(self) -> bool: ...
+
+    @property
+    @abstractmethod
+    def has_joint(self) -> bool:
+        """Whether maps are kept with their joint NEES, which older folders lack."""
+
+    @property
+    def map_numbers(self) -> list[str]:
+        """Columns of ``map`` that hold numbers."""
+        return [column for column in MAP_NUMBERS if column != JOINT or self.has_joint]
 
     @property
     def filters(self) -> list[str]:
@@ -139,6 +153,10 @@ class Results(Tables):
     def has_truth(self) -> bool:
         return self.truth is not None
 
+    @property
+    def has_joint(self) -> bool:
+        return self.map is not None and JOINT in self.map
+
     def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
         rows = {"truth": self.truth, "estimates": self.estimates, "map": self.map}[table]
         if rows is not None:
@@ -165,6 +183,10 @@ class StoredResults(Tables):
     @property
     def has_truth(self) -> bool:
         return "truth" in self.manifest.get("tables", [])
+
+    @property
+    def has_joint(self) -> bool:
+        return "map" in self.manifest.get("tables", []) and JOINT in columns_of(self.folder, "map")
 
     @property
     def estimates(self) -> pd.DataFrame:
@@ -207,7 +229,7 @@ def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:
         {e.filter: _columns(trial, e) for e in estimates},
         None if trial.truth is None else _truth_columns(trial, trial.truth),
         tuple(e.failure for e in estimates if e.failure),
-        {e.filter: _map_columns(trial, e.map) for e in estimates if e.map is not None and e.failure is None},
+        {e.filter: _map_columns(trial, e, e.map) for e in estimates if e.map is not None and e.failure is None},
     )
 
 
@@ -251,21 +273,42 @@ def _nees(error: Array | None, P: Array, first: int) -> Array:
     return value
 
 
-def _map_columns(trial: Trial, map_: Map) -> Columns:
+def _map_columns(trial: Trial, estimates: Estimates, map_: Map) -> Columns:
     """Rows of ``map.parquet``; without NEES where the id is no landmark of the world, or its place is not known."""
     ids, count = map_.landmarks, len(map_.landmarks)
-    nees = np.full(count, np.nan)
+    nees, joint = np.full(count, np.nan), np.full(count, np.nan)
     if trial.landmarks is not None:
         judged = (ids < len(trial.landmarks)) & ~np.isin(ids, trial.things)
         w = whiten(trial.landmarks[ids[judged]] - map_.mean[judged], map_.covariance[judged])
         nees[judged] = np.einsum("ki,ki->k", w, w)
+        joint[judged] = _joint_nees(trial, estimates, map_, judged)
     return {
         "run": np.full(count, trial.run),
         "landmark": ids if trial.labels is None else trial.labels[ids],
         **dict(zip("xyz", map_.mean.T, strict=True)),
         **{name: map_.covariance[:, i, j] for name, (i, j) in POINT_COVARIANCE.items()},
         "nees": nees,
+        JOINT: joint,
     }
+
+
+def _joint_nees(trial: Trial, estimates: Estimates, map_: Map, judged: Array) -> Array:
+    """Parts (K,) of the joint NEES, in the filter's own error, of the landmarks that are ``judged``; NaN if not known.
+
+    The part of a landmark is that given the pose and the landmarks before it: independent of the others, and
+    chi-square with 3 degrees of freedom, if the joint covariance is right.
+    """
+    if map_.joint is None or trial.truth is None or trial.landmarks is None:
+        return np.full(int(judged.sum()), np.nan)
+    ids, kept = map_.landmarks[judged], np.repeat(np.append(True, judged), 3)
+    with one_blas_thread():
+        parts = joint_nees(
+            *planar_map_error(
+                trial.truth[-1], trial.landmarks[ids], estimates.pose[-1], map_.mean[judged],
+                map_.joint[np.ix_(kept, kept)], estimates.error,
+            )
+        )  # fmt: skip
+    return parts[1:]
 
 
 def _truth_columns(trial: Trial, path: Array) -> Columns:
@@ -287,7 +330,7 @@ def estimates_table(parts: Sequence[tuple[str, Columns]], own: bool = False) -> 
 def map_table(parts: Sequence[tuple[str, Columns]]) -> pd.DataFrame | None:
     """``map.parquet`` of (filter, columns), one below the other; None without a row."""
     table = _by_filter("map", parts)
-    return table if len(table) else None
+    return (table if JOINT in table else table.assign(**{JOINT: np.nan})) if len(table) else None
 
 
 def _by_filter(name: str, parts: Sequence[tuple[str, Columns]]) -> pd.DataFrame:

@@ -6,14 +6,35 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 Advance = Callable[[int], None]
+KERNELS = "kernels"  # unit of what is compiled: said even where all else is quiet
+_quiet = ContextVar("quiet", default=False)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Inside, only the compiling of kernels is said: many short works report for themselves."""
+    token = _quiet.set(True)
+    try:
+        yield
+    finally:
+        _quiet.reset(token)
+
+
+def say(text: str) -> None:
+    """One line on standard error, unless it is to be quiet."""
+    if not _quiet.get():
+        print(text, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def progress(label: str, total: int, unit: str = "runs") -> Iterator[Advance]:
     """Yields a function to call with the number of units just done; writes to standard error."""
-    if sys.stderr.isatty():
+    if _quiet.get() and unit != KERNELS:
+        yield lambda _: None
+    elif sys.stderr.isatty():
         with _bar(label, total, unit) as advance:
             yield advance
     else:

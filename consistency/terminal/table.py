@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from consistency.diagnostics import Interval, Verdict
+from consistency.diagnostics import Interval, MapScore, Verdict
 from consistency.diagnostics.export import map_text
 from consistency.diagnostics.monitor import CAVEAT, accepted_scales
 from consistency.diagnostics.wording import short
@@ -30,7 +30,8 @@ COLOURS = {
 }  # fmt: skip
 
 
-def _console() -> Console:
+def open_console() -> Console:
+    """Standard output: coloured on a terminal, plain and wide elsewhere."""
     # pipes and files get plain wide lines, so that nothing is cut
     return Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False)
 
@@ -54,7 +55,7 @@ def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
         if verdict.world is not None:
             status, anees, ratio, *_ = _cells(verdict.world)
             table.add_row("", f"{ADDITIVE}, beside it", status, anees, ratio)
-    console = _console()
+    console = open_console()
     console.print(table)
     for line in _below(verdicts):
         console.print(line, markup=False, soft_wrap=not console.is_terminal)
@@ -87,10 +88,22 @@ def _below(verdicts: dict[str, Verdict]) -> list[str]:
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
-    maps = [f"{name} {map_text(v.map)}" for name, v in verdicts.items() if v.map is not None and v.map.landmarks]
+    maps = {name: v.map for name, v in verdicts.items() if v.map is not None and v.map.landmarks}
     if maps:
-        lines.append(f"map after the last step, mean NEES / 3, not judged: {', '.join(maps)}")
+        judged = "" if any(m.verdict is not None for m in maps.values()) else ", not judged"
+        scores = "; ".join(f"{name} {_map_cells(m)}" for name, m in maps.items())
+        lines.append(f"map after the last step, mean NEES / 3{judged}: {scores}")
     return lines
+
+
+def _map_cells(m: MapScore) -> str:
+    """NEES of landmarks over 3, and the verdict on the map with the ratio of pose and map together."""
+    text = map_text(m)
+    if m.verdict is None:
+        return text
+    joint = m.verdict.joint
+    together = "" if joint is None or not joint.runs else f" (together with the pose {short(joint.both.value)})"
+    return f"{m.verdict.status}, {text}{together}"
 
 
 def print_findings(findings: Sequence[Finding]) -> None:
@@ -102,7 +115,7 @@ def print_findings(findings: Sequence[Finding]) -> None:
         colour = COLOURS[finding.verdict]
         texts = (escape(text) for text in (finding.id, finding.published, finding.measured))
         table.add_row(*texts, f"[{colour}]{finding.verdict}[/{colour}]")
-    _console().print(table)
+    open_console().print(table)
 
 
 def verdicts_json(verdicts: dict[str, Verdict]) -> str:
@@ -136,7 +149,7 @@ def print_plan(planned: dict[str, Any]) -> None:
 
 def print_comparisons(compared: Sequence[Compared]) -> None:
     """One table a pair: both values, their ratio or difference with its interval, and a sentence."""
-    console = _console()
+    console = open_console()
     for each in compared:
         c = each.comparison
         table = RichTable(box=None, pad_edge=False)
@@ -177,7 +190,7 @@ def print_watched(watched: Watched) -> None:
     table.add_row(
         *cells, *(f"{value:.3g}" for value in (monitor.evidence, monitor.largest)), f"{monitor.threshold:.4g}"
     )
-    console = _console()
+    console = open_console()
     console.print(table)
     console.print(f"\n{_sentence(watched)}", markup=False, soft_wrap=not console.is_terminal)
 

@@ -10,8 +10,8 @@ from scipy import stats
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, planar_error
-from consistency.store.parquet import COLUMNS, COVARIANCE, OWN_COVARIANCE, Columns
-from consistency.store.results import POSE, Tables
+from consistency.store.parquet import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, Columns
+from consistency.store.results import JOINT, POSE, Tables
 from consistency.types import Array, Failure, Indices
 
 
@@ -24,10 +24,19 @@ class Errors(NamedTuple):
 
 
 class Landmarks(NamedTuple):
-    """NEES of the landmarks in the maps after the last step; M landmarks of all runs."""
+    """Landmarks in the maps after the last step; M of all runs."""
 
     run: Indices  # (M,)
     nees: Array  # (M,), NaN where the landmark is not judged
+    label: Indices  # (M,)
+    error: Array  # (M, 3), truth minus estimate, NaN where the truth is not known
+    covariance: Array  # (M, 3, 3)
+    joint: Array  # (M,), NEES given the pose and the landmarks above it in its run; NaN where it was not kept
+
+    def of_runs(self, runs: int | None) -> Landmarks:
+        """Those of runs 0 to ``runs`` - 1, or of all."""
+        some = self.run < (np.inf if runs is None else runs)
+        return Landmarks(*(column[some] for column in self))
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,7 @@ def curves(results: Tables, filter_name: str, steps: int | None = None) -> Curve
     )  # fmt: skip
 
 
-def _fill(covariance: Array, at: tuple[Any, Any], batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
+def _fill(covariance: Array, at: tuple[Any, ...], batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
     for name, (i, j) in columns.items():
         covariance[*at, i, j] = covariance[*at, j, i] = batch[name]
 
@@ -134,9 +143,27 @@ def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: s
 
 
 def _landmarks(results: Tables, filter_name: str) -> Landmarks | None:
-    batches = list(results.batches("map", ["run", "nees"], filter_name))
-    run, nees = (np.concatenate([[], *(batch[column] for batch in batches)]) for column in ("run", "nees"))
-    return Landmarks(run.astype(np.int64), nees) if len(run) else None
+    batches = list(results.batches("map", results.map_numbers, filter_name))
+    if not sum(len(batch["run"]) for batch in batches):
+        return None
+    rows = {column: np.concatenate([batch[column] for batch in batches]) for column in results.map_numbers}
+    covariance = np.empty((len(rows["run"]), 3, 3))
+    _fill(covariance, (slice(None),), rows, POINT_COVARIANCE)
+    error = _places(results, rows["landmark"]) - np.stack([rows[axis] for axis in "xyz"], axis=-1)
+    joint = rows.get(JOINT, np.full(len(error), np.nan))
+    return Landmarks(rows["run"], rows["nees"], rows["landmark"], error, covariance, joint)
+
+
+def _places(results: Tables, labels: Indices) -> Array:
+    """True positions (M, 3) of landmarks (M,), m; NaN where they are not known."""
+    places = np.full((len(labels), 3), np.nan)
+    if results.landmarks is not None and len(results.landmarks):
+        table = results.landmarks.sort_values("landmark")
+        known = table["landmark"].to_numpy()
+        at = np.minimum(np.searchsorted(known, labels), len(known) - 1)
+        here = known[at] == labels
+        places[here] = table[list("xyz")].to_numpy()[at[here]]
+    return places
 
 
 def run_means(c: Curves) -> Array:

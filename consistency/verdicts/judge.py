@@ -12,6 +12,7 @@ import numpy as np
 from consistency.diagnostics import (
     Design,
     Evidence,
+    JointNees,
     Settings,
     Verdict,
     follow,
@@ -26,9 +27,10 @@ from consistency.diagnostics.scale import FEW
 from consistency.errors import InputError
 from consistency.recording import Recording
 from consistency.store.results import POSE, Tables
-from consistency.types import Array
-from consistency.verdicts.curves import Curves, curves, run_means, steps_of
+from consistency.types import Array, Indices
+from consistency.verdicts.curves import Curves, Landmarks, curves, run_means, steps_of
 
+POINT = ("x", "y", "z")
 OPTION = {
     "ratio": "detect",
     "false_alarm": "false-alarm",
@@ -88,7 +90,9 @@ def analyse(
 def verdict_of(c: Curves, settings: Settings) -> Verdict:
     """The verdict of one filter in its own error, with that in the additive error and the map beside it."""
     world = None if c.own is None else judge(evidence_of(c, additive=True), settings)
-    return with_map(replace(judge(evidence_of(c), settings), world=world, convention=own_convention(c)), c)
+    verdict = replace(judge(evidence_of(c), settings), world=world, convention=own_convention(c))
+    map_ = map_evidence(c)
+    return with_map(verdict, c, map_verdict=None if map_ is None else judge(map_, settings))
 
 
 def own_convention(c: Curves) -> str | None:
@@ -96,12 +100,56 @@ def own_convention(c: Curves) -> str | None:
     return None if c.own is None else c.convention
 
 
-def with_map(verdict: Verdict, c: Curves, runs: int | None = None) -> Verdict:
-    """The verdict with the score of the maps of runs 0 to ``runs`` - 1, or of all."""
+def with_map(verdict: Verdict, c: Curves, runs: int | None = None, map_verdict: Verdict | None = None) -> Verdict:
+    """The verdict with the score of the maps of runs 0 to ``runs`` - 1, or of all, and with what was judged of them."""
     if c.landmarks is None:
         return verdict
-    some = c.landmarks.run < (np.inf if runs is None else runs)
-    return replace(verdict, map=map_score(c.landmarks.run[some], c.landmarks.nees[some]))
+    some = c.landmarks.of_runs(runs)
+    return replace(verdict, map=replace(map_score(some.run, some.nees), verdict=map_verdict))
+
+
+def map_evidence(c: Curves) -> Evidence | None:
+    """The maps of one filter as the referee takes them, landmarks in the place of steps; None where none is judged.
+
+    Landmarks that every map holds stand with their errors. Which runs saw the others depends on where the robot was,
+    and so on the error: those count in the joint NEES only, unless there are no others.
+    """
+    if c.landmarks is None or not np.isfinite(c.landmarks.nees).any():
+        return None
+    some = Landmarks(*(column[np.isfinite(c.landmarks.nees)] for column in c.landmarks))
+    runs, row = np.unique(some.run, return_inverse=True)
+    labels, column = np.unique(some.label, return_inverse=True)
+    nees = np.full((len(runs), len(labels)), np.nan)
+    nees[row, column] = some.nees
+    error, covariance = np.full((*nees.shape, 3), np.nan), np.full((*nees.shape, 3, 3), np.nan)
+    error[row, column], covariance[row, column] = some.error, some.covariance
+    common = np.isfinite(nees).all(axis=0)
+    kept = common if common.any() else np.full(len(labels), True)
+    known = common.any() and bool(np.isfinite(error[:, kept]).all())
+    return Evidence(
+        c.filter,
+        error[:, kept] if known else None,
+        covariance[:, kept] if known else None,
+        nees[:, kept],
+        dof=3,
+        failures=c.failures,
+        axes=POINT,
+        run_numbers=runs,
+        landmarks=labels[kept],
+        joint=_joint(c, some, runs, row, column, kept),
+    )
+
+
+def _joint(c: Curves, some: Landmarks, runs: Indices, row: Indices, column: Indices, kept: Array) -> JointNees | None:
+    """NEES of pose and map together of ``runs``, in whose rows and columns the landmarks stand; None where not kept."""
+    nees = c.judged.nees
+    if nees is None or np.isnan(some.joint).all():
+        return None
+    of_runs, parts = nees[np.searchsorted(c.runs, runs)], np.full((len(runs), len(kept)), np.nan)
+    parts[row, column] = some.joint
+    last = of_runs.shape[1] - 1 - np.argmax(np.isfinite(of_runs[:, ::-1]), axis=1)
+    pose = of_runs[np.arange(len(runs)), last]
+    return JointNees(pose, np.bincount(row, some.joint), 3 * np.bincount(row), parts[:, kept])
 
 
 def design_of(results: Tables) -> Design | None:

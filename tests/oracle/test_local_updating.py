@@ -26,6 +26,8 @@ ALL = [
     ("ekf-uvd", "herath2007-stereo"),
     ("ukf-xyz", "herath2007-xyz"),
     ("ukf-uvd", "herath2007-stereo"),
+    ("debiased-ekf-xyz", "herath2007-stereo"),
+    ("ispkf-uvd", "herath2007-stereo"),
     ("parked-ekf-uvd", "herath2007-stereo"),
 ]
 

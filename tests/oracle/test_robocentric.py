@@ -151,6 +151,9 @@ def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any
     assert ours.map is not None
     assert twin.map is not None
     assert np.allclose(ours.map.mean, twin.map.mean, rtol=1e-7, atol=1e-9)
+    assert ours.map.joint is not None
+    assert twin.map.joint is not None
+    assert np.abs(ours.map.joint - twin.map.joint).max() < 1e-8 * np.abs(twin.map.joint).max()
     whole = rc.compiled(rc.RobotCentredKalman("trial", centred.Corrections())).run(trial, scenario.belief)
     assert (left_out == "nothing") == bool(np.array_equal(ours.pose, whole.pose))  # each correction does something
 

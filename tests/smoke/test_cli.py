@@ -93,6 +93,10 @@ def test_list_names_everything(folder: Path) -> None:
     assert {"herath2007-stereo", "linear-gaussian", "long-loop"} <= set(listed["scenarios"])
     assert {"kf", "ukf-uvd", "filterpy-ukf-xyz"} <= set(listed["filters"])
     assert "e04_stereo" in listed["experiments"]
+    assert {"regime", "small"} <= set(listed["sweeps"])
+    assert list(listed["filter_summaries"]) == listed["filters"]
+    summary = listed["filter_summaries"]["ispkf-uvd"]
+    assert f"ispkf-uvd            {summary}\n" in consistency("list", cwd=folder).stdout
 
 
 def test_reproduce_writes_findings(folder: Path) -> None:

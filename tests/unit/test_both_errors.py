@@ -256,8 +256,8 @@ def test_the_terminal_names_each_error(results: cs.Results, capsys: pytest.Captu
     assert f"{v.world.accuracy.rmse_position:.3f}" in own.split()
     assert world.split()[:5] == ["so2,", "beside", "it", v.world.status, f"{v.world.scale.mean_anees:.2f}"]
     assert below[0].startswith("error right: Log(truth estimate^-1) of SE(2), in the world frame; so2: position")
-    assert below[1].startswith("map after the last step, mean NEES / 3, not judged: ekf-uvd ")
-    assert f"right {map_text(v.map)}" in below[1]
+    assert below[1].startswith("map after the last step, mean NEES / 3: ekf-uvd ")
+    assert f"right {v.map.verdict.status}, {map_text(v.map)}" in below[1]
 
 
 def test_without_maps_and_own_errors_nothing_is_added(results: cs.Results, capsys: pytest.CaptureFixture[str]) -> None:
@@ -270,10 +270,11 @@ def test_without_maps_and_own_errors_nothing_is_added(results: cs.Results, capsy
 
 
 def test_a_verdict_in_words(results: cs.Results) -> None:
-    text = str(analyse(results)["right"])
+    v = analyse(results)["right"]
+    text = str(v)
     assert "  error             right: Log(truth estimate^-1) of SE(2), in the world frame" in text
     assert "(additive error, 'so2')" in text
-    assert "after the last step; not judged" in text
+    assert f"after the last step; the map is {v.map.verdict.reasons[0]}" in text
     plain = str(analyse(replace(results, map=None))["ekf-uvd"])
     assert "map" not in plain
     assert "error  " not in plain

@@ -75,6 +75,51 @@ def test_labels_of_a_map_are_sorted(uvd: cs.Scenario) -> None:
     np.testing.assert_array_equal(turned.mean, plain.mean)
 
 
+class WithJoint(Invariant):
+    """Gives the joint Gaussian of pose and map too."""
+
+    def joint(self, state: Any) -> Any:
+        return self.twin.joint(state)
+
+
+def test_the_joint_covariance_is_sorted_as_the_map_is(uvd: cs.Scenario) -> None:
+    class Backwards(WithJoint):
+        def map(self, state: Any) -> dict[int, cs.Gaussian]:
+            return dict(reversed(super().map(state).items()))
+
+        def joint(self, state: Any) -> cs.Gaussian:
+            given = super().joint(state)
+            rows = np.arange(len(given.mean)).reshape(-1, 3)
+            rows[1:] = rows[:0:-1]
+            return cs.Gaussian(given.mean[rows.ravel()], given.covariance[np.ix_(rows.ravel(), rows.ravel())])
+
+    trial = cs.simulate(uvd)
+    compiled = cs.get_filter("ekf-uvd").run(trial, uvd.belief).map.joint
+    for filter_ in (WithJoint(), Backwards()):
+        np.testing.assert_allclose(run_filter(filter_, trial, uvd.belief).map.joint, compiled, atol=1e-9)
+    assert run_filter(Invariant(), trial, uvd.belief).map.joint is None
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda P: P[1:, 1:], "ValueError: joint() gave an array of shape"),
+        (lambda P: np.where(P[0, 0] == P, np.nan, P), "the joint covariance of pose and map is not finite"),
+        (lambda P: P + np.eye(len(P), k=2), "the joint covariance of pose and map is not symmetric"),
+    ],
+)
+def test_a_joint_covariance_that_cannot_be(uvd: cs.Scenario, spoil: Any, reason: str) -> None:
+    class Breaks(WithJoint):
+        def joint(self, state: Any) -> cs.Gaussian:
+            given = super().joint(state)
+            return cs.Gaussian(given.mean, spoil(given.covariance))
+
+    said = run_filter(Breaks(), cs.simulate(uvd), uvd.belief)
+    assert said.failure is not None
+    assert said.failure.reason.startswith(reason)
+    assert said.map is None
+
+
 def test_a_filter_without_map_has_none(uvd: cs.Scenario) -> None:
     class Mapless(Invariant):
         map = None  # type: ignore[assignment]

@@ -10,7 +10,7 @@ import pytest
 from draws import identities, independent, verdict_on
 
 from consistency.diagnostics import Answer, Equivalence, Evidence, Interval, Settings, Verdict, judge, records
-from consistency.diagnostics.questions import ABOUT, MAIN, SHARES, answers
+from consistency.diagnostics.questions import ABOUT, MAIN, OF_MAP, SHARES, answers
 from consistency.diagnostics.records import Innovations
 from consistency.types import Array
 
@@ -157,7 +157,7 @@ def test_every_status_has_a_meaning_and_every_question_a_share() -> None:
         "consistent", "overconfident", "conservative", "biased", "heavy-tailed", "inconsistent", "undecided", "failed",
     ]  # fmt: skip
     assert set(SHARES) == set(ABOUT)
-    two_sided = {q: s for q, s in SHARES.items() if q != "scale in some direction"}
+    two_sided = {q: s for q, s in SHARES.items() if q not in ("scale in some direction", *OF_MAP)}
     assert SHARES[MAIN] == 0.5
     assert sum(two_sided.values()) == pytest.approx(1.0)
 

@@ -9,6 +9,7 @@ import pytest
 from invariant import Invariant
 
 import consistency as cs
+from consistency.diagnostics import Interval, MapScore
 from consistency.reporting import write_reports
 from consistency.reporting.blocks import Name, Status, Table
 from consistency.reporting.build import build_report
@@ -69,14 +70,20 @@ def test_the_rmse_is_that_of_the_pose_in_the_world(study: Study) -> None:
     assert cell != f"{track.verdict.accuracy.rmse_position:.3f}", "negative control"
 
 
+def _of_map(score: MapScore) -> tuple[Interval, ...]:
+    return score.ratio, score.verdict.joint.both, score.verdict.joint.map
+
+
 def test_maps_of_all_filters(study: Study) -> None:
     rows = rows_of(maps.SECTION.blocks(study))
     score = study.tracks[0].verdict.map
-    value, low, high = score.ratio
+    ends = [f"{brief(i.value)} [{brief(i.low)}, {brief(i.high)}]" for i in _of_map(score)]
     count = len(study.results.map) // 2
     assert rows[0][0] == Name("ekf-uvd", study.tracks[0].look)
-    assert rows[0][1:] == (brief(value), f"[{brief(low)}, {brief(high)}]", "6", str(count), "0")
+    assert rows[0][1:] == (score.verdict.status, *ends, "6", str(count), "0")
     assert len(rows) == 2
+    sentences = [getattr(block, "text", "") for block in maps.SECTION.blocks(study)]
+    assert f"Map of ekf-uvd: {score.verdict.reasons[0]}." in sentences
     without = tuple(replace(track, verdict=replace(track.verdict, map=None)) for track in study.tracks)
     assert len(rows_of(maps.SECTION.blocks(replace(study, tracks=(study.tracks[0], without[1]))))) == 1
     assert maps.SECTION.blocks(replace(study, tracks=without)) == ()
@@ -89,8 +96,8 @@ def test_both_formats_hold_both_sections(folder: Path, tmp_path: Path) -> None:
         "Errors of their own",
         "right, its own",
         "so2, additive",
-        "Mean NEES / 3 of the map",
-        "It is not judged",
+        "Mean NEES / 3 of landmarks",
+        "no verdict on a pose depends on it",
     ):
         assert text in page
     assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")

@@ -83,6 +83,29 @@ def replace_rows(P: Array, n: int, o: int, rows: Array, own: Array) -> None:
 
 
 @inner
+def move_block(P: Array, n: int, o: int, F: Array) -> None:
+    """P (n, n) <- G P G', with G the identity but for its block F (3, 3) at ``o``, beyond the robot's."""
+    for j in range(o):
+        row = P[j]
+        v0, v1, v2 = row[o], row[o + 1], row[o + 2]
+        for a in range(3):
+            row[o + a] = F[a, 0] * v0 + F[a, 1] * v1 + F[a, 2] * v2
+    p0, p1, p2 = P[o], P[o + 1], P[o + 2]
+    for j in range(o + 3, n):
+        v0, v1, v2 = p0[j], p1[j], p2[j]
+        p0[j] = F[0, 0] * v0 + F[0, 1] * v1 + F[0, 2] * v2
+        p1[j] = F[1, 0] * v0 + F[1, 1] * v1 + F[1, 2] * v2
+        p2[j] = F[2, 0] * v0 + F[2, 1] * v1 + F[2, 2] * v2
+    xx, xy, xz, yy, yz, zz = p0[o], p0[o + 1], p0[o + 2], p1[o + 1], p1[o + 2], p2[o + 2]
+    for a in range(3):
+        v0 = F[a, 0] * xx + F[a, 1] * xy + F[a, 2] * xz
+        v1 = F[a, 0] * xy + F[a, 1] * yy + F[a, 2] * yz
+        v2 = F[a, 0] * xz + F[a, 1] * yz + F[a, 2] * zz
+        for b in range(a, 3):
+            P[o + a, o + b] = v0 * F[b, 0] + v1 * F[b, 1] + v2 * F[b, 2]
+
+
+@inner
 def append_landmark(P: Array, n: int, Jp: Array, Jz: Array, R: Array) -> None:
     """P[:n + w, n:n + w] <- covariance of a landmark put at n with all before it, Jp (w, r), Jz (w, 3), R (3, 3)."""
     w, r = Jp.shape

@@ -125,6 +125,15 @@ def divide_by_root(state: State, m: int, work: Work[NamedTuple], total: float) -
 
 
 @inner
+def shift(state: State, m: int, j: int, work: Work[NamedTuple]) -> float:
+    """By how much the whitened gain moves variable j of an additive error."""
+    total, y = 0.0, state.n + state.base
+    for row in range(OBSERVED * m):
+        total += work.A[row, j] * work.A[row, y]
+    return total
+
+
+@inner
 def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
     """x (n,) <- moved by W' S^-1/2 innovation, P (n, n) <- P - W' W; with the columns of Phi as ``local`` says."""
     rows, n, base = OBSERVED * m, state.n, state.base

@@ -50,6 +50,7 @@ class Outcome(NamedTuple):
     code: int  # of REASONS, or 0
     points: Array  # (n_landmarks, 3), landmarks in the world after the last step, NaN where none was seen
     spread: Array  # (n_landmarks, 3, 3), and their covariances
+    joint: Array  # (3 + 3 K, 3 + 3 K), covariance of the robot and the K landmarks of these, additive errors
 
 
 @inner
@@ -131,6 +132,43 @@ def _map(slam: Slam, state: State, local: NamedTuple, points: Array, spread: Arr
                     spread[label, i, j] = total
 
 
+@inner
+def _joint(slam: Slam, state: State, local: NamedTuple) -> Array:
+    """Covariance of the additive errors of the robot and of its landmarks in the world, by label: D P D'."""
+    r, w, P = robot_width(slam.motion), landmark_width(slam.landmark), state.P
+    labels = np.flatnonzero(state.offset >= 0)
+    count, point, nothing = len(labels) + 1, np.empty(3), np.zeros(w)
+    D, at = np.zeros((count, 3, r + w)), np.zeros((count, r + w), np.int64)  # of each block its Jacobian, and by what
+    for a in range(3):
+        D[0, a, a], at[0, a] = 1.0, a
+    to_error(slam.error, state.x[:r], nothing, D[0, :, :r], D[0, :, r:])
+    for i, label in enumerate(labels, 1):
+        pose_at, o = held_at(slam.covariance, int(label), local), state.offset[label]
+        pose, values = state.x[pose_at : pose_at + r], state.x[o : o + w]
+        world_point(slam.landmark, robot_frame(slam.motion, pose), values, point, D[i, :, :r], D[i, :, r:])
+        to_error(slam.error, pose, values, D[i, :, :r], D[i, :, r:])
+        for a in range(r + w):
+            at[i, a] = pose_at + a if a < r else o + a - r
+    n = at.max() + 1
+    joint, rows = np.empty((3 * count, 3 * count)), np.empty((3, n))
+    for i in range(count):
+        fill_matrix(rows, 0.0)
+        for b in range(r + w):
+            p = at[i, b]
+            for q in range(n):
+                value = P[min(p, q), max(p, q)]
+                for a in range(3):
+                    rows[a, q] += D[i, a, b] * value
+        for j in range(i, count):
+            for a in range(3):
+                for b in range(3):
+                    total = 0.0
+                    for c in range(r + w):
+                        total += rows[a, at[j, c]] * D[j, b, c]
+                    joint[3 * i + a, 3 * j + b] = joint[3 * j + b, 3 * i + a] = total
+    return joint
+
+
 class Memory(NamedTuple):
     """All arrays of a trial."""
 
@@ -158,6 +196,7 @@ def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
         0,
         np.full((n_landmarks, 3), np.nan),
         np.full((n_landmarks, 3, 3), np.nan),
+        np.empty((0, 0)),
     )
 
 
@@ -232,10 +271,11 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     if code == 0:
         settle(slam.covariance, slam, whole, state, local)
         _map(slam, whole, local, out.points, out.spread)
+    joint = _joint(slam, whole, local) if code == 0 else np.empty((0, 0))
     keep((own_slam, own_data, own_memory, own_work, own_local))
     return Outcome(
         own_out.pose, own_out.covariance, own_out.own, own_out.nis, own_out.nis_dof, step, code,
-        own_out.points, own_out.spread,
+        own_out.points, own_out.spread, joint,
     )  # fmt: skip
 
 

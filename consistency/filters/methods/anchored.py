@@ -184,7 +184,12 @@ class AnchoredKalman:
         return {label: Gaussian(p, D @ state.P[blocks[label], blocks[label]] @ D.T) for label, (p, D) in points.items()}
 
     def joint(self, state: SlamState) -> Gaussian:
-        return plain.joint_of(state)
+        blocks = [slice(at, at + 6) for at in range(3, len(state.x), 6)]
+        mean, D = np.zeros(3 + 3 * len(blocks)), np.zeros((3 + 3 * len(blocks), len(state.x)))
+        mean[:3], D[:3, :3] = state.x[:3], np.eye(3)
+        for i, at in enumerate(blocks, 1):
+            mean[3 * i : 3 * i + 3], D[3 * i : 3 * i + 3, at] = anchored_point(state.x[at])
+        return Gaussian(mean, D @ state.P @ D.T)
 
 
 def anchored_point(values: Array) -> tuple[Array, Array]:

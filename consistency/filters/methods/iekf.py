@@ -15,7 +15,7 @@ from consistency.filters import plain
 from consistency.filters.compiled import Compiled
 from consistency.filters.kernel.covariance import state_index
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, whiten
+from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, shift, whiten
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.slam import (
@@ -80,7 +80,7 @@ def correct_iterated(
         is_last = i == update.passes - 1
         for a in range(involved):
             j = state_index(r, w, a, work.at)
-            state.x[j] = work.room.prior[a] + (0.0 if is_last else _shift(state, m, j, work))
+            state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(state, m, j, work))
     apply(slam, state, m, local, work)
     return 0, first_nis
 
@@ -96,15 +96,6 @@ def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[
                 y[OBSERVED * i + a] -= work.Hp[i, a, c] * (prior[c] - x[c])
             for c in range(w):
                 y[OBSERVED * i + a] -= work.Hl[i, a, c] * (prior[r + w * i + c] - x[o + c])
-
-
-@inner
-def _shift(state: State, m: int, j: int, work: Work[PriorRoom]) -> float:
-    """By how much the whitened gain moves variable j."""
-    total, y = 0.0, state.n + state.base
-    for row in range(OBSERVED * m):
-        total += work.A[row, j] * work.A[row, y]
-    return total
 
 
 class IteratedKalman(plain.WorldPointTwin):

@@ -162,7 +162,14 @@ class RobotCentredKalman:
         return Gaussian(state.x[:3], state.P[:3, :3])
 
     def map(self, state: CentredState) -> dict[int, Gaussian]:
-        return {label: _world_point(state, label) for label in state.places}
+        points = {label: _world_point(state, label) for label in state.places}
+        return {label: Gaussian(point, D @ state.P @ D.T) for label, (point, D) in points.items()}
+
+    def joint(self, state: CentredState) -> Gaussian:
+        points = [_world_point(state, label) for label in state.places]
+        mean = np.concatenate([state.x[:3], *(point for point, _ in points)])
+        D = np.vstack([np.eye(3, len(state.x)), *(D for _, D in points)])
+        return Gaussian(mean, D @ state.P @ D.T)
 
 
 def _block(at: int) -> slice:
@@ -271,8 +278,8 @@ def _parked(state: CentredState) -> CentredState:
     )  # fmt: skip
 
 
-def _world_point(state: CentredState, label: int) -> Gaussian:
-    """A landmark as a point in the world, m, to first order."""
+def _world_point(state: CentredState, label: int) -> tuple[Array, Array]:
+    """A landmark as a point (3,) in the world, m, and its Jacobian (3, n)."""
     at, frame, pose, to_shift = _block(state.places[label]), slice(0, 3), state.x[:3], shift_matrix(state.x[:3])
     if label in state.parked:
         frame, pose, to_shift = _clone(state, state.parked[label])
@@ -284,7 +291,7 @@ def _world_point(state: CentredState, label: int) -> Gaussian:
     D = np.zeros((3, len(state.x)))
     D[:, at] = R @ axes @ np.column_stack([dm / rho, -m / rho**2])
     D[:, frame] = np.column_stack([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-point[1], point[0], 0.0]]) @ to_shift
-    return Gaussian(point, D @ state.P @ D.T)
+    return point, D
 
 
 def compiled(twin: RobotCentredKalman) -> Compiled:

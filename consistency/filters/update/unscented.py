@@ -65,6 +65,7 @@ class SigmaRoom(NamedTuple):
     Mt: Array  # (L, 3 m) transposed statistical linearisation
     pose: Array  # (r,)
     landmark: Array  # (w,)
+    prior: Array  # (L,) mean of that prior, for an update that iterates
 
 
 @implement(make_room, Unscented)
@@ -79,6 +80,7 @@ def sigma_room(update: Unscented, r: int, w: int, m: int, n: int) -> SigmaRoom:
         np.empty((L, OBSERVED * m)),
         np.empty(r),
         np.empty(w),
+        np.empty(L),
     )
 
 
@@ -132,7 +134,7 @@ def correct_unscented(
     update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
-    if not _innovate(update, slam, state, m, work):
+    if not innovate_by_points(update, slam, state, m, work):
         return POSE, np.nan
     innovate(state, data, m, work)
     code, nis = whiten(state, data, m, work)
@@ -142,8 +144,11 @@ def correct_unscented(
 
 
 @inner
-def _innovate(update: Unscented, slam: Slam, state: State, m: int, work: Work[SigmaRoom]) -> bool:
-    """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite."""
+def innovate_by_points(update: Unscented, slam: Slam, state: State, m: int, work: Work[SigmaRoom]) -> bool:
+    """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite.
+
+    The points lie about ``state.x`` (n,), which need not be the mean of P; the linearisation is ``work.room.Mt``.
+    """
     r, w, width, rows = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base, OBSERVED * m
     L = r + w * m
     spread, w0m, w0c, weight = _weights(L, update)

@@ -8,6 +8,7 @@ from consistency.reporting.section import Section
 from consistency.reporting.sections import (
     anees,
     axes,
+    filters,
     findings,
     first_order,
     further,
@@ -29,6 +30,7 @@ from consistency.reporting.sections import (
 
 SECTIONS: tuple[Section[Any, Any], ...] = (
     findings.SECTION,
+    filters.SECTION,
     verdicts.SECTION,
     world.SECTION,
     pose_errors.SECTION,

@@ -1,0 +1,113 @@
+"""How overconfident is a filter in a world? Scores of trials, on all workers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import joblib
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.filters.compiled import one_blas_thread
+from consistency.filters.stepping import name_of, run_filter
+from consistency.protocols import Filter, WholeTrial
+from consistency.runs.montecarlo import compile_for, worker_count
+from consistency.scenario import Scenario
+from consistency.simulation import require_landmarks_in_view
+from consistency.simulation.world import World
+from consistency.store.results import POSE, outcome_of
+
+WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not
+Job = tuple[Scenario, Sequence[int]]  # a world, and the trials in it
+
+
+@dataclass(frozen=True)
+class Done:
+    """Scores of the trials of a world, fewer than were asked for where the time was up."""
+
+    scores: tuple[float, ...]
+    seconds: float  # of the fastest trial; others may have waited for a busy machine
+
+
+class Bench:
+    """Scores one filter; to be used in a ``with``, which holds the workers.
+
+    The score of a trial is log(mean NEES of the run / 3), which is 0 or a little less for a right filter. The logarithm
+    keeps one diverged run among many from deciding which of two worlds is worse.
+    """
+
+    def __init__(self, filter_: Filter, jobs: int = -1) -> None:
+        self.filter, self.workers = filter_, worker_count(jobs)
+        self._stack = ExitStack()
+        self._parallel: Any = None
+
+    def __enter__(self) -> Bench:
+        self._stack.enter_context(one_blas_thread())
+        if self.workers > 1:  # kernels release the GIL; Python needs processes
+            threads = isinstance(self.filter, WholeTrial)
+            options = {} if threads else {"inner_max_num_threads": 1}
+            self._stack.enter_context(
+                joblib.parallel_config("threading" if threads else "loky", n_jobs=self.workers, **options)
+            )
+            self._parallel = self._stack.enter_context(joblib.Parallel())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def compile(self, worlds: Sequence[Scenario]) -> None:
+        """Compile what the filter needs in these worlds, so that a search spends no time on it."""
+        for world in worlds:
+            try:
+                compile_for([self.filter], require_landmarks_in_view(world).trial(0, 0), world.belief)
+            except InputError:
+                continue
+
+    def __call__(self, jobs: Sequence[Job], seed: int, until: float = np.inf) -> list[Done | None]:
+        """Scores of each job in its order; None for a world in which no landmark comes into view.
+
+        No trial begins after ``until``, a time of ``time.monotonic``.
+        """
+        if self._parallel is None:
+            return [_score(self.filter, *job, seed, until) for job in jobs]
+        tasks = (joblib.delayed(_score)(self.filter, *job, seed, until) for job in jobs)
+        return list(self._parallel(tasks))
+
+    def split(self, world: Scenario, runs: Sequence[int]) -> list[Job]:
+        """The trials of one world as a job for each worker."""
+        return [(world, part) for part in (runs[i :: self.workers] for i in range(self.workers)) if part]
+
+
+def _score(filter_: Filter, scenario: Scenario, runs: Sequence[int], seed: int, until: float) -> Done | None:
+    if time.monotonic() >= until:
+        return Done((), 0.0)
+    try:
+        world = require_landmarks_in_view(scenario)
+    except InputError:
+        return None
+    scores, fastest = [], np.inf
+    for run in runs:
+        began = time.monotonic()
+        if began >= until:
+            break
+        scores.append(score_of_run(filter_, scenario, world, run, seed))
+        fastest = min(fastest, time.monotonic() - began)
+    return Done(tuple(scores), fastest if scores else 0.0)
+
+
+def score_of_run(filter_: Filter, scenario: Scenario, world: World, run: int, seed: int) -> float:
+    """log(mean NEES / 3) of a run in the filter's own error; :data:`WORST` where it failed."""
+    trial = world.trial(run, seed)
+    estimates = run_filter(filter_, trial, scenario.belief)
+    if estimates.failure is not None:
+        return WORST
+    columns = outcome_of(trial, [estimates]).estimates[name_of(filter_)]
+    nees = np.asarray(columns.get("own_nees", columns["nees"]), float)
+    nees = nees[np.isfinite(nees)]
+    if not len(nees):
+        return WORST
+    return min(float(np.log(max(nees.mean() / len(POSE), 1.0 / np.exp(WORST)))), WORST)

@@ -1,0 +1,95 @@
+"""``sweep`` and ``recommend`` in processes of their own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from command import consistency
+
+from consistency.cli import main
+from consistency.scenario import data_folder
+
+SWEEP = """
+summary = "Two densities"
+base = "small.toml"
+filters = ["ekf-uvd"]
+[rule]
+max_runs = 12
+[grid]
+range = [3.0, 4.0]
+density = [0.2]
+"""
+
+
+@pytest.fixture(scope="module")
+def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``small.toml``, a short world, ``grid.toml``, and ``out``, its sweep in two shares."""
+    folder = tmp_path_factory.mktemp("sweep")
+    text = (data_folder("scenarios") / "herath2007-stereo.toml").read_text()
+    (folder / "small.toml").write_text(text.replace("steps = 500", "steps = 40"))
+    (folder / "grid.toml").write_text(SWEEP)
+    (folder / "zero.toml").write_text(SWEEP.replace("range = [3.0, 4.0]", "baseline = [0.0]"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def out(at: Path) -> Path:
+    first = consistency("sweep", "grid.toml", "--out", "out", "--share", "1/2", "--jobs", "1", cwd=at)
+    assert "1 of the whole sweep are missing" in first.stdout
+    second = consistency("sweep", "grid.toml", "--out", "out", "--share", "2/2", "--jobs", "1", cwd=at)
+    assert "out/report.pdf" in second.stdout
+    return at / "out"
+
+
+def test_a_sweep_leaves_a_map_and_a_report(out: Path) -> None:
+    assert list(pd.read_csv(out / "map.csv")["range"]) == [3.0, 4.0]
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert "http" not in (out / "report.html").read_text().split("<main")[1].split("<script")[0]
+
+
+def test_the_same_command_has_nothing_to_do(out: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in out.glob("cells/*/*/*")}
+    again = consistency("sweep", "grid.toml", "--out", "out", cwd=out.parent)
+    assert "2 of 2 are there already" in again.stderr
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    consistency("sweep", "out", cwd=out.parent)
+
+
+def test_a_rig_is_looked_up(out: Path) -> None:
+    arguments = ("recommend", "small.toml", "--map", "out", "--density", "0.1", "--runs", "4", "--jobs", "1", "--json")
+    advice = json.loads(consistency(*arguments, cwd=out.parent).stdout)
+    assert advice["filters"][0]["filter"] == "ekf-uvd"
+    assert advice["axes"]["range"] == {"value": 4.0, "inside": True}
+    assert "nearest cell of the map" in consistency("recommend", "small.toml", "--map", "out", cwd=out.parent).stdout
+
+
+BAD = {
+    "baseline of 0": (("sweep", "zero.toml", "--out", "o"), "zero.toml: key 'grid.baseline': values must be positive"),
+    "no folder": (("sweep", "grid.toml"), "--out: missing"),
+    "no such sweep": (("sweep", "regimes", "--out", "o"), "did you mean 'regime'"),
+    "wrong filter": (("sweep", "grid.toml", "--filter", "kf", "--out", "o"), "filters that fit"),
+    "share": (("sweep", "grid.toml", "--out", "o", "--share", "3/2"), "must be I/N"),
+    "no share": (("sweep", "grid.toml", "--out", "o", "--share", "half"), "must be I/N, as 2/8"),
+    "jobs": (("sweep", "grid.toml", "--out", "o", "--jobs", "0"), "jobs must be at least 1"),
+    "folder with options": (("sweep", ".", "--share", "1/2"), "only reported again"),
+    "no sweep's folder": (("sweep", "."), "manifest.json: missing"),
+    "no map": (("recommend", "small.toml", "--map", "none"), "none: cannot be read"),
+    "confirm": (("recommend", "small.toml", "--map", "out", "--confirm", "3"), "must be 0, 1 or 2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(out: Path, case: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit 2, one sentence, nothing written; here in this process, which saves seconds."""
+    arguments, expected = BAD[case]
+    monkeypatch.chdir(out.parent)
+    before = sorted(out.parent.rglob("*"))
+    with pytest.raises(SystemExit, match="2"):
+        main(list(arguments))
+    stderr = capsys.readouterr().err
+    assert expected in stderr
+    assert len(stderr.strip().splitlines()) == 1
+    assert sorted(out.parent.rglob("*")) == before

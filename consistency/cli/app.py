@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import typer
 
-from consistency.cli.challenging import challenge
 from consistency.errors import InputError
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
@@ -61,7 +60,8 @@ def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")]
         listed = {"scenarios": scenarios, "filters": list(filters), "experiments": experiments, "sweeps": sweeps}
         print(json.dumps(listed | {"filter_summaries": filters}, indent=2))
         return
-    marked = {name: f"{text}{' (not realisable)' * (name in BOUNDS | SMOOTHERS)}" for name, text in filters.items()}
+    marks = dict.fromkeys(BOUNDS, " (not realisable)") | dict.fromkeys(SMOOTHERS, " (all data at once)")
+    marked = {name: text + marks.get(name, "") for name, text in filters.items()}
     named = {"Scenarios": scenarios, "Experiments": experiments, "Sweeps": sweeps, "Filters": marked}
     for title, entries in named.items():
         print(title)
@@ -512,9 +512,6 @@ def monitor(
         print_watched(watched)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
-
-
-app.command()(challenge)
 
 
 def main(arguments: list[str] | None = None) -> Any:

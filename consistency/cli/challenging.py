@@ -8,9 +8,11 @@ from typing import Annotated
 
 import typer
 
+from consistency.cli.app import Seed, app
 from consistency.errors import InputError
 
 
+@app.command()
 def challenge(
     filter_name: Annotated[str, typer.Argument(metavar="FILTER", help="Built-in filter (see 'list').")],
     scenario: Annotated[
@@ -26,7 +28,7 @@ def challenge(
         int | None,
         typer.Option("--trials", help="Trials of the search instead of --minutes; the same result on each machine."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the search and of the noise.")] = 0,
+    seed: Seed = 0,
     jobs: Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core.")] = -1,
     false_alarm: Annotated[
         float, typer.Option("--false-alarm", help="Chance that a right filter is found overconfident.")

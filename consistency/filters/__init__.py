@@ -59,9 +59,9 @@ MODULES: dict[str, tuple[str, str, str]] = {
     "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD", "EKF of the library filterpy, on pixels"),
     "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ", "UKF of the library filterpy, on points"),
     "filterpy-ukf-uvd": ("external.filterpy", "UKF_UVD", "UKF of the library filterpy, on pixels"),
-    "gtsam-batch-uvd": ("external.gtsam", "BATCH_UVD", "Smoother of all data so far, by gtsam's iSAM2"),
-    "gtsam-lag-uvd": ("external.gtsam", "LAG_UVD", "Smoother of the last 50 poses and all landmarks, by gtsam"),
-    "gtsam-map-uvd": ("external.gtsam", "MAP_UVD", "Smoother of the whole trial, by gtsam: a bound"),
+    "gtsam-batch-uvd": ("external.gtsam", "BATCH_UVD", "Smoother of gtsam, each pose by all data up to its step"),
+    "gtsam-lag-uvd": ("external.gtsam", "LAG_UVD", "Smoother of gtsam over the last steps"),
+    "gtsam-map-uvd": ("external.gtsam", "MAP_UVD", "Batch maximum a posteriori of gtsam: a bound"),
 }
 BOUNDS = frozenset({"ideal-ekf-xyz", "ideal-ekf-uvd"})  # told the truth: ``realisable`` of these is False
 SMOOTHERS = frozenset({"gtsam-map-uvd"})  # each pose by the data of the whole trial: ``causal`` of these is False
@@ -73,14 +73,14 @@ def filter_names() -> list[str]:
     return list(MODULES)
 
 
-def usable_names() -> list[str]:
-    """Names of the built-in filters whose libraries are installed."""
-    return [name for name, (module, _, _) in MODULES.items() if _missing(module) is None]
-
-
 def filter_summaries() -> dict[str, str]:
     """What each built-in filter is, in a few words, by name."""
     return {name: summary for name, (_, _, summary) in MODULES.items()}
+
+
+def usable_names() -> list[str]:
+    """Names of the built-in filters whose libraries are installed."""
+    return [name for name, (module, _, _) in MODULES.items() if _missing(module) is None]
 
 
 def get_filter(name: str) -> Any:

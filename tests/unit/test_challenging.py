@@ -419,7 +419,7 @@ def test_what_a_smaller_world_has_to_keep(score: float, limit: float | None) -> 
     assert kept == (None if limit is None else pytest.approx(limit))
     assert worst in campaign.tried
     assert set(bench.seeds) == set(campaign.plan.seeds[:2])  # the worst is looked at again, on trials of its own
-    assert len(campaign.checked[worst]) == 24
+    assert len(campaign.checked[worst]) == 48
     assert len(campaign.tried[worst].scores) == RUNGS[-1]
 
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import Evidence, JointNees, Settings, Verdict, judge
-from consistency.diagnostics.joint import joint_test
+from consistency.diagnostics.joint import joint_test, near
 from consistency.diagnostics.landmarks import joint_nees
 from consistency.diagnostics.questions import JOINT, JOINT_DISTRIBUTION
 from consistency.filters import get_filter
@@ -53,6 +53,9 @@ def verdict_on(rng: np.random.Generator, spoil: str = "", false_alarm: float = 0
         w[:, 3:] *= 1.12
     elif spoil == "pose":
         w[:, :3] *= 2.0
+    elif spoil == "hidden":
+        w[:, :3] *= 0.3
+        w[:, 3:] *= 1.3
     elif spoil == "a landmark":
         w[:, -3:] *= 2.5
     elif spoil == "conservative":
@@ -117,6 +120,23 @@ def test_what_is_wrong_is_named(spoil: str, status: str, words: str) -> None:
     assert not any("step" in line for line in v.reasons), v.reasons
 
 
+def test_landmarks_and_the_joint_error_may_contradict_each_other() -> None:
+    """At a false-alarm rate of 1e-3: small errors of the pose hide large ones of the map given the pose."""
+    v = verdict_on(np.random.default_rng(5), "hidden", false_alarm=1e-3, runs=60)
+    assert v.status == "inconsistent", v.reasons
+    assert v.inflation < 1.0 < v.joint.both.value
+
+
+@pytest.mark.parametrize("ratio", [1.1, 1 / 1.1])
+def test_a_joint_scale_within_the_tolerance_is_excused(ratio: float) -> None:
+    joint = JointNees(np.full(50, 3.0 * ratio), np.full(50, 197.0 * ratio), np.full(50, 197))
+    for tolerance, excused in ((1.2, True), (1.05, False), (None, False)):
+        settings = Settings(tolerance=tolerance)
+        test = joint_test(joint, settings)
+        assert test.p_values[JOINT] < 1e-10
+        assert near(test, settings) == excused
+
+
 def test_the_pose_alone_shows_in_its_part() -> None:
     v = verdict_on(np.random.default_rng(6), "pose", runs=60)
     assert not v.joint.pose.holds(1.0)
@@ -144,7 +164,8 @@ def test_the_joint_error_is_that_of_its_covariance(convention: str) -> None:
     rng = np.random.default_rng(1)
     pose, points = np.array([3.0, -2.0, 0.7]), rng.uniform(-5, 5, (4, 3))
     n = 3 + points.size
-    zero, P = planar_map_error(pose, points, pose, points, np.eye(n), convention)
+    root = rng.standard_normal((n, n))
+    zero, P = planar_map_error(pose, points, pose, points, root @ root.T, convention)
     assert np.abs(zero).max() < 1e-12
     T, step = np.empty((n, n)), 1e-6
     for j in range(n):
@@ -153,7 +174,7 @@ def test_the_joint_error_is_that_of_its_covariance(convention: str) -> None:
         moved = ((pose + h * d[:3], points + h * d[3:].reshape(-1, 3)) for h in (1, -1))
         ends = [planar_map_error(*true, pose, points, np.eye(n), convention)[0] for true in moved]
         T[:, j] = (ends[0] - ends[1]) / (2 * step)
-    np.testing.assert_allclose(P, T @ T.T, atol=1e-7)
+    np.testing.assert_allclose(P, T @ root @ root.T @ T.T, rtol=1e-6, atol=1e-6)
     true = pose + np.array([0.1, 0.2, 0.3])
     error, _ = planar_map_error(true, points, pose, points, np.eye(n), convention)
     np.testing.assert_allclose(error[:3], planar_error(true, pose, convention))
@@ -191,6 +212,10 @@ def test_the_table_has_the_nees_of_the_joint_error(results: cs.Results, name: st
     assert rows["joint_nees"].sum() + pose == pytest.approx(error @ np.linalg.solve(own, error), rel=1e-8)
     joint = map_evidence(curves(results, name)).joint
     assert joint.pose[2] + joint.map[2] == pytest.approx(rows["joint_nees"].sum() + pose)
+    evidence = map_evidence(curves(results, name))
+    for j, label in enumerate(evidence.landmarks):
+        mean = rows[rows["landmark"] == label][["x", "y", "z"]].to_numpy()[0]
+        np.testing.assert_allclose(evidence.error[2, j], trial.landmarks[label] - mean)
 
 
 def test_results_without_joint_nees_are_judged_and_say_so(results: cs.Results, tmp_path: Path) -> None:

@@ -354,7 +354,10 @@ def of_map(labels_in_map: list[int], **changes: Any) -> pd.DataFrame:
         z=np.ones((3, 3)), n_landmarks=5, truth=np.zeros((2, 3)), landmarks=np.diag([1.0, 2.0, 3.0]),
         source=np.array([0, -1, 2]),
     )  # fmt: skip
-    map_ = Map(np.array(labels_in_map), np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
+    joint = np.eye(3 + 3 * count)
+    joint[0, 3] = joint[3, 0] = 0.5  # pose and first landmark, in x
+    blocks = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
+    map_ = Map(np.array(labels_in_map), np.zeros((count, 3)), blocks, joint)
     said = Estimates("f", 3, np.zeros((1, 3)), np.eye(3)[None], np.full(1, np.nan), np.zeros(1, np.int64), map=map_)
     broken = replace(said, filter="g", failure=Failure("g", 3, 1, "NaN"))
     outcome = outcome_of(replace(trial, **changes), [said, broken])
@@ -366,9 +369,11 @@ def test_labels_that_are_no_landmark_have_no_nees() -> None:
     """Id 4 is none in the world; id 1 is one that was never seen as itself; id 2 is only seen under another id."""
     rows = of_map([0, 1, 2, 4])
     np.testing.assert_array_equal(rows["nees"], [1.0, np.nan, 9.0, np.nan])
+    np.testing.assert_allclose(rows["joint_nees"], [4.0 / 3.0, np.nan, 9.0, np.nan])
     assert list(rows["run"]) == [3] * 4
     np.testing.assert_array_equal(of_map([0, 1, 2], source=None)["nees"], [1.0, 4.0, 9.0])
-    assert of_map([0, 1], landmarks=None)["nees"].isna().all()
+    assert of_map([0, 1], landmarks=None)[["nees", "joint_nees"]].isna().all(axis=None)
+    assert of_map([0, 1], truth=None)["joint_nees"].isna().all()
     assert list(of_map([0, 4], labels=np.array([10, 11, 12, 13, 77]))["landmark"]) == [10, 77]
 
 

@@ -7,9 +7,12 @@ landmarks through the new frame. What a landmark that is carried so for hundreds
 to first order only; one that has not been seen for a while is therefore *parked*: it keeps its numbers in the frame of
 a clone of the pose, and is carried over at once, by an iterated update, when it is seen again.
 
-The error of pose and clones in that update is right-invariant, T_true = Exp(xi) T. With M(p) the matrix that takes
-(dp, dheading) to xi, and J_l the left Jacobian of SE(2), a covariance about T holds about Exp(xi) T after a turn by
-M(p+)^-1 J_l(xi) M(p-). That is done to the pose; for a clone T stays where it was, and xi is in the state.
+The error of pose and clones is right-invariant, T_true = Exp(xi) T. Let M(p) be the matrix that takes (dp, dheading) to
+xi, and J_l the left Jacobian of SE(2). The error xi before the motion of a step, and the noise delta of the motion, are
+in T_true = Exp(xi) Exp(delta) T. If the update says that they are x and d, the error about Exp(x) Exp(d) T is
+J_l(x) (xi - x) to first order, with what is left of delta turned alike. So the covariance of the pose is turned by
+M(p+)^-1 J_l(x) M(p-), where x is what the update says of the error *without* the noise of the motion: noise that is seen
+at once turns nothing. For a clone T stays where it was made, and xi is in the state.
 
 Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
 its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not
@@ -63,6 +66,7 @@ class CentredState:
     P: Array  # (n, n), of dp, dheading; and of the errors of these
     problem: Problem
     step: int = 0
+    noise: Array = field(default_factory=lambda: np.zeros((3, 2)))  # (n, 2), what the last motion added to the errors
     places: dict[int, int] = field(default_factory=dict)  # offset of each landmark by label
     seen: dict[int, int] = field(default_factory=dict)  # step at which each was seen last
     parked: dict[int, int] = field(default_factory=dict)  # number of the clone at which a landmark is parked, by label
@@ -103,8 +107,8 @@ class RobotCentredKalman:
             F[rows[:, :, None], rows[:, None, :]] = J
             by_forward, by_turn = -rho * R[:, 0], np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1)
             G[rows] = control.dt * (D @ np.stack([by_forward, by_turn], axis=2))
-        P = F @ state.P @ F.T + plain.process_noise(G, belief)
-        return replace(state, x=x, P=P, step=state.step + 1)
+        noise = G * [belief.motion.sigma_v, belief.motion.sigma_omega]
+        return replace(state, x=x, P=F @ state.P @ F.T + noise @ noise.T, step=state.step + 1, noise=noise)
 
     def update(self, state: CentredState, observation: Observation) -> tuple[CentredState, Info]:
         labels = [int(label) for label in observation.landmarks]
@@ -143,10 +147,11 @@ class RobotCentredKalman:
                 break
         after = _moved_by(state, delta)
         P = state.P - W @ S @ W.T
+        T = np.linalg.inv(_shifts(after)) @ _shifts(state)  # keeps the covariance of xi
         if self.which.turning:
-            T = np.linalg.inv(_shifts(after)) @ _tangent(state, delta)
-            P = T @ P @ T.T
-        after = replace(after, P=P)
+            motion = state.noise @ (H @ state.noise).T @ np.linalg.solve(S, innovation)
+            T = np.linalg.inv(_shifts(after)) @ _tangent(state, delta - motion)
+        after = replace(after, P=T @ P @ T.T)
         return _activated(after, [label for label in seen if label in state.parked]), Info(innovation, S, W)
 
     def _inserted(self, state: CentredState, label: int, z: Array) -> CentredState:

@@ -63,6 +63,7 @@ class ConvertingRoom(NamedTuple):
     R: Array  # (m, 3, 3)
     delta: Array  # (3 + 6 m,) a correction of the robot and of all these
     before: Array  # (3 + 6 m,)
+    noise: Array  # (2, n) what the motion of this step added to the errors, for each of its noises
     moving: Indices  # (n / 3,) offsets of the landmarks that move
     J: Array  # (n / 3, 3, 3) how
     three: Array  # (4, 3, 3)
@@ -77,7 +78,7 @@ def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) 
         3 + 3 * np.arange(2 * m),
         np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)),
         np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3, 3)), np.empty(most), np.empty(most),
-        np.empty(n // 3, np.int64), np.empty((n // 3, 3, 3)), np.empty((4, 3, 3)), np.empty((4, 3)),
+        np.empty((2, n)), np.empty(n // 3, np.int64), np.empty((n // 3, 3, 3)), np.empty((4, 3, 3)), np.empty((4, 3)),
     )  # fmt: skip
 
 
@@ -94,7 +95,7 @@ def predict_centred(
     x, P, n, room, G = state.x, state.P, state.n, work.room, work.small
     columns = noise_columns(slam.motion, x[:3], u, G)
     move(slam.motion, x[:3], u, x[:3])
-    noise = work.rows[:columns, :n]
+    noise = room.noise[:columns, :n]
     fill_matrix(noise, 0.0)
     for c in range(columns):
         noise[c, 0], noise[c, 1], noise[c, 2] = G[0, c] + x[1] * G[2, c], G[1, c] - x[0] * G[2, c], G[2, c]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.filters.error.invariant_pose import left_jacobian, move_pose
-from consistency.filters.kernel.arrays import copy, fill, fill_matrix
-from consistency.filters.kernel.blas import add_transposed_times
+from consistency.filters.kernel.arrays import copy, fill
+from consistency.filters.kernel.blas import add_transposed_times, solve_transposed
 from consistency.filters.kernel.covariance import gather_rows, replace_rows, state_index, subtract_gram
 from consistency.filters.kernel.dispatch import implement
 from consistency.filters.kernel.gain import apply_beyond, divide_by_root
@@ -46,9 +46,10 @@ def correct_converted(
     total = _innovate(room.rows, width, room.at, m, work)
     code, nis = divide_by_root(state, 3 * m, work, total)
     if code == 0:
-        _move(update, state, m, work)
+        _move(state, m, work)
         apply_beyond(state, 3 * m, local.factors, work)
-        _turn(state, local, work)
+        if update.turning:
+            _turn(state, m, local, work)
         for i in range(m):
             if room.clone[i] >= 0:
                 _reclaim(slam, state, work.label[i], local, work)
@@ -247,28 +248,26 @@ def _is_settled(size: int, room: ConvertingRoom) -> bool:
 
 
 @inner
-def _move(update: Converting, state: State, m: int, work: Work[ConvertingRoom]) -> None:
-    """x <- moved by A' y, P <- P - A' A; ``three[1]`` <- what turns the pose, about where it is now."""
-    x, n, room = state.x, state.n, work.room
-    A, delta, turn, pose = work.A[: 3 * m, :n], work.delta[:n], room.three[1], room.poses[1]
+def _move(state: State, m: int, work: Work[ConvertingRoom]) -> None:
+    """x <- moved by ``work.delta`` <- A' y, P <- P - A' A."""
+    x, n, pose = state.x, state.n, work.room.poses[1]
+    A, delta = work.A[: 3 * m, :n], work.delta[:n]
     fill(delta, 0.0)
     add_transposed_times(A, work.A[: 3 * m, n + state.base], delta)
     subtract_gram(state.P, n, 3, A)
     for i in range(3, n):
         x[i] += delta[i]
     move_pose(x[:3], delta[:3], pose)
-    left_jacobian(delta[:3], turn)
-    if not update.turning:  # as if the additive error of the pose were moved along
-        fill_matrix(turn, 0.0)
-        turn[0, 0] = turn[1, 1] = turn[2, 2] = 1.0
-        turn[0, 2], turn[1, 2] = pose[1] - x[1], x[0] - pose[0]
     copy(pose, x[:3])
 
 
 @inner
-def _turn(state: State, local: Clones, work: Work[ConvertingRoom]) -> None:
-    """Rows and columns of the pose in P, and its rows in Phi, turned by ``three[1]``."""
-    P, T, own = state.P, work.room.three[1], work.room.three[2]
+def _turn(state: State, m: int, local: Clones, work: Work[ConvertingRoom]) -> None:
+    """The pose in P, and its rows in Phi, turned by J_l at what the update corrects of the error before the motion."""
+    P, T, own, xi = state.P, work.room.three[1], work.room.three[2], work.room.poses[0]
+    copy(work.delta[:3], xi)
+    _subtract_motion(state, m, xi, work)
+    left_jacobian(xi, T)
     _turn_rows(P, 3, state.n, T)
     _turn_rows(local.factors.Phi, 0, state.base, T)
     for a in range(3):
@@ -277,6 +276,30 @@ def _turn(state: State, local: Clones, work: Work[ConvertingRoom]) -> None:
     for a in range(3):
         for b in range(a, 3):
             P[a, b] = P[b, a] = own[a, 0] * T[b, 0] + own[a, 1] * T[b, 1] + own[a, 2] * T[b, 2]
+
+
+@inner
+def _subtract_motion(state: State, m: int, xi: Array, work: Work[ConvertingRoom]) -> None:
+    """xi (3,) <- without what the update says of the noise in the motion of this step; S and y hold their roots."""
+    room, y = work.room, work.A[: 3 * m, state.n + state.base]
+    N = room.rows[: 3 * m, :2]  # H G, where nothing is gathered any more
+    for j in range(m):
+        for a in range(3):
+            for c in range(2):
+                g = room.noise[c]
+                if room.clone[j] < 0:
+                    N[3 * j + a, c] = g[work.at[j] + a]
+                else:
+                    N[3 * j + a, c] = (
+                        room.by_pose[j, a, 0] * g[0] + room.by_pose[j, a, 1] * g[1] + room.by_pose[j, a, 2] * g[2]
+                    )
+    solve_transposed(work.S[: 3 * m, : 3 * m], N)
+    for c in range(2):
+        said = 0.0
+        for row in range(3 * m):
+            said += N[row, c] * y[row]
+        for a in range(3):
+            xi[a] -= said * room.noise[c, a]
 
 
 @inner

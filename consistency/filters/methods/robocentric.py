@@ -11,8 +11,8 @@ The error of pose and clones is right-invariant, T_true = Exp(xi) T. Let M(p) be
 xi, and J_l the left Jacobian of SE(2). The error xi before the motion of a step, and the noise delta of the motion, are
 in T_true = Exp(xi) Exp(delta) T. If the update says that they are x and d, the error about Exp(x) Exp(d) T is
 J_l(x) (xi - x) to first order, with what is left of delta turned alike. So the covariance of the pose is turned by
-M(p+)^-1 J_l(x) M(p-), where x is what the update says of the error *without* the noise of the motion: noise that is seen
-at once turns nothing. For a clone T stays where it was made, and xi is in the state.
+M(p+)^-1 J_l(x) M(p-), where x is what the update says of the error *without* the noise of the motion: noise that is
+seen at once turns nothing. For a clone T stays where it was made, and xi is in the state.
 
 Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
 its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from consistency.errors import InputError
 from consistency.filters.plain_sensors import heading_matrix as heading_matrix
@@ -196,8 +197,11 @@ def in_space(mean: Array, P: Array) -> Gaussian:
 
 
 def joint_of(state: SlamState) -> Gaussian:
-    """Robot and landmarks together, (n,) and (n, n), of a state whose error is additive."""
-    return Gaussian(state.x, state.P)
+    """Robot and landmarks together, (3 + 3 K,) and its covariance, of a state whose error is additive."""
+    count = (len(state.x) - 3) // state.width
+    spatial = np.eye(3)[:, : state.width]  # one in the plane is known to be at height zero
+    T = block_diag(np.eye(3), *[spatial] * count)
+    return Gaussian(T @ state.x, T @ state.P @ T.T)
 
 
 class Noting(Protocol):

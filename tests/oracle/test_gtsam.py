@@ -15,6 +15,7 @@ from scipy.stats import truncnorm
 
 import consistency as cs
 from consistency.filters import EXTRAS, SMOOTHERS, filter_names, plain, usable_names
+from consistency.filters.plain_sensors import PointSensor
 from consistency.filters.stepping import run_filter, step_through
 from consistency.models import motion, point, stereo
 from consistency.protocols import Problem
@@ -220,7 +221,7 @@ class LinearWorld:
         return self.origins[label]
 
     def sight(self, step: int, observation: Observation) -> Any:
-        sensor = plain.PointSensor(self.problem.belief.sensor, uvd=False)
+        sensor = PointSensor(self.problem.belief.sensor, uvd=False)
         labels, at = [int(label) for label in observation.landmarks], self.reference[step]
         known = [self.origins[label] for label in labels]
         H = [sensor.jacobians(at, place) for place in known]

@@ -259,8 +259,8 @@ def test_a_filter_that_does_not_fit_the_sensor(xyz: cs.Scenario) -> None:
 
 
 def test_an_unknown_filter(xyz: cs.Scenario) -> None:
-    with pytest.raises(cs.InputError, match=r"unknown filter 'ekf-xzy' \(did you mean 'ekf-xyz'\?\); known: kf, "):
-        cs.run_trials(xyz, ["ekf-xzy"], runs=1)
+    with pytest.raises(cs.InputError, match=r"unknown filter 'ekf-xyzz' \(did you mean 'ekf-xyz'\?\); known: kf, "):
+        cs.run_trials(xyz, ["ekf-xyzz"], runs=1)
 
 
 def test_no_filter(xyz: cs.Scenario) -> None:

@@ -233,12 +233,16 @@ def test_a_stop_that_is_taken_for_an_error_is_no_result(at: Path, monkeypatch: p
         except KeyboardInterrupt as stop:
             raise ValueError("while serialising") from stop
 
-    with monkeypatch.context() as patch:
-        patch.setattr(cells, "run_until_decided", swallows)
-        with pytest.raises(KeyboardInterrupt):
-            run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored where the shell said so
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(cells, "run_until_decided", swallows)
+            with pytest.raises(KeyboardInterrupt):
+                run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert open_sweep(at / "out").results() == {}
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)[1] == 0
 
 

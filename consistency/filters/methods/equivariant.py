@@ -169,16 +169,22 @@ class EquivariantKalman:
         return state.P[:3, :3]
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:
-        pose, landmarks = state.x[:3], {}
+        joint = self.joint(state)
+        blocks = {label: slice(state.at(label), state.at(label) + 3) for label in state.landmarks}
+        return {label: Gaussian(joint.mean[at], joint.covariance[at, at]) for label, at in blocks.items()}
+
+    def joint(self, state: SlamState) -> Gaussian:
+        """Robot and landmarks in the world together, (n,) and (n, n), additive errors."""
+        pose, mean, D = state.x[:3], state.x.copy(), np.zeros_like(state.P)
         t, A = _mounted(state)
+        D[:3, :3] = _additive_from_right(pose)
         for label in state.landmarks:
-            o = state.at(label)
-            q, involved = state.x[o : o + 3], np.r_[:3, o : o + 3]
-            world = _in_world(pose, A @ q + t)
-            by_point = plain.heading_matrix(pose[2]) @ A @ _along_group(q, q)
-            D = np.column_stack([_by_pose(pose, world) @ _additive_from_right(pose), by_point])
-            landmarks[label] = Gaussian(world, D @ state.P[np.ix_(involved, involved)] @ D.T)
-        return landmarks
+            at = slice(state.at(label), state.at(label) + 3)
+            q = state.x[at]
+            mean[at] = _in_world(pose, A @ q + t)
+            D[at, :3] = _by_pose(pose, mean[at]) @ D[:3, :3]
+            D[at, at] = plain.heading_matrix(pose[2]) @ A @ _along_group(q, q)
+        return Gaussian(mean, D @ state.P @ D.T)
 
 
 def _mounted(state: SlamState) -> tuple[Array, Array]:

@@ -76,6 +76,9 @@ class LinearKalman:
     def map(self, state: LinearState) -> dict[int, Gaussian]:
         return plain.map_of(state.slam)
 
+    def joint(self, state: LinearState) -> Gaussian:
+        return plain.joint_of(state.slam)
+
 
 def parts(problem: Problem, controls: Array) -> Slam:
     """Parts of the filter; the reference is the path that the controls plan."""

@@ -157,11 +157,16 @@ class RightInvariantKalman:
         return state.P[:3, :3]
 
     def map(self, state: SlamState) -> dict[int, Gaussian]:
-        return plain.map_of(replace(state, P=self.joint(state).covariance))
+        return plain.map_of(_additive(state))
 
     def joint(self, state: SlamState) -> Gaussian:
-        T = additive_from_right(state.x, state.width)
-        return Gaussian(state.x, T @ state.P @ T.T)
+        return plain.joint_of(_additive(state))
+
+
+def _additive(state: SlamState) -> SlamState:
+    """The state with the covariance of its additive error."""
+    T = additive_from_right(state.x, state.width)
+    return replace(state, P=T @ state.P @ T.T)
 
 
 def additive_from_right(x: Array, width: int = 3) -> Array:

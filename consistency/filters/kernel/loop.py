@@ -137,7 +137,7 @@ def _joint(slam: Slam, state: State, local: NamedTuple) -> Array:
     """Covariance of the additive errors of the robot and of its landmarks in the world, by label: D P D'."""
     r, w, P = robot_width(slam.motion), landmark_width(slam.landmark), state.P
     labels = np.flatnonzero(state.offset >= 0)
-    count, point, nothing = len(labels) + 1, np.empty(3), np.zeros(w)
+    count, point, nothing = len(labels) + 1, np.empty(3), np.ones(w)
     D, at = np.zeros((count, 3, r + w)), np.zeros((count, r + w), np.int64)  # of each block its Jacobian, and by what
     for a in range(3):
         D[0, a, a], at[0, a] = 1.0, a

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -187,6 +187,15 @@ def require_key(axis: Axis, base: Scenario) -> None:
                 beside = f", where '{part}' could be {', '.join(known)}" if known and part != key.split(".")[0] else ""
                 raise InputError(f"key 'grid.{axis.key}': unknown; allowed: {allowed}{beside}")
             table = table.get(part, table.get(stem))
+
+
+def leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of all that nested tables hold."""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{path}{key}.")
+        else:
+            yield path + key, value
 
 
 def with_changes(base: Scenario, name: str, summary: str, changes: Changes) -> Scenario:

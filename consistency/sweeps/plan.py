@@ -7,7 +7,7 @@ import hashlib
 import itertools
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from consistency.runs.montecarlo import resolve_filters
 from consistency.runs.sequential import plan_of
 from consistency.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
 from consistency.store.results import POSE
-from consistency.sweeps.axes import QUANTITIES, Axis, require_key, with_changes
+from consistency.sweeps.axes import QUANTITIES, Axis, leaves, require_key, with_changes
 
 LONGEST = 150  # characters of a folder's name
 REFERENCE = {"uvd": "ekf-uvd", "xyz": "ekf-xyz", "linear": "kf"}  # filter whose step costs 1, by the sensor's model
@@ -60,15 +60,7 @@ class SweepFile(Table):
     @classmethod
     def _flat(cls, grid: dict[str, Any]) -> dict[str, Any]:
         """``truth.path.speed = [...]`` may stand with or without quotes."""
-        return dict(_leaves(grid))
-
-
-def _leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{path}{key}.")
-        else:
-            yield path + key, value
+        return dict(leaves(grid))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from pydantic import ValidationError
 from consistency.errors import InputError
 from consistency.scenario import Scenario, UvdSensor, explain, load_scenario, read_table
 from consistency.store.log import SensorFile
-from consistency.sweeps.axes import QUANTITIES, Axis, Changes, density_of, say_value, with_changes
+from consistency.sweeps.axes import QUANTITIES, Axis, Changes, density_of, leaves, say_value, with_changes
 from consistency.sweeps.plan import Cell, Sweep
 
 AT = 0.05  # of a grid step: nearer to a value of the grid than that is at it
@@ -187,7 +186,7 @@ def differences(rig: Scenario, sweep: Sweep) -> list[str]:
     varied = {key for axis in sweep.axes for key in axis.changes(base, axis.values[0])}
     if any(axis.key == "density" for axis in sweep.axes):
         varied |= {f"truth.landmarks.{key}" for key in ("layout", "count", "seed", "x", "y", "z", "points")}
-    theirs, ours = dict(_leaves(base.model_dump())), dict(_leaves(rig.model_dump()))
+    theirs, ours = dict(leaves(base.model_dump())), dict(leaves(rig.model_dump()))
     keys = [key for key in dict.fromkeys((*ours, *theirs)) if key.startswith(("truth.", "belief."))]
     other = [key for key in keys if key not in varied and not _alike(ours.get(key), theirs.get(key))]
     mistold = [key for key in told_otherwise(rig) if key not in told_otherwise(base) and key not in other]
@@ -196,19 +195,11 @@ def differences(rig: Scenario, sweep: Sweep) -> list[str]:
 
 def told_otherwise(scenario: Scenario) -> list[str]:
     """Keys of the belief whose value is not the true one."""
-    truth = dict(_leaves(scenario.truth.model_dump(), "belief."))
-    belief = dict(_leaves(scenario.belief.model_dump(), "belief."))
+    truth = dict(leaves(scenario.truth.model_dump(), "belief."))
+    belief = dict(leaves(scenario.belief.model_dump(), "belief."))
     if truth.get(searched := "belief.sensor.disparity") is not None:
         belief.setdefault(searched, None)
     return [key for key, value in belief.items() if key in truth and not _alike(value, truth[key])]
-
-
-def _leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{path}{key}.")
-        else:
-            yield path + key, value
 
 
 def _alike(a: Any, b: Any) -> bool:

@@ -219,9 +219,10 @@ def test_landmarks_are_parked_and_come_back(small: Small) -> None:
 
 
 def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
-    clones = make_clones(Parking(50, 20), 3, 3, 12, 100, 2)
+    clones = make_clones(Parking(50, 20, start=10), 3, 3, 36, 100, 2)
+    clones.factors.Phi[:] = 1.0
     clones.of[:], clones.uses[0], clones.here[0] = 0, 2, 9
-    state = State(np.ones(12), np.ones((12, 12)), 12, 0, np.array([3, 6]))
+    state = State(np.ones(12), np.ones((12, 12)), 12, 9, np.array([3, 6]))
     unpark(0, state, clones)
     assert clones.uses[0] == 1
     assert state.P.all()
@@ -232,6 +233,8 @@ def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
     assert not np.triu(state.P[9:, 9:]).any()
     assert not state.x[9:].any()
     assert state.P[:9, :9].all()
+    assert not clones.factors.Phi[9:12, :9].any()
+    assert clones.factors.Phi[:9].all()
 
 
 # --- bad input -----------------------------------------------------------------------------------

@@ -29,6 +29,8 @@ class Corrections(NamedTuple):
     debiasing: bool = True
     prediction: bool = True  # noise of what is observed taken where it is predicted, not where it was measured
     iteration: bool = True
+    waiting: bool = True  # what returns stays parked while the turn since its clone is in doubt
+    chaining: bool = True  # a closure moves each clone by what the motion before it is corrected
 
 
 # --- geometry ----------------------------------------------------------------------------------------
@@ -95,6 +97,34 @@ def left_jacobian(xi: Array) -> Array:
     """J_l of SE(2) to second order, (3, 3)."""
     ad = np.array([[0.0, -xi[2], xi[1]], [xi[2], 0.0, -xi[0]], [0.0, 0.0, 0.0]])
     return np.asarray(np.eye(3) + ad / 2.0 + ad @ ad / 6.0)
+
+
+def apart(poses: Array, xi: Array) -> tuple[Array, Array]:
+    """Poses (k, 3) moved by errors (k, 3), each Exp(xi) T; d error about the moved ones / d xi, (3 k, 3 k)."""
+    C = plain.block_diagonal(np.array([left_jacobian(x) for x in xi]))
+    return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), C
+
+
+def chained(poses: Array, xi: Array) -> tuple[Array, Array]:
+    """The same for poses in the order of time, where xi are the sums of the errors of the motion from each to the next.
+
+    Pose j is Exp(xi_1) Exp(xi_2 - xi_1) ... Exp(xi_j - xi_j-1) T_j: the motion between two poses depends on its own
+    error alone, whatever the errors before it are. With B = Ad(Exp(xi_1) ... Exp(xi_j-1 - xi_j-2)) J_l(xi_j - xi_j-1),
+    row j of the Jacobian is row j - 1 plus B times the difference of xi_j and xi_j-1.
+    """
+    steps = np.diff(xi, axis=0, prepend=np.zeros((1, 3)))
+    E, row = np.zeros(3), np.zeros((3, xi.size))  # E is the product so far, as a pose
+    out, C = np.zeros(poses.shape), np.zeros((xi.size, xi.size))
+    for j, (pose, step) in enumerate(zip(poses, steps, strict=True)):
+        M = shift_matrix(E) @ plain.heading_matrix(E[2])  # Ad
+        B = M @ left_jacobian(step)
+        row[:, 3 * j : 3 * j + 3] += B
+        if j > 0:
+            row[:, 3 * j - 3 : 3 * j] -= B
+        C[3 * j : 3 * j + 3] = row
+        E = moved(E, M @ step)
+        out[j] = [*(E[:2] + plain.heading_matrix(E[2])[:2, :2] @ pose[:2]), E[2] + pose[2]]
+    return out, C
 
 
 # --- conversion --------------------------------------------------------------------------------------

@@ -219,7 +219,7 @@ def test_landmarks_are_parked_and_come_back(small: Small) -> None:
 
 
 def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
-    clones = make_clones(Parking(50, 20, start=10), 3, 3, 36, 100, 2)
+    clones = make_clones(Parking(50, 20, 4e-4, True, start=10), 3, 3, 36, 100, 2)
     clones.factors.Phi[:] = 1.0
     clones.of[:], clones.uses[0], clones.here[0] = 0, 2, 9
     state = State(np.ones(12), np.ones((12, 12)), 12, 9, np.array([3, 6]))

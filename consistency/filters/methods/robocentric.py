@@ -22,6 +22,7 @@ observation is predicted: taken where it was measured, it would give more weight
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,8 +31,10 @@ from consistency.errors import InputError
 from consistency.filters import plain
 from consistency.filters.centred import (
     Corrections,
+    apart,
     bias,
     carried,
+    chained,
     converted,
     left_jacobian,
     moved,
@@ -54,8 +57,11 @@ from consistency.protocols import Problem
 from consistency.types import Array, Control, Gaussian, Info, Observation
 
 EVERY, UNSEEN = 50, 20  # steps between two rounds of parking, and without a sight before a landmark is parked
+DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
-TEMPERED = 2.0  # decades by which the noise of parked landmarks is raised in the first pass; half a decade less in each
+TEMPERED = 2.0  # decades by which the noise of what is in doubt is raised in the first pass; half a decade less in each
+
+Chart = Callable[[Array, Array], tuple[Array, Array]]  # poses and errors (k, 3) to moved poses and (3 k, 3 k)
 
 
 @dataclass(frozen=True)
@@ -125,34 +131,51 @@ class RobotCentredKalman:
         return state, info
 
     def _correct(self, state: CentredState, seen: list[int], z: Array) -> tuple[CentredState, Info]:
-        delta, shifts = np.zeros(len(state.x)), _shifts(state)
-        deviation, involved = np.sqrt(np.diag(shifts @ state.P @ shifts.T)), _involved(state, seen)
-        is_parked = np.array([label in state.parked for label in seen])
-        is_iterated = self.which.iteration and bool(is_parked.any())
-        expected = np.zeros((len(seen), 3))
-        for i in range(PASSES if is_iterated else 1):
-            here = _moved_by(state, delta)
+        in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
+        is_chained = self.which.chaining and bool(in_doubt.any())
+        chart = chained if is_chained else apart
+        if is_chained:
+            state = _settled(state)
+        T, involved = _shifts(state), _involved(state, state.clones if is_chained else _clones_of(state, seen), seen)
+        P = T @ state.P @ T.T  # of the pose, too, by xi from here on
+        delta, expected = np.zeros(len(state.x)), np.zeros((len(seen), 3))
+        deviation = np.sqrt(np.diag(P))
+        for i in range(PASSES if in_doubt.any() else 1):
+            here, C = _charted(state, delta, chart)
             h, H = _expected(here, seen)
-            H = H @ _tangent(state, delta)
-            expected = np.where(is_parked[:, None] | (i == 0), h, expected)
+            H = H @ C
+            expected = np.where(in_doubt[:, None] | (i == 0), h, expected)
             y, R = observed(z, expected, state.problem.belief.sensor, self.which)
-            if is_iterated:
-                R[is_parked] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
+            if in_doubt.any():
+                R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
             gap = y - h
             gap[:, 0] = wrap(gap[:, 0])
             innovation = gap.ravel() + H @ delta
-            S, W = plain.gain(state.P, H, plain.block_diagonal(R))
+            S, W = plain.gain(P, H, plain.block_diagonal(R))
             before, delta = delta, W @ innovation
-            if i >= 2 * TEMPERED and np.all((np.abs(shifts @ (delta - before)) <= SETTLED * deviation)[involved]):
+            if i >= 2 * TEMPERED and np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]):
                 break
-        after = _moved_by(state, delta)
-        P = state.P - W @ S @ W.T
-        T = np.linalg.inv(_shifts(after)) @ _shifts(state)  # keeps the covariance of xi
-        if self.which.turning:
-            motion = state.noise @ (H @ state.noise).T @ np.linalg.solve(S, innovation)
-            T = np.linalg.inv(_shifts(after)) @ _tangent(state, delta - motion)
-        after = replace(after, P=T @ P @ T.T)
-        return _activated(after, [label for label in seen if label in state.parked]), Info(innovation, S, W)
+        if is_chained:
+            after, _ = _charted(state, delta, chart)
+        else:
+            after, C = _moved_by(state, delta), np.eye(len(delta))
+            if self.which.turning:
+                noise = T @ state.noise
+                motion = noise @ (H @ noise).T @ np.linalg.solve(S, innovation)
+                C[:3, :3] = left_jacobian((delta - motion)[:3])
+        turned = np.linalg.inv(_shifts(after)) @ C
+        after = replace(after, P=turned @ (P - W @ S @ W.T) @ turned.T)
+        stays = in_doubt if self.which.waiting else np.zeros(len(seen), dtype=bool)
+        back = [label for label, held in zip(seen, stays, strict=True) if label in state.parked and not held]
+        return _activated(after, back), Info(innovation, S, W)
+
+    def _is_in_doubt(self, state: CentredState, label: int) -> bool:
+        """Whether the turn since the clone of a parked landmark was little known before the motion of this step."""
+        if not self.which.iteration or label not in state.parked:
+            return False
+        clone = state.clones[state.parked[label]] + 2
+        turn = state.P[2, 2] + state.P[clone, clone] - 2.0 * state.P[2, clone]
+        return bool(turn - state.noise[2] @ state.noise[2] > DOUBT**2)
 
     def _inserted(self, state: CentredState, label: int, z: Array) -> CentredState:
         sensor, n = state.problem.belief.sensor, len(state.x)
@@ -184,28 +207,43 @@ def _block(at: int) -> slice:
 def _moved_by(state: CentredState, delta: Array) -> CentredState:
     """The state moved by an error (n,): the pose by Exp, all else by a sum."""
     x = state.x + delta
-    x[:3] = moved(state.x[:3], shift_matrix(state.x[:3]) @ delta[:3])
+    x[:3] = moved(state.x[:3], delta[:3])
     return replace(state, x=x)
 
 
-def _involved(state: CentredState, seen: list[int]) -> Array:
-    """Indices of the pose, of the landmarks ``seen``, and of the clones of those that are parked."""
-    starts = [0, *(state.places[label] for label in seen)]
-    starts += [state.clones[state.parked[label]] for label in seen if label in state.parked]
-    return np.unique(np.add.outer(starts, np.arange(3)))
+def _charted(state: CentredState, delta: Array, chart: Chart) -> tuple[CentredState, Array]:
+    """The state moved by an error (n,), every clone to where it is then; d error about that / d error, (n, n)."""
+    numbers = sorted(state.clones)  # in the order of time
+    at = np.array([*(state.clones[number] for number in numbers), 0])[:, None] + np.arange(3)
+    poses = np.array([*(state.origins[number] for number in numbers), state.x[:3]])
+    x, C = state.x + delta, np.eye(len(delta))
+    x[:3] = delta[:3]
+    poses, C[np.ix_(at.ravel(), at.ravel())] = chart(poses, x[at])
+    x[at] = 0.0
+    x[:3] = poses[-1]
+    return replace(state, x=x, origins=dict(zip(numbers, poses[:-1], strict=True))), C
+
+
+def _settled(state: CentredState) -> CentredState:
+    """Every clone at the pose it has, with the covariance of the error about that."""
+    after, C = _charted(state, np.zeros(len(state.x)), apart)
+    return replace(after, P=C @ state.P @ C.T)
+
+
+def _clones_of(state: CentredState, seen: list[int]) -> set[int]:
+    return {state.parked[label] for label in seen if label in state.parked}
+
+
+def _involved(state: CentredState, clones: Collection[int], seen: list[int]) -> Array:
+    """Indices of the pose, of the landmarks ``seen``, and of ``clones``."""
+    starts = [0, *(state.places[label] for label in seen), *(state.clones[number] for number in clones)]
+    return np.add.outer(starts, np.arange(3)).ravel()
 
 
 def _shifts(state: CentredState) -> Array:
     """(n, n), from the additive error of the pose to xi; the identity elsewhere."""
     T = np.eye(len(state.x))
     T[:3, :3] = shift_matrix(state.x[:3])
-    return T
-
-
-def _tangent(state: CentredState, delta: Array) -> Array:
-    """(n, n), d xi of the pose about the moved state / d error about ``state``, at ``delta``; else the identity."""
-    T = _shifts(state)
-    T[:3, :3] = left_jacobian(T[:3, :3] @ delta[:3]) @ T[:3, :3]
     return T
 
 
@@ -309,10 +347,12 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
         su, sv, sd = sensor.sigma
         pixels = Pixels(su, sv, sd, low, high, which.truncation, which.debiasing, which.prediction)
         every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
+        doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if which.parking else 0
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
-            InvariantPose(), Converted(), Converting(pixels, which.turning, PASSES if which.iteration else 1),
-            Parking(every, unseen),
+            InvariantPose(), Converted(),
+            Converting(pixels, which.turning, which.waiting, which.chaining, PASSES, clones),
+            Parking(every, unseen, doubt, which.chaining),
         )  # fmt: skip
 
     return Compiled(twin, parts, sensors=("uvd",), uvd=True)

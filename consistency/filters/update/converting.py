@@ -22,11 +22,18 @@ from consistency.types import Array, Indices
 
 @part(sensor="Uvd", landmark="InverseRange", error="InvariantPose", covariance="Parking")
 class Converting(NamedTuple):
-    """What is known of the pixels, whether covariances are turned, and the passes of an update at most."""
+    """What is known of the pixels, whether covariances are turned, what is done about a return, and at most how often.
+
+    ``waiting``: what returns in doubt stays parked; ``chaining``: it moves all clones, of which there are ``clones`` at
+    most; ``passes``: of such an update at most.
+    """
 
     pixels: Pixels
     turning: bool
+    waiting: bool
+    chaining: bool
     passes: int
+    clones: int
 
 
 @part(update="Converting")
@@ -47,13 +54,18 @@ class CentredSlam(NamedTuple):
 
 
 class ConvertingRoom(NamedTuple):
-    """For up to m landmarks in a step, and a state of up to n variables."""
+    """For up to m landmarks and c clones in a step, and a state of up to n variables."""
 
-    at: Indices  # (2 m,) offsets of the seen landmarks, then of the clones of those that are parked
+    at: Indices  # (m + c,) offsets of the seen landmarks, then of clones: of those that are parked, or all
+    number: Indices  # (c,) numbers of these clones
     clone: Indices  # (m,) which of these clones a landmark has, or -1
-    rows: Array  # (3 + 6 m, n) rows of P, and behind them of Phi, of the robot and of all these
-    among: Array  # (3 + 6 m, 3 + 6 m) their columns of these alone
-    place: Indices  # (2 m,) their offsets there
+    rows: Array  # (3 + 3 (m + c), n) rows of P, and behind them of Phi, of the robot and of all these
+    among: Array  # (3 + 3 (m + c), 3 + 3 (m + c)) their columns of these alone
+    cast: Array  # (3 + 3 (m + c), 3 + 3 (m + c)) and by errors about the poses of a pass
+    place: Indices  # (m + c,) their offsets there
+    frames: Array  # (c + 1, 3) poses of the clones and of the robot where ``delta`` leads
+    turns: Array  # (c + 1, 3, 3) error about each / d delta
+    links: Array  # (c + 1, 3, 3) how errors about them are chained
     own: Array  # (m, 3, 3) Jacobian with respect to the landmark
     shift: Array  # (m, 3, 3) and to xi of its clone less that of the pose, about the moved state
     by_clone: Array  # (m, 3, 3) and to xi of its clone
@@ -61,8 +73,8 @@ class ConvertingRoom(NamedTuple):
     y: Array  # (m, 3) converted observations
     h: Array  # (m, 3) what is expected
     R: Array  # (m, 3, 3)
-    delta: Array  # (3 + 6 m,) a correction of the robot and of all these
-    before: Array  # (3 + 6 m,)
+    delta: Array  # (3 + 3 (m + c),) a correction of the robot and of all these
+    before: Array  # (3 + 3 (m + c),)
     noise: Array  # (2, n) what the motion of this step added to the errors, for each of its noises
     moving: Indices  # (n / 3,) offsets of the landmarks that move
     J: Array  # (n / 3, 3, 3) how
@@ -72,10 +84,12 @@ class ConvertingRoom(NamedTuple):
 
 @implement(make_room, Converting)
 def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) -> ConvertingRoom:
-    most = 3 + 6 * m
+    c = max(m, update.clones)
+    most = 3 + 3 * (m + c)
     return ConvertingRoom(
-        np.empty(2 * m, np.int64), np.empty(m, np.int64), np.empty((most, n)), np.empty((most, most)),
-        3 + 3 * np.arange(2 * m),
+        np.empty(m + c, np.int64), np.empty(c, np.int64), np.empty(m, np.int64), np.empty((most, n)),
+        np.empty((most, most)), np.empty((most, most)), 3 + 3 * np.arange(m + c),
+        np.empty((c + 1, 3)), np.empty((c + 1, 3, 3)), np.empty((c + 1, 3, 3)),
         np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)),
         np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3, 3)), np.empty(most), np.empty(most),
         np.empty((2, n)), np.empty(n // 3, np.int64), np.empty((n // 3, 3, 3)), np.empty((4, 3, 3)), np.empty((4, 3)),

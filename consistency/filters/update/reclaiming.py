@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.filters.error.invariant_pose import left_jacobian, move_pose
-from consistency.filters.kernel.arrays import copy, fill
+from consistency.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.filters.kernel.blas import add_transposed_times, solve_transposed
 from consistency.filters.kernel.covariance import gather_rows, replace_rows, state_index, subtract_gram
 from consistency.filters.kernel.dispatch import implement
@@ -15,12 +15,21 @@ from consistency.filters.kernel.slam import Data, Frame, State, correct, robot_f
 from consistency.filters.kernel.work import Work
 from consistency.filters.landmark.inverse_range import carried
 from consistency.filters.sensor.conversion import observe_range
+from consistency.filters.update.charting import (
+    aim_apart,
+    aim_chained,
+    cast_columns,
+    cast_rows,
+    cast_state,
+    move_chain,
+    unchain,
+)
 from consistency.filters.update.converting import CentredSlam, Converting, ConvertingRoom
-from consistency.filters.upkeep.parking import Clones, unpark
+from consistency.filters.upkeep.parking import Clones, is_in_doubt, recentre, unpark
 from consistency.types import Array, Indices
 
 SETTLED = 1e-3  # change in standard deviations that ends an iteration
-TEMPERED = 2.0  # decades by which the noise of parked landmarks is raised in the first pass; half a decade less in each
+TEMPERED = 2.0  # decades by which the noise of what is in doubt is raised in the first pass; half a decade less in each
 
 
 @implement(correct, Converting)
@@ -35,52 +44,96 @@ def correct_converted(
     work: Work[ConvertingRoom],
 ) -> tuple[int, float]:
     room, width = work.room, state.n + state.base
-    parked = _gather(state, m, local, work)
-    if parked > 0:
-        code = _iterate(update, slam, state, data, m, parked, local, work)
+    in_doubt = _is_any_in_doubt(m, local, work)
+    chained = in_doubt and update.chaining
+    if chained:
+        recentre(state, local)
+    clones = _gather(state, m, chained, local, work)
+    if in_doubt:
+        code = _iterate(update, slam, state, data, m, clones, chained, local, work)
         if code > 0:
             return code, np.nan
     else:
-        fill(room.delta[: 3 + 3 * m], 0.0)
-        _expect(update, slam, state, data, True, m, local, work)
+        fill(room.delta[: 3 + 3 * (m + clones)], 0.0)
+        aim_apart(state, m, clones, local, room)
+        _expect(update, slam, state, data, True, m, clones, local, work)
+    if chained:
+        cast_state(state, m, clones, room)
     total = _innovate(room.rows, width, room.at, m, work)
     code, nis = divide_by_root(state, 3 * m, work, total)
     if code == 0:
         _move(state, m, work)
         apply_beyond(state, 3 * m, local.factors, work)
-        if update.turning:
-            _turn(state, m, local, work)
+        if chained:
+            move_chain(state, m, clones, local, work)
+        else:
+            move_pose(state.x[:3], work.delta[:3], room.frames[clones])
+            copy(room.frames[clones], state.x[:3])
+            if update.turning:
+                _turn(state, m, local, work)
         for i in range(m):
-            if room.clone[i] >= 0:
+            if room.clone[i] >= 0 and not (update.waiting and is_in_doubt(work.label[i], local)):
                 _reclaim(slam, state, work.label[i], local, work)
     return code, nis
 
 
 @inner
-def _gather(state: State, m: int, local: Clones, work: Work[ConvertingRoom]) -> int:
-    """Rows of P and Phi of all that the update involves; returns how many clones of parked landmarks that is."""
-    n, base, room, Phi, clones = state.n, state.base, work.room, local.factors.Phi, 0
+def _is_any_in_doubt(m: int, local: Clones, work: Work[ConvertingRoom]) -> bool:
+    in_doubt = False
+    for i in range(m):
+        in_doubt = in_doubt or is_in_doubt(work.label[i], local)
+    return in_doubt
+
+
+@inner
+def _gather(state: State, m: int, is_chained: bool, local: Clones, work: Work[ConvertingRoom]) -> int:
+    """Rows of P and Phi of all that the update involves; returns how many clones that is.
+
+    They are those of parked landmarks that are seen, or in a chain all of them in the order of time.
+    """
+    n, base, room, Phi = state.n, state.base, work.room, local.factors.Phi
+    clones = _list_all(local, room.number) if is_chained else _list_seen(m, local, work)
     for i in range(m):
         room.at[i], room.clone[i] = work.at[i], -1
-        number = local.of[work.label[i]]
-        if number >= 0:
-            o = local.here[number]
-            for c in range(clones):
-                if room.at[m + c] == o:
-                    room.clone[i] = c
-            if room.clone[i] < 0:
-                room.clone[i], room.at[m + clones] = clones, o
-                clones += 1
+        for c in range(clones):
+            if room.number[c] == local.of[work.label[i]]:
+                room.clone[i] = c
+    for c in range(clones):
+        room.at[m + c] = local.here[room.number[c]]
     count = m + clones
     gather_rows(state.P, n, 3, 3, room.at, count, room.rows)
     if base > 0:
         for i in range(3 + 3 * count):
             copy(Phi[state_index(3, 3, i, room.at), :base], room.rows[i, n : n + base])
-    if clones > 0:
-        for i in range(3 + 3 * count):
-            for j in range(3 + 3 * count):
-                room.among[i, j] = room.rows[i, state_index(3, 3, j, room.at)]
     return clones
+
+
+@inner
+def _list_seen(m: int, local: Clones, work: Work[ConvertingRoom]) -> int:
+    clones = 0
+    for i in range(m):
+        number, is_new = local.of[work.label[i]], True
+        for c in range(clones):
+            is_new = is_new and work.room.number[c] != number
+        if number >= 0 and is_new:
+            work.room.number[clones] = number
+            clones += 1
+    return clones
+
+
+@inner
+def _list_all(local: Clones, numbers: Indices) -> int:
+    clones, last = 0, -1
+    while True:
+        found = -1
+        for number in range(len(local.uses)):
+            is_next = local.uses[number] > 0 and local.made[number] > last
+            if is_next and (found < 0 or local.made[number] < local.made[found]):
+                found = number
+        if found < 0:
+            return clones
+        numbers[clones], last = found, local.made[found]
+        clones += 1
 
 
 @inner
@@ -91,28 +144,42 @@ def _iterate(
     data: Data,
     m: int,
     clones: int,
+    is_chained: bool,
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> int:
     """Gauss-Newton on what the update involves; ``room`` has the last linearisation, ``delta`` where it was made."""
     room, size = work.room, 3 + 3 * (m + clones)
-    alone = State(state.x, room.among, size, 0, state.offset)
-    delta = room.delta[:size]
+    among, cast, delta = room.among[:size, :size], room.cast[:size, :size], room.delta[:size]
+    for i in range(size):
+        for j in range(size):
+            among[i, j] = room.rows[i, state_index(3, 3, j, room.at)]
+    alone = State(state.x, cast, size, 0, state.offset)
     fill(delta, 0.0)
     for i in range(update.passes):
         copy(delta, room.before[:size])
-        _expect(update, slam, state, data, i == 0, m, local, work)
-        if update.passes > 1:
-            _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), room)
-        total = _innovate(room.among, size, room.place, m, work)
+        copy_matrix(among, cast)
+        if is_chained:
+            aim_chained(state, m, clones, local, room)
+            cast_rows(cast, size, m, clones, room)
+            cast_columns(cast, room.place, m, clones, room)
+        else:
+            aim_apart(state, m, clones, local, room)
+        _expect(update, slam, state, data, i == 0, m, clones, local, work)
+        _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), local, work)
+        total = _innovate(cast, size, room.place, m, work)
         code, _ = divide_by_root(alone, 3 * m, work, total)
         if code > 0:
             return code
         fill(delta, 0.0)
         add_transposed_times(work.A[: 3 * m, :size], work.A[: 3 * m, size], delta)
+        if is_chained:
+            unchain(delta, m, clones, room)
         if i >= 2.0 * TEMPERED and _is_settled(size, room):
             break
     copy(room.before[:size], delta)
+    if is_chained:
+        aim_chained(state, m, clones, local, room)
     return 0
 
 
@@ -142,31 +209,23 @@ def _expect(
     data: Data,
     is_first: bool,
     m: int,
+    clones: int,
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> None:
-    """h and its Jacobians where ``delta`` leads, and the observations there; those of landmarks in use once."""
+    """h and its Jacobians where ``delta`` leads, and the observations; again there of what is in doubt only."""
     x, room, delta = state.x, work.room, work.room.delta
-    D, turn = room.three[0], room.three[1]
-    around, pose, clone, xi = room.poses[0], room.poses[1], room.poses[2], room.poses[3]
-    move_pose(x[:3], delta[:3], pose)
+    D, around = room.three[0], room.poses[0]
     for j in range(m):
-        o, h = work.at[j], room.h[j]
+        o, h, c = work.at[j], room.h[j], room.clone[j]
         for a in range(3):
             h[a] = x[o + a] + delta[3 + 3 * j + a]
-        is_parked = room.clone[j] >= 0
-        if is_parked:
+        if c >= 0:
             copy(h, around)
-            q, p = room.at[m + room.clone[j]], 3 + 3 * (m + room.clone[j])
-            for a in range(3):
-                xi[a] = x[q + a] + delta[p + a]
-            move_pose(local.origin[local.of[work.label[j]]], xi, clone)
-            _seen_from(slam, clone, pose, around, h, room.own[j], room.shift[j], D)
-            left_jacobian(xi, turn)
-            _times(1.0, room.shift[j], turn, room.by_clone[j])
-            left_jacobian(delta[:3], turn)
-            _times(-1.0, room.shift[j], turn, room.by_pose[j])
-        if is_parked or is_first:
+            _seen_from(slam, room.frames[c], room.frames[clones], around, h, room.own[j], room.shift[j], D)
+            _times(1.0, room.shift[j], room.turns[c], room.by_clone[j])
+            _times(-1.0, room.shift[j], room.turns[clones], room.by_pose[j])
+        if is_first or (c >= 0 and is_in_doubt(work.label[j], local)):
             z = data.z[work.known[j]]
             observe_range(slam.sensor, update.pixels, z, h, room.y[j], room.R[j], D, around)
 
@@ -180,13 +239,13 @@ def _times(weight: float, A: Array, B: Array, C: Array) -> None:
 
 
 @inner
-def _temper(m: int, factor: float, room: ConvertingRoom) -> None:
-    """R of the parked landmarks, worked out in this pass, is raised."""
+def _temper(m: int, factor: float, local: Clones, work: Work[ConvertingRoom]) -> None:
+    """R of what is in doubt, worked out in this pass, is raised."""
     for j in range(m):
-        if room.clone[j] >= 0:
+        if is_in_doubt(work.label[j], local):
             for a in range(3):
                 for b in range(3):
-                    room.R[j, a, b] *= factor
+                    work.room.R[j, a, b] *= factor
 
 
 @inner
@@ -249,16 +308,14 @@ def _is_settled(size: int, room: ConvertingRoom) -> bool:
 
 @inner
 def _move(state: State, m: int, work: Work[ConvertingRoom]) -> None:
-    """x <- moved by ``work.delta`` <- A' y, P <- P - A' A."""
-    x, n, pose = state.x, state.n, work.room.poses[1]
+    """x <- moved by ``work.delta`` <- A' y, but for the robot; P <- P - A' A."""
+    x, n = state.x, state.n
     A, delta = work.A[: 3 * m, :n], work.delta[:n]
     fill(delta, 0.0)
     add_transposed_times(A, work.A[: 3 * m, n + state.base], delta)
     subtract_gram(state.P, n, 3, A)
     for i in range(3, n):
         x[i] += delta[i]
-    move_pose(x[:3], delta[:3], pose)
-    copy(pose, x[:3])
 
 
 @inner

@@ -31,11 +31,15 @@ WORTH = 1.1  # variables of the whole state for each of active part and base fro
 class Parking(NamedTuple):
     """Steps between two rounds of parking, 0 for none, and without a sight before a landmark is parked.
 
-    ``start`` is the number of variables in the state from which updates are local.
+    A return is in doubt where the variance of the turn since the clone is above ``doubt``, rad^2; if ``whole``, a step
+    with such a return works on the whole state. ``start`` is the number of variables in the state from which updates
+    are local.
     """
 
     every: int
     unseen: int
+    doubt: float
+    whole: bool
     start: int = LOCAL_FROM
 
 
@@ -47,6 +51,8 @@ class Clones(NamedTuple):
     at: Indices  # (clones,) offset of each clone in the whole state, 0 where it has none yet
     here: Indices  # (clones,) and in the variables of a step, 0 where it is in the passive rest
     uses: Indices  # (clones,) landmarks parked at each
+    made: Indices  # (clones,) step at which each was made
+    doubted: Indices  # (clones,) 1 if a landmark there is seen in this step and its return is in doubt
     origin: Array  # (clones, 3) pose T of each
     step: Indices  # (1,) steps so far
     rows: Array  # (9, n)
@@ -74,6 +80,8 @@ def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landm
         np.zeros(most, np.int64),
         np.zeros(most, np.int64),
         np.zeros(most, np.int64),
+        np.zeros(most, np.int64),
+        np.zeros(most, np.int64),
         np.zeros((most, 3)),
         np.zeros(1, np.int64),
         np.zeros((9, n)),
@@ -94,20 +102,51 @@ def prepare_parked(
     due = covariance.every > 0 and step > 0 and step % covariance.every == 0
     due = due and _is_any_idle(covariance, whole, step, local)
     if state.base > 0 and (due or _is_crowded(whole, state, labels, local)):
-        join(slam, whole, state.n, state.base, local.factors)
-        copy(whole.offset, state.offset)
-        copy(local.at, local.here)
-        state = State(whole.x, whole.P, whole.n, 0, state.offset)
+        state = _joined(slam, whole, state, local)
     if due:
         whole = _park(covariance, whole, step, local)
         state = State(whole.x, whole.P, whole.n, 0, state.offset)
-    if state.base == 0 and whole.n >= covariance.start and _is_worth_it(whole, local):
-        state = _split(covariance, whole, state.offset, local)
+    if state.base == 0:
+        needs_whole = _needs_whole(covariance, state, labels, local)
+        if not needs_whole and whole.n >= covariance.start and _is_worth_it(whole, local):
+            state = _split(covariance, whole, state.offset, local)
     if state.base > 0:
         state = _call_back(covariance, whole, state, labels, local)
+        if _needs_whole(covariance, state, labels, local):
+            state = _joined(slam, whole, state, local)
     for label in labels:
         local.seen[label] = step + 1
     return whole, state
+
+
+@inner
+def _joined(slam: Slam, whole: State, state: State, local: Clones) -> State:
+    """All variables, after what the active part did to them."""
+    join(slam, whole, state.n, state.base, local.factors)
+    copy(whole.offset, state.offset)
+    copy(local.at, local.here)
+    return State(whole.x, whole.P, whole.n, 0, state.offset)
+
+
+@inner
+def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clones) -> bool:
+    """Finds what of the ``labels`` returns in doubt, and whether that takes the whole state."""
+    P, any_doubted = state.P, False
+    fill(local.doubted, 0)
+    for label in labels:
+        number = local.of[label]
+        if number >= 0:
+            o = local.here[number] + 2
+            if P[2, 2] + P[o, o] - 2.0 * P[2, o] > covariance.doubt:
+                local.doubted[number] = 1
+                any_doubted = True
+    return any_doubted and covariance.whole
+
+
+@inner
+def is_in_doubt(label: int, local: Clones) -> bool:
+    """Whether a landmark of this step is parked where the turn since then is little known."""
+    return local.of[label] >= 0 and local.doubted[local.of[label]] == 1
 
 
 @implement(append, Parking)
@@ -145,6 +184,7 @@ def _park(covariance: Parking, whole: State, step: int, local: Clones) -> State:
         o = n
         n += 3
     local.at[number] = local.here[number] = o
+    local.made[number] = step
     for label in range(len(local.of)):
         if _is_idle(covariance, whole, label, step, local):
             local.of[label] = number
@@ -253,7 +293,16 @@ def settle_clones(covariance: Parking, slam: Slam, whole: State, state: State, l
     """``whole`` <- all variables; a clone <- its pose, with the covariance of the error about that."""
     if state.base > 0:
         join(slam, whole, state.n, state.base, local.factors)
-    x, P, n, rows = whole.x, whole.P, whole.n, local.rows
+    recentre(State(whole.x, whole.P, whole.n, 0, whole.offset), local)
+    for number in range(len(local.at)):
+        if local.uses[number] > 0:
+            copy(local.origin[number], whole.x[local.at[number] : local.at[number] + 3])
+
+
+@inner
+def recentre(state: State, local: Clones) -> None:
+    """Each clone of a whole state <- an error of zero about the pose that it has, and the covariance of that error."""
+    x, P, n, rows = state.x, state.P, state.n, local.rows
     turn, own, at = np.empty((3, 3)), np.empty((3, 3)), np.empty(1, np.int64)
     for number in range(len(local.at)):
         if local.uses[number] > 0:
@@ -268,4 +317,5 @@ def settle_clones(covariance: Parking, slam: Slam, whole: State, state: State, l
                     own[a, b] = turn[b, 0] * rows[a, o] + turn[b, 1] * rows[a, o + 1] + turn[b, 2] * rows[a, o + 2]
             replace_rows(P, n, o, rows, own)
             move_pose(local.origin[number], x[o : o + 3], turn[0])
-            copy(turn[0], x[o : o + 3])
+            copy(turn[0], local.origin[number])
+            fill(x[o : o + 3], 0.0)

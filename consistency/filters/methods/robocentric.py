@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,7 +59,8 @@ from consistency.types import Array, Control, Gaussian, Info, Observation
 
 EVERY, UNSEEN = 50, 20  # steps between two rounds of parking, and without a sight before a landmark is parked
 DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
-PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
+PASSES, SETTLED = 20, 1e-2  # of an update at most, and the change in standard deviations that ends it
+PASSES_CHAINED = 12  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
 TEMPERED = 2.0  # decades by which the noise of what is in doubt is raised in the first pass; half a decade less in each
 
 Chart = Callable[[Array, Array], tuple[Array, Array]]  # poses and errors (k, 3) to moved poses and (3 k, 3 k)
@@ -78,6 +80,18 @@ class CentredState:
     parked: dict[int, int] = field(default_factory=dict)  # number of the clone at which a landmark is parked, by label
     clones: dict[int, int] = field(default_factory=dict)  # offset of each clone by number
     origins: dict[int, Array] = field(default_factory=dict)  # pose T (3,) of each, which is Exp(xi) T
+
+
+class Solution(NamedTuple):
+    """An update with k numbers, as the last pass found it."""
+
+    delta: Array  # (n,), xi of the pose, of clones in the sense of the chart, and errors of landmarks
+    C: Array  # (n, n), error about where the pass began / d delta
+    H: Array  # (k, n), by delta
+    S: Array  # (k, k)
+    W: Array  # (n, k)
+    innovation: Array  # (k,)
+    is_settled: bool
 
 
 class RobotCentredKalman:
@@ -131,43 +145,57 @@ class RobotCentredKalman:
         return state, info
 
     def _correct(self, state: CentredState, seen: list[int], z: Array) -> tuple[CentredState, Info]:
+        is_parked = np.array([label in state.parked for label in seen])
         in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
-        is_chained = self.which.chaining and bool(in_doubt.any())
-        chart = chained if is_chained else apart
-        if is_chained:
+        attempts = [(apart, PASSES if self.which.iteration and is_parked.any() else 1)]
+        if self.which.chaining and in_doubt.any():
             state = _settled(state)
-        T, involved = _shifts(state), _involved(state, state.clones if is_chained else _clones_of(state, seen), seen)
+            attempts.insert(0, (chained, PASSES_CHAINED))
+        T = _shifts(state)
         P = T @ state.P @ T.T  # of the pose, too, by xi from here on
-        delta, expected = np.zeros(len(state.x)), np.zeros((len(seen), 3))
-        deviation = np.sqrt(np.diag(P))
-        for i in range(PASSES if in_doubt.any() else 1):
+        for chart, passes in attempts:
+            found = self._solved(state, P, seen, z, is_parked, in_doubt, chart, passes)
+            if found.is_settled:
+                break
+        if chart is chained:
+            (after, _), turned = _charted(state, found.delta, chained), found.C
+        else:
+            after, turned = _moved_by(state, found.delta), np.eye(len(state.x))
+            if self.which.turning:
+                noise = T @ state.noise
+                motion = noise @ (found.H @ noise).T @ np.linalg.solve(found.S, found.innovation)
+                turned[:3, :3] = left_jacobian((found.delta - motion)[:3])
+        turned = np.linalg.inv(_shifts(after)) @ turned
+        after = replace(after, P=turned @ (P - found.W @ found.S @ found.W.T) @ turned.T)
+        stays = in_doubt if self.which.waiting else np.zeros(len(seen), dtype=bool)
+        back = [label for label, is_back in zip(seen, is_parked & ~stays, strict=True) if is_back]
+        return _activated(after, back), Info(found.innovation, found.S, found.W)
+
+    def _solved(
+        self, state: CentredState, P: Array, seen: list[int], z: Array, is_parked: Array, in_doubt: Array,
+        chart: Chart, passes: int,
+    ) -> Solution:  # fmt: skip
+        """The update by at most so many passes of Gauss-Newton, in a chart of the poses."""
+        delta, expected, deviation = np.zeros(len(P)), np.zeros((len(seen), 3)), np.sqrt(np.diag(P))
+        involved = _involved(state, state.clones if in_doubt.any() else _clones_of(state, seen), seen)
+        is_settled = False
+        for i in range(passes):
             here, C = _charted(state, delta, chart)
             h, H = _expected(here, seen)
             H = H @ C
-            expected = np.where(in_doubt[:, None] | (i == 0), h, expected)
+            expected = np.where(is_parked[:, None] | (i == 0), h, expected)
             y, R = observed(z, expected, state.problem.belief.sensor, self.which)
-            if in_doubt.any():
-                R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
+            R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
             gap = y - h
             gap[:, 0] = wrap(gap[:, 0])
             innovation = gap.ravel() + H @ delta
             S, W = plain.gain(P, H, plain.block_diagonal(R))
             before, delta = delta, W @ innovation
-            if i >= 2 * TEMPERED and np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]):
+            is_settled = i >= (2 * TEMPERED if in_doubt.any() else 1)
+            is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))
+            if is_settled:
                 break
-        if is_chained:
-            after, _ = _charted(state, delta, chart)
-        else:
-            after, C = _moved_by(state, delta), np.eye(len(delta))
-            if self.which.turning:
-                noise = T @ state.noise
-                motion = noise @ (H @ noise).T @ np.linalg.solve(S, innovation)
-                C[:3, :3] = left_jacobian((delta - motion)[:3])
-        turned = np.linalg.inv(_shifts(after)) @ C
-        after = replace(after, P=turned @ (P - W @ S @ W.T) @ turned.T)
-        stays = in_doubt if self.which.waiting else np.zeros(len(seen), dtype=bool)
-        back = [label for label, held in zip(seen, stays, strict=True) if label in state.parked and not held]
-        return _activated(after, back), Info(innovation, S, W)
+        return Solution(delta, C, H, S, W, innovation, is_settled)
 
     def _is_in_doubt(self, state: CentredState, label: int) -> bool:
         """Whether the turn since the clone of a parked landmark was little known before the motion of this step."""
@@ -348,10 +376,11 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
         pixels = Pixels(su, sv, sd, low, high, which.truncation, which.debiasing, which.prediction)
         every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
         doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if which.parking else 0
+        chain = PASSES_CHAINED if which.chaining else 0
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
             InvariantPose(), Converted(),
-            Converting(pixels, which.turning, which.waiting, which.chaining, PASSES, clones),
+            Converting(pixels, which.turning, which.waiting, PASSES if which.iteration else 1, chain, clones),
             Parking(every, unseen, doubt, which.chaining),
         )  # fmt: skip
 

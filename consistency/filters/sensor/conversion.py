@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import Triple
 from consistency.filters.sensor.uvd import Uvd
 from consistency.types import Array
 
@@ -30,21 +29,26 @@ class Pixels(NamedTuple):
 
 
 @inner
+def _cosines(sensor: Uvd, u: float, v: float) -> tuple[float, float]:
+    """Of the azimuth and the elevation of a pixel; cos(atan(x)) = 1 / sqrt(1 + x^2)."""
+    f = sensor.f
+    ca = f / math.sqrt(f * f + u * u)
+    return ca, f / math.sqrt(f * f + v * ca * v * ca)
+
+
+@inner
 def convert(sensor: Uvd, u: float, v: float, d: float, y: Array) -> None:
     """``y`` (3,) <- azimuth and elevation (rad) and inverse range (1/m)."""
-    a = np.arctan2(-u, sensor.f)
-    e = np.arctan2(-v * np.cos(a), sensor.f)
-    y[0], y[1], y[2] = a, e, d * np.cos(e) * np.cos(a) / (sensor.f * sensor.B)
+    ca, ce = _cosines(sensor, u, v)
+    y[0], y[1], y[2] = math.atan2(-u, sensor.f), math.atan2(-v * ca, sensor.f), d * ce * ca / (sensor.f * sensor.B)
 
 
 @inner
 def conversion_jacobian(sensor: Uvd, u: float, v: float, d: float, J: Array) -> None:
     """``J`` (3, 3) <- derivatives of :func:`convert`."""
     f, g = sensor.f, 1.0 / (sensor.f * sensor.B)
-    a = np.arctan2(-u, f)
-    sa, ca = np.sin(a), np.cos(a)
-    e = np.arctan2(-v * ca, f)
-    se, ce = np.sin(e), np.cos(e)
+    ca, ce = _cosines(sensor, u, v)
+    sa, se = -u / f * ca, -v * ca / f * ce
     a_u, e_v = -f / (f * f + u * u), -ce * ce * ca / f
     e_u = ce * ce * v * sa * a_u / f
     J[0, 0], J[0, 1], J[0, 2] = a_u, 0.0, 0.0
@@ -53,17 +57,22 @@ def conversion_jacobian(sensor: Uvd, u: float, v: float, d: float, J: Array) -> 
 
 
 @inner
-def add_bias(sensor: Uvd, pixels: Pixels, z: Triple, weight: float, around: Array, y: Array) -> None:
-    """``y`` += weight (mean of the conversion - conversion of the mean), by three points in u and in v."""
-    u, v, d = z
-    for i in range(2):
-        step = np.sqrt(3.0) * (pixels.su if i == 0 else pixels.sv)
-        for sign in (-1.0, 1.0, 0.0):
-            along = sign * step
-            convert(sensor, u + (along if i == 0 else 0.0), v + (along if i == 1 else 0.0), d, around)
-            share = weight / 6.0 if sign != 0.0 else -weight / 3.0
-            for a in range(3):
-                y[a] += share * around[a]
+def subtract_bias(sensor: Uvd, pixels: Pixels, u: float, v: float, d: float, y: Array) -> None:
+    """``y`` (3,), the conversion, <- less what its mean differs from it, by three points in u and in v."""
+    f, g = sensor.f, 1.0 / (sensor.f * sensor.B)
+    a, e, rho = 6.0 * y[0], 6.0 * y[1], 6.0 * y[2]
+    du, dv = math.sqrt(3.0) * pixels.su, math.sqrt(3.0) * pixels.sv
+    for sign in (-1.0, 1.0):
+        ca, ce = _cosines(sensor, u + sign * du, v)
+        a += y[0] - math.atan2(-u - sign * du, f)
+        e += y[1] - math.atan2(-v * ca, f)
+        rho += y[2] - d * g * ce * ca
+    ca, _ = _cosines(sensor, u, v)  # an error of v leaves the azimuth as it is
+    for sign in (-1.0, 1.0):
+        beside = (v + sign * dv) * ca
+        e += y[1] - math.atan2(-beside, f)
+        rho += y[2] - d * g * ca * f / math.sqrt(f * f + beside * beside)
+    y[0], y[1], y[2] = a / 6.0, e / 6.0, rho / 6.0
 
 
 @inner
@@ -81,15 +90,13 @@ def untruncated(pixels: Pixels, d: float, expected: float) -> tuple[float, float
 
 
 @inner
-def observe_range(
-    sensor: Uvd, pixels: Pixels, z: Array, expected: Array, y: Array, R: Array, J: Array, around: Array
-) -> None:
+def observe_range(sensor: Uvd, pixels: Pixels, z: Array, expected: Array, y: Array, R: Array, J: Array) -> None:
     """``y`` (3,) <- the observation z where ``expected`` (3,) is predicted, ``R`` (3, 3) <- its noise."""
     ca, ce = np.cos(expected[0]), np.cos(expected[1])
     u, v, d, measured, variance = z[0], z[1], z[2], z[2], pixels.sd * pixels.sd
     if ca > BESIDE and ce > BESIDE:
-        u = -sensor.f * np.tan(expected[0])
-        v = -sensor.f * np.tan(expected[1]) / ca
+        u = -sensor.f * np.sin(expected[0]) / ca
+        v = -sensor.f * np.sin(expected[1]) / (ce * ca)
         d = expected[2] * sensor.f * sensor.B / (ce * ca)
     if pixels.truncation:
         measured, variance = untruncated(pixels, measured, d)
@@ -97,7 +104,7 @@ def observe_range(
         u, v, d = z[0], z[1], measured
     convert(sensor, z[0], z[1], measured, y)
     if pixels.debiasing:
-        add_bias(sensor, pixels, (z[0], z[1], measured), -1.0, around, y)
+        subtract_bias(sensor, pixels, z[0], z[1], measured, y)
     conversion_jacobian(sensor, u, v, d, J)
     for a in range(3):
         for b in range(3):

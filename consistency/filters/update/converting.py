@@ -14,7 +14,7 @@ from consistency.filters.kernel.slam import Frame, State, make_notes, make_room,
 from consistency.filters.kernel.work import NoNotes, Work
 from consistency.filters.landmark.inverse_range import InverseRange, carried
 from consistency.filters.motion.unicycle import Unicycle
-from consistency.filters.sensor.conversion import Pixels, add_bias, conversion_jacobian, convert
+from consistency.filters.sensor.conversion import Pixels, conversion_jacobian, convert, subtract_bias
 from consistency.filters.sensor.uvd import Uvd
 from consistency.filters.upkeep.parking import Clones, Parking
 from consistency.types import Array, Indices
@@ -22,17 +22,17 @@ from consistency.types import Array, Indices
 
 @part(sensor="Uvd", landmark="InverseRange", error="InvariantPose", covariance="Parking")
 class Converting(NamedTuple):
-    """What is known of the pixels, whether covariances are turned, what is done about a return, and at most how often.
+    """What is known of the pixels, whether covariances are turned, and what is done about a return.
 
-    ``waiting``: what returns in doubt stays parked; ``chaining``: it moves all clones, of which there are ``clones`` at
-    most; ``passes``: of such an update at most.
+    ``waiting``: what returns in doubt stays parked; ``passes`` of such an update at most, and of one in a ``chain``,
+    tried first, 0 for none; ``clones`` at most.
     """
 
     pixels: Pixels
     turning: bool
     waiting: bool
-    chaining: bool
     passes: int
+    chain: int
     clones: int
 
 
@@ -185,6 +185,6 @@ def place_converted(
     sensor, pixels, y = slam.sensor, slam.update.pixels, state.x[state.n : state.n + 3]
     convert(sensor, z[0], z[1], z[2], y)
     if pixels.debiasing:
-        add_bias(sensor, pixels, (z[0], z[1], z[2]), -1.0, work.room.poses[0], y)
+        subtract_bias(sensor, pixels, z[0], z[1], z[2], y)
     conversion_jacobian(sensor, z[0], z[1], z[2], work.Jz)
     fill_matrix(work.Jp, 0.0)

@@ -28,7 +28,7 @@ from consistency.filters.update.converting import CentredSlam, Converting, Conve
 from consistency.filters.upkeep.parking import Clones, is_in_doubt, recentre, unpark
 from consistency.types import Array, Indices
 
-SETTLED = 1e-3  # change in standard deviations that ends an iteration
+SETTLED = 1e-2  # change in standard deviations that ends an iteration
 TEMPERED = 2.0  # decades by which the noise of what is in doubt is raised in the first pass; half a decade less in each
 
 
@@ -45,15 +45,17 @@ def correct_converted(
 ) -> tuple[int, float]:
     room, width = work.room, state.n + state.base
     in_doubt = _is_any_in_doubt(m, local, work)
-    chained = in_doubt and update.chaining
+    chained = in_doubt and update.chain > 0
     if chained:
         recentre(state, local)
-    clones = _gather(state, m, chained, local, work)
-    if in_doubt:
-        code = _iterate(update, slam, state, data, m, clones, chained, local, work)
-        if code > 0:
-            return code, np.nan
-    else:
+    clones, code = _gather(state, m, chained, local, work), 0
+    if chained:
+        code, chained = _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
+    if code == 0 and not chained and clones > 0 and update.passes > 1:
+        code, _ = _iterate(update, slam, state, data, m, clones, update.passes, False, local, work)
+    if code > 0:
+        return code, np.nan
+    if clones == 0 or update.passes == 1:
         fill(room.delta[: 3 + 3 * (m + clones)], 0.0)
         aim_apart(state, m, clones, local, room)
         _expect(update, slam, state, data, True, m, clones, local, work)
@@ -144,19 +146,24 @@ def _iterate(
     data: Data,
     m: int,
     clones: int,
+    passes: int,
     is_chained: bool,
     local: Clones,
     work: Work[ConvertingRoom],
-) -> int:
-    """Gauss-Newton on what the update involves; ``room`` has the last linearisation, ``delta`` where it was made."""
-    room, size = work.room, 3 + 3 * (m + clones)
+) -> tuple[int, bool]:
+    """Gauss-Newton on what the update involves; a code of REASONS, and whether it settled in so many ``passes``.
+
+    ``room`` has the last linearisation, ``delta`` where it was made.
+    """
+    room, size, is_settled = work.room, 3 + 3 * (m + clones), False
+    least = 2.0 * TEMPERED if _is_any_in_doubt(m, local, work) else 1.0
     among, cast, delta = room.among[:size, :size], room.cast[:size, :size], room.delta[:size]
     for i in range(size):
         for j in range(size):
             among[i, j] = room.rows[i, state_index(3, 3, j, room.at)]
     alone = State(state.x, cast, size, 0, state.offset)
     fill(delta, 0.0)
-    for i in range(update.passes):
+    for i in range(passes):
         copy(delta, room.before[:size])
         copy_matrix(among, cast)
         if is_chained:
@@ -170,17 +177,18 @@ def _iterate(
         total = _innovate(cast, size, room.place, m, work)
         code, _ = divide_by_root(alone, 3 * m, work, total)
         if code > 0:
-            return code
+            return code, False
         fill(delta, 0.0)
         add_transposed_times(work.A[: 3 * m, :size], work.A[: 3 * m, size], delta)
         if is_chained:
             unchain(delta, m, clones, room)
-        if i >= 2.0 * TEMPERED and _is_settled(size, room):
+        is_settled = i >= least and _is_settled(size, room)
+        if is_settled:
             break
     copy(room.before[:size], delta)
     if is_chained:
         aim_chained(state, m, clones, local, room)
-    return 0
+    return 0, is_settled
 
 
 @inner
@@ -213,7 +221,7 @@ def _expect(
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> None:
-    """h and its Jacobians where ``delta`` leads, and the observations; again there of what is in doubt only."""
+    """h and its Jacobians where ``delta`` leads, and the observations there; those of landmarks in use once."""
     x, room, delta = state.x, work.room, work.room.delta
     D, around = room.three[0], room.poses[0]
     for j in range(m):
@@ -225,9 +233,9 @@ def _expect(
             _seen_from(slam, room.frames[c], room.frames[clones], around, h, room.own[j], room.shift[j], D)
             _times(1.0, room.shift[j], room.turns[c], room.by_clone[j])
             _times(-1.0, room.shift[j], room.turns[clones], room.by_pose[j])
-        if is_first or (c >= 0 and is_in_doubt(work.label[j], local)):
+        if is_first or c >= 0:
             z = data.z[work.known[j]]
-            observe_range(slam.sensor, update.pixels, z, h, room.y[j], room.R[j], D, around)
+            observe_range(slam.sensor, update.pixels, z, h, room.y[j], room.R[j], D)
 
 
 @inner

@@ -59,9 +59,11 @@ from consistency.types import Array, Control, Gaussian, Info, Observation
 
 EVERY, UNSEEN = 50, 20  # steps between two rounds of parking, and without a sight before a landmark is parked
 DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
-PASSES, SETTLED = 20, 1e-2  # of an update at most, and the change in standard deviations that ends it
+PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 12  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
-TEMPERED = 2.0  # decades by which the noise of what is in doubt is raised in the first pass; half a decade less in each
+TEMPERED = (
+    2.0  # decades by which the noise of a return in doubt is raised in the first pass; half a decade less in each
+)
 
 Chart = Callable[[Array, Array], tuple[Array, Array]]  # poses and errors (k, 3) to moved poses and (3 k, 3 k)
 
@@ -147,6 +149,7 @@ class RobotCentredKalman:
     def _correct(self, state: CentredState, seen: list[int], z: Array) -> tuple[CentredState, Info]:
         is_parked = np.array([label in state.parked for label in seen])
         in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
+        is_new = any(state.step - state.seen[label] > 1 for label in np.array(seen)[in_doubt])
         attempts = [(apart, PASSES if self.which.iteration and is_parked.any() else 1)]
         if self.which.chaining and in_doubt.any():
             state = _settled(state)
@@ -154,7 +157,7 @@ class RobotCentredKalman:
         T = _shifts(state)
         P = T @ state.P @ T.T  # of the pose, too, by xi from here on
         for chart, passes in attempts:
-            found = self._solved(state, P, seen, z, is_parked, in_doubt, chart, passes)
+            found = self._solved(state, P, seen, z, is_parked, in_doubt, is_new, chart, passes)
             if found.is_settled:
                 break
         if chart is chained:
@@ -173,7 +176,7 @@ class RobotCentredKalman:
 
     def _solved(
         self, state: CentredState, P: Array, seen: list[int], z: Array, is_parked: Array, in_doubt: Array,
-        chart: Chart, passes: int,
+        is_new: bool, chart: Chart, passes: int,
     ) -> Solution:  # fmt: skip
         """The update by at most so many passes of Gauss-Newton, in a chart of the poses."""
         delta, expected, deviation = np.zeros(len(P)), np.zeros((len(seen), 3)), np.sqrt(np.diag(P))
@@ -185,13 +188,14 @@ class RobotCentredKalman:
             H = H @ C
             expected = np.where(is_parked[:, None] | (i == 0), h, expected)
             y, R = observed(z, expected, state.problem.belief.sensor, self.which)
-            R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
+            if is_new:
+                R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
             gap = y - h
             gap[:, 0] = wrap(gap[:, 0])
             innovation = gap.ravel() + H @ delta
             S, W = plain.gain(P, H, plain.block_diagonal(R))
             before, delta = delta, W @ innovation
-            is_settled = i >= (2 * TEMPERED if in_doubt.any() else 1)
+            is_settled = i >= (2 * TEMPERED if is_new else 1)
             is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))
             if is_settled:
                 break

@@ -28,8 +28,10 @@ from consistency.filters.update.converting import CentredSlam, Converting, Conve
 from consistency.filters.upkeep.parking import Clones, is_in_doubt, recentre, unpark
 from consistency.types import Array, Indices
 
-SETTLED = 1e-2  # change in standard deviations that ends an iteration
-TEMPERED = 2.0  # decades by which the noise of what is in doubt is raised in the first pass; half a decade less in each
+SETTLED = 1e-3  # change in standard deviations that ends an iteration
+TEMPERED = (
+    2.0  # decades by which the noise of a return in doubt is raised in the first pass; half a decade less in each
+)
 
 
 @implement(correct, Converting)
@@ -156,7 +158,7 @@ def _iterate(
     ``room`` has the last linearisation, ``delta`` where it was made.
     """
     room, size, is_settled = work.room, 3 + 3 * (m + clones), False
-    least = 2.0 * TEMPERED if _is_any_in_doubt(m, local, work) else 1.0
+    least = 2.0 * TEMPERED if local.new[0] else 1.0
     among, cast, delta = room.among[:size, :size], room.cast[:size, :size], room.delta[:size]
     for i in range(size):
         for j in range(size):
@@ -173,7 +175,8 @@ def _iterate(
         else:
             aim_apart(state, m, clones, local, room)
         _expect(update, slam, state, data, i == 0, m, clones, local, work)
-        _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), local, work)
+        if local.new[0]:
+            _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), local, work)
         total = _innovate(cast, size, room.place, m, work)
         code, _ = divide_by_root(alone, 3 * m, work, total)
         if code > 0:

@@ -53,6 +53,7 @@ class Clones(NamedTuple):
     uses: Indices  # (clones,) landmarks parked at each
     made: Indices  # (clones,) step at which each was made
     doubted: Indices  # (clones,) 1 if a landmark there is seen in this step and its return is in doubt
+    new: Indices  # (1,) 1 if one of these was not seen in the step before
     origin: Array  # (clones, 3) pose T of each
     step: Indices  # (1,) steps so far
     rows: Array  # (9, n)
@@ -82,6 +83,7 @@ def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landm
         np.zeros(most, np.int64),
         np.zeros(most, np.int64),
         np.zeros(most, np.int64),
+        np.zeros(1, np.int64),
         np.zeros((most, 3)),
         np.zeros(1, np.int64),
         np.zeros((9, n)),
@@ -131,15 +133,17 @@ def _joined(slam: Slam, whole: State, state: State, local: Clones) -> State:
 @inner
 def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clones) -> bool:
     """Finds what of the ``labels`` returns in doubt, and whether that takes the whole state."""
-    P, any_doubted = state.P, False
+    P, step, any_doubted = state.P, local.step[0] - 1, False
     fill(local.doubted, 0)
+    local.new[0] = 0
     for label in labels:
         number = local.of[label]
         if number >= 0:
             o = local.here[number] + 2
             if P[2, 2] + P[o, o] - 2.0 * P[2, o] > covariance.doubt:
-                local.doubted[number] = 1
-                any_doubted = True
+                local.doubted[number], any_doubted = 1, True
+                if local.seen[label] < step:
+                    local.new[0] = 1
     return any_doubted and covariance.whole
 
 

@@ -105,26 +105,27 @@ def apart(poses: Array, xi: Array) -> tuple[Array, Array]:
     return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), C
 
 
-def chained(poses: Array, xi: Array) -> tuple[Array, Array]:
+def chained(poses: Array, xi: Array, on: int) -> tuple[Array, Array]:
     """The same for poses in the order of time, where xi are the sums of the errors of the motion from each to the next.
 
-    Pose j is Exp(xi_1) Exp(xi_2 - xi_1) ... Exp(xi_j - xi_j-1) T_j: the motion between two poses depends on its own
-    error alone, whatever the errors before it are. With B = Ad(Exp(xi_1) ... Exp(xi_j-1 - xi_j-2)) J_l(xi_j - xi_j-1),
-    row j of the Jacobian is row j - 1 plus B times the difference of xi_j and xi_j-1.
+    Pose j is E_j T_j with E_j = E_j-1 Exp(xi_j - xi_j-1): the motion between two poses depends on its own error alone,
+    whatever the errors before it are. With B = Ad(E_j-1) J_l(xi_j - xi_j-1), row j of the Jacobian is row j - 1 plus B
+    times the difference of xi_j and xi_j-1. In place of the one before it, the last pose hangs on pose ``on``.
     """
-    steps = np.diff(xi, axis=0, prepend=np.zeros((1, 3)))
-    E, row = np.zeros(3), np.zeros((3, xi.size))  # E is the product so far, as a pose
-    out, C = np.zeros(poses.shape), np.zeros((xi.size, xi.size))
-    for j, (pose, step) in enumerate(zip(poses, steps, strict=True)):
-        M = shift_matrix(E) @ plain.heading_matrix(E[2])  # Ad
-        B = M @ left_jacobian(step)
-        row[:, 3 * j : 3 * j + 3] += B
+    E, rows, out = np.zeros((len(xi), 3)), np.zeros((len(xi), 3, xi.size)), np.zeros(poses.shape)
+    for j, pose in enumerate(poses):
+        before, last, step = np.zeros(3), -1, xi[j]
         if j > 0:
-            row[:, 3 * j - 3 : 3 * j] -= B
-        C[3 * j : 3 * j + 3] = row
-        E = moved(E, M @ step)
-        out[j] = [*(E[:2] + plain.heading_matrix(E[2])[:2, :2] @ pose[:2]), E[2] + pose[2]]
-    return out, C
+            last = on if j == len(xi) - 1 else j - 1
+            before, step, rows[j] = E[last], xi[j] - xi[last], rows[last]
+        M = shift_matrix(before) @ plain.heading_matrix(before[2])  # Ad
+        B = M @ left_jacobian(step)
+        rows[j, :, 3 * j : 3 * j + 3] += B
+        if j > 0:
+            rows[j, :, 3 * last : 3 * last + 3] -= B
+        E[j] = moved(before, M @ step)
+        out[j] = [*(E[j, :2] + plain.heading_matrix(E[j, 2])[:2, :2] @ pose[:2]), E[j, 2] + pose[2]]
+    return out, rows.reshape(xi.size, xi.size)
 
 
 # --- conversion --------------------------------------------------------------------------------------

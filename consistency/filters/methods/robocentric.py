@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -149,19 +150,21 @@ class RobotCentredKalman:
     def _correct(self, state: CentredState, seen: list[int], z: Array) -> tuple[CentredState, Info]:
         is_parked = np.array([label in state.parked for label in seen])
         in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
-        is_new = any(state.step - state.seen[label] > 1 for label in np.array(seen)[in_doubt])
-        attempts = [(apart, PASSES if self.which.iteration and is_parked.any() else 1)]
+        new = np.array([state.step - state.seen[label] > 1 for label in seen])
+        attempts: list[tuple[Chart, int]] = [(apart, PASSES if self.which.iteration and is_parked.any() else 1)]
         if self.which.chaining and in_doubt.any():
             state = _settled(state)
-            attempts.insert(0, (chained, PASSES_CHAINED))
+            held = [state.parked[label] for label in np.array(seen)[in_doubt & ~new]]
+            chain = partial(chained, on=sorted(state.clones).index(min(held, default=max(state.clones))))
+            attempts.insert(0, (chain, PASSES_CHAINED))
         T = _shifts(state)
         P = T @ state.P @ T.T  # of the pose, too, by xi from here on
         for chart, passes in attempts:
-            found = self._solved(state, P, seen, z, is_parked, in_doubt, is_new, chart, passes)
+            found = self._solved(state, P, seen, z, is_parked, in_doubt, new, chart, passes)
             if found.is_settled:
                 break
-        if chart is chained:
-            (after, _), turned = _charted(state, found.delta, chained), found.C
+        if chart is not apart:
+            (after, _), turned = _charted(state, found.delta, chart), found.C
         else:
             after, turned = _moved_by(state, found.delta), np.eye(len(state.x))
             if self.which.turning:
@@ -176,26 +179,26 @@ class RobotCentredKalman:
 
     def _solved(
         self, state: CentredState, P: Array, seen: list[int], z: Array, is_parked: Array, in_doubt: Array,
-        is_new: bool, chart: Chart, passes: int,
+        new: Array, chart: Chart, passes: int,
     ) -> Solution:  # fmt: skip
         """The update by at most so many passes of Gauss-Newton, in a chart of the poses."""
         delta, expected, deviation = np.zeros(len(P)), np.zeros((len(seen), 3)), np.sqrt(np.diag(P))
         involved = _involved(state, state.clones if in_doubt.any() else _clones_of(state, seen), seen)
-        is_settled = False
+        is_tempered, is_settled = bool((in_doubt & new).any()), False
         for i in range(passes):
             here, C = _charted(state, delta, chart)
             h, H = _expected(here, seen)
             H = H @ C
             expected = np.where(is_parked[:, None] | (i == 0), h, expected)
             y, R = observed(z, expected, state.problem.belief.sensor, self.which)
-            if is_new:
+            if is_tempered:
                 R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
             gap = y - h
             gap[:, 0] = wrap(gap[:, 0])
             innovation = gap.ravel() + H @ delta
             S, W = plain.gain(P, H, plain.block_diagonal(R))
             before, delta = delta, W @ innovation
-            is_settled = i >= (2 * TEMPERED if is_new else 1)
+            is_settled = i >= (2 * TEMPERED if is_tempered else 1)
             is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))
             if is_settled:
                 break

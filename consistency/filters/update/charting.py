@@ -1,9 +1,9 @@
 """Where an update moves the robot and its clones, and the errors about those poses: charts of a robot-centred state.
 
-Apart, each pose is Exp(xi) T. Chained, in the order of time, pose j is Exp(xi_1) Exp(xi_2 - xi_1) ...
-Exp(xi_j - xi_j-1) T_j, so that the motion between two poses depends on its own error alone. Errors about the poses
-moved so are C (xi - what moved them): row j of C is row j - 1 plus B_j = Ad(Exp(xi_1) ... Exp(xi_j-1 - xi_j-2))
-J_l(xi_j - xi_j-1) times the difference of the rows. The robot is the last.
+Apart, each pose is Exp(xi) T. Chained, in the order of time, pose j is E_j T_j with E_j = E_j-1 Exp(xi_j - xi_j-1), so
+that the motion between two poses depends on its own error alone. Errors about the poses moved so are C (xi - what moved
+them): row j of C is row j - 1 plus B_j = Ad(E_j-1) J_l(xi_j - xi_j-1) times the difference of the rows. The robot is
+the last; in place of the clone before it, it hangs on clone ``room.on``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from consistency.filters.error.planar import exponential
 from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
 from consistency.filters.kernel.covariance import replace_rows
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import State
+from consistency.filters.kernel.slam import State, Triple
 from consistency.filters.kernel.work import Work
 from consistency.filters.update.converting import ConvertingRoom
 from consistency.filters.upkeep.parking import Clones
@@ -40,10 +40,14 @@ def aim_apart(state: State, m: int, clones: int, local: Clones, room: Converting
 def aim_chained(state: State, m: int, clones: int, local: Clones, room: ConvertingRoom) -> None:
     """The same in the chain; ``delta`` of the poses <- C delta, ``links`` (clones + 1, 3, 3) <- B."""
     whole, step, last, J = room.poses[0], room.poses[1], room.poses[2], room.three[0]
+    whole_on, last_on = room.poses[3], room.poses[4]
     fill(whole, 0.0)
     fill(last, 0.0)
     for c in range(clones + 1):
-        p, before = _place(m, c, clones), _place(m, c - 1, clones)
+        p, before = _place(m, c, clones), _place(m, room.on[0] if c == clones else c - 1, clones)
+        if c == clones:
+            copy(whole_on, whole)
+            copy(last_on, last)
         for a in range(3):
             step[a] = room.delta[p + a] - last[a]
             last[a] = room.delta[p + a]
@@ -55,6 +59,9 @@ def aim_chained(state: State, m: int, clones: int, local: Clones, room: Converti
                 room.delta[p + a] += room.links[c, a, b] * step[b]
         _move_on(whole, step)
         _compose(whole, state.x[:3] if c == clones else local.origin[room.number[c]], room.frames[c])
+        if c == room.on[0]:
+            copy(whole, whole_on)
+            copy(last, last_on)
         fill_matrix(room.turns[c], 0.0)
         for a in range(3):
             room.turns[c, a, a] = 1.0
@@ -63,11 +70,14 @@ def aim_chained(state: State, m: int, clones: int, local: Clones, room: Converti
 @inner
 def unchain(delta: Array, m: int, clones: int, room: ConvertingRoom) -> None:
     """``delta`` of the poses, in the places of the rows of ``room``, <- C^-1 delta."""
-    step, last, total = room.poses[0], room.poses[1], room.poses[2]
+    step, last, total, last_on, total_on = room.poses[0], room.poses[1], room.poses[2], room.poses[3], room.poses[4]
     fill(last, 0.0)
     fill(total, 0.0)
     for c in range(clones + 1):
         p, B = _place(m, c, clones), room.links[c]
+        if c == clones:
+            copy(last_on, last)
+            copy(total_on, total)
         for a in range(3):
             step[a] = delta[p + a] - last[a]
             last[a] = delta[p + a]
@@ -77,21 +87,24 @@ def unchain(delta: Array, m: int, clones: int, room: ConvertingRoom) -> None:
         total[0] += scale * (B[1, 1] * x - B[0, 1] * y)
         total[1] += scale * (B[0, 0] * y - B[1, 0] * x)
         copy(total, delta[p : p + 3])
+        if c == room.on[0]:
+            copy(last, last_on)
+            copy(total, total_on)
 
 
 @inner
 def cast_rows(rows: Array, width: int, m: int, clones: int, room: ConvertingRoom) -> None:
     """``rows`` (3 + 3 (m + clones), >= width) <- C rows."""
     for i in range(width):
-        u0 = u1 = u2 = v0 = v1 = v2 = 0.0
+        u = v = u_on = v_on = (0.0, 0.0, 0.0)
         for c in range(clones + 1):
-            p, B = _place(m, c, clones), room.links[c]
-            w0, w1, w2 = rows[p, i] - u0, rows[p + 1, i] - u1, rows[p + 2, i] - u2
-            u0, u1, u2 = rows[p, i], rows[p + 1, i], rows[p + 2, i]
-            v0 += B[0, 0] * w0 + B[0, 1] * w1 + B[0, 2] * w2
-            v1 += B[1, 0] * w0 + B[1, 1] * w1 + B[1, 2] * w2
-            v2 += B[2, 0] * w0 + B[2, 1] * w1 + B[2, 2] * w2
-            rows[p, i], rows[p + 1, i], rows[p + 2, i] = v0, v1, v2
+            p = _place(m, c, clones)
+            if c == clones:
+                u, v = u_on, v_on
+            u, v = _link(room.links[c], (rows[p, i], rows[p + 1, i], rows[p + 2, i]), u, v)
+            rows[p, i], rows[p + 1, i], rows[p + 2, i] = v
+            if c == room.on[0]:
+                u_on, v_on = u, v
 
 
 @inner
@@ -99,15 +112,27 @@ def cast_columns(rows: Array, at: Indices, m: int, clones: int, room: Converting
     """``rows`` <- rows C', where ``at`` says where the landmarks, and then the clones, are among the columns."""
     for i in range(3 + 3 * (m + clones)):
         row = rows[i]
-        u0 = u1 = u2 = v0 = v1 = v2 = 0.0
+        u = v = u_on = v_on = (0.0, 0.0, 0.0)
         for c in range(clones + 1):
-            q, B = 0 if c == clones else at[m + c], room.links[c]
-            w0, w1, w2 = row[q] - u0, row[q + 1] - u1, row[q + 2] - u2
-            u0, u1, u2 = row[q], row[q + 1], row[q + 2]
-            v0 += B[0, 0] * w0 + B[0, 1] * w1 + B[0, 2] * w2
-            v1 += B[1, 0] * w0 + B[1, 1] * w1 + B[1, 2] * w2
-            v2 += B[2, 0] * w0 + B[2, 1] * w1 + B[2, 2] * w2
-            row[q], row[q + 1], row[q + 2] = v0, v1, v2
+            q = 0 if c == clones else at[m + c]
+            if c == clones:
+                u, v = u_on, v_on
+            u, v = _link(room.links[c], (row[q], row[q + 1], row[q + 2]), u, v)
+            row[q], row[q + 1], row[q + 2] = v
+            if c == room.on[0]:
+                u_on, v_on = u, v
+
+
+@inner
+def _link(B: Array, here: Triple, last: Triple, cast: Triple) -> tuple[Triple, Triple]:
+    """What is ``here``, and its image: that of the ``last``, ``cast``, plus B (here - last)."""
+    x, y, t = here[0] - last[0], here[1] - last[1], here[2] - last[2]
+    moved = (
+        cast[0] + B[0, 0] * x + B[0, 1] * y + B[0, 2] * t,
+        cast[1] + B[1, 0] * x + B[1, 1] * y + B[1, 2] * t,
+        cast[2] + B[2, 0] * x + B[2, 1] * y + B[2, 2] * t,
+    )
+    return here, moved
 
 
 @inner

@@ -63,6 +63,7 @@ class ConvertingRoom(NamedTuple):
     among: Array  # (3 + 3 (m + c), 3 + 3 (m + c)) their columns of these alone
     cast: Array  # (3 + 3 (m + c), 3 + 3 (m + c)) and by errors about the poses of a pass
     place: Indices  # (m + c,) their offsets there
+    on: Indices  # (1,) which of these clones the robot hangs on
     frames: Array  # (c + 1, 3) poses of the clones and of the robot where ``delta`` leads
     turns: Array  # (c + 1, 3, 3) error about each / d delta
     links: Array  # (c + 1, 3, 3) how errors about them are chained
@@ -79,7 +80,7 @@ class ConvertingRoom(NamedTuple):
     moving: Indices  # (n / 3,) offsets of the landmarks that move
     J: Array  # (n / 3, 3, 3) how
     three: Array  # (4, 3, 3)
-    poses: Array  # (4, 3)
+    poses: Array  # (5, 3)
 
 
 @implement(make_room, Converting)
@@ -88,11 +89,11 @@ def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) 
     most = 3 + 3 * (m + c)
     return ConvertingRoom(
         np.empty(m + c, np.int64), np.empty(c, np.int64), np.empty(m, np.int64), np.empty((most, n)),
-        np.empty((most, most)), np.empty((most, most)), 3 + 3 * np.arange(m + c),
+        np.empty((most, most)), np.empty((most, most)), 3 + 3 * np.arange(m + c), np.zeros(1, np.int64),
         np.empty((c + 1, 3)), np.empty((c + 1, 3, 3)), np.empty((c + 1, 3, 3)),
         np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)),
         np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3, 3)), np.empty(most), np.empty(most),
-        np.empty((2, n)), np.empty(n // 3, np.int64), np.empty((n // 3, 3, 3)), np.empty((4, 3, 3)), np.empty((4, 3)),
+        np.empty((2, n)), np.empty(n // 3, np.int64), np.empty((n // 3, 3, 3)), np.empty((4, 3, 3)), np.empty((5, 3)),
     )  # fmt: skip
 
 

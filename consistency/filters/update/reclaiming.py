@@ -93,7 +93,8 @@ def _is_any_in_doubt(m: int, local: Clones, work: Work[ConvertingRoom]) -> bool:
 def _gather(state: State, m: int, is_chained: bool, local: Clones, work: Work[ConvertingRoom]) -> int:
     """Rows of P and Phi of all that the update involves; returns how many clones that is.
 
-    They are those of parked landmarks that are seen, or in a chain all of them in the order of time.
+    They are those of parked landmarks that are seen, or in a chain all of them in the order of time. There the robot
+    hangs on the first with a landmark that was in doubt in the last step, too, or on the last of all.
     """
     n, base, room, Phi = state.n, state.base, work.room, local.factors.Phi
     clones = _list_all(local, room.number) if is_chained else _list_seen(m, local, work)
@@ -102,8 +103,11 @@ def _gather(state: State, m: int, is_chained: bool, local: Clones, work: Work[Co
         for c in range(clones):
             if room.number[c] == local.of[work.label[i]]:
                 room.clone[i] = c
-    for c in range(clones):
+    room.on[0] = clones - 1
+    for c in range(clones - 1, -1, -1):
         room.at[m + c] = local.here[room.number[c]]
+        if local.doubted[room.number[c]] == 2:
+            room.on[0] = c
     count = m + clones
     gather_rows(state.P, n, 3, 3, room.at, count, room.rows)
     if base > 0:

@@ -52,7 +52,9 @@ class Clones(NamedTuple):
     here: Indices  # (clones,) and in the variables of a step, 0 where it is in the passive rest
     uses: Indices  # (clones,) landmarks parked at each
     made: Indices  # (clones,) step at which each was made
-    doubted: Indices  # (clones,) 1 if a landmark there is seen in this step and its return is in doubt
+    doubted: (
+        Indices  # (clones,) 1 if a landmark there is seen in this step and its return is in doubt, 2 if the last, too
+    )
     new: Indices  # (1,) 1 if one of these was not seen in the step before
     origin: Array  # (clones, 3) pose T of each
     step: Indices  # (1,) steps so far
@@ -141,16 +143,18 @@ def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clon
         if number >= 0:
             o = local.here[number] + 2
             if P[2, 2] + P[o, o] - 2.0 * P[2, o] > covariance.doubt:
-                local.doubted[number], any_doubted = 1, True
-                if local.seen[label] < step:
-                    local.new[0] = 1
+                any_doubted = True
+                if local.seen[label] == step:
+                    local.doubted[number] = 2
+                else:
+                    local.new[0], local.doubted[number] = 1, max(local.doubted[number], 1)
     return any_doubted and covariance.whole
 
 
 @inner
 def is_in_doubt(label: int, local: Clones) -> bool:
     """Whether a landmark of this step is parked where the turn since then is little known."""
-    return local.of[label] >= 0 and local.doubted[local.of[label]] == 1
+    return local.of[label] >= 0 and local.doubted[local.of[label]] > 0
 
 
 @implement(append, Parking)

@@ -24,13 +24,12 @@ class Corrections(NamedTuple):
     """What tells this filter from a plain robot-centred one; each can be left out, to see what it is worth."""
 
     parking: bool = True
-    turning: bool = True
+    turning: bool = True  # the motion between clones has the errors that a return leaves it, in its own frame
     truncation: bool = True
     debiasing: bool = True
     prediction: bool = True  # noise of what is observed taken where it is predicted, not where it was measured
     iteration: bool = True
-    waiting: bool = True  # what returns stays parked while the turn since its clone is in doubt
-    chaining: bool = True  # a closure moves each clone by what the motion before it is corrected
+    waiting: bool = True  # what returns in doubt, and is all that is seen, stays parked
 
 
 # --- geometry ----------------------------------------------------------------------------------------

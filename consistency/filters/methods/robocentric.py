@@ -152,7 +152,7 @@ class RobotCentredKalman:
         in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
         new = np.array([state.step - state.seen[label] > 1 for label in seen])
         attempts: list[tuple[Chart, int]] = [(apart, PASSES if self.which.iteration and is_parked.any() else 1)]
-        if self.which.chaining and in_doubt.any():
+        if self.which.turning and in_doubt.any():
             state = _settled(state)
             held = [state.parked[label] for label in np.array(seen)[in_doubt & ~new]]
             chain = partial(chained, on=sorted(state.clones).index(min(held, default=max(state.clones))))
@@ -163,18 +163,14 @@ class RobotCentredKalman:
             found = self._solved(state, P, seen, z, is_parked, in_doubt, new, chart, passes)
             if found.is_settled:
                 break
+        after, turned = _moved_by(state, found.delta), np.eye(len(state.x))
         if chart is not apart:
             (after, _), turned = _charted(state, found.delta, chart), found.C
-        else:
-            after, turned = _moved_by(state, found.delta), np.eye(len(state.x))
-            if self.which.turning:
-                noise = T @ state.noise
-                motion = noise @ (found.H @ noise).T @ np.linalg.solve(found.S, found.innovation)
-                turned[:3, :3] = left_jacobian((found.delta - motion)[:3])
         turned = np.linalg.inv(_shifts(after)) @ turned
         after = replace(after, P=turned @ (P - found.W @ found.S @ found.W.T) @ turned.T)
-        stays = in_doubt if self.which.waiting else np.zeros(len(seen), dtype=bool)
-        back = [label for label, is_back in zip(seen, is_parked & ~stays, strict=True) if is_back]
+        back = [label for label in seen if label in state.parked]
+        if self.which.waiting and len(seen) == 1 and in_doubt.any():
+            back = []
         return _activated(after, back), Info(found.innovation, found.S, found.W)
 
     def _solved(
@@ -383,12 +379,12 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
         pixels = Pixels(su, sv, sd, low, high, which.truncation, which.debiasing, which.prediction)
         every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
         doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if which.parking else 0
-        chain = PASSES_CHAINED if which.chaining else 0
+        chain = PASSES_CHAINED if which.turning else 0
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
             InvariantPose(), Converted(),
-            Converting(pixels, which.turning, which.waiting, PASSES if which.iteration else 1, chain, clones),
-            Parking(every, unseen, doubt, which.chaining),
+            Converting(pixels, which.waiting, PASSES if which.iteration else 1, chain, clones),
+            Parking(every, unseen, doubt, which.turning),
         )  # fmt: skip
 
     return Compiled(twin, parts, sensors=("uvd",), uvd=True)

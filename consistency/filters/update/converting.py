@@ -22,14 +22,13 @@ from consistency.types import Array, Indices
 
 @part(sensor="Uvd", landmark="InverseRange", error="InvariantPose", covariance="Parking")
 class Converting(NamedTuple):
-    """What is known of the pixels, whether covariances are turned, and what is done about a return.
+    """What is known of the pixels, and what is done about a return.
 
-    ``waiting``: what returns in doubt stays parked; ``passes`` of such an update at most, and of one in a ``chain``,
+    ``waiting``: alone and in doubt it stays parked; ``passes`` of such an update at most, and of one in a ``chain``,
     tried first, 0 for none; ``clones`` at most.
     """
 
     pixels: Pixels
-    turning: bool
     waiting: bool
     passes: int
     chain: int

@@ -6,7 +6,7 @@ import numpy as np
 
 from consistency.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.filters.kernel.arrays import copy, copy_matrix, fill
-from consistency.filters.kernel.blas import add_transposed_times, solve_transposed
+from consistency.filters.kernel.blas import add_transposed_times
 from consistency.filters.kernel.covariance import gather_rows, replace_rows, state_index, subtract_gram
 from consistency.filters.kernel.dispatch import implement
 from consistency.filters.kernel.gain import apply_beyond, divide_by_root
@@ -73,10 +73,9 @@ def correct_converted(
         else:
             move_pose(state.x[:3], work.delta[:3], room.frames[clones])
             copy(room.frames[clones], state.x[:3])
-            if update.turning:
-                _turn(state, m, local, work)
+        waits = update.waiting and in_doubt and m == 1
         for i in range(m):
-            if room.clone[i] >= 0 and not (update.waiting and is_in_doubt(work.label[i], local)):
+            if room.clone[i] >= 0 and not waits:
                 _reclaim(slam, state, work.label[i], local, work)
     return code, nis
 
@@ -331,56 +330,6 @@ def _move(state: State, m: int, work: Work[ConvertingRoom]) -> None:
     subtract_gram(state.P, n, 3, A)
     for i in range(3, n):
         x[i] += delta[i]
-
-
-@inner
-def _turn(state: State, m: int, local: Clones, work: Work[ConvertingRoom]) -> None:
-    """The pose in P, and its rows in Phi, turned by J_l at what the update corrects of the error before the motion."""
-    P, T, own, xi = state.P, work.room.three[1], work.room.three[2], work.room.poses[0]
-    copy(work.delta[:3], xi)
-    _subtract_motion(state, m, xi, work)
-    left_jacobian(xi, T)
-    _turn_rows(P, 3, state.n, T)
-    _turn_rows(local.factors.Phi, 0, state.base, T)
-    for a in range(3):
-        for b in range(3):
-            own[a, b] = T[a, 0] * P[0, b] + T[a, 1] * P[1, b] + T[a, 2] * P[2, b]
-    for a in range(3):
-        for b in range(a, 3):
-            P[a, b] = P[b, a] = own[a, 0] * T[b, 0] + own[a, 1] * T[b, 1] + own[a, 2] * T[b, 2]
-
-
-@inner
-def _subtract_motion(state: State, m: int, xi: Array, work: Work[ConvertingRoom]) -> None:
-    """xi (3,) <- without what the update says of the noise in the motion of this step; S and y hold their roots."""
-    room, y = work.room, work.A[: 3 * m, state.n + state.base]
-    N = room.rows[: 3 * m, :2]  # H G, where nothing is gathered any more
-    for j in range(m):
-        for a in range(3):
-            for c in range(2):
-                g = room.noise[c]
-                if room.clone[j] < 0:
-                    N[3 * j + a, c] = g[work.at[j] + a]
-                else:
-                    N[3 * j + a, c] = (
-                        room.by_pose[j, a, 0] * g[0] + room.by_pose[j, a, 1] * g[1] + room.by_pose[j, a, 2] * g[2]
-                    )
-    solve_transposed(work.S[: 3 * m, : 3 * m], N)
-    for c in range(2):
-        said = 0.0
-        for row in range(3 * m):
-            said += N[row, c] * y[row]
-        for a in range(3):
-            xi[a] -= said * room.noise[c, a]
-
-
-@inner
-def _turn_rows(A: Array, first: int, last: int, T: Array) -> None:
-    """Rows 0 to 2 of A <- T times them, in columns first..last-1."""
-    for j in range(first, last):
-        v0, v1, v2 = A[0, j], A[1, j], A[2, j]
-        for a in range(3):
-            A[a, j] = T[a, 0] * v0 + T[a, 1] * v1 + T[a, 2] * v2
 
 
 @inner

@@ -7,12 +7,15 @@ landmarks through the new frame. What a landmark that is carried so for hundreds
 to first order only; one that has not been seen for a while is therefore *parked*: it keeps its numbers in the frame of
 a clone of the pose, and is carried over at once, by an iterated update, when it is seen again.
 
-The error of pose and clones is right-invariant, T_true = Exp(xi) T. Let M(p) be the matrix that takes (dp, dheading) to
-xi, and J_l the left Jacobian of SE(2). The error xi before the motion of a step, and the noise delta of the motion, are
-in T_true = Exp(xi) Exp(delta) T. If the update says that they are x and d, the error about Exp(x) Exp(d) T is
-J_l(x) (xi - x) to first order, with what is left of delta turned alike. So the covariance of the pose is turned by
-M(p+)^-1 J_l(x) M(p-), where x is what the update says of the error *without* the noise of the motion: noise that is
-seen at once turns nothing. For a clone T stays where it was made, and xi is in the state.
+The error of pose and clones is right-invariant, T_true = Exp(xi) T; M(p) takes (dp, dheading) to xi. A return whose
+turn since the clone is little known is *in doubt*. It corrects poses by decimetres, and what is known of the motion
+from one clone to the next is known in the frame of the first, wherever that is moved. So the poses are moved along a
+chain, E_j = E_j-1 Exp(xi_j - xi_j-1), T_j <- E_j T_j, and the covariance is *turned* with them: the error about the
+moved poses is that of pose j - 1 plus Ad(E_j-1) J_l(xi_j - xi_j-1) times the difference of what is left of xi_j and
+xi_j-1. The robot hangs on the last clone. Where it sees nothing but one landmark in doubt, that landmark *waits* at
+its clone: the robot may then be anywhere on a circle about it, a straight line in xi, whereas a landmark in the frame
+of the robot would keep p + R m / rho to first order only. From the second such step on the robot hangs on that clone,
+since a turn about a point is Exp of one xi, and of a sum of many to first order only.
 
 Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
 its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not
@@ -62,9 +65,7 @@ EVERY, UNSEEN = 50, 20  # steps between two rounds of parking, and without a sig
 DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 12  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
-TEMPERED = (
-    2.0  # decades by which the noise of a return in doubt is raised in the first pass; half a decade less in each
-)
+TEMPERED = 2.0  # decades by which the noise of a return in doubt is raised in the first pass; then half a decade less
 
 Chart = Callable[[Array, Array], tuple[Array, Array]]  # poses and errors (k, 3) to moved poses and (3 k, 3 k)
 

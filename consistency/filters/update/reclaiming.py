@@ -29,9 +29,7 @@ from consistency.filters.upkeep.parking import Clones, is_in_doubt, recentre, un
 from consistency.types import Array, Indices
 
 SETTLED = 1e-3  # change in standard deviations that ends an iteration
-TEMPERED = (
-    2.0  # decades by which the noise of a return in doubt is raised in the first pass; half a decade less in each
-)
+TEMPERED = 2.0  # decades by which the noise of a return in doubt is raised in the first pass; then half a decade less
 
 
 @implement(correct, Converting)

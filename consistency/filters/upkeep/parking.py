@@ -52,9 +52,7 @@ class Clones(NamedTuple):
     here: Indices  # (clones,) and in the variables of a step, 0 where it is in the passive rest
     uses: Indices  # (clones,) landmarks parked at each
     made: Indices  # (clones,) step at which each was made
-    doubted: (
-        Indices  # (clones,) 1 if a landmark there is seen in this step and its return is in doubt, 2 if the last, too
-    )
+    doubted: Indices  # (clones,) 1 if a return there is in doubt in this step, 2 if it was in the last, too
     new: Indices  # (1,) 1 if one of these was not seen in the step before
     origin: Array  # (clones, 3) pose T of each
     step: Indices  # (1,) steps so far

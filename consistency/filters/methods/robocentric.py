@@ -63,6 +63,7 @@ from consistency.types import Array, Control, Gaussian, Info, Observation
 
 EVERY, UNSEEN = 50, 20  # steps between two rounds of parking, and without a sight before a landmark is parked
 DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
+KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 12  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
 TEMPERED = 2.0  # decades by which the noise of a return in doubt is raised in the first pass; then half a decade less
@@ -170,7 +171,7 @@ class RobotCentredKalman:
         turned = np.linalg.inv(_shifts(after)) @ turned
         after = replace(after, P=turned @ (P - found.W @ found.S @ found.W.T) @ turned.T)
         back = [label for label in seen if label in state.parked]
-        if self.which.waiting and len(seen) == 1 and in_doubt.any():
+        if self.which.waiting and len(seen) == 1 and in_doubt.any() and self._waits(state, seen[0]):
             back = []
         return _activated(after, back), Info(found.innovation, found.S, found.W)
 
@@ -208,6 +209,11 @@ class RobotCentredKalman:
         clone = state.clones[state.parked[label]] + 2
         turn = state.P[2, 2] + state.P[clone, clone] - 2.0 * state.P[2, clone]
         return bool(turn - state.noise[2] @ state.noise[2] > DOUBT**2)
+
+    def _waits(self, state: CentredState, label: int) -> bool:
+        """Whether the distance of a parked landmark from its clone is well known."""
+        rho = state.places[label] + 2
+        return bool(state.P[rho, rho] < (KNOWN * state.x[rho]) ** 2)
 
     def _inserted(self, state: CentredState, label: int, z: Array) -> CentredState:
         sensor, n = state.problem.belief.sensor, len(state.x)
@@ -384,7 +390,7 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
             InvariantPose(), Converted(),
-            Converting(pixels, which.waiting, PASSES if which.iteration else 1, chain, clones),
+            Converting(pixels, KNOWN if which.waiting else 0.0, PASSES if which.iteration else 1, chain, clones),
             Parking(every, unseen, doubt, which.turning),
         )  # fmt: skip
 

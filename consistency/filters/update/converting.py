@@ -24,12 +24,12 @@ from consistency.types import Array, Indices
 class Converting(NamedTuple):
     """What is known of the pixels, and what is done about a return.
 
-    ``waiting``: alone and in doubt it stays parked; ``passes`` of such an update at most, and of one in a ``chain``,
-    tried first, 0 for none; ``clones`` at most.
+    ``waiting``: alone and in doubt it stays parked if its distance is known to this part of it; ``passes`` of such an
+    update at most, and of one in a ``chain``, tried first, 0 for none; ``clones`` at most.
     """
 
     pixels: Pixels
-    waiting: bool
+    waiting: float
     passes: int
     chain: int
     clones: int

@@ -48,6 +48,8 @@ def correct_converted(
     chained = in_doubt and update.chain > 0
     if chained:
         recentre(state, local)
+    rho = work.at[0] + 2
+    waits = in_doubt and m == 1 and state.P[rho, rho] < (update.waiting * state.x[rho]) ** 2
     clones, code = _gather(state, m, chained, local, work), 0
     if chained:
         code, chained = _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
@@ -71,7 +73,6 @@ def correct_converted(
         else:
             move_pose(state.x[:3], work.delta[:3], room.frames[clones])
             copy(room.frames[clones], state.x[:3])
-        waits = update.waiting and in_doubt and m == 1
         for i in range(m):
             if room.clone[i] >= 0 and not waits:
                 _reclaim(slam, state, work.label[i], local, work)

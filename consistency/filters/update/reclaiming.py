@@ -346,7 +346,7 @@ def _reclaim(slam: CentredSlam, state: State, label: int, local: Clones, work: W
     _times(1.0, shift, D, turned)
     room.at[0], room.at[1] = o, q
     gather_rows(P, n, 3, 3, room.at, 2, room.rows)
-    for i in range(9):
+    for i in range(9 if base > 0 else 0):
         copy(Phi[state_index(3, 3, i, room.at), :base], room.rows[i, n : n + base])
     rows, out = room.rows, work.rows
     for i in range(n + base):
@@ -356,7 +356,8 @@ def _reclaim(slam: CentredSlam, state: State, label: int, local: Clones, work: W
                 total += J[a, c] * rows[3 + c, i] + turned[a, c] * rows[6 + c, i] - shift[a, c] * rows[c, i]
             out[a, i] = total
     for a in range(3):
-        copy(out[a, n : n + base], Phi[o + a, :base])
+        if base > 0:
+            copy(out[a, n : n + base], Phi[o + a, :base])
         for b in range(3):
             total = 0.0
             for c in range(3):

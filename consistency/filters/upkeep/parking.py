@@ -110,7 +110,7 @@ def prepare_parked(
         state = State(whole.x, whole.P, whole.n, 0, state.offset)
     if state.base == 0:
         needs_whole = _needs_whole(covariance, state, labels, local)
-        if not needs_whole and whole.n >= covariance.start and _is_worth_it(whole, local):
+        if not needs_whole and whole.n >= covariance.start and _is_worth_it(whole, labels, local):
             state = _split(covariance, whole, state.offset, local)
     if state.base > 0:
         state = _call_back(covariance, whole, state, labels, local)
@@ -237,13 +237,21 @@ def to_plain_base(covariance: Parking, x: Array, p: int, robot: Array, landmark:
 
 
 @inner
-def _is_worth_it(whole: State, local: Clones) -> bool:
-    """Whether an active part of robot and landmarks in use, with a base as large, is small beside the whole."""
-    n = 3
+def _is_worth_it(whole: State, labels: Indices, local: Clones) -> bool:
+    """Whether an active part of robot and landmarks in use, with a base as large, is small beside the whole.
+
+    It must have room for what of the ``labels`` is new or called back, each with a clone.
+    """
+    n, more = 3, 0
     for label in range(len(local.of)):
         if whole.offset[label] >= 0 and local.of[label] < 0:
             n += 3
-    return n <= len(local.factors.x) and 2.0 * WORTH * n <= whole.n
+    for label in labels:
+        if whole.offset[label] < 0:
+            more += 3
+        elif local.of[label] >= 0:
+            more += 6
+    return n + more <= len(local.factors.x) and 2.0 * WORTH * n <= whole.n
 
 
 @inner

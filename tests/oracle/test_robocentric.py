@@ -258,8 +258,8 @@ def test_worlds_in_which_it_was_overconfident_are_mended() -> None:
     """Two that `consistency challenge` found: with the pose turned by whole corrections the mean NEES of the first is
     10.6, without the chain that of the second 46.
 
-    The means over 24 runs, of 3.2 and 5.4 with seed 7, spread by 0.35 and 1 between seeds: less than one in a million is
-    above the limits.
+    The means over 24 runs, of 3.2 and 5.4 with seed 7, spread by 0.35 and 1 between seeds: less than one in a million
+    is above the limits.
     """
     scenario = cs.load_scenario("herath2007-stereo")
 

@@ -181,7 +181,8 @@ class RobotCentredKalman:
     ) -> Solution:  # fmt: skip
         """The update by at most so many passes of Gauss-Newton, in a chart of the poses."""
         delta, expected, deviation = np.zeros(len(P)), np.zeros((len(seen), 3)), np.sqrt(np.diag(P))
-        involved = _involved(state, state.clones if in_doubt.any() else _clones_of(state, seen), seen)
+        is_chained = self.which.turning and bool(in_doubt.any())  # tried, or given up: all clones are in the update
+        involved = _involved(state, state.clones if is_chained else _clones_of(state, seen), seen)
         is_tempered, is_settled = bool((in_doubt & new).any()), False
         for i in range(passes):
             here, C = _charted(state, delta, chart)

@@ -13,6 +13,7 @@ from scipy.stats import norm
 
 from consistency.errors import InputError
 from consistency.filters import plain
+from consistency.filters.plain_sensors import disparity_sigma
 from consistency.scenario.sensor import BelievedSensor
 from consistency.types import Array
 
@@ -166,7 +167,9 @@ def bias(z: Array, sensor: BelievedSensor) -> Array:
     return b
 
 
-def untruncated(d: Array, expected: Array, sigma: float, searched: tuple[float, float]) -> tuple[Array, Array]:
+def untruncated(
+    d: Array, expected: Array, sigma: Array | float, searched: tuple[Array | float, Array | float]
+) -> tuple[Array, Array]:
     """What d would be without the search range, and its variance: moments of the truncated normal about ``expected``.
 
     d* = e + (d - e - sigma lambda) / kappa with variance sigma^2 / kappa, where sigma lambda and sigma^2 kappa are
@@ -198,14 +201,21 @@ def searched(sensor: BelievedSensor, name: str) -> tuple[float, float]:
     return sensor.disparity
 
 
-def observed(z: Array, expected: Array, sensor: BelievedSensor, which: Corrections) -> tuple[Array, Array]:
-    """Observations (m, 3) as inverse range where ``expected`` (m, 3) is predicted, and their noise (m, 3, 3)."""
+def observed(
+    z: Array, shift: Array, expected: Array, sensor: BelievedSensor, which: Corrections
+) -> tuple[Array, Array]:
+    """Observations (m, 3) as inverse range where ``expected`` (m, 3) is predicted, and their noise (m, 3, 3).
+
+    ``shift`` (m,) are the biases in px that were subtracted from their disparities.
+    """
     at = imaged(expected, sensor)
     at = np.where(np.isnan(at), z, at)
+    sigma = disparity_sigma(z[:, 2], sensor)
     z, variance = z.copy(), np.tile(np.square(sensor.sigma), (len(z), 1))
+    variance[:, 2] = np.square(sigma)
     if which.truncation:
-        range_ = searched(sensor, "robot-centred")
-        z[:, 2], variance[:, 2] = untruncated(z[:, 2], at[:, 2], sensor.sigma[2], range_)
+        low, high = searched(sensor, "robot-centred")
+        z[:, 2], variance[:, 2] = untruncated(z[:, 2], at[:, 2], sigma, (low - shift, high - shift))
     y, J = converted(z, sensor)[0], converted(at if which.prediction else z, sensor)[1]
     if which.debiasing:
         y -= bias(z, sensor)

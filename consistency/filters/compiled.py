@@ -17,7 +17,7 @@ from consistency.filters.kernel.dispatch import fits, require_fitting
 from consistency.filters.kernel.gain import REASONS
 from consistency.filters.kernel.loop import Outcome, trial_kernel
 from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
-from consistency.filters.plain_sensors import sensor_noise
+from consistency.filters.plain_sensors import bias_at, sensor_noise
 from consistency.filters.upkeep.local import LOCAL_FROM, Local
 from consistency.filters.upkeep.parking import Parking
 from consistency.geometry.conventions import ADDITIVE
@@ -141,9 +141,12 @@ class Compiled:
         slam = self.parts(problem, np.array(trial.controls, float))
         z, R = sensor_noise(trial.z, belief.sensor, converted=belief.sensor.model == "uvd" and not self.uvd)
         # copies: writable and C-contiguous, so that one compiled signature serves every caller
-        controls, z, R, start = (np.array(a, float, order="C") for a in (trial.controls, z, R, trial.start))
+        shift = bias_at(trial.z, belief.sensor)[:, -1]
+        controls, z, R, shift, start = (
+            np.array(a, float, order="C") for a in (trial.controls, z, R, shift, trial.start)
+        )
         first, landmark = (np.array(a, np.int64, order="C") for a in (trial.first, trial.landmark))
-        data = Data(controls, first, landmark, z, R, start, trial.n_landmarks)
+        data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks)
         r, w = robot_width(slam.motion), landmark_width(slam.landmark)
         slam = self._with_upkeep(slam, r + w * trial.n_landmarks)
         return slam, data, r + w * len(np.unique(landmark))

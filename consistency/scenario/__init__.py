@@ -6,6 +6,7 @@ ideal observation, one effect a file: its keys and its ``apply``. Nothing here d
 """
 
 from consistency.scenario.belief import Belief, BelievedMotion, SigmaPoints
+from consistency.scenario.effects import BiasMap, DisparityGrowth
 from consistency.scenario.record import Scenario, data_folder, load_scenario, scenario_names
 from consistency.scenario.sensor import (
     PLANAR_SENSORS,
@@ -53,10 +54,12 @@ __all__ = [
     "Belief",
     "BelievedMotion",
     "BelievedSensor",
+    "BiasMap",
     "Circle",
     "CircularLandmarks",
     "Corridor",
     "Count",
+    "DisparityGrowth",
     "FigureOfEight",
     "Finite",
     "Interval",

@@ -21,10 +21,16 @@ from pydantic import (
 
 from consistency.geometry import rotation
 from consistency.models.point import Mounting
-from consistency.scenario.effects import BUILT_IN, ListedEffect
+from consistency.scenario.effects import BUILT_IN, BiasMap, DisparityGrowth, ListedEffect
 from consistency.scenario.tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 
 PLANAR_SENSORS = ("relative-xy", "range-bearing")  # of landmarks in the plane, with two values each
+LEFT_OUT = (
+    "effects",
+    "disparity",
+    "disparity_growth",
+    "bias",
+)  # keys without which a sensor is as if they were unknown
 
 
 def _size(model: str | None) -> int:
@@ -80,11 +86,24 @@ class Sensor(Table):
             )
         return self
 
+    @model_serializer(mode="wrap")
+    def _without_what_is_left_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A sensor without an optional key has the content, and so the hash, of one that knows of none."""
+        content: dict[str, Any] = handler(self)
+        return {key: value for key, value in content.items() if value or key not in LEFT_OUT}
+
 
 class StereoSensor(Sensor):
     """A sensor that may have a baseline."""
 
     B: Positive | None = None  # m
+    disparity_growth: DisparityGrowth | None = None  # how the noise of a disparity grows with it
+
+    @model_validator(mode="after")
+    def _has_disparities(self) -> StereoSensor:
+        if self.disparity_growth is not None and self.model != "uvd":
+            raise ValueError(f"disparity_growth is of a sensor 'uvd', not '{self.model}'; leave it out")
+        return self
 
 
 class ImageSensor(Sensor):
@@ -107,6 +126,7 @@ class BelievedSensor(StereoSensor):
     """Noise and calibration as the filter has them; f and B are needed for ``uvd``."""
 
     disparity: tuple[Positive, Positive] | None = None  # px, the search range, for filters that allow for it
+    bias: BiasMap | None = None  # subtracted from what is measured, at the measured pixel
 
     @model_validator(mode="after")
     def _rig(self) -> BelievedSensor:
@@ -114,15 +134,9 @@ class BelievedSensor(StereoSensor):
             raise ValueError("a uvd sensor needs f (px) and B (m)")
         if self.disparity is not None:
             _require_search_range(self.disparity)
+        if self.bias is not None and self.model != "uvd":
+            raise ValueError(f"bias is of a sensor 'uvd', not '{self.model}'; leave it out")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_an_unknown_range(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A belief without a search range has the content, and so the hash, of one that knows of none."""
-        content: dict[str, Any] = handler(self)
-        if self.disparity is None:
-            content.pop("disparity", None)
-        return content
 
 
 def _require_search_range(disparity: tuple[float, float]) -> None:
@@ -184,14 +198,6 @@ class TrueSensor(ImageSensor):
                 )
             taken.add(effect.label)
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_an_empty_list(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A sensor without listed effects has the content, and so the hash, of one that knows of none."""
-        content: dict[str, Any] = handler(self)
-        if not self.effects:
-            content.pop("effects", None)
-        return content
 
 
 class XyzSensor(TrueSensor):

@@ -27,6 +27,7 @@ SIGMA_UNITS = {"uvd": "_px", "xyz": "_m", "linear": "_m", "relative-xy": "_m", "
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Rate = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Triple = tuple[Finite, Finite, Finite]
 Sigmas = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]

@@ -32,7 +32,8 @@ def effects_of(sensor: TrueSensor) -> list[Effect]:
     early = [effect for effect in sensor.effects if effect.before_noise]
     late = [effect for effect in sensor.effects if not effect.before_noise]
     search = [SearchRange(*sensor.disparity)] if isinstance(sensor, UvdSensor) else []
-    return [FieldOfView(), *early, Noise(sensor.sigma), *late, *search]
+    noise = Noise(sensor.sigma, sensor.disparity_growth if isinstance(sensor, UvdSensor) else None)
+    return [FieldOfView(), *early, noise, *late, *search]
 
 
 class Chain:

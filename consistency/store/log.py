@@ -132,6 +132,7 @@ def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, o
         unit: list(sensor["sigma"]),
         **{key: sensor[key] for key in ("f", "B") if key in sensor},
         **({"disparity": list(sensor["disparity"])} if "disparity" in sensor else {}),
+        **{key: sensor[key] for key in ("disparity_growth", "bias") if key in sensor},
         **({"image": list(view[0]), "principal_point": list(view[1])} if view else {}),
         "mount": {key: list(value) for key, value in sensor["mount"].items()},
         "motion": belief.motion.model_dump(),

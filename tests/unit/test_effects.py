@@ -86,10 +86,10 @@ class Ghosts(ListedEffect):
         return observations.add(step, thing, pixel[thing])
 
 
-class Mismatch(ListedEffect):
+class Mistaken(ListedEffect):
     """The first row of every tenth step shows what the second is of."""
 
-    kind: Literal["mismatch"] = "mismatch"
+    kind: Literal["mistaken"] = "mistaken"
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
         step = observations.step
@@ -131,7 +131,7 @@ class Silent(ListedEffect):
 
 @pytest.fixture(autouse=True)
 def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    for effect in (Shift, Scale, Draw, Ghosts, Mismatch, Broken, Silent):
+    for effect in (Shift, Scale, Draw, Ghosts, Mistaken, Broken, Silent):
         monkeypatch.setitem(EFFECTS, effect.model_fields["kind"].default, effect)
     CALLS.clear()
     DRAWN.clear()
@@ -324,7 +324,7 @@ def test_two_effects_do_not_share_ids(small: Small) -> None:
 
 
 def test_a_mismatch_keeps_its_id_and_says_what_it_is_of(small: Small) -> None:
-    plain, trial = cs.simulate(with_effects(small)), cs.simulate(with_effects(small, {"kind": "mismatch"}))
+    plain, trial = cs.simulate(with_effects(small)), cs.simulate(with_effects(small, {"kind": "mistaken"}))
     row = np.flatnonzero(trial.spurious)
     assert len(row) > 3
     assert np.array_equal(trial.landmark, plain.landmark)
@@ -357,7 +357,7 @@ def test_a_filter_takes_a_thing_for_a_landmark(small: Small, name: str) -> None:
 # --- files ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("effect", [GHOSTS, {"kind": "mismatch"}])
+@pytest.mark.parametrize("effect", [GHOSTS, {"kind": "mistaken"}])
 def test_labels_go_through_a_log(small: Small, tmp_path: Path, effect: dict[str, Any]) -> None:
     scenario = with_effects(small, effect)
     simulate_log(scenario, runs=2, seed=5, out=tmp_path / "log")
@@ -467,7 +467,8 @@ def test_a_linear_log_holds_landmarks_only(linear: cs.Scenario, tmp_path: Path) 
 # --- mistakes ---------------------------------------------------------------------------------------------
 
 SHIFT = {"kind": "shift", "by_px": [0.0, 0.0, 1.0]}
-ALL = "'broken', 'draw', 'ghosts', 'mismatch', 'scale', 'shift', 'silent'"
+OWN = {"broken", "draw", "ghosts", "mistaken", "scale", "shift", "silent"}
+ALL = ", ".join(f"'{kind}'" for kind in sorted(OWN | set(EFFECTS)))
 MISTAKES: dict[str, tuple[Any, str]] = {
     "unknown kind": ([{"kind": "blur"}], rf"\.effects\.0\.kind': 'blur' is not one of .*{ALL}"),
     "no kind": ([{"by_px": [0.0, 0.0, 1.0]}], r"\.effects\.0\.kind': missing; it must be given"),

@@ -31,6 +31,7 @@ import numpy as np
 
 from consistency.filters import plain
 from consistency.filters.centred import untruncated
+from consistency.filters.plain_sensors import bias_at, disparity_sigma
 from consistency.models import stereo
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Gaussian, Observation
@@ -101,7 +102,7 @@ class PlanarStereo:
 
     def placed(self, label: int, pose: Array, z: Array) -> Array:
         """A landmark (3,) by its first observation; where it is told from is kept."""
-        R = plain.heading_matrix(pose[2])
+        R, z = plain.heading_matrix(pose[2]), z - bias_at(z[None], self.problem.belief.sensor)[0]
         way = R @ self.axes @ self._points(z)
         self.origins[label] = np.array([pose[0], pose[1], 0.0]) + R @ self.offset
         r = float(np.linalg.norm(way))
@@ -110,19 +111,24 @@ class PlanarStereo:
     def sight(self, step: int, observation: Observation) -> gtsam.CustomFactor:
         """All that is seen in a step, in standard deviations."""
         labels = [int(label) for label in observation.landmarks]
-        origins, z, n = np.array([self.origins[label] for label in labels]), np.array(observation.z), 3 * len(labels)
-        sensor, points, rows = self.problem.belief.sensor, self._points(z), np.arange(n).reshape(-1, 3)
+        origins, n = np.array([self.origins[label] for label in labels]), 3 * len(labels)
+        sensor = self.problem.belief.sensor
+        bias = bias_at(observation.z, sensor)
+        z = observation.z - bias
+        sigma, of_d = np.tile(sensor.sigma, (len(z), 1)), disparity_sigma(z[:, 2], sensor)
+        sigma[:, 2] = of_d
+        points, rows = self._points(z), np.arange(n).reshape(-1, 3)
 
         def error(values: list[Array]) -> tuple[Array, list[Array]]:
             q, rho, by_pose, by_landmark = self.scaled(values[0], np.array(values[1:]), origins)
             expected, by_q, by_rho = self.projected(q, rho)
-            far = (q[:, 0] <= 0.0) | ~(np.abs(expected - z) < FAR * np.array(sensor.sigma)).all(axis=1)
-            d, variance = self._unsearched(z[:, 2], expected[:, 2])
+            far = (q[:, 0] <= 0.0) | ~(np.abs(expected - z) < FAR * sigma).all(axis=1)
+            d, variance = self._unsearched(z[:, 2], expected[:, 2], of_d, bias[:, 2])
             if far.any():  # as projected at what is measured
                 by_q[far] = self.projected(points[far], np.ones((far.sum(), 1)))[1] / rho[far, :, None]
                 by_rho[far] = -(by_q[far] @ q[far, :, None])[..., 0] / rho[far]
                 expected[far] = z[far] + (by_q[far] @ (q - rho * points)[far, :, None])[..., 0]
-            aim, sigmas = z.copy(), np.tile(sensor.sigma, (len(z), 1))
+            aim, sigmas = z.copy(), sigma.copy()
             aim[~far, 2], sigmas[~far, 2] = d[~far], np.sqrt(variance[~far])
             by_landmark = by_q @ by_landmark
             by_landmark[:, :, 2] += by_rho
@@ -171,12 +177,16 @@ class PlanarStereo:
         u, v, d = z.T
         return np.array(stereo.triangulate(u, v, d, sensor.f or 0.0, sensor.B or 0.0)).T
 
-    def _unsearched(self, d: Array, expected: Array) -> tuple[Array, Array]:
-        """Disparities (m,) and their variances without the search range, where there is one."""
+    def _unsearched(self, d: Array, expected: Array, sigma: Array | float, shift: Array) -> tuple[Array, Array]:
+        """Disparities (m,) and their variances without the search range, where there is one.
+
+        ``sigma`` is their standard deviation in px, ``shift`` (m,) the bias in px that was subtracted from them.
+        """
         sensor = self.problem.belief.sensor
         if sensor.disparity is None:
-            return d, np.full(len(d), sensor.sigma[2] ** 2)
-        return untruncated(d, expected, sensor.sigma[2], sensor.disparity)
+            return d, np.full(len(d), sigma**2)
+        low, high = sensor.disparity
+        return untruncated(d, expected, sigma, (low - shift, high - shift))
 
     # --- landmarks -------------------------------------------------------------------------------
 

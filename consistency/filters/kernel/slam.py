@@ -45,6 +45,7 @@ class Data(NamedTuple):
     landmark: Indices  # (M,)
     z: Array  # (M, s)
     R: Array  # (M, s, s), noise of each observation
+    shift: Array  # (M,), bias in px that was subtracted from each disparity, by which its search range has moved
     start: Array  # (r,), known exactly
     n_landmarks: int
 

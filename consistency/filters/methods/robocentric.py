@@ -53,6 +53,7 @@ from consistency.filters.error.invariant_pose import InvariantPose
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.landmark.inverse_range import InverseRange
 from consistency.filters.parts import motion_of, sensor_of
+from consistency.filters.plain_sensors import bias_at, variance_at
 from consistency.filters.sensor.conversion import Pixels
 from consistency.filters.update import reclaiming  # noqa: F401, registers the update
 from consistency.filters.update.converting import Converted, Converting
@@ -139,17 +140,19 @@ class RobotCentredKalman:
         labels = [int(label) for label in observation.landmarks]
         known = np.array([label in state.places for label in labels], dtype=bool)
         info = Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
+        bias = bias_at(observation.z, state.problem.belief.sensor)
+        unbiased = observation.z - bias
         if known.any():
             seen = [label for label in labels if label in state.places]
-            state, info = self._correct(state, seen, observation.z[known])
-        for label, z in zip(np.array(labels)[~known], observation.z[~known], strict=True):
+            state, info = self._correct(state, seen, unbiased[known], bias[known, 2])
+        for label, z in zip(np.array(labels)[~known], unbiased[~known], strict=True):
             state = self._inserted(state, int(label), z)
         state = replace(state, seen=state.seen | dict.fromkeys(labels, state.step))
         if self.which.parking and state.step % EVERY == 0:
             state = _parked(state)
         return state, info
 
-    def _correct(self, state: CentredState, seen: list[int], z: Array) -> tuple[CentredState, Info]:
+    def _correct(self, state: CentredState, seen: list[int], z: Array, shift: Array) -> tuple[CentredState, Info]:
         is_parked = np.array([label in state.parked for label in seen])
         in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
         new = np.array([state.step - state.seen[label] > 1 for label in seen])
@@ -162,7 +165,7 @@ class RobotCentredKalman:
         T = _shifts(state)
         P = T @ state.P @ T.T  # of the pose, too, by xi from here on
         for chart, passes in attempts:
-            found = self._solved(state, P, seen, z, is_parked, in_doubt, new, chart, passes)
+            found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, passes)
             if found.is_settled:
                 break
         after, turned = _moved_by(state, found.delta), np.eye(len(state.x))
@@ -176,8 +179,8 @@ class RobotCentredKalman:
         return _activated(after, back), Info(found.innovation, found.S, found.W)
 
     def _solved(
-        self, state: CentredState, P: Array, seen: list[int], z: Array, is_parked: Array, in_doubt: Array,
-        new: Array, chart: Chart, passes: int,
+        self, state: CentredState, P: Array, seen: list[int], z: Array, shift: Array, is_parked: Array,
+        in_doubt: Array, new: Array, chart: Chart, passes: int,
     ) -> Solution:  # fmt: skip
         """The update by at most so many passes of Gauss-Newton, in a chart of the poses."""
         delta, expected, deviation = np.zeros(len(P)), np.zeros((len(seen), 3)), np.sqrt(np.diag(P))
@@ -189,7 +192,7 @@ class RobotCentredKalman:
             h, H = _expected(here, seen)
             H = H @ C
             expected = np.where(is_parked[:, None] | (i == 0), h, expected)
-            y, R = observed(z, expected, state.problem.belief.sensor, self.which)
+            y, R = observed(z, shift, expected, state.problem.belief.sensor, self.which)
             if is_tempered:
                 R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
             gap = y - h
@@ -222,7 +225,7 @@ class RobotCentredKalman:
         if self.which.debiasing:
             y = y - bias(z[None], sensor)[0]
         P = np.zeros((n + 3, n + 3))
-        P[:n, :n], P[n:, n:] = state.P, (J * np.square(sensor.sigma)) @ J.T
+        P[:n, :n], P[n:, n:] = state.P, J @ variance_at(z[None], sensor).reshape(3, 3) @ J.T
         return replace(state, x=np.append(state.x, y), P=P, places=state.places | {label: n})
 
     def pose(self, state: CentredState) -> Gaussian:
@@ -383,8 +386,8 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
     def parts(problem: Problem, controls: Array) -> Slam:
         sensor = problem.belief.sensor
         low, high = searched(sensor, twin.name) if which.truncation else (0.0, 0.0)
-        su, sv, sd = sensor.sigma
-        pixels = Pixels(su, sv, sd, low, high, which.truncation, which.debiasing, which.prediction)
+        su, sv, _ = sensor.sigma
+        pixels = Pixels(su, sv, low, high, which.truncation, which.debiasing, which.prediction)
         every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
         doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if which.parking else 0
         chain = PASSES_CHAINED if which.turning else 0

@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.errors import InputError
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled
 from consistency.filters.kernel.dispatch import implement, part
@@ -54,7 +55,7 @@ from consistency.filters.kernel.slam import (
 from consistency.filters.kernel.work import Work
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
-from consistency.filters.plain_sensors import sensor_noise
+from consistency.filters.plain_sensors import point_noise, variance_at
 from consistency.filters.sensor.xyz import (
     locate_xyz_jacobian,
     measure_xyz,
@@ -66,6 +67,7 @@ from consistency.filters.update.joint import NoRoom, joint_room, predict_by_erro
 from consistency.models import stereo
 from consistency.models.point import Mounting
 from consistency.protocols import Problem
+from consistency.scenario import BelievedSensor
 from consistency.types import Array, Control, Info
 
 
@@ -94,7 +96,10 @@ def locate_debiased(sensor: DebiasedXyz, z: Array) -> Triple:
 
 @part(sensor="Xyz DebiasedXyz")
 class NoiseAtPrediction(NamedTuple):
-    """Focal length in px, baseline in m, standard deviations in px, and the rho at 1 m whose bias is subtracted."""
+    """Focal length in px, baseline in m, standard deviations in px, and the rho at 1 m whose bias is subtracted.
+
+    ``sd`` is 0 where each observation has its own.
+    """
 
     f: float
     B: float
@@ -132,9 +137,13 @@ def correct_with_noise_at_prediction(
 @inner
 def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Work[NoRoom]) -> float:
     """y (3 m,) <- y - bias, S (3 m, 3 m) <- S + R; returns a sum that is finite if all that is given is."""
-    total, rows, variance = 0.0, 3 * m, (noise.su**2, noise.sv**2, noise.sd**2)
+    total, rows, of_d = 0.0, 3 * m, noise.sd**2
     for i in range(m):
         first = 3 * i
+        if noise.sd == 0.0:
+            # depth x = f B / d was measured with the variance (x^2 / (f B))^2 sigma_d^2
+            of_d = data.R[work.known[i], 0, 0] * (noise.f * noise.B / data.z[work.known[i], 0] ** 2) ** 2
+        variance = (noise.su**2, noise.sv**2, of_d)
         p = work.zhat[first : first + 3]
         if p[0] > 0.0:
             u, v, d = stereo.project(p[0], p[1], p[2], noise.f, noise.B)
@@ -161,6 +170,11 @@ class TriangulatedKalman(plain.WorldPointTwin):
         super().__init__(name, uvd=False)
         self.debiasing = debiasing
 
+    def init(self, problem: Problem) -> SlamState:
+        if self.debiasing:
+            _require_one_sigma(problem.belief.sensor, self.name)
+        return super().init(problem)
+
     def predict(self, state: SlamState, control: Control) -> SlamState:
         return plain.predict_extended(state, control)
 
@@ -171,7 +185,8 @@ class TriangulatedKalman(plain.WorldPointTwin):
         front = expected[:, 0] > 0.0
         x, y, up = expected[front].T
         pixels = np.column_stack(stereo.project(x, y, up, sensor.f or 0.0, sensor.B or 0.0))
-        _, R[front] = sensor_noise(pixels, sensor, converted=True)
+        measured = np.column_stack(stereo.project(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0))
+        R[front] = point_noise(pixels, variance_at(measured[front], sensor), sensor)
         bias = np.where(front, self._bias_ratio(state, expected[:, 0]), 0.0)[:, None] * expected
         innovation = z.ravel() - zhat - bias.ravel()
         S, W = plain.gain(state.P, H, plain.block_diagonal(R))
@@ -187,10 +202,27 @@ class TriangulatedKalman(plain.WorldPointTwin):
         return np.square(rho) if self.debiasing else np.zeros_like(rho)
 
 
+def _require_one_sigma(sensor: BelievedSensor, name: str) -> None:
+    """Refuse a noise that differs between disparities: the bias of a new landmark is that of one sigma.
+
+    Raises
+    ------
+    InputError
+        The belief holds such a noise.
+    """
+    if sensor.disparity_growth is not None:
+        raise InputError(
+            f"filter '{name}' subtracts a bias that holds for one sigma of all disparities; leave out "
+            "belief.sensor.disparity_growth, or take predicted-ekf-xyz"
+        )
+
+
 def predicted_parts(problem: Problem, controls: Array) -> Slam:
     """Parts of ``predicted-ekf-xyz``."""
     sensor = problem.belief.sensor
     su, sv, sd = sensor.sigma
+    if sensor.disparity_growth is not None:
+        sd = 0.0
     noise = NoiseAtPrediction(sensor.f or 0.0, sensor.B or 0.0, su, sv, sd, rho=0.0)
     return ekf.xyz_parts(problem, controls)._replace(update=noise)
 
@@ -198,6 +230,7 @@ def predicted_parts(problem: Problem, controls: Array) -> Slam:
 def debiased_parts(problem: Problem, controls: Array) -> Slam:
     """Parts of ``debiased-ekf-xyz``."""
     sensor = problem.belief.sensor
+    _require_one_sigma(sensor, "debiased-ekf-xyz")
     f, B = sensor.f or 0.0, sensor.B or 0.0
     su, sv, sd = sensor.sigma
     rho = sd / (f * B)

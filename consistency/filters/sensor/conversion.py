@@ -16,11 +16,10 @@ BEYOND = 4.0  # standard deviations outside the search range at which a predicte
 
 
 class Pixels(NamedTuple):
-    """Standard deviations in px, the search range in px, and which corrections are made."""
+    """Standard deviations of u and v in px, the search range in px, and which corrections are made."""
 
     su: float
     sv: float
-    sd: float
     low: float
     high: float
     truncation: bool
@@ -76,11 +75,10 @@ def subtract_bias(sensor: Uvd, pixels: Pixels, u: float, v: float, d: float, y: 
 
 
 @inner
-def untruncated(pixels: Pixels, d: float, expected: float) -> tuple[float, float]:
+def untruncated(low: float, high: float, sigma: float, d: float, expected: float) -> tuple[float, float]:
     """What d would be without the search range, and its variance: moments of the truncated normal."""
-    sigma = pixels.sd
-    e = min(max(expected, pixels.low - BEYOND * sigma), pixels.high + BEYOND * sigma)
-    alpha, beta = (pixels.low - e) / sigma, (pixels.high - e) / sigma
+    e = min(max(expected, low - BEYOND * sigma), high + BEYOND * sigma)
+    alpha, beta = (low - e) / sigma, (high - e) / sigma
     mass = 0.5 * (math.erfc(-beta / math.sqrt(2.0)) - math.erfc(-alpha / math.sqrt(2.0)))
     root = math.sqrt(2.0 * math.pi)
     at_low, at_high = math.exp(-0.5 * alpha * alpha) / root, math.exp(-0.5 * beta * beta) / root
@@ -90,16 +88,21 @@ def untruncated(pixels: Pixels, d: float, expected: float) -> tuple[float, float
 
 
 @inner
-def observe_range(sensor: Uvd, pixels: Pixels, z: Array, expected: Array, y: Array, R: Array, J: Array) -> None:
-    """``y`` (3,) <- the observation z where ``expected`` (3,) is predicted, ``R`` (3, 3) <- its noise."""
+def observe_range(
+    sensor: Uvd, pixels: Pixels, z: Array, of_d: float, shift: float, expected: Array, y: Array, R: Array, J: Array
+) -> None:
+    """``y`` (3,) <- the observation z where ``expected`` (3,) is predicted, ``R`` (3, 3) <- its noise.
+
+    ``of_d`` is the variance of its disparity in px^2, and ``shift`` the bias that was subtracted from it.
+    """
     ca, ce = np.cos(expected[0]), np.cos(expected[1])
-    u, v, d, measured, variance = z[0], z[1], z[2], z[2], pixels.sd * pixels.sd
+    u, v, d, measured, variance = z[0], z[1], z[2], z[2], of_d
     if ca > BESIDE and ce > BESIDE:
         u = -sensor.f * np.sin(expected[0]) / ca
         v = -sensor.f * np.sin(expected[1]) / (ce * ca)
         d = expected[2] * sensor.f * sensor.B / (ce * ca)
     if pixels.truncation:
-        measured, variance = untruncated(pixels, measured, d)
+        measured, variance = untruncated(pixels.low - shift, pixels.high - shift, math.sqrt(of_d), measured, d)
     if not pixels.prediction:
         u, v, d = z[0], z[1], measured
     convert(sensor, z[0], z[1], measured, y)

@@ -239,8 +239,9 @@ def _expect(
             _times(1.0, room.shift[j], room.turns[c], room.by_clone[j])
             _times(-1.0, room.shift[j], room.turns[clones], room.by_pose[j])
         if is_first or c >= 0:
-            z = data.z[work.known[j]]
-            observe_range(slam.sensor, update.pixels, z, h, room.y[j], room.R[j], D)
+            i = work.known[j]
+            z, of_d, shift = data.z[i], data.R[i, 2, 2], data.shift[i]
+            observe_range(slam.sensor, update.pixels, z, of_d, shift, h, room.y[j], room.R[j], D)
 
 
 @inner

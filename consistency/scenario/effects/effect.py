@@ -40,6 +40,7 @@ class ListedEffect(Table):
     models: ClassVar[tuple[str, ...]] = ("xyz", "uvd", "linear", "relative-xy", "range-bearing")  # that it works on
     draws: ClassVar[bool] = True  # whether it needs random numbers
     before_noise: ClassVar[bool] = False  # whether it is applied before the sensor's noise or after it
+    errs: ClassVar[bool] = True  # whether what is measured then differs from what a belief without it expects
 
     kind: str
     name: Annotated[str, Field(min_length=1)] | None = None

@@ -49,8 +49,6 @@ def _visible(context: Context, x: Array, y: Array, z: Array) -> Array:
     if sensor.image is None:
         return seen
     assert sensor.f is not None
-    (width, height), (column, row) = sensor.image, sensor.centre
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, _ = stereo.project(x, y, z, sensor.f, 0.0)
-    inside = (u >= -column) & (u < width - column) & (v >= -row) & (v < height - row)
-    return np.asarray(seen & (x > 0) & inside)
+    return np.asarray(seen & (x > 0) & context.in_image(u, v))

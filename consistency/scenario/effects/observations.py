@@ -62,6 +62,20 @@ class Observations:
         """Landmark that each row is really of, shape (M,); -1 where it is of none."""
         return self.landmark if self.source is None else self.source
 
+    def tracks(self) -> tuple[Indices, Indices]:
+        """Number of the track of each row from 0 on, and how many rows of it come before; both (M,).
+
+        A track is what is seen of one id in consecutive steps; after a gap a new one begins.
+        """
+        order = np.argsort(self.landmark, kind="stable")
+        landmark, step = self.landmark[order], self.step[order]
+        begins = np.ones(len(order), bool)
+        begins[1:] = (landmark[1:] != landmark[:-1]) | (step[1:] != step[:-1] + 1)
+        track, age = np.empty(len(order), np.int64), np.empty(len(order), np.int64)
+        track[order] = number = np.cumsum(begins) - 1
+        age[order] = np.arange(len(order)) - np.flatnonzero(begins)[number]
+        return track, age
+
     def keep(self, chosen: Array) -> Observations:
         """The rows for which ``chosen``, of the shape of ``step``, is true."""
         z = self._z if callable(self._z) else self._z[chosen]
@@ -148,6 +162,13 @@ class Context:
         if self.sensor.model == "range-bearing":
             return np.stack(planar.range_bearing(*points[:2]), axis=-1)
         return np.stack(points[: self.sensor.size], axis=-1)
+
+    def in_image(self, u: Array, v: Array) -> Array:
+        """Which pixels, in px from the principal point, are in the image; all of them where it has no bounds."""
+        if self.sensor.image is None:
+            return np.ones(np.shape(u), bool)
+        (width, height), (column, row) = self.sensor.image, self.sensor.centre
+        return np.asarray((u >= -column) & (u < width - column) & (v >= -row) & (v < height - row))
 
     def points(self, step: Indices, landmark: Indices) -> tuple[Array, Array, Array]:
         """True x, y, z of landmarks in the sensor frame in steps 1..T, m, each (M,)."""

@@ -18,6 +18,7 @@ from consistency.scenario import (
     Truth,
     UniformLandmarks,
     UvdSensor,
+    misbelief,
 )
 from consistency.simulation.path import lap_length, planned_path
 from consistency.types import Array
@@ -205,18 +206,10 @@ def require_right_belief(base: Scenario) -> None:
     Raises
     ------
     InputError
-        A key of the belief differs from that of the truth.
+        A key of the belief differs from that of the truth, or the sensor errs in a way that no belief holds.
     """
-    truth, belief = base.truth, base.belief
-    keys = [("motion", key) for key in ("sigma_v", "sigma_omega")]
-    keys += [("sensor", key) for key in ("sigma", "mount", "f", "B", "disparity")]
-    for table, key in keys:
-        believed, true = (getattr(getattr(of, table), key, None) for of in (belief, truth))
-        if believed is not None and true is not None and believed != true:
-            raise InputError(
-                f"scenario '{base.name}': key 'belief.{table}.{key}' is not what truth.{table}.{key} is; make them "
-                "the same, for only the filter's own approximation is challenged"
-            )
+    if wrong := misbelief(base):
+        raise InputError(f"scenario '{base.name}': {wrong}, for only the filter's own approximation is challenged")
 
 
 def _dimensions(base: Scenario) -> list[Dimension]:

@@ -5,8 +5,9 @@ scenario, ``record`` puts them together, ``writing`` makes a file of one. ``effe
 ideal observation, one effect a file: its keys and its ``apply``. Nothing here draws a trial; that is the simulation's.
 """
 
+from consistency.scenario.agreement import misbelief
 from consistency.scenario.belief import Belief, BelievedMotion, SigmaPoints
-from consistency.scenario.effects import BiasMap, DisparityGrowth
+from consistency.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
 from consistency.scenario.record import Scenario, data_folder, load_scenario, scenario_names
 from consistency.scenario.sensor import (
     PLANAR_SENSORS,
@@ -64,7 +65,9 @@ __all__ = [
     "Finite",
     "Interval",
     "LinearSensor",
+    "ListedEffect",
     "ListedLandmarks",
+    "LocalBias",
     "Mount",
     "NonNegative",
     "Path_",
@@ -88,6 +91,7 @@ __all__ = [
     "data_folder",
     "explain",
     "load_scenario",
+    "misbelief",
     "read_table",
     "scenario_names",
     "scenario_text",

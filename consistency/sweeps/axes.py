@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.scenario import Scenario, UniformLandmarks
+from consistency.scenario import Scenario, UniformLandmarks, UvdSensor
+from consistency.scenario.tables import UNITS
 from consistency.simulation import draw_landmarks
 
 Changes = dict[str, Any]  # dotted key of the scenario -> value
@@ -43,10 +44,20 @@ def _baseline(base: Scenario, value: float) -> Changes:
 def equivalent_baseline(scenario: Scenario, base: Scenario) -> float:
     """Baseline (m) that makes depths with the base's camera as exact as the scenario's are.
 
-    sigma_depth = z^2 sigma_d / (f B), so that B counts with f over sigma_d.
+    sigma_depth = z^2 sigma_d / (f B), so that B counts with f over sigma_d; a sigma_d that grows with the disparity is
+    taken in the middle of the range.
     """
     (f, B), (f_base, _) = scenario.truth.sensor.rig or (np.nan, np.nan), base.truth.sensor.rig or (np.nan, np.nan)
-    return float(B * (f / scenario.truth.sensor.sigma[2]) / (f_base / base.truth.sensor.sigma[2]))
+    return float(B * (f / _disparity_noise(scenario)) / (f_base / _disparity_noise(base)))
+
+
+def _disparity_noise(scenario: Scenario) -> float:
+    """Standard deviation of a disparity in px."""
+    sensor = scenario.truth.sensor
+    if not isinstance(sensor, UvdSensor) or sensor.disparity_growth is None:
+        return sensor.sigma[2]
+    middle = sensor.f * sensor.B / np.mean(sensor.range)
+    return float(sensor.sigma[2] * sensor.disparity_growth.ratio_at(np.array(middle)))
 
 
 def _range(base: Scenario, value: float) -> Changes:
@@ -206,7 +217,8 @@ def with_changes(base: Scenario, name: str, summary: str, changes: Changes) -> S
         table = data
         for parent in parents:
             table = table[parent]
-        if key not in table:
-            table.pop(key.rpartition("_")[0], None)  # the value comes with its unit
+        stem, _, unit = key.rpartition("_")
+        if key not in table and f"_{unit}" in UNITS.values():
+            table.pop(stem, None)  # the value comes with its unit
         table[key] = value
     return Scenario.model_validate(data)

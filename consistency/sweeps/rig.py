@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from consistency.errors import InputError
-from consistency.scenario import Scenario, UvdSensor, explain, load_scenario, read_table
+from consistency.scenario import ListedEffect, LocalBias, Scenario, UvdSensor, explain, load_scenario, read_table
 from consistency.store.log import SensorFile
 from consistency.sweeps.axes import QUANTITIES, Axis, Changes, density_of, leaves, say_value, with_changes
 from consistency.sweeps.plan import Cell, Sweep
@@ -94,7 +94,8 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
     changes: Changes = {
         f"truth.sensor.{key}": value
         for key, value in {"sigma": file.sigma, "f": file.f, "B": file.B, "image": image, "disparity": disparity,
-                           "principal_point": file.principal_point, "mount": file.mount.model_dump()}.items()
+                           "principal_point": file.principal_point, "mount": file.mount.model_dump(),
+                           "disparity_growth": file.disparity_growth, "effects": _with_bias(camera, file)}.items()
     } | {
         "belief.sensor": file.belief().model_dump() | {"disparity": disparity},
         "belief.motion": file.motion.model_dump(),
@@ -107,6 +108,12 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
     except ValidationError as error:
         raise InputError(f"{path}: {explain(error, Scenario)}") from None
     return Rig(str(path), scenario, tuple(assumed))
+
+
+def _with_bias(camera: UvdSensor, file: SensorFile) -> list[ListedEffect]:
+    """The effects of the map's world, and the biases that the file tells of: what it subtracts is the case."""
+    effects = [effect for effect in camera.effects if not isinstance(effect, LocalBias)]
+    return effects if file.bias is None else [*effects, LocalBias.model_validate(file.bias.model_dump())]
 
 
 def _with_options(scenario: Scenario, request: Request) -> Scenario:
@@ -197,8 +204,9 @@ def told_otherwise(scenario: Scenario) -> list[str]:
     """Keys of the belief whose value is not the true one."""
     truth = dict(leaves(scenario.truth.model_dump(), "belief."))
     belief = dict(leaves(scenario.belief.model_dump(), "belief."))
-    if truth.get(searched := "belief.sensor.disparity") is not None:
-        belief.setdefault(searched, None)
+    for key in truth:
+        if key.startswith("belief.sensor.disparity"):
+            belief.setdefault(key, None)
     return [key for key, value in belief.items() if key in truth and not _alike(value, truth[key])]
 
 

@@ -127,6 +127,55 @@ def test_a_wrong_belief_is_refused() -> None:
         space_of(STEREO.variant("wrong", belief__sensor__B=0.1))
 
 
+GROWTH = {"disparity": [2.0, 10.0], "ratio": [1.0, 2.0]}
+BIAS = {"u": [-100.0, 100.0], "v": [0.0], "bias_d": [[0.5, -0.5]]}
+
+
+@pytest.mark.parametrize(
+    ("truth", "belief", "complaint"),
+    [
+        (
+            {"disparity_growth": GROWTH},
+            {},
+            r"'belief\.sensor\.disparity_growth' is not what truth\.sensor\.disparity_g",
+        ),
+        ({}, {"disparity_growth": GROWTH}, r"'belief\.sensor\.disparity_growth' is not"),
+        ({"effects": [{"kind": "local-bias", **BIAS}]}, {}, r"'belief\.sensor\.bias' is not the bias of the effect"),
+        ({}, {"bias": BIAS}, r"'belief\.sensor\.bias' is not the bias of the effect"),
+        (
+            {"effects": [{"kind": "swap", "rate": 0.1}]},
+            {},
+            r"no belief holds the effect 'swap' \(truth\.sensor\.effects\)",
+        ),
+    ],
+)
+def test_a_sensor_that_errs_otherwise_than_believed_is_refused(truth: dict, belief: dict, complaint: str) -> None:
+    keys = {f"truth__sensor__{key}": value for key, value in truth.items()}
+    keys |= {f"belief__sensor__{key}": value for key, value in belief.items()}
+    with pytest.raises(InputError, match=complaint):
+        space_of(STEREO.variant("wrong", **keys))
+
+
+def test_a_sensor_that_errs_as_believed_is_challenged() -> None:
+    chosen = {
+        "kind": "selection", "count": 6, "forget_steps": 4, "seed": 1, "cells": [4, 3], "near": 6.0,
+        "strength": 1.0, "stereo": 1.0, "image": 1.0, "depth": 1.0,
+    }  # fmt: skip
+    base = STEREO.variant(
+        "right", truth__sensor__effects=[{"kind": "local-bias", **BIAS}, chosen], belief__sensor__bias=BIAS,
+        truth__sensor__disparity_growth=GROWTH, belief__sensor__disparity_growth=GROWTH,
+    )  # fmt: skip
+    space = space_of(base)
+    other = space.world(tuple(2.0 * d.base if d.name == "sensor" else d.base for d in space.dimensions))
+    assert (
+        other.truth.sensor.disparity_growth
+        == other.belief.sensor.disparity_growth
+        == base.truth.sensor.disparity_growth
+    )
+    assert other.truth.sensor.sigma[2] == 2.0 * base.truth.sensor.sigma[2]
+    assert other.truth.sensor.effects == base.truth.sensor.effects
+
+
 def test_a_scenario_with_listed_landmarks_has_fewer_dimensions() -> None:
     base = STEREO.variant("listed", truth__landmarks={"layout": "listed", "points": [(2.0, 0.0, 0.0)]})
     assert [d.name for d in space_of(base).dimensions] == ["sensor", "odometry", "steps", "baseline", "range"]

@@ -12,17 +12,17 @@ import pytest
 
 import consistency as cs
 from consistency.errors import InputError
-from consistency.scenario import data_folder
+from consistency.scenario import data_folder, misbelief
 from consistency.store.log import write_log
 from consistency.sweeps import recommend as advising
 from consistency.sweeps import regime as maps
-from consistency.sweeps.axes import Axis
+from consistency.sweeps.axes import Axis, equivalent_baseline
 from consistency.sweeps.cell import CellResult
 from consistency.sweeps.plan import load_sweep
 from consistency.sweeps.printing import advice_json, notes_of, print_advice, sentences_of
 from consistency.sweeps.recommend import recommend_for
 from consistency.sweeps.regime import Regime, read_regime
-from consistency.sweeps.rig import Request, differences, place_on, read_rig
+from consistency.sweeps.rig import Request, differences, place_on, read_rig, told_otherwise
 
 BASE = "herath2007-stereo"
 SENSOR = """
@@ -250,6 +250,32 @@ def test_the_sensor_of_a_simulated_log_is_read(tmp_path: Path, regime: Regime) -
     advice = advise(regime, str(log / "sensor.toml"))
     assert advice.nearest.indices == (1, 2, 2, 1)
     assert advice.unlike == ("truth.sensor.principal_point",)
+
+
+def test_a_sensor_that_was_characterised_is_put_into_the_world(tmp_path: Path, regime: Regime) -> None:
+    """Growth and biases of its file are the case, and believed; no cell of the map is so."""
+    path = tmp_path / "sensor.toml"
+    tables = """
+[disparity_growth]
+disparity_px = [2.0, 20.0]
+ratio = [1.0, 3.0]
+[bias]
+u_px = [-100.0, 100.0]
+v_px = [0.0]
+bias_d_px = [[0.5, -0.5]]
+"""
+    path.write_text(SENSOR + tables)
+    scenario = read_rig(Request(str(path)), regime.sweep.base).scenario
+    assert misbelief(scenario) == ""
+    assert scenario.belief.sensor.bias is not None
+    assert scenario.truth.sensor.disparity_growth == scenario.belief.sensor.disparity_growth is not None
+    assert [effect.kind for effect in scenario.truth.sensor.effects] == ["local-bias"]
+    d = 150.0 * 0.09 / np.mean(scenario.truth.sensor.range)
+    counted = 0.09 / np.interp(d, [2.0, 20.0], [1.0, 3.0])
+    assert equivalent_baseline(scenario, regime.sweep.base) == pytest.approx(counted)
+    assert "truth.sensor.disparity_growth.ratio" in differences(scenario, regime.sweep)
+    unbelieved = scenario.variant("unbelieved", belief__sensor__disparity_growth=None)
+    assert "belief.sensor.disparity_growth.ratio" in told_otherwise(unbelieved)
 
 
 def test_options_change_the_rig(regime: Regime) -> None:

@@ -19,6 +19,7 @@ EXPECTED = {
     "esde-xy", "iekf-slam-xy", "ocekf-slam-xy", "range-bearing",
     "herath2007-optimistic", "herath2007-stereo", "herath2007-wide-baseline", "herath2007-xyz", "linear-gaussian",
     "long-loop",
+    *(f"herath2007-{issue}" for issue in ("bias", "drift", "fov", "growth", "junction", "mismatch", "selection")),
 }  # fmt: skip
 Edit = Callable[[dict], None]
 
@@ -293,5 +294,5 @@ def test_missing_file(tmp_path: Path) -> None:
 def test_unknown_name_with_a_suggestion() -> None:
     with pytest.raises(cs.InputError, match=r"unknown scenario 'herath2007-stero' \(did you mean 'herath2007-stereo'"):
         cs.load_scenario("herath2007-stero")
-    with pytest.raises(cs.InputError, match="unknown scenario 'zzz'; known: esde-xy, herath2007-optimistic, "):
+    with pytest.raises(cs.InputError, match="unknown scenario 'zzz'; known: esde-xy, herath2007-bias, "):
         cs.load_scenario("zzz")

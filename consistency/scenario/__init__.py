@@ -5,7 +5,7 @@ scenario, ``record`` puts them together, ``writing`` makes a file of one. ``effe
 ideal observation, one effect a file: its keys and its ``apply``. Nothing here draws a trial; that is the simulation's.
 """
 
-from consistency.scenario.belief import Belief, BelievedMotion, SigmaPoints
+from consistency.scenario.belief import Belief, BelievedMotion, GuardSettings, SigmaPoints
 from consistency.scenario.record import Scenario, data_folder, load_scenario, scenario_names
 from consistency.scenario.sensor import (
     PLANAR_SENSORS,
@@ -58,6 +58,7 @@ __all__ = [
     "Corridor",
     "Count",
     "FigureOfEight",
+    "GuardSettings",
     "Finite",
     "Interval",
     "LinearSensor",

@@ -99,6 +99,13 @@ def innovate(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple
 @inner
 def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float]:
     """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. Gives a code of REASONS or 0, and NIS."""
+    total = add_noise(slam, state, data, m, work)
+    return divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+
+
+@inner
+def add_noise(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> float:
+    """S (s m, s m) <- S + R; returns a sum that is finite if innovation and S are."""
     s = observed_width(slam.sensor)
     rows, width = s * m, state.n + state.base
     S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
@@ -109,7 +116,7 @@ def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple])
             for c in range(s):
                 S[r, s * i + c] += data.R[work.known[i], a, c]
             total += y[r] + S[r, r:].sum()
-    return divide_by_root(state, rows, work, total)
+    return total
 
 
 @inner

@@ -42,6 +42,7 @@ from consistency.filters.kernel.slam import (
     State,
     Triple,
     correct,
+    foresee,
     locate,
     locate_jacobian,
     make_room,
@@ -127,6 +128,24 @@ def correct_with_noise_at_prediction(
     if code == 0:
         apply(slam, state, m, local, work)
     return code, nis
+
+
+@implement(foresee, NoiseAtPrediction)
+def foresee_with_noise_at_prediction(
+    update: NoiseAtPrediction,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    local: Factors,
+    work: Work[NoRoom],
+) -> int:
+    gather(slam, state, m, local, work)
+    linearise_seen(slam, state, k, m, work)
+    combine_seen(slam, state, m, work)
+    _add_noise(update, data, m, innovate(slam, state, data, m, work), work)
+    return 0
 
 
 @inner

@@ -143,10 +143,10 @@ class Compiled:
         own = None if self.error == ADDITIVE else out.own
         labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
         map_ = Map(labels, out.points[labels], out.spread[labels], out.joint) if out.code == 0 else None
-        rejected = None if self.guard is None else out.rejected
         return Estimates(
-            self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_, rejected
-        )
+            self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_,
+            None if self.guard is None else out.rejected,
+        )  # fmt: skip
 
     def _arguments(self, trial: Trial, belief: Belief) -> tuple[Slam, Data, int]:
         problem = problem_for(self, trial, belief)

@@ -81,9 +81,7 @@ def read_log(folder: str | Path) -> Log:
             f"{path}: missing; 'consistency frontend' makes a log of images, 'consistency simulate' one of a scenario"
         )
     sensor = read_table(path, SensorFile)
-    belief = Belief(
-        motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points, guard=sensor.guard
-    )
+    belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points, guard=sensor.guard)
     controls, observations = read_parquet(folder, "controls"), _observations(folder, sensor)
     tables = {
         name: read_parquet(folder, name) if (folder / f"{name}.parquet").exists() else None

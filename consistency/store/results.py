@@ -238,9 +238,7 @@ def joined(parts: Sequence[Results]) -> Results:
     failures = pd.concat([p.failures for p in parts if len(p.failures)] or [parts[0].failures], ignore_index=True)
     guarded = [part.rejections for part in parts if part.rejections is not None]
     rejections = pd.concat(guarded, ignore_index=True) if guarded else None
-    return replace(
-        parts[0], estimates=estimates, failures=failures, manifest=manifest, map=map_, rejections=rejections
-    )
+    return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest, map=map_, rejections=rejections)
 
 
 def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:

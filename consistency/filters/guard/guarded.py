@@ -35,9 +35,9 @@ class Guarded:
     """``filter_`` with a guard of a ``kind``: "gate", "joint" or "ransac".
 
     ``update`` first asks the filter for innovation and S of the known landmarks, by an update whose state is thrown
-    away; then it updates with what the guard keeps. So the filter's ``update`` must return :class:`Info`, whose rows are
-    those of the landmarks that it knows, in the order of the observation. Innovations behind a gate are not those of
-    an optimal gain: the guarded filter declares nothing about them.
+    away; then it updates with what the guard keeps. So the filter's ``update`` must return :class:`Info`, whose rows
+    are those of the landmarks that it knows, in the order of the observation. Innovations behind a guard are not
+    white: the guarded filter declares nothing about them.
 
     Raises
     ------

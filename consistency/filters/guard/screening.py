@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,7 +68,7 @@ def watch_tracks(guard: NamedTuple, s: int, m: int, rows: int, n_landmarks: int)
 
 @inner
 def screen_known(
-    guard: NamedTuple,
+    guard: Any,
     slam: Slam,
     state: State,
     data: Data,
@@ -83,11 +83,11 @@ def screen_known(
     withhold(slam.covariance, data, k, watch.rejected, local)
     if m == 0:
         return 0, 0
-    code = foresee(slam.update, slam, state, data, k, m, local, work)
+    code, column = foresee(slam.update, slam, state, data, k, m, local, work)
     if code > 0:
         return code, m
     s = observed_width(slam.sensor)
-    if not keep_some(guard, s, m, work.A[: s * m, state.n + state.base], work.S, watch):
+    if not keep_some(guard, s, m, work.A[: s * m, column], work.S, watch):
         return INNOVATION, m
     for i in range(m):
         label, kept = work.label[i], watch.kept[i]

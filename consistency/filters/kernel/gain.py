@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.filters.kernel.arrays import copy_matrix
 from consistency.filters.kernel.blas import add_gram, add_product_of_transposed, add_transposed_times, solve_transposed
-from consistency.filters.kernel.covariance import definite_root, gather_rows, subtract_gram
+from consistency.filters.kernel.covariance import definite_root, gather_rows, state_index, subtract_gram
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.measuring import linearise
@@ -134,6 +134,36 @@ def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float
     if np.isfinite(nis):
         return 0, nis
     return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan
+
+
+@inner
+def marginal(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> State:
+    """The robot and the ``m`` seen landmarks alone, which ``work`` then lists by their places there.
+
+    It is all that S and the innovation depend on. :func:`leave_marginal` puts the list back.
+    """
+    r, w, places = robot_width(slam.motion), landmark_width(slam.landmark), work.places
+    size = r + w * m
+    for a in range(size):
+        places[a] = state_index(r, w, a, work.at)
+        work.alone[a] = state.x[places[a]]
+    for a in range(size):
+        for b in range(a, size):
+            work.among[a, b] = state.P[min(places[a], places[b]), max(places[a], places[b])]
+            if b < r:
+                work.among[b, a] = work.among[a, b]
+    for i in range(m):
+        work.at[i] = r + w * i
+    return State(work.alone, work.among, size, 0, state.offset)
+
+
+@inner
+def leave_marginal(slam: Slam, m: int, work: Work[NamedTuple]) -> int:
+    """``work`` lists landmarks by their places in the state again; returns the size of the marginal."""
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    for i in range(m):
+        work.at[i] = work.places[r + w * i]
+    return r + w * m
 
 
 @inner

@@ -357,11 +357,11 @@ def correct(
 @generic()
 def foresee(
     update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
-) -> int:
-    """Upper half of ``work.S`` (s m, s m) and the column of ``work.A`` after the state <- S and innovation.
+) -> tuple[int, int]:
+    """Upper half of ``work.S`` (s m, s m) and a column of ``work.A`` <- innovation covariance and innovation.
 
     They are those of an update in step k + 1 with the ``m`` landmarks that ``work`` lists, as the twin's ``Info`` has
-    them; the state stays as it is. Returns a code of REASONS, 0 where all is well.
+    them; the state stays as it is. Returns a code of REASONS, 0 where all is well, and the number of the column.
     """
     raise NotImplementedError
 

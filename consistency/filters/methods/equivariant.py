@@ -34,7 +34,17 @@ from consistency.filters import plain
 from consistency.filters.compiled import Compiled
 from consistency.filters.error.polar import Polar
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.gain import add_noise, apply, combine_seen, gather, innovate, linearise_seen, whiten
+from consistency.filters.kernel.gain import (
+    add_noise,
+    apply,
+    combine_seen,
+    gather,
+    innovate,
+    leave_marginal,
+    linearise_seen,
+    marginal,
+    whiten,
+)
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.slam import (
@@ -97,10 +107,11 @@ def foresee_equivariant(
     m: int,
     local: Factors,
     work: Work[NoRoom],
-) -> int:
-    _innovate_by_output(slam, state, data, k, m, local, work)
-    add_noise(slam, state, data, m, work)
-    return 0
+) -> tuple[int, int]:
+    seen = marginal(slam, state, m, work)
+    _innovate_by_output(slam, seen, data, k, m, local, work)
+    add_noise(slam, seen, data, m, work)
+    return 0, leave_marginal(slam, m, work)
 
 
 @inner

@@ -98,10 +98,9 @@ def correct_by_iterated_points(
 @implement(foresee, IteratedPoints)
 def foresee_by_first_points(
     update: IteratedPoints, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
-) -> int:
+) -> tuple[int, int]:
     """Innovation and S of the first pass, which are those of the unscented filter."""
-    code: int = foresee(update.points, slam, state, data, k, m, local, work)
-    return code
+    return foresee(update.points, slam, state, data, k, m, local, work)
 
 
 @inner

@@ -32,7 +32,9 @@ from consistency.filters.kernel.gain import (
     divide_by_root,
     gather,
     innovate,
+    leave_marginal,
     linearise_seen,
+    marginal,
 )
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
@@ -140,12 +142,13 @@ def foresee_with_noise_at_prediction(
     m: int,
     local: Factors,
     work: Work[NoRoom],
-) -> int:
-    gather(slam, state, m, local, work)
-    linearise_seen(slam, state, k, m, work)
-    combine_seen(slam, state, m, work)
-    _add_noise(update, data, m, innovate(slam, state, data, m, work), work)
-    return 0
+) -> tuple[int, int]:
+    seen = marginal(slam, state, m, work)
+    gather(slam, seen, m, local, work)
+    linearise_seen(slam, seen, k, m, work)
+    combine_seen(slam, seen, m, work)
+    _add_noise(update, data, m, innovate(slam, seen, data, m, work), work)
+    return 0, leave_marginal(slam, m, work)
 
 
 @inner

@@ -74,16 +74,17 @@ def foresee_converted(
     m: int,
     local: Clones,
     work: Work[ConvertingRoom],
-) -> int:
+) -> tuple[int, int]:
     """As far as the update; a chain moves clones and covariance on its way, and they are put back."""
+    column = state.n + state.base
     if not _is_any_in_doubt(m, local, work) or update.chain == 0:
-        return _aim(update, slam, state, data, m, local, work)[0]
+        return _aim(update, slam, state, data, m, local, work)[0], column
     x, P, origin = state.x[: state.n].copy(), state.P[: state.n, : state.n].copy(), local.origin.copy()
     code = _aim(update, slam, state, data, m, local, work)[0]
     copy(x, state.x[: state.n])
     copy_matrix(P, state.P[: state.n, : state.n])
     copy_matrix(origin, local.origin)
-    return code
+    return code, column
 
 
 @inner
@@ -98,7 +99,7 @@ def _aim(
 ) -> tuple[int, int, bool, float]:
     """A, S and the innovation where the update leads, found by iteration where something was parked.
 
-    Returns a code of REASONS, how many clones are in it, whether they are in a chain, and a sum that is finite if all is.
+    Returns a code of REASONS, how many clones are in it, whether in a chain, and a sum that is finite if all is.
     """
     room = work.room
     chained = _is_any_in_doubt(m, local, work) and update.chain > 0

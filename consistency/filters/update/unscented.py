@@ -21,7 +21,7 @@ from consistency.filters.kernel.arrays import copy, fill
 from consistency.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
 from consistency.filters.kernel.covariance import definite_root, state_index
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.gain import POSE, add_noise, apply, gather, innovate, whiten
+from consistency.filters.kernel.gain import POSE, add_noise, apply, gather, innovate, leave_marginal, marginal, whiten
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.linalg import semidefinite_cholesky
 from consistency.filters.kernel.local_state import Factors
@@ -148,13 +148,14 @@ def correct_unscented(
 @implement(foresee, Unscented)
 def foresee_by_points(
     update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
-) -> int:
-    gather(slam, state, m, local, work)
-    if not innovate_by_points(update, slam, state, m, work):
-        return POSE
-    innovate(slam, state, data, m, work)
-    add_noise(slam, state, data, m, work)
-    return 0
+) -> tuple[int, int]:
+    seen, code = marginal(slam, state, m, work), POSE
+    gather(slam, seen, m, local, work)
+    if innovate_by_points(update, slam, seen, m, work):
+        innovate(slam, seen, data, m, work)
+        add_noise(slam, seen, data, m, work)
+        code = 0
+    return code, leave_marginal(slam, m, work)
 
 
 @inner

@@ -19,9 +19,9 @@ COLUMNS = (
 )
 CAPTION = (
     "Observations offered to filters with a guard, over all runs. Precision: the share of the rejected ones that are "
-    "spurious; recall: the share of the spurious ones that are rejected, the first sighting of a landmark included, which "
-    "no guard can judge. 95 % intervals by Clopper and Pearson at the effective number of observations, with runs as "
-    "clusters. A dash where nothing is spurious, or where a log does not say what is."
+    "spurious; recall: the share of the spurious ones that are rejected, the first sighting of a landmark included, "
+    "which no guard can judge. 95 % intervals by Clopper and Pearson at the effective number of observations, with "
+    "runs as clusters. A dash where nothing is spurious, or where a log does not say what is."
 )
 
 

@@ -37,12 +37,7 @@ class Guarded:
     ``update`` first asks the filter for innovation and S of the known landmarks, by an update whose state is thrown
     away; then it updates with what the guard keeps. So the filter's ``update`` must return :class:`Info`, whose rows
     are those of the landmarks that it knows, in the order of the observation. Innovations behind a guard are not
-    white: the guarded filter declares nothing about them.
-
-    Raises
-    ------
-    InputError
-        There is no such guard, or the filter cannot be guarded.
+    white: the guarded filter declares nothing about them. :func:`guarded` is the way to one.
     """
 
     def __init__(self, filter_: Filter, kind: str) -> None:

@@ -140,20 +140,21 @@ def added_distance(i: int, count: int, s: int, y: Array, S: Array, watch: Watch)
     """
     root, white, added = watch.root, watch.white, 0.0
     for a in range(s):
-        row = s * count + a
-        for c in range(row + 1):
-            j = watch.chosen[c // s] if c < s * count else i
-            p, q = s * i + a, s * j + c % s
-            rest = S[min(p, q), max(p, q)]
-            for b in range(c):
-                rest -= root[row, b] * root[c, b]
-            if c < row:
-                root[row, c] = rest / root[c, c]
-            elif rest > 0.0:
-                root[row, row] = np.sqrt(rest)
-            else:
-                return np.nan
-        rest = y[s * i + a]
+        row, p = s * count + a, s * i + a
+        for g in range(count + 1):
+            first = s * (watch.chosen[g] if g < count else i)
+            for e in range(s if g < count else a + 1):
+                c, q = s * g + e, first + e
+                rest = S[p, q] if p < q else S[q, p]
+                for b in range(c):
+                    rest -= root[row, b] * root[c, b]
+                if c < row:
+                    root[row, c] = rest / root[c, c]
+                elif rest > 0.0:
+                    root[row, row] = np.sqrt(rest)
+                else:
+                    return np.nan
+        rest = y[p]
         for b in range(row):
             rest -= root[row, b] * white[b]
         white[row] = rest / root[row, row]

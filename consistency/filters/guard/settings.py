@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.stats import chi2
@@ -32,5 +33,10 @@ class Limits:
 
 def limits_of(settings: GuardSettings, s: int, m: int) -> Limits:
     """Limits of up to ``m`` observations of ``s`` values in a step."""
-    joint = np.append(0.0, chi2.ppf(settings.confidence, s * np.arange(1, max(m, 1) + 1)))
-    return Limits(joint, settings.threshold**2)
+    return Limits(np.array(_quantiles(settings.confidence, s, max(m, 1))), settings.threshold**2)
+
+
+@cache
+def _quantiles(confidence: float, s: int, m: int) -> tuple[float, ...]:
+    """Of chi-square with 0, s, ... s m degrees of freedom; asked in every trial, or in every step by a plain filter."""
+    return 0.0, *map(float, np.atleast_1d(chi2.ppf(confidence, s * np.arange(1, m + 1))))

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.filters.kernel.arrays import copy_matrix
 from consistency.filters.kernel.blas import add_gram, add_product_of_transposed, add_transposed_times, solve_transposed
-from consistency.filters.kernel.covariance import definite_root, gather_rows, state_index, subtract_gram
+from consistency.filters.kernel.covariance import definite_root, gather_rows, subtract_gram
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.measuring import linearise
@@ -140,21 +140,24 @@ def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float
 def marginal(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> State:
     """The robot and the ``m`` seen landmarks alone, which ``work`` then lists by their places there.
 
-    It is all that S and the innovation depend on. :func:`leave_marginal` puts the list back.
+    It is all that S and the innovation depend on. ``work.rows`` (r + w m, r + w m) <- its covariance, as
+    :func:`gather` would; :func:`leave_marginal` puts the list back.
     """
-    r, w, places = robot_width(slam.motion), landmark_width(slam.landmark), work.places
+    r, w, places, rows = robot_width(slam.motion), landmark_width(slam.landmark), work.places, work.rows
     size = r + w * m
-    for a in range(size):
-        places[a] = state_index(r, w, a, work.at)
-        work.alone[a] = state.x[places[a]]
-    for a in range(size):
-        for b in range(a, size):
-            work.among[a, b] = state.P[min(places[a], places[b]), max(places[a], places[b])]
-            if b < r:
-                work.among[b, a] = work.among[a, b]
+    for a in range(r):
+        places[a] = a
     for i in range(m):
+        for c in range(w):
+            places[r + w * i + c] = work.at[i] + c
         work.at[i] = r + w * i
-    return State(work.alone, work.among, size, 0, state.offset)
+    for a in range(size):
+        i = places[a]
+        work.alone[a] = state.x[i]
+        for b in range(a, size):
+            j = places[b]
+            rows[a, b] = rows[b, a] = state.P[i, j] if i < j else state.P[j, i]
+    return State(work.alone, state.P, size, 0, state.offset)
 
 
 @inner

@@ -38,7 +38,6 @@ class Work(NamedTuple, Generic[Room]):
     small: Array  # (r, r)
     places: Indices  # (L,) of a marginal: places in the state of the robot and of the seen landmarks
     alone: Array  # (L,) their values
-    among: Array  # (L, L) their covariance, upper half
     room: Room  # what the update alone needs
     notes: Any  # what the linearisation point alone needs, of a type of its own
 
@@ -67,7 +66,6 @@ def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[Named
         np.empty((r, r)),
         np.empty(r + w * m, np.int64),
         np.empty(r + w * m),
-        np.empty((r + w * m, r + w * m)),
         make_room(slam.update, r, w, s, m, n),
         make_notes(slam.point, r, w, steps, labels),
     )

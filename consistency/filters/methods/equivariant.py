@@ -90,7 +90,8 @@ def correct_equivariant(
     local: Factors,
     work: Work[NoRoom],
 ) -> tuple[int, float]:
-    _innovate_by_output(slam, state, data, k, m, local, work)
+    gather(slam, state, m, local, work)
+    _innovate_by_output(slam, state, data, k, m, work)
     code, nis = whiten(slam, state, data, m, work)
     if code == 0:
         apply(slam, state, m, local, work)
@@ -109,17 +110,14 @@ def foresee_equivariant(
     work: Work[NoRoom],
 ) -> tuple[int, int]:
     seen = marginal(slam, state, m, work)
-    _innovate_by_output(slam, seen, data, k, m, local, work)
+    _innovate_by_output(slam, seen, data, k, m, work)
     add_noise(slam, seen, data, m, work)
     return 0, leave_marginal(slam, m, work)
 
 
 @inner
-def _innovate_by_output(
-    slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NoRoom]
-) -> None:
-    """A <- C* P, S <- C* P C*' and the innovation of the ``m`` landmarks."""
-    gather(slam, state, m, local, work)
+def _innovate_by_output(slam: Slam, state: State, data: Data, k: int, m: int, work: Work[NoRoom]) -> None:
+    """A <- C* P, S <- C* P C*' and the innovation of the ``m`` landmarks, from the rows of P in ``work``."""
     linearise_seen(slam, state, k, m, work)
     for i in range(m):
         _average(slam.sensor, data.z[work.known[i]], state.x[work.at[i] : work.at[i] + 3], work.Hl[i])

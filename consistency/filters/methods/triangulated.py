@@ -144,7 +144,6 @@ def foresee_with_noise_at_prediction(
     work: Work[NoRoom],
 ) -> tuple[int, int]:
     seen = marginal(slam, state, m, work)
-    gather(slam, seen, m, local, work)
     linearise_seen(slam, seen, k, m, work)
     combine_seen(slam, seen, m, work)
     _add_noise(update, data, m, innovate(slam, seen, data, m, work), work)

@@ -65,7 +65,6 @@ def foresee_linearised(
 ) -> tuple[int, int]:
     """Innovation and S with Jacobians at the prediction, which is also where an iterated update begins."""
     seen = marginal(slam, state, m, work)
-    gather(slam, seen, m, local, work)
     linearise_seen(slam, seen, k, m, work)
     combine_seen(slam, seen, m, work)
     innovate(slam, seen, data, m, work)

@@ -150,7 +150,6 @@ def foresee_by_points(
     update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
 ) -> tuple[int, int]:
     seen, code = marginal(slam, state, m, work), POSE
-    gather(slam, seen, m, local, work)
     if innovate_by_points(update, slam, seen, m, work):
         innovate(slam, seen, data, m, work)
         add_noise(slam, seen, data, m, work)

@@ -9,6 +9,7 @@ from .diagnostics.records import Verdict as Verdict
 from .errors import InputError as InputError
 from .filters import filter_names as filter_names
 from .filters import get_filter as get_filter
+from .filters.guard.guarded import guarded as guarded
 from .runs.findings import Study as Study
 from .runs.montecarlo import run_trials as run_trials
 from .scenario import Scenario as Scenario

@@ -47,6 +47,10 @@ class Filter(Protocol):
     landmarks in the state by label, as points (3,) in the world with their covariance (3, 3). ``joint(state)`` gives
     the pose and these K points, in the order of ``map``, as one Gaussian, (3 + 3 K,) and (3 + 3 K, 3 + 3 K), of the
     additive errors.
+
+    ``rejected(state)`` is for filters that leave out observations: which ones (m,) of the last step, in the order in
+    which they were offered. It is asked in each step, and the rejections are scored. An attribute ``innovates = False``
+    says that ``update`` gives no innovations, so that no guard can be put before the filter.
     """
 
     def init(self, problem: Problem) -> Any: ...

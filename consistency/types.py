@@ -148,6 +148,7 @@ class Estimates:
     error: str = "so2"  # convention of the error that ``own`` is the covariance of
     own: Array | None = None  # (T, 3, 3), where that error is not the additive one of the world
     map: Map | None = None  # after the last step; None where the filter gives none or the run failed
+    rejected: Array | None = None  # (M,), observations that a guard kept from the filter; None without a guard
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,7 @@ def share(study: cs.Study, worlds: dict[str, cs.Scenario]) -> cs.Finding:
         scenario="herath2007-stereo, 5 variants",
         id="bias-or-noise",
         source=SOURCE,
-        claim=f"what makes ekf-uvd inconsistent with a disparity of {POOLED} px is mostly a constant bias used as noise",
+        claim=f"what makes ekf-uvd inconsistent with a disparity of {POOLED} px is mostly constant bias used as noise",
         statistic="share of the excess of the mean ANEES over 3 that goes when the bias map is known",
         published="local biases are part of the noise; correcting them is difficult",
         measured="share {:.3f} [{:.3f}, {:.3f}], with the noise known, too, {:.3f} [{:.3f}, {:.3f}]; ANEES ".format(
@@ -128,7 +128,9 @@ def interval_of_share(before: Array, after: Array, seed: int) -> tuple[float, fl
 def survivors(study: cs.Study, worlds: dict[str, cs.Scenario]) -> cs.Finding:
     """Verdicts of several filters where nobody has measured the bias."""
     world, white = worlds["as noise"], worlds["noise"]
-    found = {name: cs.analyse(study.results(world, [name]), [name], confidence=1.0 - FALSE_ALARM)[name] for name in FILTERS}
+    found = {
+        name: cs.analyse(study.results(world, [name]), [name], confidence=1.0 - FALSE_ALARM)[name] for name in FILTERS
+    }
     beside = {name: study.judged(white, name)[0].statistic for name in FILTERS}
     return study.finding(
         all(verdict.status != "consistent" for verdict in found.values()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ from scipy.stats import ttest_rel
 import consistency as cs
 from consistency.runs.findings import OURS, script
 from consistency.types import Array
+from consistency.verdicts.curves import Curves
 
 FINDINGS = ("fig10a", "fig10b", "guarded", "fov", "feature-count", "near-far-mix")
 LONG = True
@@ -79,7 +81,7 @@ def ransac(study: cs.Study) -> cs.Finding:
 
 def guarded(study: cs.Study) -> cs.Finding:
     """Every guard against what the same filter does on clean data."""
-    rows, texts, holds = [], [], True
+    rows, texts, holds = list[tuple[object, ...]](), list[str](), True
     for name in FILTERS:
         verdict, curves = study.judged("herath2007-stereo", name)
         before = log_rmse(curves, (0, 1))
@@ -116,10 +118,9 @@ def field_of_view(study: cs.Study) -> cs.Finding:
             world = lens(degrees, k)
             for name in FILTERS:
                 verdict, curves = study.judged(world, name)
-                rows.append((degrees, k, name, verdict.status, verdict.statistic, verdict.accuracy.rmse_position,
-                             verdict.accuracy.rmse_heading))  # fmt: skip
+                rows.append((degrees, k, name, verdict.status, verdict.statistic, *rmse(verdict)))
                 heading[degrees, k, name], nees[degrees, k, name] = log_rmse(curves, (2,)), log_nees(curves)
-    columns = ["degrees", "k1", "filter", "status", "anees", "rmse_position", "rmse_heading"]
+    columns = ["degrees", "k1", "filter", "status", "anees", "rmse_position_m", "rmse_heading_deg"]
     table = study.tables["field_of_view"] = pd.DataFrame(rows, columns=columns)
     narrow, wide = FIELDS[0], FIELDS[-1]
     tests = {
@@ -167,13 +168,13 @@ def lens(degrees: float, k: float) -> cs.Scenario:
 def degrees_of(table: pd.DataFrame, name: str, k: float) -> str:
     """RMSE of heading over the field of view."""
     rows = table[(table["filter"] == name) & (table.k1 == k)]
-    return ", ".join(f"{np.degrees(row.rmse_heading):.2f} deg at {row.degrees:g}" for row in rows.itertuples())
+    return ", ".join(f"{e:.2f} deg at {d:g}" for e, d in zip(rows.rmse_heading_deg, rows.degrees, strict=True))
 
 
 def anees_of(table: pd.DataFrame, name: str, k: float) -> str:
     """ANEES over the field of view."""
     rows = table[(table["filter"] == name) & (table.k1 == k)]
-    return ", ".join(f"{row.anees:.2f}" for row in rows.itertuples())
+    return ", ".join(f"{anees:.2f}" for anees in rows.anees)
 
 
 # --- which features, section 4.2 ---------------------------------------------------------------------
@@ -183,7 +184,7 @@ def feature_count(study: cs.Study) -> cs.Finding:
     """More features at a time."""
     found = {count: study.judged(selected(count), "parked-ekf-uvd") for count in COUNTS}
     errors = {count: log_rmse(curves, (0, 1)) for count, (_, curves) in found.items()}
-    steps = list(zip(COUNTS, COUNTS[1:], strict=False))
+    steps = list(pairwise(COUNTS))
     tests = {pair: greater(errors[pair[0]], errors[pair[1]]) for pair in steps}
     return study.finding(
         all(p < LEVEL for p in tests.values()),
@@ -194,7 +195,7 @@ def feature_count(study: cs.Study) -> cs.Finding:
         statistic="RMSE of position of parked-ekf-uvd with more features at a time",
         published="the least number is found by experiment",
         measured=", ".join(
-            f"{count}: {verdict.accuracy.rmse_position:.3f} m ({verdict.status} {verdict.statistic:.2f})"
+            f"{count}: {rmse(verdict)[0]:.3f} m ({verdict.status} {verdict.statistic:.2f})"
             for count, (verdict, _) in found.items()
         ),
         accept=f"from each count of {', '.join(map(str, COUNTS))} to the next the log RMSE of runs falls (one-sided "
@@ -230,8 +231,7 @@ def near_far_mix(study: cs.Study) -> cs.Finding:
         statistic="RMSE of position and heading of parked-ekf-uvd with eight features at a time",
         published="both are needed",
         measured="; ".join(
-            f"{name} {verdict.accuracy.rmse_position:.3f} m, {np.degrees(verdict.accuracy.rmse_heading):.2f} deg "
-            f"({verdict.status})"
+            "{} {:.3f} m, {:.2f} deg ({})".format(name, *rmse(verdict), verdict.status)
             for name, (verdict, _) in found.items()
         )
         + f"; p {tests[0]:.2g}, {tests[1]:.2g}",
@@ -243,7 +243,7 @@ def near_far_mix(study: cs.Study) -> cs.Finding:
 # --- of runs -----------------------------------------------------------------------------------------
 
 
-def log_rmse(curves: cs.Curves, axes: Sequence[int]) -> Array:
+def log_rmse(curves: Curves, axes: Sequence[int]) -> Array:
     """log RMSE of some axes in each run (runs,), NaN where it failed."""
     error = curves.additive.error
     assert error is not None
@@ -251,8 +251,9 @@ def log_rmse(curves: cs.Curves, axes: Sequence[int]) -> Array:
     return value
 
 
-def log_nees(curves: cs.Curves) -> Array:
+def log_nees(curves: Curves) -> Array:
     """log of the mean NEES of each run (runs,), NaN where it failed."""
+    assert curves.nees is not None
     value: Array = np.log(np.nanmean(curves.nees, axis=1))
     return value
 
@@ -263,13 +264,26 @@ def greater(a: Array, b: Array) -> float:
     return float(ttest_rel(a[both], b[both], alternative="greater").pvalue)
 
 
+def rmse(verdict: cs.Verdict) -> tuple[float, float]:
+    """RMSE of position (m) and of heading (degrees)."""
+    assert verdict.accuracy is not None
+    return verdict.accuracy.rmse_position, float(np.degrees(verdict.accuracy.rmse_heading))
+
+
 def rank(verdict: cs.Verdict) -> int:
     return NO_WORSE.get(verdict.status, len(NO_WORSE))
 
 
 def summary(verdict: cs.Verdict) -> str:
     """Status, ANEES, RMSE of position."""
-    return f"{verdict.status}, ANEES {verdict.statistic:.2f}, RMSE {verdict.accuracy.rmse_position:.3f} m"
+    return f"{verdict.status}, ANEES {verdict.statistic:.2f}, RMSE {rmse(verdict)[0]:.3f} m"
+
+
+def scored(verdict: cs.Verdict) -> str:
+    """Precision and recall of what a guard rejected."""
+    score = verdict.rejection
+    assert score is not None
+    return f"precision {score.precision.value:.3f}, recall {score.recall.value:.3f}"
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ def _main(
 def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
     """Scenarios, filters, experiments and sweeps."""
     from consistency.filters import BOUNDS, SMOOTHERS, filter_summaries
+    from consistency.filters.guard.settings import KINDS
     from consistency.runs.findings import experiment_summaries
     from consistency.scenario import load_scenario, scenario_names
     from consistency.sweeps.plan import sweep_summaries
@@ -58,11 +59,15 @@ def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")]
     experiments, sweeps, filters = experiment_summaries(), sweep_summaries(), filter_summaries()
     if as_json:
         listed = {"scenarios": scenarios, "filters": list(filters), "experiments": experiments, "sweeps": sweeps}
-        print(json.dumps(listed | {"filter_summaries": filters}, indent=2))
+        print(json.dumps(listed | {"filter_summaries": filters, "guards": KINDS}, indent=2))
         return
     marks = dict.fromkeys(BOUNDS, " (not realisable)") | dict.fromkeys(SMOOTHERS, " (all data at once)")
     marked = {name: text + marks.get(name, "") for name, text in filters.items()}
-    named = {"Scenarios": scenarios, "Experiments": experiments, "Sweeps": sweeps, "Filters": marked}
+    guards = {f"FILTER+{kind}": text for kind, text in KINDS.items()}
+    named = {
+        "Scenarios": scenarios, "Experiments": experiments, "Sweeps": sweeps, "Filters": marked,
+        "Guards, before any filter but smoothers": guards,
+    }  # fmt: skip
     for title, entries in named.items():
         print(title)
         width = max((len(name) for name in entries), default=0)
@@ -140,7 +145,7 @@ def _options(**options: Any) -> dict[str, Any]:
 @app.command()
 def run(
     out: Out,
-    filters: Annotated[list[str], typer.Option("--filter", help="Filter name; give it again for more.")],
+    filters: Annotated[list[str], typer.Option("--filter", help="Filter name, or FILTER+gate; again for more.")],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
     runs: Annotated[int | None, typer.Option("--runs", help="Number of Monte Carlo runs [default: 50].")] = None,

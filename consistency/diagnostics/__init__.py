@@ -28,9 +28,11 @@ from consistency.diagnostics.records import (
     Interval,
     JointNees,
     MapScore,
+    RejectionScore,
     Settings,
     Verdict,
 )
+from consistency.diagnostics.rejection import clustered_share, rejection_score
 from consistency.diagnostics.scale import MeanTest, mean_test, ratio_interval
 from consistency.diagnostics.sequential import Design, follow, look, sequential_design, speaks
 from consistency.diagnostics.shape import identity_statistic, mean_shape, sphericity
@@ -59,6 +61,7 @@ __all__ = [
     "Outlier",
     "PilotPlan",
     "Pit",
+    "RejectionScore",
     "RunSummary",
     "Settings",
     "Verdict",
@@ -67,6 +70,7 @@ __all__ = [
     "anees_interval",
     "answers",
     "chi2_mean_interval",
+    "clustered_share",
     "compare",
     "coverage",
     "coverage_interval",
@@ -95,6 +99,7 @@ __all__ = [
     "pit",
     "power_of",
     "ratio_interval",
+    "rejection_score",
     "required_runs",
     "rmse",
     "sequential_design",

@@ -11,7 +11,7 @@ from consistency.diagnostics.wording import p_text, plural, question_text, short
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
-    from consistency.diagnostics.records import Equivalence, MapScore, Verdict
+    from consistency.diagnostics.records import Equivalence, Interval, MapScore, RejectionScore, Verdict
 
 
 def flat(v: Verdict) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def flat(v: Verdict) -> dict[str, Any]:
         "failures": [[f.run, f.step, f.reason] for f in v.failures],
         "answers": [vars(a) for a in v.answers], "p_value": v.p_value, "left_out_steps": list(v.left_out_steps),
     }  # fmt: skip
-    for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy, _map, _joint):
+    for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy, _map, _joint, _rejection):
         s |= part(v)
     if v.convention is not None or v.notes:
         s |= {"convention": v.convention, "notes": list(v.notes)}
@@ -128,6 +128,16 @@ def _map(v: Verdict) -> dict[str, Any]:
     return s
 
 
+def _rejection(v: Verdict) -> dict[str, Any]:
+    if (r := v.rejection) is None:
+        return {}
+    return {
+        "rejected": r.rejected, "offered": r.offered, "spurious": r.spurious,
+        "rejection_precision": tuple(r.precision), "rejection_recall": tuple(r.recall),
+        "rejection_false_alarms": tuple(r.false_alarms),
+    }  # fmt: skip
+
+
 def _joint(v: Verdict) -> dict[str, Any]:
     s: dict[str, Any] = {} if v.landmarks is None else {"landmarks": list(v.landmarks)}
     if (j := v.joint) is None:
@@ -167,6 +177,8 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("in the world", _in_world(v.world)))
     if v.map is not None:
         rows.append(("map NEES / 3", f"{map_text(v.map)}, after the last step{_map_status(v.map)}"))
+    if v.rejection is not None:
+        rows.append(("rejected", rejection_text(v.rejection)))
     rows.append(("failed runs", f"{len({f.run for f in v.failures})} of {v.runs}"))
     faults = [
         f"{question_text(v, a.question)} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated
@@ -191,6 +203,22 @@ def map_text(m: MapScore) -> str:
         return f"-{left_out}"
     value, low, high = m.ratio
     return f"{short(value)} [{short(low)}, {short(high)}]{left_out}"
+
+
+def rejection_text(r: RejectionScore) -> str:
+    """What a guard rejected, and where spurious observations are known precision and recall."""
+    rejected = f"{r.rejected} of {r.offered} observations"
+    if not r.spurious:
+        return f"{rejected} ({_percent(r.false_alarms)})"
+    return (
+        f"{rejected}, {r.spurious} of them spurious: precision {_percent(r.precision)}, recall {_percent(r.recall)}, "
+        f"right ones rejected {_percent(r.false_alarms)}"
+    )
+
+
+def _percent(share: Interval) -> str:
+    value, low, high = (f"{100 * end:.3g}" for end in share)
+    return f"{value if value != 'nan' else '-'} [{low}, {high}] %"
 
 
 def text(v: Verdict) -> str:

@@ -265,6 +265,19 @@ class MapScore:
 
 
 @dataclass(frozen=True)
+class RejectionScore:
+    """Observations that a guard rejected, with 95 % intervals of the shares from the runs."""
+
+    precision: Interval  # of the rejected ones those that are spurious
+    recall: Interval  # of the spurious ones those that are rejected
+    false_alarms: Interval  # of the right ones those that are rejected
+    runs: int
+    offered: int
+    spurious: int  # none where it is not known
+    rejected: int
+
+
+@dataclass(frozen=True)
 class Accuracy:
     """Size of the errors by themselves, and other people's indices."""
 
@@ -309,6 +322,7 @@ class Verdict:
     map: MapScore | None = None
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
     joint: JointScore | None = None  # of the verdict on a map
+    rejection: RejectionScore | None = None  # of a filter with a guard
 
     @property
     def in_world(self) -> Verdict:

@@ -100,13 +100,18 @@ def usable_names() -> list[str]:
 
 
 def get_filter(name: str) -> Any:
-    """Built-in filter by name.
+    """Built-in filter by name, behind a guard where the name ends in "+" and its kind.
 
     Raises
     ------
     InputError
-        Unknown name, or a filter of a library that is not installed.
+        Unknown name or guard, a filter that cannot be guarded, or a filter of a library that is not installed.
     """
+    inner, plus, kind = name.partition("+")
+    if plus:
+        from consistency.filters.guard.guarded import guarded
+
+        return guarded(get_filter(inner), kind)
     if name not in MODULES:
         if "," in name:
             raise InputError(f"unknown filter '{name}'; give --filter once for each filter")

@@ -13,6 +13,8 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from consistency.errors import InputError
+from consistency.filters.guard.guarded import Guarded
+from consistency.filters.guard.parts import guard_part
 from consistency.filters.kernel.dispatch import fits, require_fitting
 from consistency.filters.kernel.gain import REASONS
 from consistency.filters.kernel.loop import Outcome, trial_kernel
@@ -22,7 +24,7 @@ from consistency.filters.upkeep.local import LOCAL_FROM, Local
 from consistency.filters.upkeep.parking import Parking
 from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Problem, Truth
-from consistency.scenario import Belief
+from consistency.scenario import Belief, GuardSettings
 from consistency.types import Array, Control, Estimates, Failure, Gaussian, Info, Map, Observation, Trial
 
 _lock = threading.Lock()
@@ -61,6 +63,7 @@ class Compiled:
         :class:`consistency.protocols.Filter`
     error : convention of the error in which its covariance is meant, see
         :mod:`consistency.geometry.conventions`
+    guard : kind of the guard that the twin has, if it has one
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
     allow it; the numbers are the same. ``realisable`` is that of the twin: False for a bound that is told the truth.
@@ -77,11 +80,19 @@ class Compiled:
         uvd: bool,
         innovations: str | None = None,
         error: str = ADDITIVE,
+        guard: str | None = None,
     ) -> None:
         self.twin, self.parts, self.sensors, self.uvd = twin, parts, sensors, uvd
         self.innovations, self.error = innovations, error
         self.name: str = twin.name
         self.realisable: bool = is_realisable(twin)
+        self.guard = guard
+
+    def guarded(self, kind: str) -> Compiled:
+        """This filter behind a guard, with the twin behind the same guard in plain Python."""
+        return Compiled(
+            Guarded(self.twin, kind), self.parts, sensors=self.sensors, uvd=self.uvd, error=self.error, guard=kind
+        )
 
     def init(self, problem: Problem) -> Any:
         return self.twin.init(problem)
@@ -133,8 +144,9 @@ class Compiled:
         labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
         map_ = Map(labels, out.points[labels], out.spread[labels], out.joint) if out.code == 0 else None
         return Estimates(
-            self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_
-        )
+            self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_,
+            None if self.guard is None else out.rejected,
+        )  # fmt: skip
 
     def _arguments(self, trial: Trial, belief: Belief) -> tuple[Slam, Data, int]:
         problem = problem_for(self, trial, belief)
@@ -149,6 +161,9 @@ class Compiled:
         data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks)
         r, w = robot_width(slam.motion), landmark_width(slam.landmark)
         slam = self._with_upkeep(slam, r + w * trial.n_landmarks)
+        if self.guard is not None:
+            most = int(np.diff(first).max(initial=1))
+            slam = slam._replace(guard=guard_part(self.guard, belief.guard or GuardSettings(), z.shape[1], most))
         return slam, data, r + w * len(np.unique(landmark))
 
     def _with_upkeep(self, slam: Slam, most: int) -> Slam:

@@ -72,8 +72,8 @@ class _Unusable(Exception):
 def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float | None = None) -> Estimates:
     """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``.
 
-    ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``map`` and ``joint``
-    after the last step.
+    ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``rejected`` in each step
+    of one that has it, ``map`` and ``joint`` after the last step.
 
     Raises
     ------
@@ -84,6 +84,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
     pose, covariance = np.full((T, 3), np.nan), np.full((T, 3, 3), np.nan)
     own = None if error == ADDITIVE else covariance.copy()
     nis, dof = np.full(T, np.nan), np.zeros(T, np.int64)
+    rejected = np.zeros(len(trial.landmark), bool) if callable(getattr(filter_, "rejected", None)) else None
     rank = _Rank(error)
     reason, step, map_ = "", 0, None
     started = time.monotonic()
@@ -95,6 +96,8 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
                 state = filter_.init(problem)
             state = filter_.predict(state, trial.control(step))
             state, info = _state_and_info(filter_.update(state, trial.observation(step)))
+            if rejected is not None:
+                rejected[trial.first[step - 1] : trial.first[step]] = _value_of(filter_, "rejected", state)
             mean, covariances = _pose_and_covariances(filter_, state, error)
             if info is not None and len(info.innovation):
                 np.linalg.cholesky(info.S)
@@ -112,7 +115,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
         if own is not None:
             own[step - 1] = covariances[1]
     failure = Failure(name, trial.run, step, reason) if reason else None
-    return Estimates(name, trial.run, pose, covariance, nis, dof, failure, error, own, map_)
+    return Estimates(name, trial.run, pose, covariance, nis, dof, failure, error, own, map_, rejected)
 
 
 def _reason(exception: Exception) -> str:

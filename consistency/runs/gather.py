@@ -22,12 +22,14 @@ from consistency.store.results import (
     NUMBERS,
     OWN_NUMBERS,
     Outcome,
+    Rejected,
     Results,
     StoredResults,
     Tables,
     estimates_table,
     failures_table,
     map_table,
+    rejections_table,
     truth_table,
 )
 from consistency.store.storage import NewFolder, undisturbed
@@ -88,6 +90,7 @@ class Gathered:
         self._require_readable()
         self.runs: set[int] = set()
         self._failures: list[Failure] = []
+        self._rejections: list[Rejected] = []
         self._spools: list[Spool] = []
         self._estimates = {name: self._pieces() for name in self.filters}
         self._maps = {name: self._pieces() for name in self.filters}
@@ -109,6 +112,7 @@ class Gathered:
             if outcome.truth is not None:
                 self._truth.append(outcome.truth)
         self._failures += outcome.failures
+        self._rejections += outcome.rejections
         self.runs.add(outcome.run)
 
     @property
@@ -128,7 +132,7 @@ class Gathered:
         truth = truth_table(list(self._true()))
         return Results(
             estimates_table(estimates, bool(self.errors)), failures, truth if len(truth) else None, landmarks, manifest,
-            map_table(maps),
+            map_table(maps), self._all_rejections(),
         )  # fmt: skip
 
     def _stored(
@@ -148,9 +152,11 @@ class Gathered:
             write_table(new.path / "failures.parquet", "failures", failures)
             if landmarks is not None:
                 write_table(new.path / "landmarks.parquet", "landmarks", landmarks)
+            if (rejections := self._all_rejections()) is not None:
+                write_table(new.path / "rejections.parquet", "rejections", rejections)
             for spool in self._spools:
                 spool.path.unlink(missing_ok=True)
-        return StoredResults(new.folder, failures, landmarks, new.put_in_place(manifest))
+        return StoredResults(new.folder, failures, landmarks, new.put_in_place(manifest), rejections)
 
     def _write(
         self, new: NewFolder, table: str, of: Callable[[str], Iterator[Columns]], columns: Sequence[str] = ()
@@ -212,3 +218,12 @@ class Gathered:
         failures = [f for f in (Failure(*row) for row in before) if f.run in self.kept and f.filter in rank]
         failures += [failure for failure in self._failures if failure.run in self.runs]
         return failures_table(sorted(failures, key=lambda f: (rank[f.filter], f.run, f.step)))
+
+    def _all_rejections(self) -> pd.DataFrame | None:
+        """By filter and run; None where no filter has a guard."""
+        rank = {name: i for i, name in enumerate(self.filters)}
+        before = None if self.previous is None else self.previous.rejections
+        rows = [] if before is None else [Rejected(*row) for row in before.itertuples(index=False)]
+        rows = [row for row in rows if row.run in self.kept and row.filter in rank]
+        rows += [row for row in self._rejections if row.run in self.runs]
+        return rejections_table(sorted(rows, key=lambda row: (rank[row.filter], row.run)))

@@ -6,7 +6,7 @@ ideal observation, one effect a file: its keys and its ``apply``. Nothing here d
 """
 
 from consistency.scenario.agreement import misbelief
-from consistency.scenario.belief import Belief, BelievedMotion, SigmaPoints
+from consistency.scenario.belief import Belief, BelievedMotion, GuardSettings, SigmaPoints
 from consistency.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
 from consistency.scenario.record import Scenario, data_folder, load_scenario, scenario_names
 from consistency.scenario.sensor import (
@@ -63,6 +63,7 @@ __all__ = [
     "DisparityGrowth",
     "FigureOfEight",
     "Finite",
+    "GuardSettings",
     "Interval",
     "LinearSensor",
     "ListedEffect",

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+
 from consistency.scenario.sensor import BelievedSensor
-from consistency.scenario.tables import Finite, NonNegative, Positive, Table
+from consistency.scenario.tables import Count, Finite, NonNegative, Positive, Table
+
+Share = Annotated[float, Field(gt=0, lt=1, strict=True)]
 
 
 class BelievedMotion(Table):
@@ -24,9 +30,35 @@ class SigmaPoints(Table):
     kappa: Finite = 0.0
 
 
+class GuardSettings(Table):
+    """What a guarded filter takes for spurious; an unguarded one does not read it.
+
+    ``confidence`` is the share of right observations that a gate lets pass. The default, 0.99, is that of Neira &
+    Tardos (2001) and of Civera et al. (2010). ``threshold``, of ``ransac`` alone, is the distance in standard
+    deviations up to which what is left of an innovation supports a hypothesis: 2, as in Civera et al. (2010).
+    ``min_age`` is the number of sightings from which a track is used: with 1, the default, from the first on.
+    ``forget_after`` is the number of observations of a landmark that are rejected one after the other until all later
+    ones are refused; by default a landmark is never given up.
+    """
+
+    confidence: Share = 0.99
+    threshold: Positive = 2.0
+    min_age: Count = 1
+    forget_after: Count | None = None
+
+
 class Belief(Table):
     """What the filter takes to be the case."""
 
     motion: BelievedMotion
     sensor: BelievedSensor
     sigma_points: SigmaPoints = SigmaPoints()
+    guard: GuardSettings | None = None  # None: the defaults
+
+    @model_serializer(mode="wrap")
+    def _without_guard(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A belief without the table has the content, and so the hash, of one that knows of no guards."""
+        content: dict[str, Any] = handler(self)
+        if self.guard is None:
+            content.pop("guard", None)
+        return content

@@ -14,7 +14,16 @@ import pandas as pd
 import tomli_w
 
 from consistency.errors import InputError
-from consistency.scenario import Belief, BelievedMotion, Finite, PicturedSensor, SigmaPoints, Table, read_table
+from consistency.scenario import (
+    Belief,
+    BelievedMotion,
+    Finite,
+    GuardSettings,
+    PicturedSensor,
+    SigmaPoints,
+    Table,
+    read_table,
+)
 from consistency.scenario.tables import SIGMA_UNITS
 from consistency.store.parquet import COLUMNS, read_parquet, require_table
 from consistency.store.results import POSE, controls_table, observations_table, truth_of
@@ -38,6 +47,7 @@ class SensorFile(PicturedSensor):
     motion: BelievedMotion
     start: Start | None = None
     sigma_points: SigmaPoints = SigmaPoints()
+    guard: GuardSettings | None = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +81,7 @@ def read_log(folder: str | Path) -> Log:
             f"{path}: missing; 'consistency frontend' makes a log of images, 'consistency simulate' one of a scenario"
         )
     sensor = read_table(path, SensorFile)
-    belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points)
+    belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points, guard=sensor.guard)
     controls, observations = read_parquet(folder, "controls"), _observations(folder, sensor)
     tables = {
         name: read_parquet(folder, name) if (folder / f"{name}.parquet").exists() else None
@@ -138,6 +148,7 @@ def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, o
         "motion": belief.motion.model_dump(),
         "start": dict(zip(POSE, map(float, start), strict=True)),
         "sigma_points": belief.sigma_points.model_dump(),
+        **({} if belief.guard is None else {"guard": belief.guard.model_dump(exclude_none=True)}),
     }
 
 

@@ -32,6 +32,10 @@ COLUMNS: dict[str, dict[str, str]] = {
         "nis_dof": "int64",
     },
     "failures": {"filter": "str", "run": "int64", "step": "int64", "reason": "str"},
+    "rejections": {
+        "filter": "str", "run": "int64", "offered": "int64", "spurious": "int64", "rejected": "int64",
+        "rejected_spurious": "int64",
+    },
     "map": {
         "filter": "str", "run": "int64", "landmark": "int64", "x": "float64", "y": "float64", "z": "float64",
         **dict.fromkeys(POINT_COVARIANCE, "float64"), "nees": "float64",

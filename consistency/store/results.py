@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -43,6 +43,17 @@ JOINT = "joint_nees"  # of a landmark, given the pose and the landmarks above it
 MAP_NUMBERS = [*(column for column in COLUMNS["map"] if column != "filter"), JOINT]
 
 
+class Rejected(NamedTuple):
+    """How many observations a guard was offered in a run, and what it rejected; a row of ``rejections``."""
+
+    filter: str
+    run: int
+    offered: int
+    spurious: int
+    rejected: int
+    rejected_spurious: int
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What one run leaves: rows of the tables, by filter, and failures."""
@@ -52,6 +63,7 @@ class Outcome:
     truth: Columns | None
     failures: tuple[Failure, ...]
     maps: dict[str, Columns] = field(default_factory=dict)
+    rejections: tuple[Rejected, ...] = ()
 
 
 class Tables(ABC):
@@ -60,6 +72,7 @@ class Tables(ABC):
     manifest: dict[str, Any]
     failures: pd.DataFrame
     landmarks: pd.DataFrame | None
+    rejections: pd.DataFrame | None  # of filters with a guard, None where there is none
 
     @abstractmethod
     def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
@@ -148,6 +161,7 @@ class Results(Tables):
     landmarks: pd.DataFrame | None
     manifest: dict[str, Any]
     map: pd.DataFrame | None = None
+    rejections: pd.DataFrame | None = None
 
     @property
     def has_truth(self) -> bool:
@@ -166,7 +180,9 @@ class Results(Tables):
     def write(self, folder: Path, overwrite: bool = False, keep_others: bool = False) -> None:
         """Write the folder at once, as :func:`write_folder`: it appears complete or not at all."""
         tables = {"estimates": self.estimates, "failures": self.failures}
-        optional = {"truth": self.truth, "landmarks": self.landmarks, "map": self.map}
+        optional = {
+            "truth": self.truth, "landmarks": self.landmarks, "map": self.map, "rejections": self.rejections,
+        }  # fmt: skip
         tables |= {name: table for name, table in optional.items() if table is not None}
         write_folder(folder, tables, self.manifest, overwrite=overwrite, keep_others=keep_others)
 
@@ -179,6 +195,7 @@ class StoredResults(Tables):
     failures: pd.DataFrame
     landmarks: pd.DataFrame | None
     manifest: dict[str, Any]
+    rejections: pd.DataFrame | None = None
 
     @property
     def has_truth(self) -> bool:
@@ -219,7 +236,9 @@ def joined(parts: Sequence[Results]) -> Results:
     maps = [part.map for part in parts if part.map is not None]
     map_ = pd.concat(maps, ignore_index=True) if maps else None
     failures = pd.concat([p.failures for p in parts if len(p.failures)] or [parts[0].failures], ignore_index=True)
-    return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest, map=map_)
+    guarded = [part.rejections for part in parts if part.rejections is not None]
+    rejections = pd.concat(guarded, ignore_index=True) if guarded else None
+    return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest, map=map_, rejections=rejections)
 
 
 def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:
@@ -230,7 +249,17 @@ def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:
         None if trial.truth is None else _truth_columns(trial, trial.truth),
         tuple(e.failure for e in estimates if e.failure),
         {e.filter: _map_columns(trial, e, e.map) for e in estimates if e.map is not None and e.failure is None},
+        tuple(_rejected(trial, e, e.rejected) for e in estimates if e.rejected is not None),
     )
+
+
+def _rejected(trial: Trial, estimates: Estimates, rejected: Array) -> Rejected:
+    """Counts over the observations up to the end of the run, or to the step before its failure."""
+    last = estimates.failure.step - 1 if estimates.failure else trial.steps
+    rows = slice(trial.first[last])
+    spurious, rejected = trial.spurious[rows], rejected[rows]
+    counts = (len(rejected), spurious.sum(), rejected.sum(), (rejected & spurious).sum())
+    return Rejected(estimates.filter, trial.run, *(int(count) for count in counts))
 
 
 def _columns(trial: Trial, estimates: Estimates) -> Columns:
@@ -422,6 +451,13 @@ def failures_table(failures: Sequence[Failure]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS["failures"])).astype(COLUMNS["failures"])
 
 
+def rejections_table(rows: Sequence[Rejected]) -> pd.DataFrame | None:
+    """``rejections.parquet``; None without a row."""
+    if not rows:
+        return None
+    return pd.DataFrame(rows, columns=list(COLUMNS["rejections"])).astype(COLUMNS["rejections"])
+
+
 def _empty(name: str) -> pd.DataFrame:
     return pd.DataFrame({column: pd.Series(dtype=kind) for column, kind in COLUMNS[name].items()})
 
@@ -442,7 +478,8 @@ def open_results(folder: str | Path) -> StoredResults:
     for name in ("estimates", *(name for name in ("truth", "map") if name in written)):
         require_table(folder, name)
     landmarks = read_parquet(folder, "landmarks") if "landmarks" in written else None
-    results = StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest)
+    rejections = read_parquet(folder, "rejections") if "rejections" in written else None
+    results = StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest, rejections)
     if OWN_NUMBERS in map(results.numbers_of, results.filters):
         require_table(folder, "estimates", OWN_NUMBERS)
     return results
@@ -457,4 +494,7 @@ def read_results(folder: str | Path) -> Results:
         A file is missing, cut short, or lacks a column.
     """
     stored = open_results(folder)
-    return Results(stored.estimates, stored.failures, stored.truth, stored.landmarks, stored.manifest, stored.map)
+    return Results(
+        stored.estimates, stored.failures, stored.truth, stored.landmarks, stored.manifest, stored.map,
+        stored.rejections,
+    )  # fmt: skip

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from consistency.diagnostics import Interval, MapScore, Verdict
-from consistency.diagnostics.export import map_text
+from consistency.diagnostics.export import map_text, rejection_text
 from consistency.diagnostics.monitor import CAVEAT, accepted_scales
 from consistency.diagnostics.wording import short
 from consistency.geometry.conventions import ADDITIVE, PLANAR
@@ -83,7 +83,7 @@ def _cells(verdict: Verdict) -> list[str]:
 
 
 def _below(verdicts: dict[str, Verdict]) -> list[str]:
-    """What the errors are, where filters have some of their own; then the maps."""
+    """What the errors are, where filters have some of their own; then the maps, and what guards rejected."""
     lines = []
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
@@ -93,7 +93,8 @@ def _below(verdicts: dict[str, Verdict]) -> list[str]:
         judged = "" if any(m.verdict is not None for m in maps.values()) else ", not judged"
         scores = "; ".join(f"{name} {_map_cells(m)}" for name, m in maps.items())
         lines.append(f"map after the last step, mean NEES / 3{judged}: {scores}")
-    return lines
+    guarded = {name: v.rejection for name, v in verdicts.items() if v.rejection is not None}
+    return lines + [f"{name} rejected {rejection_text(score)}" for name, score in guarded.items()]
 
 
 def _map_cells(m: MapScore) -> str:

@@ -44,6 +44,21 @@ class Landmarks(NamedTuple):
         return Landmarks(*(column[some] for column in self))
 
 
+class Rejections(NamedTuple):
+    """What a guard did in each of N runs: counts of observations, (N,) each."""
+
+    run: Indices
+    offered: Indices
+    spurious: Indices
+    rejected: Indices
+    hits: Indices  # rejected and spurious
+
+    def of_runs(self, runs: int | None) -> Rejections:
+        """Those of runs 0 to ``runs`` - 1, or of all."""
+        some = self.run < (np.inf if runs is None else runs)
+        return Rejections(*(column[some] for column in self))
+
+
 @dataclass(frozen=True)
 class Curves:
     """One filter's results as arrays over (runs, steps); NaN where a run has no value."""
@@ -61,6 +76,7 @@ class Curves:
     convention: str = ADDITIVE  # of the filter's own error
     own: Errors | None = None  # in that convention, where it is not the additive one
     landmarks: Landmarks | None = None  # None where no run has a map
+    rejections: Rejections | None = None  # None of a filter without a guard
 
     @property
     def additive(self) -> Errors:
@@ -116,6 +132,7 @@ def curves(results: Tables, filter_name: str, steps: int | None = None) -> Curve
         convention=convention,
         own=None if own is None else Errors(own_error, own, own_nees),
         landmarks=_landmarks(results, filter_name),
+        rejections=_rejections(results, filter_name),
     )  # fmt: skip
 
 
@@ -157,6 +174,13 @@ def _landmarks(results: Tables, filter_name: str) -> Landmarks | None:
     error = _places(results, rows["landmark"]) - np.stack([rows[axis] for axis in "xyz"], axis=-1)
     joint = rows.get(JOINT, np.full(len(error), np.nan))
     return Landmarks(rows["run"], rows["nees"], rows["landmark"], error, covariance, joint)
+
+
+def _rejections(results: Tables, filter_name: str) -> Rejections | None:
+    if results.rejections is None:
+        return None
+    rows = results.rejections[results.rejections["filter"] == filter_name].drop(columns="filter")
+    return Rejections(*(rows[column].to_numpy() for column in rows)) if len(rows) else None
 
 
 def _places(results: Tables, labels: Indices) -> Array:

@@ -20,6 +20,7 @@ from consistency.diagnostics import (
     judge,
     map_score,
     pilot_plan,
+    rejection_score,
     required_runs,
     sequential_design,
 )
@@ -92,7 +93,7 @@ def verdict_of(c: Curves, settings: Settings) -> Verdict:
     world = None if c.own is None else judge(evidence_of(c, additive=True), settings)
     verdict = replace(judge(evidence_of(c), settings), world=world, convention=own_convention(c))
     map_ = map_evidence(c)
-    return with_map(verdict, c, map_verdict=None if map_ is None else judge(map_, settings))
+    return with_scores(verdict, c, map_verdict=None if map_ is None else judge(map_, settings))
 
 
 def own_convention(c: Curves) -> str | None:
@@ -100,8 +101,10 @@ def own_convention(c: Curves) -> str | None:
     return None if c.own is None else c.convention
 
 
-def with_map(verdict: Verdict, c: Curves, runs: int | None = None, map_verdict: Verdict | None = None) -> Verdict:
-    """The verdict with the score of the maps of runs 0 to ``runs`` - 1, or of all, and with what was judged of them."""
+def with_scores(verdict: Verdict, c: Curves, runs: int | None = None, map_verdict: Verdict | None = None) -> Verdict:
+    """The verdict with the scores of maps and guards of runs 0 to ``runs`` - 1, or of all, and with what was judged."""
+    if c.rejections is not None:
+        verdict = replace(verdict, rejection=rejection_score(*c.rejections.of_runs(runs)[1:]))
     if c.landmarks is None:
         return verdict
     some = c.landmarks.of_runs(runs)
@@ -193,7 +196,7 @@ def until_decided(c: Curves, design: Design) -> Verdict:
 def beside(verdict: Verdict, c: Curves, design: Design, runs: int) -> Verdict:
     """The verdict of a look with what the same ``runs`` say in the additive error, looked at likewise, and the map."""
     world = None if c.own is None else follow(design, lambda n: evidence_of(c, n, additive=True), runs)[0]
-    return with_map(replace(verdict, world=world, convention=own_convention(c)), c, runs)
+    return with_scores(replace(verdict, world=world, convention=own_convention(c)), c, runs)
 
 
 def analyse_recordings(

@@ -73,7 +73,7 @@ def test_excerpts_of_filters_are_the_code_that_runs() -> None:
     registry = (PACKAGE / "filters" / "__init__.py").read_text(encoding="utf-8")
     sources = [registry, *(path.read_text(encoding="utf-8") for path in METHODS.glob("*.py"))]
     excerpts = blocks("Add a filter")
-    assert len(excerpts) == 6
+    assert len(excerpts) == 7
     for excerpt in excerpts:
         pieces = re.split(r"\n{3,}", excerpt.strip("\n"))
         assert all(any(piece in source for source in sources) for piece in pieces), excerpt

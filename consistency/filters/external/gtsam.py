@@ -110,6 +110,7 @@ class _Stepwise(ABC):
     """A smoother judged like a filter: in each step the last pose, by the data up to that step."""
 
     sensors = ("uvd",)
+    innovates = False  # so that no guard can judge what it is given
 
     def __init__(self, name: str, world: World = PlanarStereo) -> None:
         self.name, self.world = name, world
@@ -179,6 +180,7 @@ class WholeTrialSmoother:
 
     sensors = ("uvd",)
     causal = False
+    innovates = False
 
     def __init__(self, name: str, world: World = PlanarStereo) -> None:
         self.name, self.world = name, world

@@ -99,6 +99,13 @@ def innovate(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple
 @inner
 def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float]:
     """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. Gives a code of REASONS or 0, and NIS."""
+    total = add_noise(slam, state, data, m, work)
+    return divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+
+
+@inner
+def add_noise(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> float:
+    """S (s m, s m) <- S + R; returns a sum that is finite if innovation and S are."""
     s = observed_width(slam.sensor)
     rows, width = s * m, state.n + state.base
     S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
@@ -109,7 +116,7 @@ def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple])
             for c in range(s):
                 S[r, s * i + c] += data.R[work.known[i], a, c]
             total += y[r] + S[r, r:].sum()
-    return divide_by_root(state, rows, work, total)
+    return total
 
 
 @inner
@@ -127,6 +134,39 @@ def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float
     if np.isfinite(nis):
         return 0, nis
     return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan
+
+
+@inner
+def marginal(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> State:
+    """The robot and the ``m`` seen landmarks alone, which ``work`` then lists by their places there.
+
+    It is all that S and the innovation depend on. ``work.rows`` (r + w m, r + w m) <- its covariance, as
+    :func:`gather` would; :func:`leave_marginal` puts the list back.
+    """
+    r, w, places, rows = robot_width(slam.motion), landmark_width(slam.landmark), work.places, work.rows
+    size = r + w * m
+    for a in range(r):
+        places[a] = a
+    for i in range(m):
+        for c in range(w):
+            places[r + w * i + c] = work.at[i] + c
+        work.at[i] = r + w * i
+    for a in range(size):
+        i = places[a]
+        work.alone[a] = state.x[i]
+        for b in range(a, size):
+            j = places[b]
+            rows[a, b] = rows[b, a] = state.P[i, j] if i < j else state.P[j, i]
+    return State(work.alone, state.P, size, 0, state.offset)
+
+
+@inner
+def leave_marginal(slam: Slam, m: int, work: Work[NamedTuple]) -> int:
+    """``work`` lists landmarks by their places in the state again; returns the size of the marginal."""
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    for i in range(m):
+        work.at[i] = work.places[r + w * i]
+    return r + w * m
 
 
 @inner

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.filters.guard import open as _open  # noqa: F401, registers the bodies of a filter without a guard
 from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
 from consistency.filters.kernel.covariance import append_landmark
 from consistency.filters.kernel.gain import NOT_FINITE, POSE
@@ -22,13 +23,17 @@ from consistency.filters.kernel.slam import (
     insert_error,
     landmark_width,
     make_local,
+    make_watch,
+    may_enter,
     observed_width,
     place,
     pose_covariance,
     predict,
     prepare,
+    rejected_rows,
     robot_frame,
     robot_width,
+    screen,
     settle,
     spare_width,
     to_error,
@@ -51,6 +56,7 @@ class Outcome(NamedTuple):
     points: Array  # (n_landmarks, 3), landmarks in the world after the last step, NaN where none was seen
     spread: Array  # (n_landmarks, 3, 3), and their covariances
     joint: Array  # (3 + 3 K, 3 + 3 K), covariance of the robot and the K landmarks of these, additive errors
+    rejected: Array  # (M,) observations that a guard rejected, or (0,)
 
 
 @inner
@@ -66,13 +72,15 @@ def _find_known(data: Data, k: int, offset: Indices, work: Work[NamedTuple]) -> 
 
 
 @inner
-def _insert_new(slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple]) -> State:
+def _insert_new(
+    slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
+) -> State:
     """The state with the landmarks that step k + 1 sees for the first time."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     x, P, n, base, offset = state.x, state.P, state.n, state.base, state.offset
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
-        if offset[label] < 0:
+        if offset[label] < 0 and may_enter(slam.guard, i, watch):
             offset[label] = n
             place(slam.point, slam, State(x, P, n, base, offset), k, label, data.z[i], work)
             insert_error(slam.error, x[:r], x[n : n + w], work.Jp)
@@ -84,16 +92,19 @@ def _insert_new(slam: Slam, state: State, data: Data, k: int, local: NamedTuple,
 
 @inner
 def _step(
-    slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple]
+    slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
 ) -> tuple[State, int, int, float]:
     """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, and the NIS."""
     predict(slam.update, slam, state, k, data.controls[k], local, work)
     m, nis = _find_known(data, k, state.offset, work), np.nan
+    code, m = screen(slam.guard, slam, state, data, k, m, local, work, watch)
+    if code > 0:
+        return state, code, 0, nis
     if m > 0:
         code, nis = correct(slam.update, slam, state, data, k, m, local, work)
         if code > 0:
             return state, code, 0, nis
-    state = _insert_new(slam, state, data, k, local, work)
+    state = _insert_new(slam, state, data, k, local, work, watch)
     return state, 0 if np.isfinite(state.x[: state.n].sum()) else NOT_FINITE, m, nis
 
 
@@ -197,6 +208,7 @@ def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
         np.full((n_landmarks, 3), np.nan),
         np.full((n_landmarks, 3, 3), np.nan),
         np.empty((0, 0)),
+        np.zeros(0, np.bool_),
     )
 
 
@@ -221,7 +233,7 @@ def _settle_new(labels: Indices, n: int, w: int, state: State, home: Indices) ->
         copy(state.offset, home)
         return state.n
     for label in labels:
-        if home[label] < 0:
+        if home[label] < 0 and state.offset[label] >= 0:  # a guard may have kept it out
             home[label] = n
             n += w
     return n
@@ -247,7 +259,11 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     own_memory, own_out = _make_memory(size, data.n_landmarks), _empty_outcome(T, r, data.n_landmarks)
     own_work = make_work(slam, size, _most_seen(data.first), T, data.n_landmarks)
     own_local = make_local(slam.covariance, r, w, size, T, data.n_landmarks)
+    own_watch = make_watch(
+        slam.guard, observed_width(slam.sensor), _most_seen(data.first), len(data.landmark), data.n_landmarks
+    )
     memory, work, local, out = lend(own_memory), lend(own_work), lend(own_local), lend(own_out)
+    watch = lend(own_watch)
     copy(data.start, memory.x[:r])
     whole = State(memory.x, memory.P, r, 0, memory.home)
     state = State(memory.x, memory.P, r, 0, memory.active)  # of a step: the whole, unless it has a base
@@ -255,7 +271,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     for k in range(T):
         labels = data.landmark[data.first[k] : data.first[k + 1]]
         whole, state = prepare(slam.covariance, slam, whole, state, labels, local)
-        state, code, m, nis = _step(slam, state, data, k, local, work)
+        state, code, m, nis = _step(slam, state, data, k, local, work, watch)
         if m > 0:
             out.nis[k], out.nis_dof[k] = nis, observed_width(slam.sensor) * m
         if code == 0:
@@ -272,10 +288,11 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
         settle(slam.covariance, slam, whole, state, local)
         _map(slam, whole, local, out.points, out.spread)
     joint = _joint(slam, whole, local) if code == 0 else np.empty((0, 0))
-    keep((own_slam, own_data, own_memory, own_work, own_local))
+    rejected = rejected_rows(slam.guard, own_watch)
+    keep((own_slam, own_data, own_memory, own_work, own_local, own_watch))
     return Outcome(
         own_out.pose, own_out.covariance, own_out.own, own_out.nis, own_out.nis_dof, step, code,
-        own_out.points, own_out.spread, joint,
+        own_out.points, own_out.spread, joint, rejected,
     )  # fmt: skip
 
 

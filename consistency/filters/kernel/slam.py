@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-from consistency.filters.kernel.dispatch import generic
+from consistency.filters.kernel.dispatch import generic, part
 from consistency.models.point import Mounting
 from consistency.types import Array, Indices
 
@@ -25,6 +25,11 @@ class Sensor(Protocol):
     def mount(self) -> Mounting: ...
 
 
+@part()
+class Open(NamedTuple):
+    """No guard: a filter is given all observations."""
+
+
 class Slam(NamedTuple):
     """The parts of a filter; the type of each chooses its code."""
 
@@ -35,6 +40,7 @@ class Slam(NamedTuple):
     point: NamedTuple
     update: NamedTuple
     covariance: NamedTuple
+    guard: NamedTuple = Open()
 
 
 class Data(NamedTuple):
@@ -349,6 +355,67 @@ def correct(
     raise NotImplementedError
 
 
+@generic()
+def foresee(
+    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
+) -> tuple[int, int]:
+    """Upper half of ``work.S`` (s m, s m) and a column of ``work.A`` <- innovation covariance and innovation.
+
+    They are those of an update in step k + 1 with the ``m`` landmarks that ``work`` lists, as the twin's ``Info`` has
+    them; the state stays as it is. Returns a code of REASONS, 0 where all is well, and the number of the column.
+    """
+    raise NotImplementedError
+
+
+# --- guard -----------------------------------------------------------------------------------------
+
+
+@generic()
+def make_watch(guard: NamedTuple, s: int, m: int, rows: int, n_landmarks: int) -> NamedTuple:
+    """What a guard keeps of a trial with so many ``rows`` of observations, up to ``m`` in a step; made once."""
+    raise NotImplementedError
+
+
+@generic()
+def screen(
+    guard: NamedTuple,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    local: NamedTuple,
+    work: NamedTuple,
+    watch: NamedTuple,
+) -> tuple[int, int]:
+    """``work`` lists, of the ``m`` known landmarks of step k + 1, those that the guard keeps; ``watch`` has the others.
+
+    Returns a code of REASONS, 0 where all is well, and how many are left.
+    """
+    raise NotImplementedError
+
+
+@generic()
+def keep_some(guard: NamedTuple, s: int, m: int, y: Array, S: Array, watch: NamedTuple) -> bool:
+    """``watch.kept`` (m,) <- which of ``m`` observations to keep, by innovation (s m,) and the upper half of S.
+
+    False where S is not positive definite.
+    """
+    raise NotImplementedError
+
+
+@generic()
+def may_enter(guard: NamedTuple, row: int, watch: NamedTuple) -> bool:
+    """Whether the observation in this row of the data may begin a landmark."""
+    raise NotImplementedError
+
+
+@generic()
+def rejected_rows(guard: NamedTuple, watch: NamedTuple) -> Array:
+    """Which rows of the data the filter was not given, (M,), or nothing, (0,), of a filter without a guard."""
+    raise NotImplementedError
+
+
 # --- upkeep of the covariance --------------------------------------------------------------------------
 
 
@@ -390,4 +457,10 @@ def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local
 @generic()
 def held_at(covariance: NamedTuple, label: int, local: NamedTuple) -> int:
     """Offset of the pose in whose frame a landmark is; 0 is the robot's."""
+    raise NotImplementedError
+
+
+@generic()
+def withhold(covariance: NamedTuple, data: Data, k: int, rejected: Array, local: NamedTuple) -> None:
+    """``local`` <- as if the rows of step k + 1 that are ``rejected`` (M,) had not been seen."""
     raise NotImplementedError

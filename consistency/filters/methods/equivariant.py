@@ -34,7 +34,17 @@ from consistency.filters import plain
 from consistency.filters.compiled import Compiled
 from consistency.filters.error.polar import Polar
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, whiten
+from consistency.filters.kernel.gain import (
+    add_noise,
+    apply,
+    combine_seen,
+    gather,
+    innovate,
+    leave_marginal,
+    linearise_seen,
+    marginal,
+    whiten,
+)
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.slam import (
@@ -43,6 +53,7 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     correct,
+    foresee,
     locate,
     make_room,
     measure_jacobian,
@@ -80,15 +91,38 @@ def correct_equivariant(
     work: Work[NoRoom],
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
+    _innovate_by_output(slam, state, data, k, m, work)
+    code, nis = whiten(slam, state, data, m, work)
+    if code == 0:
+        apply(slam, state, m, local, work)
+    return code, nis
+
+
+@implement(foresee, EquivariantOutput)
+def foresee_equivariant(
+    update: EquivariantOutput,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    local: Factors,
+    work: Work[NoRoom],
+) -> tuple[int, int]:
+    seen = marginal(slam, state, m, work)
+    _innovate_by_output(slam, seen, data, k, m, work)
+    add_noise(slam, seen, data, m, work)
+    return 0, leave_marginal(slam, m, work)
+
+
+@inner
+def _innovate_by_output(slam: Slam, state: State, data: Data, k: int, m: int, work: Work[NoRoom]) -> None:
+    """A <- C* P, S <- C* P C*' and the innovation of the ``m`` landmarks, from the rows of P in ``work``."""
     linearise_seen(slam, state, k, m, work)
     for i in range(m):
         _average(slam.sensor, data.z[work.known[i]], state.x[work.at[i] : work.at[i] + 3], work.Hl[i])
     combine_seen(slam, state, m, work)
     innovate(slam, state, data, m, work)
-    code, nis = whiten(slam, state, data, m, work)
-    if code == 0:
-        apply(slam, state, m, local, work)
-    return code, nis
 
 
 @inner

@@ -23,6 +23,7 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     correct,
+    foresee,
     landmark_width,
     make_room,
     observed_width,
@@ -32,7 +33,7 @@ from consistency.filters.kernel.slam import (
 from consistency.filters.kernel.work import Work
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
-from consistency.filters.update.joint import predict_by_error
+from consistency.filters.update.joint import foresee_linearised, predict_by_error
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Info
 
@@ -58,6 +59,7 @@ def iterated_room(update: Iterated, r: int, w: int, s: int, m: int, n: int) -> P
 
 
 implement(predict, Iterated)(predict_by_error)
+implement(foresee, Iterated)(foresee_linearised)
 
 
 @implement(correct, Iterated)

@@ -30,6 +30,7 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     correct,
+    foresee,
     landmark_width,
     make_room,
     predict,
@@ -92,6 +93,14 @@ def correct_by_iterated_points(
             state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
     apply(slam, state, m, local, work)
     return 0, first_nis
+
+
+@implement(foresee, IteratedPoints)
+def foresee_by_first_points(
+    update: IteratedPoints, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
+) -> tuple[int, int]:
+    """Innovation and S of the first pass, which are those of the unscented filter."""
+    return foresee(update.points, slam, state, data, k, m, local, work)
 
 
 @inner

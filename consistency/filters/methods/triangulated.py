@@ -33,7 +33,9 @@ from consistency.filters.kernel.gain import (
     divide_by_root,
     gather,
     innovate,
+    leave_marginal,
     linearise_seen,
+    marginal,
 )
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
@@ -43,6 +45,7 @@ from consistency.filters.kernel.slam import (
     State,
     Triple,
     correct,
+    foresee,
     locate,
     locate_jacobian,
     make_room,
@@ -132,6 +135,24 @@ def correct_with_noise_at_prediction(
     if code == 0:
         apply(slam, state, m, local, work)
     return code, nis
+
+
+@implement(foresee, NoiseAtPrediction)
+def foresee_with_noise_at_prediction(
+    update: NoiseAtPrediction,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    local: Factors,
+    work: Work[NoRoom],
+) -> tuple[int, int]:
+    seen = marginal(slam, state, m, work)
+    linearise_seen(slam, seen, k, m, work)
+    combine_seen(slam, seen, m, work)
+    _add_noise(update, data, m, innovate(slam, seen, data, m, work), work)
+    return 0, leave_marginal(slam, m, work)
 
 
 @inner

@@ -5,9 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, whiten
+from consistency.filters.kernel.gain import (
+    add_noise,
+    apply,
+    combine_seen,
+    gather,
+    innovate,
+    leave_marginal,
+    linearise_seen,
+    marginal,
+    whiten,
+)
 from consistency.filters.kernel.local_state import Factors
-from consistency.filters.kernel.slam import Data, Slam, State, correct, make_room, predict, propagate
+from consistency.filters.kernel.slam import Data, Slam, State, correct, foresee, make_room, predict, propagate
 from consistency.filters.kernel.work import Work
 from consistency.types import Array
 
@@ -47,3 +57,16 @@ def correct_joint(
     if code == 0:
         apply(slam, state, m, local, work)
     return code, nis
+
+
+@implement(foresee, Joint)
+def foresee_linearised(
+    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NamedTuple]
+) -> tuple[int, int]:
+    """Innovation and S with Jacobians at the prediction, which is also where an iterated update begins."""
+    seen = marginal(slam, state, m, work)
+    linearise_seen(slam, seen, k, m, work)
+    combine_seen(slam, seen, m, work)
+    innovate(slam, seen, data, m, work)
+    add_noise(slam, seen, data, m, work)
+    return 0, leave_marginal(slam, m, work)

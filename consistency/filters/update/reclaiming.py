@@ -11,7 +11,7 @@ from consistency.filters.kernel.covariance import gather_rows, replace_rows, sta
 from consistency.filters.kernel.dispatch import implement
 from consistency.filters.kernel.gain import apply_beyond, divide_by_root
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import Data, Frame, State, correct, robot_frame
+from consistency.filters.kernel.slam import Data, Frame, State, correct, foresee, robot_frame
 from consistency.filters.kernel.work import Work
 from consistency.filters.landmark.inverse_range import carried
 from consistency.filters.sensor.conversion import observe_range
@@ -43,27 +43,12 @@ def correct_converted(
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> tuple[int, float]:
-    room, width = work.room, state.n + state.base
-    in_doubt = _is_any_in_doubt(m, local, work)
-    chained = in_doubt and update.chain > 0
-    if chained:
-        recentre(state, local)
-    rho = work.at[0] + 2
-    waits = in_doubt and m == 1 and state.P[rho, rho] < (update.waiting * state.x[rho]) ** 2
-    clones, code = _gather(state, m, chained, local, work), 0
-    if chained:
-        code, chained = _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
-    if code == 0 and not chained and clones > 0 and update.passes > 1:
-        code, _ = _iterate(update, slam, state, data, m, clones, update.passes, False, local, work)
+    room, rho = work.room, work.at[0] + 2
+    waits = _is_any_in_doubt(m, local, work) and m == 1
+    waits = waits and state.P[rho, rho] < (update.waiting * state.x[rho]) ** 2
+    code, clones, chained, total = _aim(update, slam, state, data, m, local, work)
     if code > 0:
         return code, np.nan
-    if clones == 0 or update.passes == 1:
-        fill(room.delta[: 3 + 3 * (m + clones)], 0.0)
-        aim_apart(state, m, clones, local, room)
-        _expect(update, slam, state, data, True, m, clones, local, work)
-    if chained:
-        cast_state(state, m, clones, room)
-    total = _innovate(room.rows, width, room.at, m, work)
     code, nis = divide_by_root(state, 3 * m, work, total)
     if code == 0:
         _move(state, m, work)
@@ -77,6 +62,63 @@ def correct_converted(
             if room.clone[i] >= 0 and not waits:
                 _reclaim(slam, state, work.label[i], local, work)
     return code, nis
+
+
+@implement(foresee, Converting)
+def foresee_converted(
+    update: Converting,
+    slam: CentredSlam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    local: Clones,
+    work: Work[ConvertingRoom],
+) -> tuple[int, int]:
+    """As far as the update; a chain moves clones and covariance on its way, and they are put back."""
+    column = state.n + state.base
+    if not _is_any_in_doubt(m, local, work) or update.chain == 0:
+        return _aim(update, slam, state, data, m, local, work)[0], column
+    x, P, origin = state.x[: state.n].copy(), state.P[: state.n, : state.n].copy(), local.origin.copy()
+    code = _aim(update, slam, state, data, m, local, work)[0]
+    copy(x, state.x[: state.n])
+    copy_matrix(P, state.P[: state.n, : state.n])
+    copy_matrix(origin, local.origin)
+    return code, column
+
+
+@inner
+def _aim(
+    update: Converting,
+    slam: CentredSlam,
+    state: State,
+    data: Data,
+    m: int,
+    local: Clones,
+    work: Work[ConvertingRoom],
+) -> tuple[int, int, bool, float]:
+    """A, S and the innovation where the update leads, found by iteration where something was parked.
+
+    Returns a code of REASONS, how many clones are in it, whether in a chain, and a sum that is finite if all is.
+    """
+    room = work.room
+    chained = _is_any_in_doubt(m, local, work) and update.chain > 0
+    if chained:
+        recentre(state, local)
+    clones, code = _gather(state, m, chained, local, work), 0
+    if chained:
+        code, chained = _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
+    if code == 0 and not chained and clones > 0 and update.passes > 1:
+        code, _ = _iterate(update, slam, state, data, m, clones, update.passes, False, local, work)
+    if code > 0:
+        return code, clones, chained, np.nan
+    if clones == 0 or update.passes == 1:
+        fill(room.delta[: 3 + 3 * (m + clones)], 0.0)
+        aim_apart(state, m, clones, local, room)
+        _expect(update, slam, state, data, True, m, clones, local, work)
+    if chained:
+        cast_state(state, m, clones, room)
+    return 0, clones, chained, _innovate(room.rows, state.n + state.base, room.at, m, work)
 
 
 @inner

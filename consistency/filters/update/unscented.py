@@ -21,7 +21,7 @@ from consistency.filters.kernel.arrays import copy, fill
 from consistency.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
 from consistency.filters.kernel.covariance import definite_root, state_index
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.gain import POSE, apply, gather, innovate, whiten
+from consistency.filters.kernel.gain import POSE, add_noise, apply, gather, innovate, leave_marginal, marginal, whiten
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.linalg import semidefinite_cholesky
 from consistency.filters.kernel.local_state import Factors
@@ -33,6 +33,7 @@ from consistency.filters.kernel.slam import (
     add_motion_noise,
     carry_root,
     correct,
+    foresee,
     landmark_width,
     make_room,
     move,
@@ -142,6 +143,18 @@ def correct_unscented(
     if code == 0:
         apply(slam, state, m, local, work)
     return code, nis
+
+
+@implement(foresee, Unscented)
+def foresee_by_points(
+    update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
+) -> tuple[int, int]:
+    seen, code = marginal(slam, state, m, work), POSE
+    if innovate_by_points(update, slam, seen, m, work):
+        innovate(slam, seen, data, m, work)
+        add_noise(slam, seen, data, m, work)
+        code = 0
+    return code, leave_marginal(slam, m, work)
 
 
 @inner

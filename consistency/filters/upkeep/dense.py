@@ -6,9 +6,20 @@ from typing import NamedTuple
 
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.local_state import Factors, make_factors
-from consistency.filters.kernel.slam import Slam, State, append, held_at, make_local, prepare, settle, spare_width
+from consistency.filters.kernel.slam import (
+    Data,
+    Slam,
+    State,
+    append,
+    held_at,
+    make_local,
+    prepare,
+    settle,
+    spare_width,
+    withhold,
+)
 from consistency.filters.kernel.work import Work
-from consistency.types import Indices
+from consistency.types import Array, Indices
 
 
 @part()
@@ -49,3 +60,8 @@ def append_nothing(
 @implement(settle, Dense)
 def settle_nothing(covariance: Dense, slam: Slam, whole: State, state: State, local: Factors) -> None:
     """Nothing to do: every step has worked on the whole state."""
+
+
+@implement(withhold, Dense)
+def withhold_nothing(covariance: Dense, data: Data, k: int, rejected: Array, local: Factors) -> None:
+    """Nothing was noted of what is seen."""

@@ -31,6 +31,7 @@ from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors, make_factors
 from consistency.filters.kernel.slam import (
+    Data,
     Slam,
     State,
     append,
@@ -41,6 +42,7 @@ from consistency.filters.kernel.slam import (
     robot_width,
     settle,
     spare_width,
+    withhold,
 )
 from consistency.filters.kernel.work import Work
 from consistency.filters.upkeep.splitting import add_label, append_rows, join, start_rows, take_out, to_base, wake
@@ -231,3 +233,8 @@ def count_settling(whole: int, n: int, b: int, local: Factors) -> None:
     paid = tally[SPENT] + _settling(whole, n, b) < tally[DENSE]
     tally[LONG] = 0.0 if paid else max(4.0 * tally[LONG], PAUSE)
     tally[LEFT] = tally[LONG]
+
+
+@implement(withhold, Local)
+def withhold_nothing_local(covariance: Local, data: Data, k: int, rejected: Array, local: Factors) -> None:
+    """What is active is so whether it is used or not."""

@@ -18,7 +18,18 @@ from consistency.filters.kernel.covariance import gather_rows, replace_rows
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors, make_factors
-from consistency.filters.kernel.slam import Slam, State, append, held_at, make_local, prepare, settle, spare_width
+from consistency.filters.kernel.slam import (
+    Data,
+    Slam,
+    State,
+    append,
+    held_at,
+    make_local,
+    prepare,
+    settle,
+    spare_width,
+    withhold,
+)
 from consistency.filters.kernel.work import Work
 from consistency.filters.upkeep.local import LOCAL_FROM
 from consistency.filters.upkeep.splitting import add_label, append_rows, join, start_rows, take_out, to_base, wake
@@ -48,6 +59,8 @@ class Clones(NamedTuple):
 
     of: Indices  # (n_landmarks,) number of the clone at which each is parked, or -1
     seen: Indices  # (n_landmarks,) step at which each was seen last
+    earlier: Indices  # (n_landmarks,) and before that, of what is seen in this step
+    doubt: Indices  # (n_landmarks,) of that, 1 if its return is in doubt, 2 if it was seen in the last step, too
     at: Indices  # (clones,) offset of each clone in the whole state, 0 where it has none yet
     here: Indices  # (clones,) and in the variables of a step, 0 where it is in the passive rest
     uses: Indices  # (clones,) landmarks parked at each
@@ -77,6 +90,8 @@ def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landm
     c = max(n // (2 * w), 1) * w if is_local else r
     return Clones(
         np.full(n_landmarks, -1),
+        np.zeros(n_landmarks, np.int64),
+        np.zeros(n_landmarks, np.int64),
         np.zeros(n_landmarks, np.int64),
         np.zeros(most, np.int64),
         np.zeros(most, np.int64),
@@ -117,8 +132,30 @@ def prepare_parked(
         if _needs_whole(covariance, state, labels, local):
             state = _joined(slam, whole, state, local)
     for label in labels:
+        local.earlier[label] = local.seen[label]
         local.seen[label] = step + 1
     return whole, state
+
+
+@implement(withhold, Parking)
+def withhold_parked(covariance: Parking, data: Data, k: int, rejected: Array, local: Clones) -> None:
+    """What is rejected was not seen, and no return of it is in doubt."""
+    fill(local.doubted, 0)
+    local.new[0] = 0
+    for i in range(data.first[k], data.first[k + 1]):
+        label = data.landmark[i]
+        if rejected[i]:
+            local.seen[label] = local.earlier[label]
+        elif local.of[label] >= 0:
+            _note_doubt(label, local)
+
+
+@inner
+def _note_doubt(label: int, local: Clones) -> None:
+    number = local.of[label]
+    local.doubted[number] = max(local.doubted[number], local.doubt[label])
+    if local.doubt[label] == 1:
+        local.new[0] = 1
 
 
 @inner
@@ -140,12 +177,11 @@ def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clon
         number = local.of[label]
         if number >= 0:
             o = local.here[number] + 2
+            local.doubt[label] = 0
             if P[2, 2] + P[o, o] - 2.0 * P[2, o] > covariance.doubt:
                 any_doubted = True
-                if local.seen[label] == step:
-                    local.doubted[number] = 2
-                else:
-                    local.new[0], local.doubted[number] = 1, max(local.doubted[number], 1)
+                local.doubt[label] = 2 if local.seen[label] == step else 1
+                _note_doubt(label, local)
     return any_doubted and covariance.whole
 
 

@@ -1,0 +1,215 @@
+"""Guards: their decisions against brute force and literal updates, and kernels against the plain form over trials."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from mismatch import corrupted
+from scipy import stats
+
+import consistency as cs
+from consistency.filters.guard import deciding, joint
+from consistency.filters.guard.deciding import kept
+from consistency.filters.guard.parts import guard_part
+from consistency.filters.guard.settings import KINDS, limits_of
+from consistency.filters.kernel.slam import keep_some, make_watch
+from consistency.filters.stepping import step_through
+from consistency.scenario import GuardSettings
+from consistency.types import Array, Estimates
+
+Small = Callable[..., cs.Scenario]
+SETTINGS = GuardSettings(confidence=0.95, threshold=1.5)
+
+
+class Step:
+    """A linear step: m landmarks with s values each of a state that is common to them, some observations far off."""
+
+    def __init__(self, rng: np.random.Generator, m: int, s: int) -> None:
+        n = 3 + s * m
+        self.m, self.s, self.P = m, s, np.diag(rng.uniform(0.1, 1.0, n))
+        self.H = np.hstack([rng.normal(size=(s * m, 3)) * 3.0, np.eye(s * m)])
+        self.R = np.diag(rng.uniform(0.5, 2.0, s * m))
+        self.S = self.H @ self.P @ self.H.T + self.R
+        self.y = np.linalg.cholesky(self.S) @ rng.normal(size=s * m)
+        self.y += np.repeat(rng.random(m) < 0.4, s) * rng.normal(size=s * m) * 6.0
+
+    def rows(self, which: Any) -> Array:
+        return np.concatenate([np.arange(self.s * i, self.s * i + self.s) for i in which]).astype(int)
+
+    def after(self, which: Any) -> tuple[Array, Array]:
+        """Innovation and S of all after an update with some, by the Kalman filter's equations."""
+        rows = self.rows(which)
+        H, S = self.H[rows], self.S[np.ix_(rows, rows)]
+        K = self.P @ H.T @ np.linalg.inv(S)
+        P = self.P - K @ S @ K.T
+        return self.y - self.H @ (K @ self.y[rows]), self.H @ P @ self.H.T + self.R
+
+    def far(self, which: Any, y: Array, S: Array) -> float:
+        rows = self.rows(which)
+        return float(y[rows] @ np.linalg.inv(S[np.ix_(rows, rows)]) @ y[rows])
+
+    def passes(self, which: Any, y: Array, S: Array) -> bool:
+        return stats.chi2.cdf(self.far(which, y, S), self.s * len(which)) <= SETTINGS.confidence
+
+
+def by_gate(step: Step) -> list[int]:
+    return [i for i in range(step.m) if step.passes([i], step.y, step.S)]
+
+
+def by_subsets(step: Step) -> list[int]:
+    for size in range(len(by_gate(step)), 0, -1):
+        sets = [c for c in itertools.combinations(by_gate(step), size) if step.passes(c, step.y, step.S)]
+        if sets:
+            return sorted(min(sets, key=lambda c: step.far(c, step.y, step.S)))
+    return []
+
+
+def by_updates(step: Step) -> list[int]:
+    candidates = by_gate(step)
+    support = {
+        i: [j for j in candidates if j == i or step.far([j], *step.after([i])) <= SETTINGS.threshold**2]
+        for i in candidates
+    }
+    if not candidates:
+        return []
+    best = max(candidates, key=lambda i: (len(support[i]), -step.far([i], step.y, step.S)))
+    after = step.after(support[best])
+    rest = [j for j in candidates if j not in support[best]]
+    return sorted(support[best] + [j for j in rest if step.passes([j], *after)])
+
+
+ORACLES = {"gate": by_gate, "joint": by_subsets, "ransac": by_updates}
+
+
+def by_kernel(kind: str, step: Step) -> Array:
+    guard = guard_part(kind, SETTINGS, step.s, step.m)
+    watch: Any = make_watch(guard, step.s, step.m, step.m, step.m)
+    assert keep_some(guard, step.s, step.m, step.y, np.triu(step.S), watch)  # the upper half alone
+    return np.array(watch.kept)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_decisions_are_those_of_the_definitions(kind: str, rng: np.random.Generator) -> None:
+    sizes = set()
+    for _ in range(150):
+        step = Step(rng, int(rng.integers(1, 7)), int(rng.integers(2, 4)))
+        expected = ORACLES[kind](step)
+        limits = limits_of(SETTINGS, step.s, step.m)
+        assert np.flatnonzero(kept(kind, step.y, step.S, step.s, limits)).tolist() == expected
+        assert np.flatnonzero(by_kernel(kind, step)).tolist() == expected
+        sizes.add(step.m - len(expected))
+    assert {0, 1, 2} <= sizes  # cases in which something happened
+
+
+def test_kinds_differ(rng: np.random.Generator) -> None:
+    steps = [Step(rng, 6, 3) for _ in range(60)]
+    decisions = {kind: [tuple(ORACLES[kind](step)) for step in steps] for kind in KINDS}
+    assert decisions["gate"] != decisions["joint"] != decisions["ransac"] != decisions["gate"]
+
+
+@pytest.mark.parametrize("nodes", [1, 3, 7, 20])
+def test_a_search_that_is_cut_short_is_so_at_the_same_node(
+    nodes: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (deciding, joint):
+        monkeypatch.setattr(module, "MOST_NODES", nodes)
+    for _ in range(40):
+        step = Step(rng, 6, 3)
+        plain = kept("joint", step.y, step.S, 3, limits_of(SETTINGS, 3, 6))
+        assert plain.tolist() == by_kernel("joint", step).tolist()
+
+
+def test_a_gate_rejects_as_many_right_observations_as_it_says(rng: np.random.Generator) -> None:
+    """Independent draws; false-alarm rate 1e-6."""
+    y, settings = rng.normal(size=3 * 4000), GuardSettings(confidence=0.9)
+    rejected = ~np.concatenate(
+        [kept("gate", part, np.eye(12), 3, limits_of(settings, 3, 4)) for part in y.reshape(-1, 12)]
+    )
+    assert stats.binomtest(int(rejected.sum()), len(rejected), 0.1).pvalue > 1e-6
+    assert stats.binomtest(int(rejected.sum()), len(rejected), 0.15).pvalue < 1e-6  # negative control
+
+
+def test_a_covariance_that_is_not_definite_ends_the_run(rng: np.random.Generator) -> None:
+    step = Step(rng, 2, 3)
+    step.S[2, 2] = -1.0
+    guard = guard_part("gate", SETTINGS, 3, 2)
+    watch: Any = make_watch(guard, 3, 2, 2, 2)
+    assert not keep_some(guard, 3, 2, step.y, step.S, watch)
+    with pytest.raises(np.linalg.LinAlgError):
+        kept("gate", step.y, step.S, 3, limits_of(SETTINGS, 3, 2))
+
+
+# --- kernels -----------------------------------------------------------------------------------------
+
+TRACKS = {"min_age": 2, "forget_after": 3}
+NAMES = [
+    ("ekf-uvd+gate", "herath2007-stereo"), ("ekf-uvd+joint", "herath2007-stereo"),
+    ("ekf-uvd+ransac", "herath2007-stereo"), ("parked-ekf-uvd+gate", "herath2007-stereo"),
+]  # fmt: skip
+MORE = [
+    ("parked-ekf-uvd+joint", "herath2007-stereo"), ("parked-ekf-uvd+ransac", "herath2007-stereo"),
+    ("robocentric-ekf-uvd+gate", "herath2007-stereo"), ("ukf-uvd+ransac", "herath2007-stereo"),
+    ("iekf-uvd+gate", "herath2007-stereo"), ("ispkf-uvd+gate", "herath2007-stereo"),
+    ("eqf-uvd+gate", "herath2007-stereo"), ("ri-ekf-uvd+joint", "herath2007-stereo"),
+    ("fej-ekf-uvd+gate", "herath2007-stereo"), ("oc-ekf-uvd+gate", "herath2007-stereo"),
+    ("ideal-ekf-uvd+gate", "herath2007-stereo"), ("anchored-ekf-uvd+gate", "herath2007-stereo"),
+    ("debiased-ekf-xyz+gate", "herath2007-stereo"), ("ekf-xyz+gate", "herath2007-xyz"),
+    ("kf+gate", "linear-gaussian"), ("ekf-xy+joint", "esde-xy"), ("ekf-rb+gate", "range-bearing"),
+]  # fmt: skip
+
+
+def difference(a: Estimates, b: Estimates) -> float:
+    """Largest difference of poses (m, rad), of covariances and of NIS relative to their size."""
+    assert a.failure is None
+    assert b.failure is None
+    size = np.abs(b.covariance).max(axis=(1, 2), keepdims=True)
+    nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
+    return float(max(np.abs(a.pose - b.pose).max(), (np.abs(a.covariance - b.covariance) / size).max(), nis))
+
+
+def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
+    trial, filter_ = corrupted(cs.simulate(scenario, run=2), rng), cs.get_filter(name)
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    assert ours.filter == twin.filter == name
+    assert ours.rejected is not None
+    assert twin.rejected is not None
+    assert ours.rejected.tolist() == twin.rejected.tolist()
+    assert (ours.rejected & trial.spurious).any()
+    assert difference(ours, twin) < 1e-9
+    assert ours.nis_dof.tolist() == twin.nis_dof.tolist()
+    assert ours.map is not None
+    assert twin.map is not None
+    assert ours.map.landmarks.tolist() == twin.map.landmarks.tolist()
+    assert difference(filter_.run(cs.simulate(scenario, run=2), scenario.belief), twin) > 1e-6  # negative control
+
+
+def of_tracks(scenario: cs.Scenario) -> cs.Scenario:
+    """The world with rules on tracks in the belief."""
+    return scenario.variant("tracks", belief__guard=TRACKS)
+
+
+@pytest.mark.parametrize(("name", "world"), NAMES)
+def test_a_guarded_kernel_is_the_guarded_twin(small: Small, name: str, world: str, rng: np.random.Generator) -> None:
+    agree(name, small(world, truth__steps=200), rng)
+    agree(name, of_tracks(small(world, truth__steps=200)), rng)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "world"), MORE)
+def test_more_guarded_kernels_are_their_guarded_twins(
+    small: Small, name: str, world: str, rng: np.random.Generator
+) -> None:
+    agree(name, small(world, truth__steps=200), rng)
+    agree(name, of_tracks(small(world, truth__steps=200)), rng)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ekf-uvd+gate", "parked-ekf-uvd+joint"])
+def test_a_guarded_kernel_is_its_twin_while_it_updates_locally(
+    small: Small, name: str, rng: np.random.Generator
+) -> None:
+    agree(name, small("herath2007-stereo", truth__steps=500), rng)

@@ -210,7 +210,7 @@ def observed(
     """
     at = imaged(expected, sensor)
     at = np.where(np.isnan(at), z, at)
-    sigma = disparity_sigma(z[:, 2], sensor)
+    sigma = disparity_sigma((at if which.prediction else z)[:, 2], sensor)
     z, variance = z.copy(), np.tile(np.square(sensor.sigma), (len(z), 1))
     variance[:, 2] = np.square(sigma)
     if which.truncation:

@@ -25,12 +25,8 @@ from consistency.scenario.effects import BUILT_IN, BiasMap, DisparityGrowth, Lis
 from consistency.scenario.tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 
 PLANAR_SENSORS = ("relative-xy", "range-bearing")  # of landmarks in the plane, with two values each
-LEFT_OUT = (
-    "effects",
-    "disparity",
-    "disparity_growth",
-    "bias",
-)  # keys without which a sensor is as if they were unknown
+# without one of these keys a sensor is as if it were unknown
+LEFT_OUT = ("effects", "disparity", "disparity_growth", "bias")
 
 
 def _size(model: str | None) -> int:

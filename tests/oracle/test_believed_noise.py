@@ -23,9 +23,17 @@ from consistency.types import Array, Control, Estimates, Gaussian, Observation, 
 
 Small = Callable[..., cs.Scenario]
 NAMES = [name for name in MODULES if name.endswith(("-uvd", "-xyz"))]
-COMPILED = ["ekf-uvd", "ekf-xyz", "predicted-ekf-xyz", "parked-ekf-uvd", "ukf-uvd"]  # also as kernels
+COMPILED = [
+    "ekf-uvd",
+    "ekf-xyz",
+    "predicted-ekf-xyz",
+    "debiased-ekf-xyz",
+    "parked-ekf-uvd",
+    "ukf-uvd",
+]  # as kernels too
+PREDICTING = {"predicted-ekf-xyz", "debiased-ekf-xyz", "parked-ekf-uvd", "robocentric-ekf-uvd"}
+CASES = [*((name, False) for name in NAMES), *((name, True) for name in COMPILED)]
 GROWTH = {"disparity": [4.0, 8.0], "ratio": [0.5, 2.5]}
-ONE_SIGMA = "debiased-ekf-xyz"
 SHIFT = 0.75  # px, of every disparity, by which a search range moves
 MAP = {
     "u": [-150.0, 0.0, 150.0], "v": [-100.0, 100.0], "bias_u": [[1.0, 0.0, -1.5], [0.5, 0.0, 0.0]],
@@ -62,27 +70,38 @@ def believing(scenario: cs.Scenario, **changes: Any) -> cs.Scenario:
     return scenario.variant("other", **{f"belief__sensor__{key}": value for key, value in changes.items()})
 
 
-@pytest.mark.parametrize(("name", "kernel"), [*((n, False) for n in NAMES), *((n, True) for n in COMPILED)])
+@pytest.mark.parametrize(("name", "kernel"), CASES)
 def test_where_all_disparities_are_alike_a_growth_is_another_sigma(small: Small, name: str, kernel: bool) -> None:
-    """At the measured disparity: what is predicted differs from 6 px, where the ratio is 1.5."""
+    """At the measured disparity, except where a filter takes all its noise at the prediction, which is not 6 px."""
     scenario, trial = short(small)
     z = np.array(trial.z)
     z[:, 2] = 6.0
     trial, filter_ = replace(trial, z=z), filter_of(name, kernel)
     su, sv, sd = scenario.belief.sensor.sigma
-    if name == ONE_SIGMA:
-        with pytest.raises(
-            cs.InputError, match=r"leave out belief\.sensor\.disparity_growth, or take predicted-ekf-xyz"
-        ):
-            cs.get_filter(name).run(trial, believing(scenario, disparity_growth=GROWTH).belief)
-        return
     grown = run_filter(filter_, trial, believing(scenario, disparity_growth=GROWTH).belief)
     scaled = run_filter(filter_, trial, believing(scenario, sigma=(su, sv, 1.5 * sd)).belief)
-    assert same(grown, scaled, 1e-6)
+    assert same(grown, scaled, 1e-6) == (name not in PREDICTING)
     assert not same(grown, run_filter(filter_, trial, scenario.belief), 1e-3)  # negative control
 
 
-@pytest.mark.parametrize(("name", "kernel"), [*((n, False) for n in NAMES), *((n, True) for n in COMPILED)])
+@pytest.mark.parametrize(("name", "kernel"), [case for case in CASES if case[0] in PREDICTING | {"ekf-uvd"}])
+def test_filters_with_their_noise_at_the_prediction_take_the_growth_there(
+    small: Small, name: str, kernel: bool
+) -> None:
+    """One landmark is seen at 6 px, is expected near that in the next step, and is measured at 9 px."""
+    scenario, trial = short(small)
+    z = np.array([[10.0, 5.0, 6.0], [10.5, 5.0, 9.0]])
+    trial = replace(
+        trial, controls=trial.controls[:2], truth=trial.truth[:3], first=np.arange(3), landmark=np.zeros(2, int), z=z
+    )
+    filter_, (su, sv, sd) = filter_of(name, kernel), scenario.belief.sensor.sigma
+    plateau = {"disparity": [4.9, 5.0, 7.0, 7.1], "ratio": [0.5, 1.5, 1.5, 0.5]}
+    grown = run_filter(filter_, trial, believing(scenario, disparity_growth=plateau).belief)
+    scaled = run_filter(filter_, trial, believing(scenario, sigma=(su, sv, 1.5 * sd)).belief)
+    assert same(grown, scaled, 1e-9) == (name in PREDICTING)
+
+
+@pytest.mark.parametrize(("name", "kernel"), CASES)
 def test_a_believed_bias_is_subtracted_before_anything_else(small: Small, name: str, kernel: bool) -> None:
     scenario, trial = short(small)
     filter_ = filter_of(name, kernel)

@@ -102,6 +102,16 @@ def test_the_matcher_takes_one_edge_or_the_other(share: float) -> None:
     assert np.all(edges.by_far == (share == 1.0))
 
 
+@pytest.mark.parametrize(("x", "seen"), [(3.0, True), (1.0, False)])
+def test_the_far_edge_must_be_behind_the_near_one(x: float, seen: bool) -> None:
+    _, effect, context = world_of()
+    edges = Crossings(np.array([[2.0, 0.0, 0.2]]), np.array([[x, 0.0, 0.3]]), np.array([[0.0, 1.0]]), np.zeros(1, bool))
+    standing = Context(context.sensor, context.landmarks, np.zeros((3, 3)), np.zeros((3, 3)))
+    z, observed = effect._seen(edges, standing)
+    assert observed.tolist() == [[seen], [seen]]
+    assert np.allclose(z[:, 0], [0.0, -150.0 * 0.3 / x, 150.0 * 0.09 / 2.0])
+
+
 def test_edges_are_drawn_as_a_world_is() -> None:
     """From their own seed, and as far behind each other as the scenario says."""
     _, effect, context = world_of()

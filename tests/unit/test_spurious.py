@@ -16,7 +16,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.scenario import data_folder
-from consistency.scenario.effects import Observations
+from consistency.scenario.effects import Drift, Observations
+from consistency.simulation import World
 from consistency.types import Array, Trial
 
 ALARM = 1e-6
@@ -161,7 +162,7 @@ def test_a_mismatch_that_is_swapped_is_still_of_no_landmark() -> None:
     assert np.all(trial.source == -1)
 
 
-@pytest.mark.parametrize(("rate", "speed"), [(0.03, 2.0), (0.2, 15.0)])
+@pytest.mark.parametrize(("rate", "speed"), [(0.03, 2.0), (0.2, 15.0), (1.0, 0.001)])
 def test_a_drifting_track_slides_until_it_ends_or_leaves_the_image(rate: float, speed: float) -> None:
     plain, trial = pair({"kind": "drift", "rate": rate, "speed_px": speed})
     at = {key: row for row, key in enumerate(zip(steps_of(trial), trial.landmark, strict=True))}
@@ -195,6 +196,18 @@ def test_a_drifting_track_slides_until_it_ends_or_leaves_the_image(rate: float, 
     assert as_often(begun, could, rate)
     assert is_like(np.array(angles), stats.uniform(-np.pi, 2.0 * np.pi))
     assert left > 0 or speed < 10.0
+
+
+def test_a_track_that_has_slid_out_of_the_image_does_not_come_back() -> None:
+    """Until it is a new track: after a gap of the landmark."""
+    world = World(cs.load_scenario("herath2007-stereo").truth)
+    u = np.array([158.0, 162.0, 155.0, 150.0])
+    z = np.column_stack([u, np.zeros(4), np.full(4, 5.0)])
+    observations = Observations(np.array([1, 2, 3, 5]), np.zeros(4, int), z, 120)
+    drift = Drift(rate=1.0, speed=1e-6)
+    kept = drift.apply(observations, np.random.default_rng(0), world.context(world.reference))
+    assert kept.step.tolist() == [1, 5]
+    assert kept.sources.tolist() == [-1, -1]
 
 
 # --- mistakes -------------------------------------------------------------------------------------------------

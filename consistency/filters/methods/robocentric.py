@@ -55,6 +55,7 @@ from consistency.filters.landmark.inverse_range import InverseRange
 from consistency.filters.parts import motion_of, sensor_of
 from consistency.filters.plain_sensors import bias_at, variance_at
 from consistency.filters.sensor.conversion import Pixels
+from consistency.filters.sensor.growth import growth_of
 from consistency.filters.update import reclaiming  # noqa: F401, registers the update
 from consistency.filters.update.converting import Converted, Converting
 from consistency.filters.upkeep.parking import Parking
@@ -386,8 +387,10 @@ def compiled(twin: RobotCentredKalman) -> Compiled:
     def parts(problem: Problem, controls: Array) -> Slam:
         sensor = problem.belief.sensor
         low, high = searched(sensor, twin.name) if which.truncation else (0.0, 0.0)
-        su, sv, _ = sensor.sigma
-        pixels = Pixels(su, sv, low, high, which.truncation, which.debiasing, which.prediction)
+        su, sv, sd = sensor.sigma
+        pixels = Pixels(
+            su, sv, sd, growth_of(sensor), low, high, which.truncation, which.debiasing, which.prediction
+        )  # fmt: skip
         every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
         doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if which.parking else 0
         chain = PASSES_CHAINED if which.turning else 0

@@ -23,7 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.errors import InputError
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled
 from consistency.filters.kernel.dispatch import implement, part
@@ -58,7 +57,8 @@ from consistency.filters.kernel.slam import (
 from consistency.filters.kernel.work import Work
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
-from consistency.filters.plain_sensors import point_noise, variance_at
+from consistency.filters.plain_sensors import disparity_sigma, point_noise, variance_at
+from consistency.filters.sensor.growth import Growth, growth_of, ratio_at
 from consistency.filters.sensor.xyz import (
     locate_xyz_jacobian,
     measure_xyz,
@@ -70,15 +70,19 @@ from consistency.filters.update.joint import NoRoom, joint_room, predict_by_erro
 from consistency.models import stereo
 from consistency.models.point import Mounting
 from consistency.protocols import Problem
-from consistency.scenario import BelievedSensor
 from consistency.types import Array, Control, Info
 
 
 @part()
 class DebiasedXyz(NamedTuple):
-    """Disparity noise over disparity at a depth of 1 m, which grows with the depth, and where the sensor is mounted."""
+    """Disparity noise over disparity at a depth of 1 m, which grows with the depth, and where the sensor is mounted.
+
+    ``growth`` is that of the noise with the disparity, and ``fB`` the disparity at 1 m, px.
+    """
 
     rho: float
+    growth: Growth
+    fB: float
     mount: Mounting
 
 
@@ -92,7 +96,7 @@ implement(locate_jacobian, DebiasedXyz)(locate_xyz_jacobian)  # the bias is take
 @implement(locate, DebiasedXyz)
 def locate_debiased(sensor: DebiasedXyz, z: Array) -> Triple:
     """The point without its bias."""
-    rho = sensor.rho * z[0]
+    rho = sensor.rho * ratio_at(sensor.growth, sensor.fB / z[0]) * z[0]
     share = 1.0 / (1.0 + rho * rho)
     return share * z[0], share * z[1], share * z[2]
 
@@ -101,7 +105,7 @@ def locate_debiased(sensor: DebiasedXyz, z: Array) -> Triple:
 class NoiseAtPrediction(NamedTuple):
     """Focal length in px, baseline in m, standard deviations in px, and the rho at 1 m whose bias is subtracted.
 
-    ``sd`` is 0 where each observation has its own.
+    ``growth`` is that of sd and rho with the disparity.
     """
 
     f: float
@@ -110,6 +114,7 @@ class NoiseAtPrediction(NamedTuple):
     sv: float
     sd: float
     rho: float
+    growth: Growth
 
 
 implement(make_room, NoiseAtPrediction)(joint_room)
@@ -158,18 +163,16 @@ def foresee_with_noise_at_prediction(
 @inner
 def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Work[NoRoom]) -> float:
     """y (3 m,) <- y - bias, S (3 m, 3 m) <- S + R; returns a sum that is finite if all that is given is."""
-    total, rows, of_d = 0.0, 3 * m, noise.sd**2
+    total, rows = 0.0, 3 * m
     for i in range(m):
         first = 3 * i
-        if noise.sd == 0.0:
-            # depth x = f B / d was measured with the variance (x^2 / (f B))^2 sigma_d^2
-            of_d = data.R[work.known[i], 0, 0] * (noise.f * noise.B / data.z[work.known[i], 0] ** 2) ** 2
-        variance = (noise.su**2, noise.sv**2, of_d)
         p = work.zhat[first : first + 3]
         if p[0] > 0.0:
             u, v, d = stereo.project(p[0], p[1], p[2], noise.f, noise.B)
             J = stereo.triangulate_jacobian(u, v, d, noise.f, noise.B)
-            share = (noise.rho * p[0]) ** 2
+            ratio = ratio_at(noise.growth, d)
+            variance = (noise.su**2, noise.sv**2, (noise.sd * ratio) ** 2)
+            share = (noise.rho * ratio * p[0]) ** 2
             for a in range(3):
                 y[first + a] -= share * p[a]
                 for b in range(3):
@@ -191,11 +194,6 @@ class TriangulatedKalman(plain.WorldPointTwin):
         super().__init__(name, uvd=False)
         self.debiasing = debiasing
 
-    def init(self, problem: Problem) -> SlamState:
-        if self.debiasing:
-            _require_one_sigma(problem.belief.sensor, self.name)
-        return super().init(problem)
-
     def predict(self, state: SlamState, control: Control) -> SlamState:
         return plain.predict_extended(state, control)
 
@@ -206,8 +204,7 @@ class TriangulatedKalman(plain.WorldPointTwin):
         front = expected[:, 0] > 0.0
         x, y, up = expected[front].T
         pixels = np.column_stack(stereo.project(x, y, up, sensor.f or 0.0, sensor.B or 0.0))
-        measured = np.column_stack(stereo.project(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0))
-        R[front] = point_noise(pixels, variance_at(measured[front], sensor), sensor)
+        R[front] = point_noise(pixels, variance_at(pixels, sensor), sensor)
         bias = np.where(front, self._bias_ratio(state, expected[:, 0]), 0.0)[:, None] * expected
         innovation = z.ravel() - zhat - bias.ravel()
         S, W = plain.gain(state.P, H, plain.block_diagonal(R))
@@ -219,44 +216,30 @@ class TriangulatedKalman(plain.WorldPointTwin):
     def _bias_ratio(self, state: SlamState, x: Array) -> Array:
         """Square of the disparity's noise over the disparity of points at depths ``x``, m, or 0."""
         sensor = state.problem.belief.sensor
-        rho = sensor.sigma[2] * x / ((sensor.f or 0.0) * (sensor.B or 0.0))
+        fB = (sensor.f or 0.0) * (sensor.B or 0.0)
+        with np.errstate(divide="ignore"):
+            rho = disparity_sigma(fB / x, sensor) * x / fB
         return np.square(rho) if self.debiasing else np.zeros_like(rho)
-
-
-def _require_one_sigma(sensor: BelievedSensor, name: str) -> None:
-    """Refuse a noise that differs between disparities: the bias of a new landmark is that of one sigma.
-
-    Raises
-    ------
-    InputError
-        The belief holds such a noise.
-    """
-    if sensor.disparity_growth is not None:
-        raise InputError(
-            f"filter '{name}' subtracts a bias that holds for one sigma of all disparities; leave out "
-            "belief.sensor.disparity_growth, or take predicted-ekf-xyz"
-        )
 
 
 def predicted_parts(problem: Problem, controls: Array) -> Slam:
     """Parts of ``predicted-ekf-xyz``."""
     sensor = problem.belief.sensor
     su, sv, sd = sensor.sigma
-    if sensor.disparity_growth is not None:
-        sd = 0.0
-    noise = NoiseAtPrediction(sensor.f or 0.0, sensor.B or 0.0, su, sv, sd, rho=0.0)
+    noise = NoiseAtPrediction(sensor.f or 0.0, sensor.B or 0.0, su, sv, sd, 0.0, growth_of(sensor))
     return ekf.xyz_parts(problem, controls)._replace(update=noise)
 
 
 def debiased_parts(problem: Problem, controls: Array) -> Slam:
     """Parts of ``debiased-ekf-xyz``."""
     sensor = problem.belief.sensor
-    _require_one_sigma(sensor, "debiased-ekf-xyz")
     f, B = sensor.f or 0.0, sensor.B or 0.0
     su, sv, sd = sensor.sigma
     rho = sd / (f * B)
-    noise = NoiseAtPrediction(f, B, su, sv, sd, rho)
-    return ekf.xyz_parts(problem, controls)._replace(sensor=DebiasedXyz(rho, sensor.mount.packed()), update=noise)
+    growth = growth_of(sensor)
+    noise = NoiseAtPrediction(f, B, su, sv, sd, rho, growth)
+    part_ = DebiasedXyz(rho, growth, f * B, sensor.mount.packed())
+    return ekf.xyz_parts(problem, controls)._replace(sensor=part_, update=noise)
 
 
 PREDICTED = Compiled(

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.filters.kernel.jit import inner
+from consistency.filters.sensor.growth import Growth, ratio_at
 from consistency.filters.sensor.uvd import Uvd
 from consistency.types import Array
 
@@ -16,10 +17,12 @@ BEYOND = 4.0  # standard deviations outside the search range at which a predicte
 
 
 class Pixels(NamedTuple):
-    """Standard deviations of u and v in px, the search range in px, and which corrections are made."""
+    """Standard deviations in px, the search range in px, and which corrections are made."""
 
     su: float
     sv: float
+    sd: float
+    growth: Growth  # of sd, with the disparity
     low: float
     high: float
     truncation: bool
@@ -93,7 +96,7 @@ def observe_range(
 ) -> None:
     """``y`` (3,) <- the observation z where ``expected`` (3,) is predicted, ``R`` (3, 3) <- its noise.
 
-    ``of_d`` is the variance of its disparity in px^2, and ``shift`` the bias that was subtracted from it.
+    ``of_d`` is the variance of its disparity in px^2 where it was measured, ``shift`` the bias that was subtracted.
     """
     ca, ce = np.cos(expected[0]), np.cos(expected[1])
     u, v, d, measured, variance = z[0], z[1], z[2], z[2], of_d
@@ -101,8 +104,11 @@ def observe_range(
         u = -sensor.f * np.sin(expected[0]) / ca
         v = -sensor.f * np.sin(expected[1]) / (ce * ca)
         d = expected[2] * sensor.f * sensor.B / (ce * ca)
+    if pixels.prediction:
+        sigma = pixels.sd * ratio_at(pixels.growth, d)
+        variance = sigma * sigma
     if pixels.truncation:
-        measured, variance = untruncated(pixels.low - shift, pixels.high - shift, math.sqrt(of_d), measured, d)
+        measured, variance = untruncated(pixels.low - shift, pixels.high - shift, math.sqrt(variance), measured, d)
     if not pixels.prediction:
         u, v, d = z[0], z[1], measured
     convert(sensor, z[0], z[1], measured, y)

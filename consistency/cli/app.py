@@ -430,7 +430,7 @@ def report(
 def reproduce(
     only: Annotated[list[str] | None, typer.Option("--only", help="Only this finding; may be repeated.")] = None,
     long: Annotated[
-        bool, typer.Option("--all", help="Also experiments that take long; so far there are none.")
+        bool, typer.Option("--all", help="Also experiments that take from minutes to hours.")
     ] = False,
     runs: Runs = 50,
     seed: Seed = 0,

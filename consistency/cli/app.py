@@ -433,10 +433,10 @@ def report(
 
 @app.command()
 def reproduce(
-    only: Annotated[list[str] | None, typer.Option("--only", help="Only this finding; may be repeated.")] = None,
-    long: Annotated[
-        bool, typer.Option("--all", help="Also experiments that take long; so far there are none.")
-    ] = False,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Only this finding or experiment; may be repeated.")
+    ] = None,
+    long: Annotated[bool, typer.Option("--all", help="Also experiments that take from minutes to hours.")] = False,
     runs: Runs = 50,
     seed: Seed = 0,
     jobs: Jobs = -1,

@@ -163,7 +163,7 @@ def reproduce(
 
     Parameters
     ----------
-    only : ids of the findings wanted; None or empty for all
+    only : ids of the findings wanted, or names of scripts for all of theirs; None or empty for all
     runs, seed, jobs : as in :func:`consistency.run_trials`
     out, overwrite : folder to write, and whether it may exist
     long : also experiments that take long; one that is named in ``only`` runs anyway
@@ -173,12 +173,19 @@ def reproduce(
     InputError
         An unknown id, a number out of range, or an output folder that cannot be written.
     """
-    selection = _selection(experiments(), only or (), long)
+    scripts = experiments()
+    only = _without_scripts(scripts, only or ())
+    selection = _selection(scripts, only, long)
     require_free(out, overwrite, "findings")
-    study, started = Study(runs, seed, jobs, only=only or ()), time.monotonic()
+    study, started = Study(runs, seed, jobs, only=only), time.monotonic()
     findings = _findings_of(study, selection)
     study.write(out, findings, time.monotonic() - started, overwrite)
     return findings
+
+
+def _without_scripts(scripts: Mapping[str, ModuleType], only: Sequence[str]) -> list[str]:
+    """The ids in ``only``, those of a script's findings in place of its name."""
+    return [finding for name in only for finding in (scripts[name].FINDINGS if name in scripts else (name,))]
 
 
 def _selection(
@@ -187,7 +194,7 @@ def _selection(
     """The scripts to run, in order, each with the ids of its findings that are wanted."""
     known = [finding for module in scripts.values() for finding in module.FINDINGS]
     if unknown := [name for name in only if name not in known]:
-        raise InputError(f"--only {unknown[0]}: no such finding; known: {', '.join(known)}")
+        raise InputError(f"--only {unknown[0]}: no such finding or experiment; known: {', '.join([*known, *scripts])}")
     pairs = [
         (module, [name for name in module.FINDINGS if not only or name in only])
         for module in scripts.values()

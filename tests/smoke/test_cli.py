@@ -126,7 +126,7 @@ BAD = {
     "truncated Parquet": (("run", "--log", "cut", *RUN[2:]), "observations.parquet: cannot be read"),
     "NaN in a log": (("run", "--log", "nan", *RUN[2:]), "column 'z1', row 7"),
     "no such results": (("analyse", "nowhere"), "no such folder"),
-    "no such finding": (("reproduce", "--only", "fig99", "--out", "o"), "no such finding"),
+    "no such finding": (("reproduce", "--only", "fig99", "--out", "o"), "no such finding or experiment"),
     "unknown command": (("judge",), "judge"),
 }  # fmt: skip
 

@@ -73,6 +73,8 @@ def test_the_same_findings_with_any_number_of_workers(scripts: Path, tmp_path: P
     ("only", "long", "expected"),
     [
         (None, False, ["one", "uno", "two", "four"]),
+        (["e03_script", "uno"], False, ["uno", "three"]),
+        (["e01_script"], False, ["one", "uno"]),
         (None, True, ["one", "uno", "two", "three", "four"]),
         (["three"], False, ["three"]),
         (["four", "uno"], False, ["uno", "four"]),

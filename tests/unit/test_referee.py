@@ -647,8 +647,8 @@ def one_axis(case: Case, rng: np.random.Generator) -> Case:
 
 
 def axes_that_cancel(case: Case, rng: np.random.Generator) -> Case:
-    """Heading too small by 2, x and y too large by 2: the NEES is right in the mean."""
-    case["w"] *= np.sqrt([0.5, 0.5, 2.0])
+    """x and y too large by 4, heading too small by 2.5: the NEES is right in the mean."""
+    case["w"] *= np.sqrt([0.25, 0.25, 2.5])
     return case
 
 
@@ -668,7 +668,7 @@ FAULTS: list[tuple[Callable[[Case, np.random.Generator], Case], str, tuple[str, 
     (wrong_for_a_moment, "scale in some step", OVER, " in step 18"),
     (one_run_lost, "outliers", HEAVY, "run 7 lies "),
     (one_axis, "scale of an axis", OVER, "heading"),
-    (axes_that_cancel, "scale of an axis", (*WRONG, *OVER), "covariance "),
+    (axes_that_cancel, "scale of an axis", (*WRONG, *OVER, *UNDER), "covariance "),
 ]
 
 

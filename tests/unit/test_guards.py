@@ -179,9 +179,10 @@ def test_a_young_track_neither_begins_a_landmark_nor_updates_one() -> None:
 
 def test_a_landmark_whose_observations_are_rejected_is_given_up() -> None:
     far = {1: 9.0}
-    steps = [{1: 0.0}, far, {1: 0.0}, far, far, {1: 0.0}]
-    assert given(Guarded(Counter(), "gate"), steps, GuardSettings(forget_after=2))[2:] == [(1,), (), (), ()]
-    assert given(Guarded(Counter(), "gate"), steps)[2:] == [(1,), (), (), (1,)]  # never, by default
+    steps = [{1: 0.0}, far, {1: 0.0}, far, {1: 0.0}, far, far, {1: 0.0}]
+    expected = [(1,), (), (1,), (), (1,), (), ()]
+    assert given(Guarded(Counter(), "gate"), steps, GuardSettings(forget_after=2)) == [*expected, ()]
+    assert given(Guarded(Counter(), "gate"), steps) == [*expected, (1,)]  # never, by default
 
 
 def test_a_filter_without_innovations_ends_as_a_failed_run(uvd: cs.Scenario) -> None:
@@ -249,6 +250,13 @@ def test_of_like_clusters_the_interval_is_the_exact_binomial_one() -> None:
     exact = stats.binomtest(3000, 12000).proportion_ci(method="exact")
     assert value == 0.25
     assert np.allclose((low, high), exact, rtol=0, atol=2e-5)
+
+
+def test_few_clusters_widen_the_interval() -> None:
+    """Ten draws of one each, half of them counted: a design effect of 10 / 9, and so 9 draws that count."""
+    value, low, high = clustered_share(np.arange(10) % 2, np.ones(10))
+    assert value == 0.5
+    assert np.allclose((low, high), (stats.beta.ppf(0.025, 4.5, 5.5), stats.beta.ppf(0.975, 5.5, 4.5)), rtol=1e-9)
 
 
 def test_the_interval_covers_a_share_that_differs_between_runs(rng: np.random.Generator) -> None:

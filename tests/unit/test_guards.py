@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,11 @@ from consistency.cli.app import app
 from consistency.diagnostics import clustered_share, rejection_score
 from consistency.filters.guard.guarded import Guarded
 from consistency.filters.stepping import optimal_gain, run_filter, step_through
+from consistency.reporting import write_reports
+from consistency.reporting.blocks import Name, Table
+from consistency.reporting.build import build_report
+from consistency.reporting.sections import rejections
+from consistency.reporting.wording import brief
 from consistency.runs.montecarlo import run_log, simulate_log
 from consistency.scenario import GuardSettings
 from consistency.scenario.effects import EFFECTS
@@ -348,6 +354,24 @@ def test_verdicts_tell_precision_and_recall(
     out = capsys.readouterr().out
     assert f"ekf-uvd+gate rejected {score.rejected} of {score.offered} observations, {score.spurious}" in out
     assert "precision" in str(verdicts["ekf-uvd+gate"])
+
+
+def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -> None:
+    cs.run_trials(wrong, FILTERS, runs=3, seed=1, jobs=1, out=tmp_path / "out")
+    study = build_report(tmp_path / "out").studies[0]
+    _, table = rejections.SECTION.blocks(study)
+    assert isinstance(table, Table)
+    ((_, (row,)),) = table.groups
+    score = study.tracks[1].verdict.rejection
+    assert score is not None
+    assert row[:4] == (
+        Name("ekf-uvd+gate", study.tracks[1].look), str(score.offered), str(score.spurious), str(score.rejected)
+    )  # fmt: skip
+    shares = (score.precision, score.recall, score.false_alarms)
+    assert [str(cell).partition(" ")[0] for cell in row[4:]] == [brief(100 * share.value) for share in shares]
+    write_reports(tmp_path / "out", tmp_path / "r.html", None, False)
+    assert "Rejected observations" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert rejections.SECTION.blocks(replace(study, tracks=study.tracks[:1])) == ()
 
 
 def test_a_clean_world_has_a_share_of_rejections_alone(uvd: cs.Scenario) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,11 @@ from consistency.cli.app import app
 from consistency.diagnostics import clustered_share, rejection_score
 from consistency.filters.guard.guarded import Guarded
 from consistency.filters.stepping import optimal_gain, run_filter, step_through
+from consistency.reporting import write_reports
+from consistency.reporting.blocks import Name, Table
+from consistency.reporting.build import build_report
+from consistency.reporting.sections import rejections
+from consistency.reporting.wording import brief
 from consistency.runs.montecarlo import run_log, simulate_log
 from consistency.scenario import GuardSettings
 from consistency.scenario.effects import EFFECTS
@@ -179,9 +185,10 @@ def test_a_young_track_neither_begins_a_landmark_nor_updates_one() -> None:
 
 def test_a_landmark_whose_observations_are_rejected_is_given_up() -> None:
     far = {1: 9.0}
-    steps = [{1: 0.0}, far, {1: 0.0}, far, far, {1: 0.0}]
-    assert given(Guarded(Counter(), "gate"), steps, GuardSettings(forget_after=2))[2:] == [(1,), (), (), ()]
-    assert given(Guarded(Counter(), "gate"), steps)[2:] == [(1,), (), (), (1,)]  # never, by default
+    steps = [{1: 0.0}, far, {1: 0.0}, far, {1: 0.0}, far, far, {1: 0.0}]
+    expected = [(1,), (), (1,), (), (1,), (), ()]
+    assert given(Guarded(Counter(), "gate"), steps, GuardSettings(forget_after=2)) == [*expected, ()]
+    assert given(Guarded(Counter(), "gate"), steps) == [*expected, (1,)]  # never, by default
 
 
 def test_a_filter_without_innovations_ends_as_a_failed_run(uvd: cs.Scenario) -> None:
@@ -207,12 +214,20 @@ def test_a_filter_of_ones_own_is_guarded_like_one_of_the_bench(wrong: cs.Scenari
     assert np.abs(ours.pose - compiled.pose).max() < 1e-10
 
 
-def test_small_maps_are_guarded_too(wrong: cs.Scenario, rng: np.random.Generator) -> None:
-    trial = cs.simulate(wrong)
-    said = step_through(cs.get_filter("submap-ekf-uvd+gate"), trial, wrong.belief)
-    assert said.failure is None
-    assert said.rejected is not None
-    assert (said.rejected & trial.spurious).sum() > 0.5 * said.rejected.sum() > 0
+def test_small_maps_are_guarded_too(wrong: cs.Scenario) -> None:
+    """The first small map is the EKF's; to a new one a landmark is new, and its observation cannot be judged."""
+    trial = cs.simulate(wrong, run=1)
+    small, whole = (
+        step_through(cs.guarded(getattr(filter_, "twin", filter_), "gate"), trial, wrong.belief)
+        for filter_ in map(cs.get_filter, ("submap-ekf-uvd", "ekf-uvd"))
+    )
+    assert small.failure is None
+    assert small.rejected is not None
+    assert whole.rejected is not None
+    joined = trial.first[50]
+    assert small.rejected[:joined].tolist() == whole.rejected[:joined].tolist()
+    assert small.rejected[:joined].any()
+    assert not small.rejected[joined : trial.first[51]].any()
 
 
 def test_an_unguarded_filter_says_nothing_of_rejection(uvd: cs.Scenario) -> None:
@@ -249,6 +264,13 @@ def test_of_like_clusters_the_interval_is_the_exact_binomial_one() -> None:
     exact = stats.binomtest(3000, 12000).proportion_ci(method="exact")
     assert value == 0.25
     assert np.allclose((low, high), exact, rtol=0, atol=2e-5)
+
+
+def test_few_clusters_widen_the_interval() -> None:
+    """Ten draws of one each, half of them counted: a design effect of 10 / 9, and so 9 draws that count."""
+    value, low, high = clustered_share(np.arange(10) % 2, np.ones(10))
+    assert value == 0.5
+    assert np.allclose((low, high), (stats.beta.ppf(0.025, 4.5, 5.5), stats.beta.ppf(0.975, 5.5, 4.5)), rtol=1e-9)
 
 
 def test_the_interval_covers_a_share_that_differs_between_runs(rng: np.random.Generator) -> None:
@@ -332,6 +354,24 @@ def test_verdicts_tell_precision_and_recall(
     out = capsys.readouterr().out
     assert f"ekf-uvd+gate rejected {score.rejected} of {score.offered} observations, {score.spurious}" in out
     assert "precision" in str(verdicts["ekf-uvd+gate"])
+
+
+def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -> None:
+    cs.run_trials(wrong, FILTERS, runs=3, seed=1, jobs=1, out=tmp_path / "out")
+    study = build_report(tmp_path / "out").studies[0]
+    _, table = rejections.SECTION.blocks(study)
+    assert isinstance(table, Table)
+    ((_, (row,)),) = table.groups
+    score = study.tracks[1].verdict.rejection
+    assert score is not None
+    assert row[:4] == (
+        Name("ekf-uvd+gate", study.tracks[1].look), str(score.offered), str(score.spurious), str(score.rejected)
+    )  # fmt: skip
+    shares = (score.precision, score.recall, score.false_alarms)
+    assert [str(cell).partition(" ")[0] for cell in row[4:]] == [brief(100 * share.value) for share in shares]
+    write_reports(tmp_path / "out", tmp_path / "r.html", None, False)
+    assert "Rejected observations" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert rejections.SECTION.blocks(replace(study, tracks=study.tracks[:1])) == ()
 
 
 def test_a_clean_world_has_a_share_of_rejections_alone(uvd: cs.Scenario) -> None:

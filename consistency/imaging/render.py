@@ -16,6 +16,7 @@ from consistency.types import Array
 
 BLUR = 0.7  # px, sd of the point spread: it leaves 9 % at half the sampling rate, and nothing that could alias
 REACH = 4.0  # sd of the point spread beyond which the border of a layer is not seen
+COARSE = 8  # px between the rays by which a layer is found in the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,29 +39,51 @@ def render(scene: Scene, camera: Camera, pose: Array, offset: Array | None = Non
     """
     R = rotation(*pose[3:])
     origin = pose[:3] if offset is None else pose[:3] + R @ offset
-    rays = camera.field.reshape(-1, 3) @ R.T
-    image = np.full(len(rays), MIDDLE, np.float32)
+    rays = camera.field @ R.T
+    image = np.full(rays.shape[:2], MIDDLE, np.float32)
     for layer in scene.layers:
-        _paint(image, layer, origin, rays, BLUR / camera.f)
-    return image.reshape(camera.size[::-1])
+        where = _box(layer, origin, rays, camera.f)
+        if where is not None:
+            part = image[where]
+            part[...] = _painted(part.ravel(), layer, origin, rays[where].reshape(-1, 3), camera.f).reshape(part.shape)
+    return image
 
 
-def _paint(image: Array, layer: Layer, origin: Array, rays: Array, spread: float) -> None:
-    """Put a layer before what ``image`` (N,) shows; ``spread`` is the sd of the point spread in rad."""
-    reach, a, b = layer.meet(origin, rays)
-    blur = spread * reach  # rays have length 1 along the axis: their reach is the depth
+def _near(layer: Layer, reach: Array, a: Array, b: Array, margin: Array) -> Array:
+    """Which of the places on a plane are on the layer or within ``margin`` m of it, and before the camera."""
     with np.errstate(invalid="ignore"):
-        far, low = layer.half[0] + REACH * blur, layer.half[1] + REACH * blur
-        hit = (reach > 0.0) & np.isfinite(reach) & (np.abs(a) < far) & (np.abs(b) < low)
+        inside = (np.abs(a) < layer.half[0] + margin) & (np.abs(b) < layer.half[1] + margin)
+        return np.asarray(inside & (reach > 0.0) & np.isfinite(reach))
+
+
+def _box(layer: Layer, origin: Array, rays: Array, f: float) -> tuple[slice, slice] | None:
+    """Rows and columns of an image whose rays (h, w, 3) may meet the layer, from every COARSE-th of them."""
+    coarse = rays[::COARSE, ::COARSE]
+    reach, a, b = layer.meet(origin, coarse.reshape(-1, 3))
+    near = _near(layer, reach, a, b, (2.0 * COARSE + REACH * BLUR) / f * reach).reshape(coarse.shape[:2])
+    if not near.any():
+        return None
+    ends = (np.flatnonzero(near.any(axis=axis))[[0, -1]] * COARSE for axis in (1, 0))
+    rows, columns = (slice(max(low - COARSE, 0), high + 2 * COARSE) for low, high in ends)
+    return rows, columns
+
+
+def _painted(image: Array, layer: Layer, origin: Array, rays: Array, f: float) -> Array:
+    """A layer before what ``image`` (N,) shows along ``rays`` (N, 3)."""
+    reach, a, b = layer.meet(origin, rays)
+    blur = BLUR / f * reach  # rays have length 1 along the axis: their reach is the depth
+    hit = _near(layer, reach, a, b, REACH * blur)
     if not hit.any():
-        return
-    whole = bool(hit.all())
-    a, b, blur = (a, b, blur) if whole else (a[hit], b[hit], blur[hit])
+        return image
+    if not hit.all():
+        a, b, blur = a[hit], b[hit], blur[hit]
     own = layer.texture.grey(a, b, blur[0] if np.ptp(blur) < 1e-9 * blur[0] else blur)
     if np.isfinite(layer.half).any():
         cover = _covered(a, layer.half[0], blur) * _covered(b, layer.half[1], blur)
         own = cover * own + (1.0 - cover) * image[hit]
-    image[slice(None) if whole else hit] = own
+    result = image.copy()
+    result[hit] = own
+    return result
 
 
 def _covered(place: Array, half: float, blur: Array) -> Array:

@@ -40,7 +40,7 @@ class Growth:
     @property
     def standard_error(self) -> Array:
         """Of ``sd``, (K,), px."""
-        return np.sqrt(np.diag(self.covariance))
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def table(self, sigma: float) -> DisparityGrowth:
         """The growth as a scenario has it, over a sensor's own ``sigma`` of disparity in px."""

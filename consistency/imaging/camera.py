@@ -134,7 +134,8 @@ class StereoCamera:
 
     def ideal(self, points: Array) -> Array:
         """(u, v, d) in px of points (N, 3) in the robot frame, m, with ideal cameras: Herath et al. (2007) eq. 22."""
-        return np.stack(stereo.project(*points.T, self.f, self.B), axis=-1)
+        x, y, z = points.T
+        return np.stack(stereo.project(x, y, z, self.f, self.B), axis=-1)
 
     def real(self, points: Array) -> Array:
         """(u, v, d) in px of points (N, 3) with the cameras as they are: what a chain without noise would measure."""

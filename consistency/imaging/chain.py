@@ -1,4 +1,4 @@
-"""The chain of Herath et al. (2007) fig. 3: stages in a row, from image pairs to tracks of (u, v, d) beside the truth."""
+"""The chain of Herath et al. (2007) fig. 3: stages in a row, from image pairs to tracks of u, v, d beside the truth."""
 
 from __future__ import annotations
 

@@ -66,9 +66,7 @@ def stand(
     return joined(parts)
 
 
-def retreat(
-    chain: Chain, camera: StereoCamera, stops: Stops, rng: np.random.Generator, shake: float = 0.0
-) -> Tracks:
+def retreat(chain: Chain, camera: StereoCamera, stops: Stops, rng: np.random.Generator, shake: float = 0.0) -> Tracks:
     """The tracks of fig. 6: features of the nearest image followed to the farthest one, an image a stop.
 
     ``shake`` is the sd of roll, pitch and heading at each stop, rad, of which the expected values know nothing.

@@ -99,7 +99,7 @@ def render_pair(scene: Scene, camera: StereoCamera, pose: Array) -> tuple[Array,
 def digitised(image: Array, noise: float, rng: np.random.Generator) -> Array:
     """Image (h, w) with Gaussian grey noise of sd ``noise``, as 8-bit."""
     drawn = rng.standard_normal(image.shape, np.float32)
-    return np.clip(np.rint(image + np.float32(noise) * drawn), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(image + np.float32(noise) * drawn), 0, 255), np.uint8)
 
 
 def film(
@@ -118,9 +118,9 @@ def film(
     noise : sd of the grey noise of a pixel
     nominal : (F, 6), where it is said to be; None for ``poses``
     """
-    last, pair = None, None
+    last, pair = np.empty(0), (np.empty(0), np.empty(0))
     for pose, said in zip(poses, poses if nominal is None else nominal, strict=True):
-        if pair is None or not np.array_equal(pose, last):
+        if not np.array_equal(pose, last):
             last, pair = pose, render_pair(scene, camera, pose)
         left, right = (digitised(image, noise, rng) for image in pair)
         yield Frame(left, right, np.asarray(pose), np.asarray(said))

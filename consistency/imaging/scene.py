@@ -66,8 +66,10 @@ class Layer:
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = normal @ (self.middle - origin) / (rays @ normal)
             start = origin - self.middle
-            return reach, start @ self.right + reach * (rays @ self.right), start @ self.down + reach * (
-                rays @ self.down
+            return (
+                reach,
+                start @ self.right + reach * (rays @ self.right),
+                start @ self.down + reach * (rays @ self.down),
             )
 
     def points(self, a: Array, b: Array) -> Array:

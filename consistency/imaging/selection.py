@@ -37,9 +37,7 @@ class GoodFeatures:
         require_size(image, 2 * int(MARGIN) + BLOCK, "the margin of the selection")
         mask = np.zeros(image.shape, np.uint8)
         mask[int(MARGIN) : -int(MARGIN), int(MARGIN) : -int(MARGIN)] = 1
-        found = opencv().goodFeaturesToTrack(
-            image, self.count, self.quality, self.distance, mask=mask, blockSize=BLOCK
-        )
+        found = opencv().goodFeaturesToTrack(image, self.count, self.quality, self.distance, mask=mask, blockSize=BLOCK)
         return np.empty((0, 2)) if found is None else from_columns(image, found.reshape(-1, 2).astype(float))
 
 

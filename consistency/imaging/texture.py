@@ -38,7 +38,8 @@ class RandomTexture:
 
     Each octave is a periodic tile; between its samples the surface is bilinear, in whichever camera it is seen, so that
     geometry is exact. The lens weakens an octave by the transfer of its point spread at the octave's middle frequency.
-    So a near surface shows detail that a far one does not, and no image holds frequencies beyond half its sampling rate.
+    So a near surface shows detail that a far one does not, and an image holds next to nothing beyond half its sampling
+    rate.
     """
 
     tiles: tuple[Array, ...]  # (TILE, TILE) each, float32, sd 1

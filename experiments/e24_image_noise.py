@@ -127,7 +127,8 @@ def figure_5a(study: cs.Study, tracks: Tracks) -> cs.Finding:
     kept = whole(tracks.kept)
     errors = centred(kept).reshape(-1, IMAGES + 1)
     study.tables["images_fig5a"] = histogram(errors.ravel())
-    scaled = errors / errors.std(axis=1, keepdims=True)
+    sd = errors.std(axis=1, keepdims=True)
+    scaled = (errors / np.where(sd > 0.0, sd, 1.0))[sd[:, 0] > 0.0]  # far away all 30 may be one sixteenth of a px
     # of n white errors about their own mean, two correlate by -1 / (n - 1)
     lags = [float((scaled[:, k:] * scaled[:, :-k]).mean() + 1.0 / IMAGES) for k in range(1, LAGS + 1)]
     stop = kept.sequence.reshape(-1, IMAGES + 1)[:, 0]

@@ -36,13 +36,16 @@ def _searched(search: tuple[int, int]) -> int:
 
 
 def _at(places: Array, disparities: Array, search: tuple[int, int]) -> Array:
-    """Values (N,) of a disparity image in sixteenths at the nearest pixels; NaN outside the search."""
+    """Values (N,) of a disparity image in sixteenths at the nearest pixels, px.
+
+    NaN outside the search and at its ends, where the best match is no minimum.
+    """
     height, width = disparities.shape
     column, row = np.rint(places).astype(int).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     d = np.full(len(places), np.nan)
     d[inside] = disparities[row[inside], column[inside]] / STEP
-    d[(d < search[0]) | (d > search[1])] = np.nan
+    d[(d <= search[0]) | (d >= search[1])] = np.nan
     return d
 
 

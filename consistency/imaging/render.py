@@ -1,4 +1,8 @@
-"""Image pairs of a scene: exact geometry, a Gaussian point spread, and grey noise."""
+"""Image pairs of a scene: exact geometry, a Gaussian point spread, and grey noise.
+
+The point spread is round on the surface that is seen, as wide as at the depth of the pixel: exact for a surface that
+faces the camera, and on a slanted one too narrow along the slant.
+"""
 
 from __future__ import annotations
 

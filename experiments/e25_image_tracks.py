@@ -37,7 +37,7 @@ STEP, FEATURES_1 = 0.02, 30  # m, experiment 1
 # --- chosen, because nothing is printed ------------------------------------------------------
 SHAKE = np.deg2rad(0.5)  # sd of roll, pitch and heading that a laser's alignment leaves: 1.3 px
 IMAGES, ROBOTS = 100, 3  # of experiment 1: 2 m, and how often
-WALLS = 12  # for fig. 6
+WALLS = 8  # for fig. 6
 SCENES, VIEWS = 6, 50  # for fig. 9: 1 m
 STRONG = 0.15  # quality of features for fig. 9: the rest lies along edges
 MIDDLE = 100.0  # px in u to both sides, where every stage works: the matchers give nothing at the left border
@@ -258,7 +258,7 @@ def budget(study: cs.Study) -> list[cs.Finding]:
         tracks = {
             "standing": stand(chain, camera, stops, generator(study, 30, number), study.workers),
             "moving": joined(
-                repeated(study, WALLS // 3, 300 + number, partial(retreat, chain, camera, Stops(), shake=shake))
+                repeated(study, WALLS // 2, 300 + number, partial(retreat, chain, camera, Stops(), shake=shake))
             ),
         }
         for motion, own in tracks.items():

@@ -12,6 +12,7 @@ from consistency.reporting.sections import (
     findings,
     first_order,
     further,
+    images,
     innovations,
     maps,
     nees,
@@ -47,6 +48,7 @@ SECTIONS: tuple[Section[Any, Any], ...] = (
     shares.SECTION,
     scenes.SECTION,
     first_order.SECTION,
+    images.SECTION,
     referee.SECTION,
     provenance.SECTION,
 )

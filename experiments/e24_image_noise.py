@@ -5,6 +5,8 @@ Experiment 2 of Herath et al. (2007) sec. 3.3 and its figures 4, 5, 7 and 8: doc
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pandas as pd
 from scipy import stats
@@ -44,7 +46,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     try:
         opencv()
     except InputError as error:
-        print(f"e24_image_noise: {error}")
+        print(f"e24_image_noise: {error}", file=sys.stderr)
         return []
     findings = []
     if any(study.wants(name) for name in FINDINGS[:4]):

@@ -5,6 +5,7 @@ Experiment 1 and figures 3, 6 and 9 of Herath et al. (2007): docs/images.md.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -54,7 +55,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     try:
         opencv()
     except InputError as error:
-        print(f"e25_image_tracks: {error}")
+        print(f"e25_image_tracks: {error}", file=sys.stderr)
         return []
     questions: list[Callable[[cs.Study], list[cs.Finding]]] = [figure_6, figure_9, experiment_1, budget]
     names = (FINDINGS[:2], FINDINGS[2:4], FINDINGS[4:5], FINDINGS[5:])

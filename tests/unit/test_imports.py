@@ -26,6 +26,7 @@ RANK = {
     "protocols": 4,
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
     "store.parquet": 4, "store.storage": 5, "store.results": 6, "store.log": 7,
+    "imaging": 6,
     "recording": 7,
     "runs.gather": 7, "runs.montecarlo": 8, "frontend": 8,
     "verdicts.curves": 7, "verdicts.judge": 8, "verdicts.monitoring": 8, "verdicts.comparison": 9,
@@ -136,6 +137,8 @@ FORBIDDEN = [
     ("store", "from consistency.store.atomic import write_whole"),
     ("verdicts.judge", "import consistency.store"),
     ("verdicts.judge", "from consistency.verdicts.comparison import Compared"),
+    ("imaging", "from consistency.runs.findings import Study"),
+    ("vision", "from consistency.imaging.chain import Chain"),
     ("vision", "from consistency.terminal.table import print_findings"),
 ]
 

@@ -12,6 +12,7 @@ from consistency.reporting.sections import (
     findings,
     first_order,
     further,
+    images,
     innovations,
     maps,
     nees,
@@ -49,6 +50,7 @@ SECTIONS: tuple[Section[Any, Any], ...] = (
     shares.SECTION,
     scenes.SECTION,
     first_order.SECTION,
+    images.SECTION,
     referee.SECTION,
     provenance.SECTION,
 )

@@ -1,0 +1,131 @@
+"""The experiments on rendered images, cut to a few images: all findings come, and a report shows their tables."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import consistency as cs
+from consistency.imaging.protocols import Stops, wall_texture
+from consistency.imaging.scene import Layer, Scene
+from consistency.reporting.build import build_report
+from consistency.reporting.drawing import Bars, Line, Points
+from consistency.reporting.sections import images as section
+
+pytest.importorskip("cv2")
+ROOT = Path(__file__).parents[2]
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"tested_{name}", ROOT / "experiments" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def noise(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = load("e24_image_noise")
+    for name, value in {"IMAGES": 6, "WALLS": 1, "RESIDUALS": (0.0, 0.005), "DRAWS": 20}.items():
+        monkeypatch.setattr(module, name, value)
+    stops: Callable[..., Stops] = lambda **given: Stops(**({"farthest": 1.4, "step": 0.2} | given))  # noqa: E731
+    monkeypatch.setattr(module, "Stops", stops)
+    return module
+
+
+@pytest.fixture
+def moving(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = load("e25_image_tracks")
+    for name, value in {"WALLS": 2, "SCENES": 1, "VIEWS": 5, "IMAGES": 4, "ROBOTS": 1, "DRAWS": 20}.items():
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(module, "Stops", lambda step=0.1: Stops(farthest=1.2, step=max(step, 0.1), images=1))
+    monkeypatch.setattr(module, "office", lambda rng: Scene((Layer.facing(3.0, wall_texture(rng)),)))
+    return module
+
+
+def test_noise_of_disparity(noise: ModuleType) -> None:
+    study = cs.Study(seed=3, jobs=1)
+    findings = {finding.id: finding for finding in noise.main(study)}
+    assert set(findings) == set(noise.FINDINGS)
+    assert findings["fig4-protocol"].verdict == "not reproduced"  # 3 stops, not 101
+    assert findings["fig5b"].verdict == "reproduced"
+    stops = study.tables["images_stops"]
+    assert len(stops) == 6
+    assert (stops["features"] >= 9).all()
+    wrong, right = (stops[stops["residual"] == k1] for k1 in (0.005, 0.0))
+    assert (wrong["pooled"] > 2 * wrong["within"]).all()
+    assert (right["pooled"] < 2 * right["within"]).all()
+    bias = study.tables["images_bias"]
+    own = bias[bias["left"] == "k1 +-0.005"]
+    assert np.corrcoef(own["bias_d"], own["expected"])[0, 1] > 0.95
+    assert bias[bias["left"] == "glass"]["expected"].abs().max() > 0.5
+    density = study.tables["images_fig5a"]
+    assert (density["density"] * (density["high"] - density["low"])).sum() == pytest.approx(1.0, abs=0.05)
+
+
+def test_only_what_is_asked_for_is_run(noise: ModuleType) -> None:
+    study = cs.Study(jobs=1, only=["fig7-8"])
+    assert [finding.id for finding in noise.main(study)] == ["fig7-8"]
+    assert set(study.tables) == {"images_bias"}
+
+
+def test_tracks_and_their_report(moving: ModuleType, noise: ModuleType, tmp_path: Path) -> None:
+    study = cs.Study(seed=3, jobs=1)
+    found = moving.main(study)
+    assert [finding.id for finding in found] == list(moving.FINDINGS)
+    stages = study.tables["images_budget"].set_index(["motion", "stage"])
+    assert stages.loc[("standing", "rectification"), "d"] > 0.2
+    assert stages.loc[("standing", "tracking"), "d"] == pytest.approx(0.0, abs=1e-9)
+    assert stages.loc[("standing", "stereo correspondence"), "u"] == pytest.approx(0.0, abs=1e-9)
+    assert stages.loc[("moving", "attitude"), "u"] > 0.5
+    assert ("standing", "attitude") not in stages.index
+    noise.main(study)
+    study.write(tmp_path / "out", found, 0.0)
+    report = build_report(tmp_path / "out")
+    blocks = section.SECTION.blocks(report)
+    assert len(blocks) == len(section.TABLES)
+    curves = [mark for mark in blocks[0].panels[0].marks if isinstance(mark, Line)]
+    stops = study.tables["images_stops"].sort_values("disparity")
+    np.testing.assert_allclose(curves[2].y, stops[stops["residual"] == 0.005]["within"])
+    np.testing.assert_allclose(curves[3].y, stops[stops["residual"] == 0.005]["pooled"])
+    bars = next(mark for mark in blocks[2].panels[0].marks if isinstance(mark, Bars))
+    assert (bars.height * np.diff(bars.edges)).sum() == pytest.approx(1.0, abs=0.05)
+    points, junctions = (mark for mark in blocks[3].panels[0].marks if isinstance(mark, Points))
+    assert len(junctions.x) == study.tables["images_fig9"]["junction"].sum()
+    assert len(points.x) == (~study.tables["images_fig9"]["junction"]).sum()
+
+
+def test_a_report_without_images_has_no_section(tmp_path: Path) -> None:
+    study = cs.Study(jobs=1)
+    study.tables["images_exp1"] = pd.DataFrame({"frame": [0.0], "tracks": [3.0], "rms_u": [0.1]})
+    study.write(tmp_path / "out", [], 0.0)
+    with pytest.raises(cs.InputError, match=r"images_exp1\.parquet: column 'rms_v' is missing"):
+        section.read(build_report(tmp_path / "out"))
+    (tmp_path / "out" / "images_exp1.parquet").unlink()
+    assert section.read(build_report(tmp_path / "out")) is None
+
+
+def test_a_junction_ranks_above_a_point(moving: ModuleType) -> None:
+    table = pd.DataFrame({"junction": [True, True, False, False], "residual": [3.0, 1.0, 2.0, 0.5]})
+    assert moving.above(table, "residual") == 0.75
+
+
+def test_without_opencv_the_experiments_are_left_out(
+    noise: ModuleType, moving: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing() -> None:
+        raise cs.InputError("images need OpenCV")
+
+    for module in (noise, moving):
+        monkeypatch.setattr(module, "opencv", missing)
+        assert module.main(cs.Study(jobs=1)) == []
+    assert capsys.readouterr().err.count("images need OpenCV") == 2

@@ -22,6 +22,8 @@ from pydantic import (
 from consistency.geometry import rotation
 from consistency.models.point import Mounting
 from consistency.scenario.effects import BUILT_IN, ListedEffect
+from consistency.scenario.effects.bias_map import BiasMap
+from consistency.scenario.effects.disparity_growth import DisparityGrowth
 from consistency.scenario.tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 
 PLANAR_SENSORS = ("relative-xy", "range-bearing")  # of landmarks in the plane, with two values each
@@ -107,6 +109,8 @@ class BelievedSensor(StereoSensor):
     """Noise and calibration as the filter has them; f and B are needed for ``uvd``."""
 
     disparity: tuple[Positive, Positive] | None = None  # px, the search range, for filters that allow for it
+    disparity_growth: DisparityGrowth | None = None
+    bias: BiasMap | None = None
 
     @model_validator(mode="after")
     def _rig(self) -> BelievedSensor:
@@ -120,8 +124,9 @@ class BelievedSensor(StereoSensor):
     def _without_an_unknown_range(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """A belief without a search range has the content, and so the hash, of one that knows of none."""
         content: dict[str, Any] = handler(self)
-        if self.disparity is None:
-            content.pop("disparity", None)
+        for key in ("disparity", "disparity_growth", "bias"):
+            if getattr(self, key) is None:
+                content.pop(key, None)
         return content
 
 

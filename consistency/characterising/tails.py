@@ -1,0 +1,77 @@
+"""The shape of a noise: how heavy its tails are, and whether it is Gaussian at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize, special, stats
+
+from consistency.diagnostics.normality import normality
+from consistency.types import Array
+
+HEAVIEST = 0.49  # 1 / nu: at 1/2 the variance is infinite
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def holds(self, value: float) -> bool:
+        """Whether a value is inside."""
+        return self.low <= value <= self.high
+
+
+@dataclass(frozen=True)
+class Tails:
+    """Shape of standardised residuals."""
+
+    weight: Estimate  # 1 / nu of Student's distribution; 0 is the normal one
+    skewness: float
+    excess_kurtosis: float
+    p_value: float  # of normality, D'Agostino & Pearson (1973)
+
+
+def tails(w: Array, level: float) -> Tails:
+    """Student's degrees of freedom by the likelihood of residuals (N,), its interval by the ratio of likelihoods.
+
+    ``level`` is the chance that the interval misses.
+    """
+    w = (w - w.mean()) / w.std(ddof=1)
+
+    def deviance(weight: float) -> float:
+        return 2.0 * optimize.minimize_scalar(
+            lambda log_scale: _negative(w, weight, float(log_scale)), bounds=(-1.5, 0.5), method="bounded"
+        ).fun
+
+    best = optimize.minimize_scalar(deviance, bounds=(0.0, HEAVIEST), method="bounded", options={"xatol": 1e-5})
+    value, least = (0.0, deviance(0.0)) if deviance(0.0) <= best.fun else (float(best.x), float(best.fun))
+    limit = least + float(stats.chi2.isf(level, 1))
+
+    def beyond(weight: float) -> float:
+        return deviance(weight) - limit
+
+    low = 0.0 if beyond(0.0) <= 0 else float(optimize.brentq(beyond, 0.0, value))
+    high = HEAVIEST if beyond(HEAVIEST) <= 0 else float(optimize.brentq(beyond, value, HEAVIEST))
+    shape = normality(w)
+    return Tails(Estimate(value, low, high), shape.skewness, shape.excess_kurtosis, shape.p_value)
+
+
+def _negative(w: Array, weight: float, log_scale: float) -> float:
+    """Negative log-likelihood of Student's distribution with 1 / weight degrees of freedom and a scale."""
+    x2 = np.exp(-2.0 * log_scale) * w**2
+    if weight < 1e-4:
+        return float(0.5 * x2.sum() + len(w) * (log_scale + 0.5 * np.log(2.0 * np.pi)))
+    nu = 1.0 / weight
+    constant = special.gammaln((nu + 1.0) / 2.0) - special.gammaln(nu / 2.0) - 0.5 * np.log(nu * np.pi)
+    return float(0.5 * (nu + 1.0) * np.log1p(x2 / nu).sum() + len(w) * (log_scale - constant))
+
+
+def rate(count: int, total: int, level: float) -> Estimate:
+    """A share with the interval of Clopper & Pearson (1934)."""
+    test = stats.binomtest(count, total).proportion_ci(1.0 - level, "exact")
+    return Estimate(count / total, float(test.low), float(test.high))

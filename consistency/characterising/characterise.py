@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from consistency.characterising.basis import hats, octaves
 from consistency.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
 from consistency.characterising.coordinate import Levels
 from consistency.characterising.likelihood import Fit, Rows, fit
-from consistency.characterising.residuals import FEW, Residuals, Selection, select
+from consistency.characterising.residuals import Residuals, Selection, select
 from consistency.characterising.tails import Estimate, Tails, rate, tails
 from consistency.errors import InputError
 from consistency.scenario import PicturedSensor
@@ -29,7 +29,7 @@ class Coordinate:
     """What is known of u, v or d."""
 
     name: str
-    sigma: Estimate | None  # px, of what is drawn anew; None where the data do not tell
+    sigma: Estimate  # px, of what is drawn anew
     pooled: float  # px, about the mean of all rows: noise, offsets and bias together
     about_tracks: float  # px, about the means of tracks
     correlation: Estimate | None  # with the step before
@@ -48,7 +48,7 @@ class Coordinate:
     @property
     def offset_px(self) -> float:
         """Standard deviation of the offsets of tracks, px."""
-        if self.offset is None or self.sigma is None:
+        if self.offset is None:
             return float("nan")
         return float(self.sigma.value * np.sqrt(self.offset.value / max(1.0 - self.offset.value, 1e-12)))
 
@@ -80,7 +80,6 @@ class Characterisation:
     kept: Residuals
     notes: tuple[str, ...] = ()  # what could not be estimated, and limits
     ratio: tuple[Estimate, ...] = ()  # sd while moving over sd at rest, of u, v, d
-    extra: Mapping[str, object] = field(default_factory=dict)
 
 
 def characterise(
@@ -170,5 +169,3 @@ def _coordinate(k: int, of: Fit, kept: Residuals, levels: Levels) -> Coordinate:
         tails(w, levels.of("tails")), lags, bounds, w / w.std(),
     )  # fmt: skip
 
-
-__all__ = ["FEW", "Characterisation", "Coordinate", "Growth", "characterise"]

@@ -17,7 +17,10 @@ from consistency.types import Array, Indices
 
 STEP = 1e-3  # of a parameter, for second differences; log sigma, atanh rho and log(1 + n q) are all of order 1
 MOST = 0.995  # magnitude of a correlation
-NOTHING = -np.inf
+IMPOSSIBLE = 1e12
+GENTLE = 1e-3  # of the rows: slope at which the first search ends
+STEPS = 30
+NEAR = 1e-6  # squared distance to the top, in standard deviations
 
 
 @dataclass(frozen=True)
@@ -157,25 +160,63 @@ def fit(rows: Rows, start: float, memory: bool = True) -> Fit:
         out[free] = values
         return out
 
-    def objective(values: Array) -> float:
+    def restricted(values: Array) -> float:
         found = regress(rows, Parameters.of(full(values), length))
-        return 1e12 if found is None else -found.value
+        return IMPOSSIBLE if found is None else -found.value
 
-    best = optimize.minimize(objective, theta[free], method="BFGS", options={"gtol": 1e-3 * np.sqrt(len(rows.r))})
-    H = curvature(objective, best.x)
-    if not np.isfinite(H).all() or np.linalg.eigvalsh(H)[0] <= 0:
-        raise ValueError("the data do not determine the noise")
-    theta = full(best.x)
+    x = np.asarray(theta[free])
+    plain = rows.X @ np.linalg.solve(rows.X.T @ rows.X + np.diag(rows.ridge + 1e-9), rows.X.T @ rows.r)
+    x = optimize.minimize(_held(rows, plain, full, length), x, method="BFGS", options={"gtol": GENTLE * len(rows.r)}).x
+    x, H = _climb(restricted, x, rows, full, length)
+    theta = full(x)
     parameters = Parameters.of(theta, length)
     regression = regress(rows, parameters)
-    assert regression is not None
+    if regression is None:
+        raise ValueError("the data do not determine the noise")
     inverse = np.linalg.inv(H)
-    scores = _scores(rows, full, best.x, regression.beta, length)
+    scores = _scores(rows, full, x, regression.beta, length)
     K = len(scores)
     robust = inverse @ (scores.T @ scores) @ inverse * K / max(K - 1, 1)
     cov, scatter = np.zeros((m + 2, m + 2)), np.zeros((m + 2, m + 2))
     cov[np.ix_(free, free)], scatter[np.ix_(free, free)] = inverse, robust
     return Fit(rows, theta, cov, scatter, regression, parameters)
+
+
+def _held(rows: Rows, bias: Array, full: Callable[[Array], Array], length: float) -> Callable[[Array], float]:
+    """Negative log-likelihood of the free parameters with the bias (N,) held, much cheaper than the restricted one."""
+    y = (rows.r - bias)[:, None]
+
+    def negative(values: Array) -> float:
+        white = whiten(rows, y, Parameters.of(full(values), length))
+        return IMPOSSIBLE if white is None else 0.5 * float(white.log_variance.sum() + (white.values**2).sum())
+
+    return negative
+
+
+def _climb(
+    restricted: Callable[[Array], float], x: Array, rows: Rows, full: Callable[[Array], Array], length: float
+) -> tuple[Array, Array]:
+    """Newton's steps to the least ``restricted``, and the curvature there.
+
+    The curvature is that with the bias held, less the share of the degrees of freedom that the bias costs.
+    """
+    share = max(1.0 - rows.X.shape[1] / len(rows.r), 0.1)
+    e = STEP * np.eye(len(x))
+    for _ in range(STEPS):
+        found = regress(rows, Parameters.of(full(x), length))
+        if found is None:
+            raise ValueError("the data do not determine the noise")
+        H = share * curvature(_held(rows, rows.X @ found.beta, full, length), x)
+        if not np.isfinite(H).all() or np.linalg.eigvalsh(H)[0] <= 0:
+            raise ValueError("the data do not determine the noise")
+        slope = np.array([(restricted(x + d) - restricted(x - d)) / (2.0 * STEP) for d in e])
+        step, size = -np.linalg.solve(H, slope), 1.0
+        if slope @ -step < NEAR:
+            return x, H
+        while restricted(x + size * step) > -found.value and size > 1e-3:
+            size *= 0.5
+        x = x + size * step
+    return x, H
 
 
 def curvature(objective: Callable[[Array], float], x: Array) -> Array:

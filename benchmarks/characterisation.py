@@ -3,10 +3,10 @@
     python benchmarks/characterisation.py                     # the promise: 100 repetitions of 10 runs, two worlds
     python benchmarks/characterisation.py --repetitions 5     # quicker
 
-Each repetition has a seed of its own. The world ``plain`` is herath2007-stereo; in ``real`` the noise of disparity grows
-with disparity and the image has a bias map of up to 2 px, as in Herath et al. (2007) fig. 5c and 8. Exit status 1 if all
-intervals hold together in fewer than 95 of 100 repetitions, if one of sigma_u, sigma_v, sigma_d is wider than 5 % of its
-value, or if the bias map is off by more than 0.1 px rms.
+Each repetition has a seed of its own. The world ``plain`` is herath2007-stereo; in ``real`` the noise of disparity
+grows with disparity and the image has a bias map of up to 2 px, as in Herath et al. (2007) fig. 5c and 8. Exit status 1
+if all intervals hold together in fewer than 95 of 100 repetitions, if the interval of one of sigma_u, sigma_v, sigma_d
+is wider than 5 % of its value, or if the bias map is off by more than 0.1 px rms.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def bias_rms(of: Characterisation, truth: Real) -> Array:
     bias = believed(of).bias
     found = np.zeros((len(u), 3)) if bias is None else bias.at(u, v)
     true = np.zeros((len(u), 3)) if truth.bias is None else truth.bias.at(u, v)
-    return np.sqrt(np.mean((found - true) ** 2, axis=0))
+    return np.asarray(np.sqrt(np.mean((found - true) ** 2, axis=0)))
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,10 @@ class Outcome:
     def text(self, name: str) -> str:
         """One paragraph."""
         held = sum(not names for names in self.missed)
-        counts = ", ".join(f"{key} {n}" for key, n in Counter(sum(self.missed, [])).most_common()) or "none"
+        counts = (
+            ", ".join(f"{key} {n}" for key, n in Counter(key for names in self.missed for key in names).most_common())
+            or "none"
+        )
         width, rms = 100 * self.width.mean(axis=0), np.sqrt(np.mean(self.rms**2, axis=0))
         return (
             f"{name}: all intervals hold in {held} of {len(self.missed)} repetitions; missed: {counts}\n"

@@ -59,7 +59,7 @@ class BiasEstimate:
 
     def matrix(self, k: int) -> Array:
         """What is believed of u, v or d, (L, K)."""
-        return self.believed[k].reshape(len(self.grid.v), len(self.grid.u))
+        return np.asarray(self.believed[k].reshape(len(self.grid.v), len(self.grid.u)))
 
 
 def estimate_bias(fits: Sequence[Fit], grid: Grid, level: float, rate: float) -> BiasEstimate:

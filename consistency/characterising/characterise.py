@@ -168,4 +168,3 @@ def _coordinate(k: int, of: Fit, kept: Residuals, levels: Levels) -> Coordinate:
         coordinate.offset_share(of, levels.of("offset")) if memory else None,
         tails(w, levels.of("tails")), lags, bounds, w / w.std(),
     )  # fmt: skip
-

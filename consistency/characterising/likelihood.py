@@ -241,4 +241,4 @@ def _scores(rows: Rows, full: Callable[[Array], Array], x: Array, beta: Array, l
 
     columns = [(by_track(x + d) - by_track(x - d)) / (2.0 * STEP) for d in STEP * np.eye(len(x))]
     scores = np.column_stack(columns)
-    return scores - scores.mean(axis=0)
+    return np.asarray(scores - scores.mean(axis=0))

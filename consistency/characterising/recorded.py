@@ -14,6 +14,9 @@ from consistency.scenario import PicturedSensor, read_table
 from consistency.store.log import SensorFile, read_log
 
 
+OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
+
+
 @dataclass(frozen=True)
 class Measured:
     """A characterisation and what of the source's file stays as it was."""
@@ -38,10 +41,10 @@ def characterise_log(folder: Path, grid: tuple[int, int]) -> Measured:
     log = read_log(folder)
     file = read_table(folder / "sensor.toml", SensorFile)
     if file.model != "uvd":
-        raise InputError(f"{folder / 'sensor.toml'}: key 'model' is '{file.model}'; only a sensor 'uvd' is characterised")
+        raise InputError(f"{folder}/sensor.toml: key 'model' is '{file.model}'; only a sensor 'uvd' is characterised")
     sensor = PicturedSensor.model_validate(file.model_dump(include=set(PicturedSensor.model_fields)))
     dumped = file.model_dump(exclude_none=True)
-    others = {key: dumped[key] for key in ("motion", "start", "sigma_points") if key in dumped}
+    others: dict[str, Any] = {key: value for key, value in dumped.items() if key in OTHERS}
     first = log.trials[0]
     if first.truth is None or first.landmarks is None:
         raise InputError(f"{folder}: no truth")

@@ -44,9 +44,12 @@ def tails(w: Array, level: float) -> Tails:
     w = (w - w.mean()) / w.std(ddof=1)
 
     def deviance(weight: float) -> float:
-        return 2.0 * optimize.minimize_scalar(
-            lambda log_scale: _negative(w, weight, float(log_scale)), bounds=(-1.5, 0.5), method="bounded"
-        ).fun
+        return (
+            2.0
+            * optimize.minimize_scalar(
+                lambda log_scale: _negative(w, weight, float(log_scale)), bounds=(-1.5, 0.5), method="bounded"
+            ).fun
+        )
 
     best = optimize.minimize_scalar(deviance, bounds=(0.0, HEAVIEST), method="bounded", options={"xatol": 1e-5})
     value, least = (0.0, deviance(0.0)) if deviance(0.0) <= best.fun else (float(best.x), float(best.fun))

@@ -8,7 +8,6 @@ from consistency.characterising.characterise import NAMES, Characterisation, Coo
 from consistency.characterising.tails import Estimate
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian
-NOUNS = {"near a limit of the sensor": "near a limit of the sensor", "grossly wrong": "grossly wrong"}
 
 
 def interval(estimate: Estimate, digits: int = 4, factor: float = 1.0) -> str:
@@ -55,7 +54,9 @@ def _growth(of: Characterisation) -> str:
         return "Growth of sigma_d with disparity: not known, the disparities are all alike."
     ends = f"{growth.nodes[0]:.3g} and {growth.nodes[-1]:.3g} px"
     if not growth.shown:
-        return f"sigma_d is the same at all disparities between {ends}, as far as the data tell (p {growth.p_value:.2g})."
+        return (
+            f"sigma_d is the same at all disparities between {ends}, as far as the data tell (p {growth.p_value:.2g})."
+        )
     values = ", ".join(f"{interval(s, 3)} at {d:.3g}" for d, s in zip(growth.nodes, growth.sigma, strict=True))
     return f"sigma_d depends on the disparity (p {growth.p_value:.2g}), in px: {values}."
 

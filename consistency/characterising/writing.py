@@ -32,7 +32,7 @@ def believed(of: Characterisation) -> PicturedSensor:
         nodes = [_rounded(d, 5) for d in of.growth.nodes]
         changes["disparity_growth"] = DisparityGrowth(disparity=tuple(nodes), ratio=tuple(ratio))
     if of.bias is not None and of.bias.shown.any():
-        matrices = {f"bias_{NAMES[k]}": _matrix(of.bias.matrix(k)) for k in np.flatnonzero(of.bias.shown)}
+        matrices = {f"bias_{NAMES[k]}": _matrix(of.bias.matrix(int(k))) for k in np.flatnonzero(of.bias.shown)}
         u, v = (tuple(_rounded(x, 6) for x in nodes) for nodes in (of.bias.grid.u, of.bias.grid.v))
         changes["bias"] = BiasMap(u=u, v=v, **matrices)
     return of.sensor.model_copy(update=changes)
@@ -43,7 +43,9 @@ def sensor_text(of: Characterisation, others: Mapping[str, Any] = MappingProxyTy
     sensor = believed(of)
     lines = [f"# {line}" for line in ("Measured by 'consistency characterise'.", counted(of) + ".", *sentences(of))]
     lines += [f'model = "{sensor.model}"', _pair("sigma_px", sensor.sigma)]
-    lines += [f"# sigma_{c.name} {interval(c.sigma)}; with offsets and bias in it {c.pooled:.4g}" for c in of.coordinates]
+    lines += [
+        f"# sigma_{c.name} {interval(c.sigma)}; with offsets and bias in it {c.pooled:.4g}" for c in of.coordinates
+    ]
     lines += [f"f_px = {sensor.f!r}", f"B_m = {sensor.B!r}"]
     for key in ("disparity", "image", "principal_point"):
         if (value := getattr(sensor, key)) is not None:

@@ -72,7 +72,7 @@ def read_log(folder: str | Path) -> Log:
         )
     sensor = read_table(path, SensorFile)
     if sensor.motion is None:
-        raise InputError(f"{path}: key 'motion': missing; it must be given, with sigma_v and sigma_omega of the odometry")
+        raise InputError(f"{path}: key 'motion': missing; give sigma_v and sigma_omega of the odometry")
     belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points)
     controls, observations = read_parquet(folder, "controls"), _observations(folder, sensor)
     tables = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -29,7 +30,7 @@ class BiasMap(Table):
     def _fits(self) -> BiasMap:
         for key in ("u", "v"):
             nodes = getattr(self, key)
-            if any(a >= b for a, b in zip(nodes, nodes[1:], strict=False)):
+            if any(a >= b for a, b in pairwise(nodes)):
                 raise ValueError(f"{key}_px must increase")
         rows, columns = len(self.v), len(self.u)
         for key in ("bias_u", "bias_v", "bias_d"):

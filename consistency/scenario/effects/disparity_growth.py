@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -23,7 +24,7 @@ class DisparityGrowth(Table):
     def _a_ratio_a_node(self) -> DisparityGrowth:
         if len(self.disparity) != len(self.ratio):
             raise ValueError(f"{len(self.disparity)} numbers in disparity_px but {len(self.ratio)} in ratio")
-        if any(a >= b for a, b in zip(self.disparity, self.disparity[1:], strict=False)):
+        if any(a >= b for a, b in pairwise(self.disparity)):
             raise ValueError("disparity_px must increase")
         return self
 

@@ -13,7 +13,7 @@ from consistency.characterising.bias import GRID, BiasEstimate, estimate_bias, g
 from consistency.characterising.coordinate import Levels
 from consistency.characterising.likelihood import Fit, Rows, fit
 from consistency.characterising.residuals import Residuals, Selection, select
-from consistency.characterising.tails import Estimate, Tails, rate, tails
+from consistency.characterising.tails import Estimate, Tails, rate, ratios, tails
 from consistency.errors import InputError
 from consistency.scenario import PicturedSensor
 from consistency.types import Array
@@ -126,6 +126,8 @@ def characterise(
         rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")), tracks, len(kept),
         {"near a limit of the sensor": chosen.at_limits, "grossly wrong": chosen.gross, "of no landmark": strange},
         levels, kept,
+        ratio=ratios(np.column_stack([f.regression.residual for f in fits]), np.ones((len(kept), 3)), kept.moving,
+                     kept.track, levels.of("sigma")),
     )  # fmt: skip
 
 

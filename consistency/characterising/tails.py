@@ -11,6 +11,7 @@ from consistency.diagnostics.normality import normality
 from consistency.types import Array
 
 HEAVIEST = 0.49  # 1 / nu: at 1/2 the variance is infinite
+FEWEST = 100  # rows at rest, and moving, that are compared
 
 
 @dataclass(frozen=True)
@@ -78,3 +79,32 @@ def rate(count: int, total: int, level: float) -> Estimate:
     """A share with the interval of Clopper & Pearson (1934)."""
     test = stats.binomtest(count, total).proportion_ci(1.0 - level, "exact")
     return Estimate(count / total, float(test.low), float(test.high))
+
+
+def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -> tuple[Estimate, ...]:
+    """Noise while moving over noise at rest, of u, v, d; nothing where one of the two has too few data.
+
+    Parameters
+    ----------
+    w : (N, 3), standardised residuals
+    weight : (N, 3), degrees of freedom of each
+    moving : (N,) of bool
+    track : (N,)
+    level : chance that one interval misses
+    """
+    if min(moving.sum(), (~moving).sum()) < FEWEST:
+        return ()
+    out = []
+    for k in range(3):
+        logs, variance = [], 0.0
+        for part in (moving, ~moving):
+            x, dof = w[part, k] ** 2, weight[part, k]
+            mean = float((dof * x).sum() / dof.sum())
+            _, where = np.unique(track[part], return_inverse=True)
+            spread = np.bincount(where, dof * (x / mean - 1.0))
+            logs.append(0.5 * np.log(mean))
+            variance += 0.25 * max(float((spread**2).sum()) / dof.sum() ** 2, 2.0 / dof.sum())
+        half = float(np.sqrt(variance) * stats.norm.isf(level / 2))
+        value = logs[0] - logs[1]
+        out.append(Estimate(float(np.exp(value)), float(np.exp(value - half)), float(np.exp(value + half))))
+    return tuple(out)

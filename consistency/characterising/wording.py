@@ -83,7 +83,8 @@ def _bias(of: Characterisation) -> list[str]:
 
 def _gross(of: Characterisation) -> str:
     share = interval(of.gross, 2, 100.0)
-    return f"{share} % of the observations are more than 6 robust sd off and are no part of sigma."
+    what = "are more than" if of.bias is not None else "are of tracks that are somewhere more than"
+    return f"{share} % of the observations {what} 6 robust sd off, and are no part of sigma."
 
 
 def _ratio(of: Characterisation) -> list[str]:

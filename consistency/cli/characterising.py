@@ -18,6 +18,7 @@ def characterise(
     ],
     out: Annotated[Path, typer.Option("--out", help="sensor.toml to write: a scenario or log can believe it.")],
     grid: Annotated[str, typer.Option("--grid", metavar="KxL", help="Nodes of the bias map, across and down.")] = "5x4",
+    at_rest: Annotated[bool, typer.Option("--at-rest", help="The sensor stood still all the time.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
@@ -29,7 +30,7 @@ def characterise(
 
     require_free_file(out, overwrite)
     nodes = _sizes(grid, "--grid", 2)
-    measured = characterise_log(source, nodes)
+    measured = characterise_log(source, nodes, at_rest)
     write_sensor(out, sensor_text(measured.of, measured.others))
     if as_json:
         print(json_of(measured.of))

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.frontend.planar_log import CAMERA, relative
 from consistency.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
+from consistency.frontend.planar_log import CAMERA, relative
 from consistency.frontend.tum import trajectory_text
 from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.store.log import write_log

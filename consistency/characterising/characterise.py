@@ -30,8 +30,8 @@ class Coordinate:
 
     name: str
     sigma: Estimate  # px, of what is drawn anew
-    pooled: float  # px, about the mean of all rows: noise, offsets and bias together
-    about_tracks: float  # px, about the means of tracks
+    pooled: float  # px, about the mean of all rows: noise, offsets and bias together; NaN where that is not known
+    about_tracks: float  # px, about the means of tracks; NaN likewise
     correlation: Estimate | None  # with the step before
     offset: Estimate | None  # share of the variance about the bias map
     tails: Tails
@@ -83,7 +83,12 @@ class Characterisation:
 
 
 def characterise(
-    data: Residuals, sensor: PicturedSensor, source: str, strange: int = 0, grid: tuple[int, int] = GRID
+    data: Residuals,
+    sensor: PicturedSensor,
+    source: str,
+    strange: int = 0,
+    grid: tuple[int, int] = GRID,
+    alone: bool = False,
 ) -> Characterisation:
     """Noise, growth, bias map, offsets, correlation and tails from residuals about the truth.
 
@@ -93,6 +98,7 @@ def characterise(
     sensor : calibration, image and search range
     strange : rows that were of no landmark
     grid : nodes of the bias map across and down
+    alone : whether the rows of a track are not in order of time and have no offset in common
 
     Raises
     ------
@@ -112,16 +118,16 @@ def characterise(
     nodes = octaves(kept.ideal[:, 2])
     levels = Levels(RATE, growth=len(nodes), bias=3 * int(cells.known.sum()))
     X = cells.regressors(kept)
-    fits = [_fitted(kept, k, X, cells.ridge, np.ones((len(kept), 1)), chosen, source) for k in range(3)]
+    fits = [_fitted(kept, k, X, cells.ridge, np.ones((len(kept), 1)), chosen, source, alone) for k in range(3)]
     growth = None
     if len(nodes) > 1:
-        by_disparity = _fitted(kept, 2, X, cells.ridge, hats(kept.ideal[:, 2], nodes), chosen, source)
+        by_disparity = _fitted(kept, 2, X, cells.ridge, hats(kept.ideal[:, 2], nodes), chosen, source, alone)
         p_value = coordinate.growth_p_value(by_disparity)
         shown = p_value < levels.rate / 6
         growth = Growth(nodes, tuple(coordinate.at_nodes(by_disparity, levels.of("growth"))), p_value, shown)
         fits[2] = by_disparity if shown else fits[2]
     return Characterisation(
-        sensor, source, _coordinates(fits, kept, levels), growth,
+        sensor, source, _coordinates(fits, kept, levels, alone), growth,
         estimate_bias(fits, cells, levels.of("bias"), levels.rate / 18),
         rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")), tracks, len(kept),
         {"near a limit of the sensor": chosen.at_limits, "grossly wrong": chosen.gross, "of no landmark": strange},
@@ -141,27 +147,30 @@ def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tu
     return u, v
 
 
-def _fitted(data: Residuals, k: int, X: Array, ridge: Array, G: Array, chosen: Selection, source: str) -> Fit:
+def _fitted(
+    data: Residuals, k: int, X: Array, ridge: Array, G: Array, chosen: Selection, source: str, alone: bool
+) -> Fit:
     """The fit of coordinate ``k``; nodes without any data are no parameters."""
     rows = Rows(data.r[:, k], X, G, data.first, data.gap, ridge)
-    memory = rows.length >= 1.5
     try:
-        return fit(rows, float(chosen.rough[k]), memory)
+        return fit(rows, float(chosen.rough[k]), memory=rows.length >= 1.5 and not alone)
     except ValueError as error:
         raise InputError(f"{source}: {error} of {NAMES[k]}; record more or longer tracks") from None
 
 
-def _coordinates(fits: list[Fit], kept: Residuals, levels: Levels) -> tuple[Coordinate, Coordinate, Coordinate]:
-    u, v, d = (_coordinate(k, fit, kept, levels) for k, fit in enumerate(fits))
+def _coordinates(
+    fits: list[Fit], kept: Residuals, levels: Levels, alone: bool
+) -> tuple[Coordinate, Coordinate, Coordinate]:
+    u, v, d = (_coordinate(k, fit, kept, levels, alone) for k, fit in enumerate(fits))
     return u, v, d
 
 
-def _coordinate(k: int, of: Fit, kept: Residuals, levels: Levels) -> Coordinate:
+def _coordinate(k: int, of: Fit, kept: Residuals, levels: Levels, alone: bool) -> Coordinate:
     r, rows = kept.r[:, k], of.rows
     n = np.diff(np.append(rows.first, len(r)))
     centred = r - (np.add.reduceat(r, rows.first) / n)[rows.track]
     lags, bounds = coordinate.autocorrelation(of)
-    memory = rows.length >= 1.5
+    memory = rows.length >= 1.5 and not alone
     w = of.regression.residual
     return Coordinate(
         NAMES[k], coordinate.noise(of, levels.of("sigma")), float(r.std(ddof=1)),

@@ -146,7 +146,7 @@ def _coordinate(k: int, of: Fitted, plain: Fitted, levels: Levels) -> Coordinate
     scaled = of.scaled[:, k]
     lags, bounds, interval = correlations(of, k, levels.of("correlation"))
     return Coordinate(
-        NAMES[k], estimate, sigma, sigma, interval, None, tails(scaled, levels.of("tails")), lags, bounds, scaled
+        NAMES[k], estimate, np.nan, np.nan, interval, None, tails(scaled, levels.of("tails")), lags, bounds, scaled
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from rich.table import Table as RichTable
 
 from consistency.characterising.characterise import Characterisation
@@ -18,7 +19,7 @@ def print_characterisation(of: Characterisation) -> None:
     for c in of.coordinates:
         table.add_row(
             c.name, interval(c.sigma), _or_dash(c.correlation), _or_dash(c.offset), _or_dash(c.tails.weight),
-            f"{c.tails.excess_kurtosis:.2f}", f"{c.pooled:.4g}",
+            f"{c.tails.excess_kurtosis:.2f}", f"{c.pooled:.4g}" if np.isfinite(c.pooled) else "-",
         )  # fmt: skip
     console = open_console()
     console.print(counted(of), markup=False, soft_wrap=not console.is_terminal)

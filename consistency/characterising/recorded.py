@@ -79,8 +79,8 @@ def _of_log(log: Log, sensor: PicturedSensor, source: str, grid: tuple[int, int]
     if len(seen.long_enough().z) == 0:
         raise InputError(
             f"{source}: has no truth.parquet and no landmark seen {SHORTEST} times at rest: while the robot moves, "
-            "noise cannot be told from motion; add true poses (noise, growth, tails), true poses and landmarks.parquet (bias "
-            "map and offsets too), or record some time at rest (noise at rest); --at-rest says that it never moved"
+            "noise cannot be told from motion; add true poses (noise, growth, tails), true poses and landmarks.parquet "
+            "(bias map and offsets too), or record some time at rest (noise at rest; --at-rest if it never moved)"
         )
     return characterise_posed(seen, sensor, source, (REST,))
 

@@ -30,7 +30,7 @@ def sentences(of: Characterisation) -> list[str]:
 
 
 def _noise(c: Coordinate) -> str:
-    parts = [f"{c.name}: {interval(c.sigma)} px is drawn anew in each observation"]
+    parts = [f"{c.name}: {interval(c.sigma)} px of noise"]
     if c.correlation is not None:
         how = "white" if c.white else f"not white, correlation {interval(c.correlation, 2)} with the step before"
         parts.append(how)

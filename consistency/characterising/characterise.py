@@ -89,6 +89,7 @@ def characterise(
     strange: int = 0,
     grid: tuple[int, int] = GRID,
     alone: bool = False,
+    miss: float = RATE,
 ) -> Characterisation:
     """Noise, growth, bias map, offsets, correlation and tails from residuals about the truth.
 
@@ -99,6 +100,7 @@ def characterise(
     strange : rows that were of no landmark
     grid : nodes of the bias map across and down
     alone : whether the rows of a track are not in order of time and have no offset in common
+    miss : chance that any interval misses
 
     Raises
     ------
@@ -116,7 +118,7 @@ def characterise(
         )
     cells = grid_of(kept, u, v)
     nodes = octaves(kept.ideal[:, 2])
-    levels = Levels(RATE, growth=len(nodes), bias=3 * int(cells.known.sum()))
+    levels = Levels(miss, growth=len(nodes), bias=3 * int(cells.known.sum()))
     X = cells.regressors(kept)
     fits = [_fitted(kept, k, X, cells.ridge, np.ones((len(kept), 1)), chosen, source, alone) for k in range(3)]
     growth = None

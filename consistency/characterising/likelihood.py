@@ -198,15 +198,14 @@ def _climb(
 ) -> tuple[Array, Array]:
     """Newton's steps to the least ``restricted``, and the curvature there.
 
-    The curvature is that with the bias held, less the share of the degrees of freedom that the bias costs.
+    The curvature is that with the bias held: its residuals have lost already the degrees of freedom that it costs.
     """
-    share = max(1.0 - rows.X.shape[1] / len(rows.r), 0.1)
     e = STEP * np.eye(len(x))
     for _ in range(STEPS):
         found = regress(rows, Parameters.of(full(x), length))
         if found is None:
             raise ValueError("the data do not determine the noise")
-        H = share * curvature(_held(rows, rows.X @ found.beta, full, length), x)
+        H = curvature(_held(rows, rows.X @ found.beta, full, length), x)
         if not np.isfinite(H).all() or np.linalg.eigvalsh(H)[0] <= 0:
             raise ValueError("the data do not determine the noise")
         slope = np.array([(restricted(x + d) - restricted(x - d)) / (2.0 * STEP) for d in e])

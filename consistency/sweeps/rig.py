@@ -79,9 +79,6 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
     image, disparity, motion = file.image, file.disparity, file.motion or base.belief.motion
     if file.motion is None:
         assumed.append(f"odometry noise of {base.name}")
-    belief = file.belief().model_dump()
-    if [key for key in ("disparity_growth", "bias") if belief.pop(key, None)]:
-        assumed.append("the same noise at all disparities, and a bias map that is right")
     if image is None and camera.image is not None:
         width, height = (round(pixels * file.f / f) for pixels in camera.image)
         image = (width, height)
@@ -101,7 +98,7 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
         for key, value in {"sigma": file.sigma, "f": file.f, "B": file.B, "image": image, "disparity": disparity,
                            "principal_point": file.principal_point, "mount": file.mount.model_dump()}.items()
     } | {
-        "belief.sensor": belief | {"disparity": disparity},
+        "belief.sensor": file.belief().model_dump() | {"disparity": disparity},
         "belief.motion": motion.model_dump(),
         "belief.sigma_points": file.sigma_points.model_dump(),
         "truth.motion.sigma_v": motion.sigma_v,

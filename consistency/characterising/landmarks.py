@@ -8,16 +8,17 @@ leverage of each observation in the fit of its point.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from consistency.characterising.residuals import GROSS, MAD, Residuals
 from consistency.models import stereo
 from consistency.types import Array, Indices
 
 SHORTEST = 3  # observations of a track: with two, most of what is seen is used up by the point
-ROUNDS = 30
+ROUNDS, SLOWLY = 30, 100  # at most; with free poses the points and the poses wait for each other
 SETTLED = 1e-6  # relative change of a sigma at which the rounds end
 NEAREST = 1e-3  # of the sigma of the disparity that a fitted one has at least
 
@@ -66,22 +67,27 @@ class Fitted:
         return Residuals(self.r, self.ideal, self.seen.track, self.seen.step, self.seen.moving)
 
 
-def fit_points(seen: Seen, f: float, B: float, parts: Indices, start: Array) -> Fitted:
+def fit_points(seen: Seen, f: float, B: float, parts: Indices, start: Array, free_poses: bool = False) -> Fitted:
     """Fit the point of each track and the noise of each component, in turns until both stay.
 
     Parameters
     ----------
     parts : (N, 3), component of each value
     start : (components,), px, first guess of the noise
+    free_poses : whether the pose of each step is fitted too, six values each, from the one that is given
     """
     sigma, points = np.asarray(start, float), _first_points(seen, f, B)
     groups = list(_groups(seen))
     N = len(seen.z)
     r, free, neighbours = np.zeros((N, 3)), np.ones((N, 3)), np.zeros((N, 3))
-    for _ in range(ROUNDS):
+    for _ in range(SLOWLY if free_poses else ROUNDS):
         for tracks, rows in groups:
             step, r[rows], free[rows], neighbours[rows] = _adjusted(seen, points[tracks], rows, f, B, sigma[parts])
             points[tracks] += step
+        if free_poses:
+            _, which = np.unique(seen.track, return_inverse=True)
+            seen, taken = posed_anew(seen, points[which], r, f, B, sigma[parts])
+            free = free - taken
         flat, count = parts.ravel(), len(sigma)
         left = np.maximum(np.bincount(flat, free.ravel(), count), 1e-9)
         new = np.sqrt(np.bincount(flat, (r**2).ravel(), count) / left)
@@ -90,6 +96,35 @@ def fit_points(seen: Seen, f: float, B: float, parts: Indices, start: Array) -> 
         if change < SETTLED:
             break
     return Fitted(seen, seen.z - r, r, free, parts, sigma, neighbours)
+
+
+def posed_anew(seen: Seen, points: Array, r: Array, f: float, B: float, sigma: Array) -> tuple[Seen, Array]:
+    """Each step's pose where the residuals of its points are least, and the leverage (N, 3) that this takes.
+
+    Parameters
+    ----------
+    points : (N, 3), the point of each row, m
+    r : (N, 3), residuals, px
+    sigma : (N, 3), px
+    """
+    local = np.einsum("nji,nj->ni", seen.R, points - seen.t)
+    x, y, z = local.T
+    jacobian = np.stack(stereo.project_jacobian(x, y, z, f, B), axis=-1) + np.zeros((len(x), 9))
+    zero = np.zeros_like(x)
+    turned = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
+    by_pose = np.concatenate([np.broadcast_to(-np.eye(3), turned.shape), turned], axis=2)
+    A = jacobian.reshape(-1, 3, 3) @ by_pose / sigma[..., None]
+    _, where, count = np.unique(seen.step, return_inverse=True, return_counts=True)
+    order, steps = np.argsort(where, kind="stable"), len(count)
+    first = np.append(0, np.cumsum(count)[:-1])
+    normal = np.add.reduceat(np.einsum("nci,ncj->nij", A, A)[order], first, axis=0)
+    pull = np.add.reduceat(np.einsum("nci,nc->ni", A, r / sigma)[order], first, axis=0)
+    cov = np.linalg.pinv(normal, hermitian=True)
+    move = np.einsum("sij,sj->si", cov, pull)[where]
+    # all steps together may move as they like with their points: one of the poses is none that is fitted
+    taken = np.einsum("nci,nij,ncj->nc", A, cov[where], A) * (steps - 1) / steps
+    R = seen.R @ Rotation.from_rotvec(move[:, 3:]).as_matrix()
+    return replace(seen, R=R, t=seen.t + np.einsum("nij,nj->ni", seen.R, move[:, :3])), taken
 
 
 def without_gross(fitted: Fitted) -> Array:

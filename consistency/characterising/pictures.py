@@ -10,7 +10,7 @@ import numpy as np
 from consistency.characterising.characterise import Characterisation
 from consistency.characterising.landmarks import SHORTEST, Seen
 from consistency.characterising.posed import characterise_posed
-from consistency.characterising.recorded import EXACT, REST
+from consistency.characterising.recorded import EXACT, FREE, REST
 from consistency.characterising.residuals import MAD
 from consistency.errors import InputError
 from consistency.frontend.planar_log import CAMERA, observations
@@ -39,6 +39,7 @@ class Sources:
     left: str | None = None
     right: str | None = None
     at_rest: bool = False
+    free_poses: bool = False
     seed: int = 0  # of RANSAC
 
 
@@ -59,8 +60,9 @@ def characterise_images(folder: Path, sources: Sources) -> Characterisation:
     R, t = _poses(sequence, sources)
     motions = visual_odometry(sequence, rng=np.random.default_rng(sources.seed))
     seen = _seen(rig, motions, R, t)
-    notes = (REST if sources.at_rest else EXACT, CHOSEN, rows_note(rig, motions))
-    return characterise_posed(seen, sensor_of(rig), str(folder), notes)
+    free = sources.free_poses or sources.at_rest
+    notes = (*((REST,) if sources.at_rest else ()), FREE if free else EXACT, CHOSEN, rows_note(rig, motions))
+    return characterise_posed(seen, sensor_of(rig), str(folder), notes, free)
 
 
 def _poses(sequence: Sequence, sources: Sources) -> tuple[Array, Array]:

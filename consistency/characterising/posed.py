@@ -23,6 +23,7 @@ from consistency.errors import InputError
 from consistency.scenario import PicturedSensor
 from consistency.types import Array, Indices
 
+FREE = 0.1  # share of a value that the fits must leave for it to tell of the shape of the noise
 FIXED = (
     "Landmarks are not known: each track's point was fitted. A bias map and constant offsets of tracks cannot be told "
     "from where the points are, so neither is estimated; what of a bias changes along a track counts as noise."
@@ -30,9 +31,11 @@ FIXED = (
 
 
 def characterise_posed(
-    seen: Seen, sensor: PicturedSensor, source: str, notes: tuple[str, ...] = ()
+    seen: Seen, sensor: PicturedSensor, source: str, notes: tuple[str, ...] = (), free_poses: bool = False
 ) -> Characterisation:
     """Noise, growth, correlation and tails from tracks of unknown points.
+
+    With ``free_poses`` the pose of each step is fitted too, so that its error is no noise.
 
     Raises
     ------
@@ -45,13 +48,13 @@ def characterise_posed(
     seen = seen.long_enough()
     short = total - len(seen.z)
     _require_enough(seen, total, source)
-    fitted = fit_points(seen, sensor.f, sensor.B, _parts(len(seen.z)), np.ones(3))
+    fitted = fit_points(seen, sensor.f, sensor.B, _parts(len(seen.z)), np.ones(3), free_poses)
     good = without_gross(fitted)
     inside = _inside(fitted, sensor)
     kept = seen.keep(good & inside).long_enough()
     _require_enough(kept, total, source)
-    plain = fit_points(kept, sensor.f, sensor.B, _parts(len(kept.z)), fitted.sigma)
-    nodes, by_disparity = _by_disparity(plain, sensor.f, sensor.B)
+    plain = fit_points(kept, sensor.f, sensor.B, _parts(len(kept.z)), fitted.sigma, free_poses)
+    nodes, by_disparity = _by_disparity(plain, sensor.f, sensor.B, free_poses)
     levels = Levels(RATE, growth=len(nodes))
     growth = None if by_disparity is None else _growth(nodes, by_disparity, levels)
     of = by_disparity if growth is not None and growth.shown and by_disparity is not None else plain
@@ -99,7 +102,7 @@ def _inside(fitted: Fitted, sensor: PicturedSensor) -> Array:
     return inside
 
 
-def _by_disparity(plain: Fitted, f: float, B: float) -> tuple[Array, Fitted | None]:
+def _by_disparity(plain: Fitted, f: float, B: float, free_poses: bool) -> tuple[Array, Fitted | None]:
     """Nodes of disparity, and the fit with a noise of its own around each; None with one node."""
     d = np.maximum(plain.ideal[:, 2], 1e-3)
     nodes = octaves(d)
@@ -109,7 +112,7 @@ def _by_disparity(plain: Fitted, f: float, B: float) -> tuple[Array, Fitted | No
     parts = _parts(len(d))
     parts[:, 2] += nearest
     start = np.append(plain.sigma[:2], np.full(len(nodes), plain.sigma[2]))
-    return nodes, fit_points(plain.seen, f, B, parts, start)
+    return nodes, fit_points(plain.seen, f, B, parts, start, free_poses)
 
 
 def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple[Estimate, float]:
@@ -143,7 +146,7 @@ def _coordinate(k: int, of: Fitted, plain: Fitted, levels: Levels) -> Coordinate
     own[:, k] = True
     sigma = float(np.sqrt((of.r[:, k] ** 2).sum() / of.free[:, k].sum())) if of is plain else float(plain.sigma[k])
     estimate, _ = log_interval(plain, own, sigma, levels.of("sigma"))
-    scaled = of.scaled[:, k]
+    scaled = of.scaled[of.free[:, k] > FREE, k]
     lags, bounds, interval = correlations(of, k, levels.of("correlation"))
     return Coordinate(
         NAMES[k], estimate, np.nan, np.nan, interval, None, tails(scaled, levels.of("tails")), lags, bounds, scaled

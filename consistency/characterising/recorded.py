@@ -24,6 +24,7 @@ from consistency.types import Array, Trial
 
 OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
 EXACT = "Poses are taken as exact: their errors are in sigma."
+FREE = "The pose of each step is fitted, six values each: what moves all points together is no noise."
 PLANE = "The truth is on a plane: what the sensor rolls, pitches and heaves is in sigma."
 SPACE = "truth.tum"  # of a log from images: true poses of the left camera in space
 REST = "Only the parts at rest are used: noise while moving may be larger."
@@ -42,7 +43,7 @@ def is_log(folder: Path) -> bool:
     return (folder / "observations.parquet").exists() or (folder / "controls.parquet").exists()
 
 
-def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False) -> Measured:
+def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False, free_poses: bool = False) -> Measured:
     """The sensor of a log folder.
 
     With true poses and landmarks everything is estimated; with true poses alone no bias map and no offsets; without
@@ -61,17 +62,23 @@ def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False)
     sensor = PicturedSensor.model_validate(file.model_dump(include=set(PicturedSensor.model_fields)))
     dumped = file.model_dump(exclude_none=True)
     others: dict[str, Any] = {key: value for key, value in dumped.items() if key in OTHERS}
-    return Measured(_of_log(log, sensor, str(folder), grid, at_rest), others)
+    return Measured(_of_log(log, sensor, str(folder), grid, at_rest, free_poses), others)
 
 
-def _of_log(log: Log, sensor: PicturedSensor, source: str, grid: tuple[int, int], at_rest: bool) -> Characterisation:
+def _of_log(
+    log: Log, sensor: PicturedSensor, source: str, grid: tuple[int, int], at_rest: bool, free_poses: bool
+) -> Characterisation:
     poses = all(trial.truth is not None for trial in log.trials)
     if poses and not at_rest and all(trial.landmarks is not None for trial in log.trials):
         data, strange = residuals_of(log.trials, sensor)
         return characterise(data, sensor, source, strange, grid)
     space = Path(source) / SPACE
     if not at_rest and len(log.trials) == 1 and space.is_file():
-        return characterise_posed(_in_space(log.trials[0], space), sensor, source, (EXACT,))
+        return characterise_posed(
+            _in_space(log.trials[0], space), sensor, source, (FREE if free_poses else EXACT,), free_poses
+        )
+    if free_poses:
+        raise InputError(f"{source}: --free-poses begins with poses in space, and there is no {SPACE} of one run")
     if poses and not at_rest:
         return characterise_posed(seen_of(log.trials, sensor.mount), sensor, source, (EXACT, PLANE))
     rests = [np.zeros(trial.steps, np.int64) if at_rest else _at_rest(trial) for trial in log.trials]

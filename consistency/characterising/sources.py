@@ -19,6 +19,7 @@ class Options:
 
     grid: tuple[int, int] = GRID
     at_rest: bool = False
+    free_poses: bool = False
     calibration: Path | None = None
     truth: Path | None = None
     format: str | None = None
@@ -48,7 +49,7 @@ def characterise_source(source: Path, options: Options) -> Measured:
     if is_log(source):
         if given := options.of_images():
             raise InputError(f"{given[0]}: goes with images, but {source} is a log")
-        return characterise_log(source, options.grid, options.at_rest)
+        return characterise_log(source, options.grid, options.at_rest, options.free_poses)
     if (options.board is None) != (options.square is None):
         raise InputError(
             "--board and --square go together: without the size of its squares, the depth of a plane is not known, and "
@@ -73,7 +74,10 @@ def _of_sequence(source: Path, options: Options) -> Measured:
         raise InputError("--distortion: goes with --board; other images bring their calibration")
     o = options
     return Measured(
-        characterise_images(source, Sources(o.calibration, o.truth, o.format, o.left, o.right, o.at_rest, o.seed)), {}
+        characterise_images(
+            source, Sources(o.calibration, o.truth, o.format, o.left, o.right, o.at_rest, o.free_poses, o.seed)
+        ),
+        {},
     )
 
 

@@ -19,6 +19,9 @@ def characterise(
     report: Annotated[Path | None, typer.Option("--report", help="Folder to write with report.html and .pdf.")] = None,
     grid: Annotated[str, typer.Option("--grid", metavar="KxL", help="Nodes of the bias map, across and down.")] = "5x4",
     at_rest: Annotated[bool, typer.Option("--at-rest", help="The sensor stood still all the time.")] = False,
+    free_poses: Annotated[
+        bool, typer.Option("--free-poses", help="Fit the pose of each step, so that its error is no noise.")
+    ] = False,
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="Of images: a file or folder, as 'frontend' takes it.")
     ] = None,
@@ -50,7 +53,9 @@ def characterise(
         require_free(report, overwrite, "characterisation", "--report")
     size = None if board is None else counts(board, "--board", CORNERS)
     nodes = counts(grid, "--grid", NODES)
-    options = Options(nodes, at_rest, calibration, truth, format, left, right, size, square, distortion, seed)
+    options = Options(
+        nodes, at_rest, free_poses, calibration, truth, format, left, right, size, square, distortion, seed
+    )
     measured = characterise_source(source, options)
     written = [] if report is None else write_sensor_reports(measured.of, report, json_of(measured.of), overwrite)
     write_sensor(out, sensor_text(measured.of, measured.others))

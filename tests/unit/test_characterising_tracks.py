@@ -148,6 +148,18 @@ def test_what_a_step_shares_is_named(rng: np.random.Generator) -> None:
     assert not still or float(still[0].split("v ")[1].split(",")[0]) < 0.1
 
 
+def test_errors_of_poses_are_no_noise_where_poses_are_free(rng: np.random.Generator) -> None:
+    seen = seen_of(rng, 400, 8)
+    shake = 0.002 * rng.standard_normal((8, 6))
+    R = seen.R @ Rotation.from_rotvec(shake[seen.step, :3]).as_matrix()
+    wrong = Seen(seen.z, R, seen.t + shake[seen.step, 3:], *list(vars(seen).values())[3:])
+    held, free = (fit_points(wrong, F, B, parts(seen), np.ones(3), free_poses) for free_poses in (False, True))
+    half = 5.5 / np.sqrt(2 * 400 * 7)
+    assert (np.abs(np.log(free.sigma / SIGMA)) < half).all()
+    assert np.log(held.sigma / SIGMA).max() > 2 * half  # negative control
+    assert np.isclose(free.free.sum(), 400 * (24 - 3) - 6 * 7, rtol=1e-3)
+
+
 def test_short_tracks_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match="of tracks with 3 or more"):
         characterise_posed(seen_of(rng, 300, 2), SENSOR, "here")

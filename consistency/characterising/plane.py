@@ -53,12 +53,14 @@ def of_model(corners: Corners, model: str, source: str, grid: Size) -> Character
         model="uvd", sigma=(1.0, 1.0, 1.0), f=calibrated.f, B=calibrated.B, image=corners.image,
         principal_point=calibrated.centre,
     )  # fmt: skip
-    of = characterise(data, sensor, f"{source}, distortion model '{model}'", grid=grid, alone=True)
+    # the nodes of the map lie where corners are: boards do not reach the edges of the image
+    where = sensor.model_copy(update={"image": None, "principal_point": None})
+    of = characterise(data, where, f"{source}, distortion model '{model}'", grid=grid, alone=True)
     rows = calibrated.rows
     spread = MAD * float(np.median(np.abs(rows - np.median(rows))))
     rms = ", ".join(f"{value:.2f}" for value in calibrated.rms)
     text = f"calibration rms {rms} px; v_left - v_right robust sd {spread:.2f} px"
-    return replace(of, notes=(text,))
+    return replace(of, sensor=sensor, notes=(text,))
 
 
 def _line(model: str, of: Characterisation) -> str:

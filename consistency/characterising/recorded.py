@@ -69,7 +69,7 @@ def _of_log(
     log: Log, sensor: PicturedSensor, source: str, grid: tuple[int, int], at_rest: bool, free_poses: bool
 ) -> Characterisation:
     poses = all(trial.truth is not None for trial in log.trials)
-    if poses and not at_rest and all(trial.landmarks is not None for trial in log.trials):
+    if poses and not at_rest and not free_poses and all(trial.landmarks is not None for trial in log.trials):
         data, strange = residuals_of(log.trials, sensor)
         return characterise(data, sensor, source, strange, grid)
     space = Path(source) / SPACE

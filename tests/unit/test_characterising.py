@@ -213,7 +213,7 @@ def test_residuals_are_the_noise_alone(uvd: cs.Scenario, tilted: dict[str, list[
     assert strange == 0
     assert len(data) == 2 * len(trial.z)
     assert np.abs(data.r).max() < 1e-6
-    assert len(data.first) == 2 * len(np.unique(trial.landmark))
+    assert len(data.first) == len(np.unique(data.track)) == 2 * len(np.unique(trial.landmark))
     assert (np.diff(data.step)[np.diff(data.track) == 0] > 0).all()
 
 

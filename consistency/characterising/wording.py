@@ -38,6 +38,10 @@ def _noise(c: Coordinate) -> str:
     if heavy:
         nu = 1.0 / c.tails.weight.value
         parts.append(f"not Gaussian, with tails of Student's distribution with {nu:.3g} degrees of freedom")
+        if (mixed := c.tails.mixture) is not None:
+            core, wide = (value * c.sigma.value for value in (mixed.core, mixed.wide))
+            rest = f"{100 * mixed.share:.2g} % with sd {wide:.3g} px"
+            parts[-1] = f"not Gaussian: most with sd {core:.3g} px, {rest}, which may be mismatches"
     else:
         parts.append("Gaussian" if c.tails.p_value >= GAUSSIAN else f"not Gaussian (skewness {c.tails.skewness:.2g})")
     if c.offset is not None:

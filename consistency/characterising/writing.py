@@ -110,7 +110,8 @@ def as_json(of: Characterisation) -> str:
 def _coordinate(c: Any) -> dict[str, Any]:
     estimates = {key: None if (e := getattr(c, key)) is None else vars(e) for key in ("sigma", "correlation", "offset")}
     shape = {"tail_weight": vars(c.tails.weight), "skewness": c.tails.skewness,
-             "excess_kurtosis": c.tails.excess_kurtosis, "normality_p": c.tails.p_value}  # fmt: skip
+             "excess_kurtosis": c.tails.excess_kurtosis, "normality_p": c.tails.p_value,
+             "mixture": None if c.tails.mixture is None else vars(c.tails.mixture)}  # fmt: skip
     return estimates | shape | {"pooled": c.pooled, "about_tracks": c.about_tracks, "autocorrelation": c.lags}
 
 

@@ -184,6 +184,18 @@ def test_tails_are_those_of_student(rng: np.random.Generator) -> None:
     assert light.weight.value < 0.03
 
 
+def test_few_wide_errors_are_told_from_students_tails(rng: np.random.Generator) -> None:
+    wide = rng.random(8000) < 0.03
+    found = tails(rng.standard_normal(8000) * np.where(wide, 5.0, 1.0), LEVEL)
+    assert found.mixture is not None
+    assert 0.02 < found.mixture.share < 0.04
+    assert np.isclose(found.mixture.wide / found.mixture.core, 5.0, rtol=0.2)
+    # both together have the variance of the residuals
+    both = (1 - found.mixture.share) * found.mixture.core**2 + found.mixture.share * found.mixture.wide**2
+    assert np.isclose(both, 1.0, rtol=0.01)
+    assert tails(stats.t.rvs(4, size=8000, random_state=rng), LEVEL).mixture is None
+
+
 def test_a_rate_has_the_interval_of_clopper_and_pearson() -> None:
     share = rate(3, 200, 0.01)
     assert np.isclose(share.low, stats.beta.ppf(0.005, 3, 198))

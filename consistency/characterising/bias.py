@@ -9,9 +9,9 @@ import numpy as np
 from scipy import optimize, stats
 
 from consistency.characterising import coordinate
-from consistency.characterising.basis import bilinear
+from consistency.characterising.basis import FEW, bilinear
 from consistency.characterising.likelihood import Fit
-from consistency.characterising.residuals import FEW, Residuals
+from consistency.characterising.residuals import Residuals
 from consistency.types import Array
 
 GRID = (5, 4)  # nodes across and down

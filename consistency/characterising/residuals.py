@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.characterising.basis import hats, octaves
+from consistency.characterising.basis import FEW, hats, octaves
 from consistency.models import point, stereo
 from consistency.scenario import PicturedSensor
 from consistency.types import Array, Indices, Trial
@@ -15,7 +15,6 @@ from consistency.types import Array, Indices, Trial
 MARGIN = 4.0  # standard deviations from a limit within which the noise decides whether a row is there at all
 GROSS = 6.0  # robust standard deviations: a Gaussian error is beyond in 2 of 10^9
 MAD = 1.482602218505602  # standard deviation of a Gaussian over its median absolute deviation
-FEW = 30  # rows of a node or a cell that say something
 HUBER = 1.345  # standard deviations beyond which a row counts less, Huber (1964)
 
 

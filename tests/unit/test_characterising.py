@@ -72,6 +72,10 @@ def test_nodes_of_disparity_are_octaves_between_the_ends_of_the_data() -> None:
     nodes = octaves(np.linspace(3.0, 27.0, 10_001))
     assert np.allclose(nodes, [3.12, 4.0, 8.0, 16.0, 26.88])
     assert len(octaves(np.full(50, 7.0))) == 1
+    d = np.concatenate([np.linspace(3.0, 3.5, 500), np.linspace(20.0, 30.0, 500)])
+    apart = octaves(d)
+    assert (hats(d, apart).sum(axis=0) >= 30).all()
+    assert 8.0 not in apart
 
 
 # --- likelihood --------------------------------------------------------------------------------------
@@ -248,12 +252,12 @@ def test_near_the_search_range_rows_are_left_out_by_their_ideal_value(rng: np.ra
 
 
 def test_mismatches_are_counted_and_are_no_noise(rng: np.random.Generator) -> None:
-    data = data_of(rng, 12_000, (1.0, 1.0, 0.65))
+    data = data_of(rng, 6_000, (1.0, 1.0, 0.65))
     wrong = rng.random(len(data)) < 0.02
     r = data.r + np.where(wrong[:, None], [0.0, 0.0, 25.0], 0.0)
     of = characterise(Residuals(r, *list(vars(data).values())[1:]), SENSOR, "test", miss=1e-6)
     assert of.gross.holds(0.02)
-    assert of.gross.low > 0.01
+    assert of.gross.low > 0.008
     assert of.coordinates[2].sigma.holds(0.65)
 
 
@@ -268,7 +272,7 @@ def test_shrinkage_is_that_of_empirical_bayes() -> None:
 
 
 def test_a_bias_is_shown_where_there_is_one_and_zero_where_nothing_is_known(rng: np.random.Generator) -> None:
-    data = data_of(rng, 9000, (1.0, 1.0, 0.6))
+    data = data_of(rng, 6000, (1.0, 1.0, 0.6))
     data = data.keep(~((data.ideal[:, 0] > 90.0) & (data.ideal[:, 1] > 50.0)))
     r = data.r.copy()
     r[:, 2] += 0.01 * data.ideal[:, 0]
@@ -283,7 +287,7 @@ def test_a_bias_is_shown_where_there_is_one_and_zero_where_nothing_is_known(rng:
     assert (np.abs(of.bias.value[2] - 0.01 * u) < of.bias.half[2])[known].all()
     assert of.bias.believed[2, -1] == 0.0
     assert (of.bias.believed[:2] == 0.0).all()
-    assert np.sqrt(np.mean((of.bias.believed[2] - 0.01 * u)[known] ** 2)) < 0.1
+    assert np.sqrt(np.mean((of.bias.believed[2] - 0.01 * u)[known] ** 2)) < 0.15
 
 
 def test_the_test_for_a_bias_pays_for_offsets_of_tracks(rng: np.random.Generator) -> None:

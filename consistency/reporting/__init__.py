@@ -16,11 +16,12 @@ from consistency.errors import InputError
 from consistency.store.atomic import write_whole
 
 if TYPE_CHECKING:
+    from consistency.characterising.characterise import Characterisation
     from consistency.reporting.blocks import Document
     from consistency.sweeps.regime import Regime
     from consistency.verdicts.monitoring import Watched
 
-__all__ = ["require_plot", "write_monitor_plot", "write_regime_reports", "write_reports"]
+__all__ = ["require_plot", "write_monitor_plot", "write_regime_reports", "write_reports", "write_sensor_reports"]
 
 KINDS = (".png", ".pdf", ".svg")  # of a plot
 
@@ -72,6 +73,32 @@ def write_regime_reports(regime: Regime, folder: Path) -> list[Path]:
 
     _write_document(compose_regime(regime), *targets)
     return targets
+
+
+def write_sensor_reports(of: Characterisation, folder: Path, data: str, overwrite: bool = False) -> list[Path]:
+    """``report.html``, ``report.pdf`` and ``characterisation.json`` in a folder that appears whole or not at all.
+
+    Parameters
+    ----------
+    data : text of the JSON file
+
+    Raises
+    ------
+    InputError
+        The folder exists or cannot be written.
+    """
+    from consistency.reporting.sensor import compose_sensor
+    from consistency.store.storage import manifest_of, write_folder
+
+    manifest = manifest_of(kind="characterisation", source=of.source)
+    document = compose_sensor(of, manifest)
+
+    def contents(at: Path) -> None:
+        _write_document(document, at / "report.html", at / "report.pdf")
+        _write(at / "characterisation.json", data.encode("utf-8"))
+
+    write_folder(folder, {}, manifest, contents, overwrite)
+    return [folder / name for name in ("report.html", "report.pdf", "characterisation.json")]
 
 
 def _write_document(document: Document, html: Path | None, pdf: Path | None) -> None:

@@ -44,7 +44,7 @@ class Start(Table):
 class SensorFile(PicturedSensor):
     """``sensor.toml``: the sensor, its mount and noise, and the noise of the odometry, as believed."""
 
-    motion: BelievedMotion
+    motion: BelievedMotion | None = None  # a log needs it; what is measured of a camera alone has none
     start: Start | None = None
     sigma_points: SigmaPoints = SigmaPoints()
     guard: GuardSettings | None = None
@@ -81,6 +81,8 @@ def read_log(folder: str | Path) -> Log:
             f"{path}: missing; 'consistency frontend' makes a log of images, 'consistency simulate' one of a scenario"
         )
     sensor = read_table(path, SensorFile)
+    if sensor.motion is None:
+        raise InputError(f"{path}: key 'motion': missing; give sigma_v and sigma_omega of the odometry")
     belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points, guard=sensor.guard)
     controls, observations = read_parquet(folder, "controls"), _observations(folder, sensor)
     tables = {

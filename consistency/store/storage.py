@@ -97,7 +97,7 @@ def plain(value: Any) -> Any:
 # --- writing -------------------------------------------------------------------------------------
 
 
-def require_free(folder: Path, overwrite: bool, kind: str = "results") -> None:
+def require_free(folder: Path, overwrite: bool, kind: str = "results", option: str = "--out") -> None:
     """Refuse, before any work, a folder that exists or cannot be made.
 
     With ``overwrite`` only a folder that this bench wrote may be replaced, and only by one of its own
@@ -105,20 +105,20 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results") -> None:
     """
     if folder.exists() or folder.is_symlink():
         if not overwrite:
-            raise InputError(f"--out {folder}: exists already; choose another folder or add --overwrite")
+            raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite")
         try:
             before = read_manifest(folder).get("kind")
             if before != kind:
                 raise InputError(f"it holds {before}, not {kind}")
         except InputError as error:
             raise InputError(
-                f"--out {folder}: is not an output folder of this bench; not overwritten ({error})"
+                f"{option} {folder}: is not an output folder of this bench; not overwritten ({error})"
             ) from None
     try:
         with tempfile.TemporaryDirectory(dir=_above(folder), prefix=f".{folder.name}."):
             pass
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from None
+        raise InputError(f"{option} {folder}: cannot be written ({error.strerror})") from None
 
 
 def _above(folder: Path) -> Path:

@@ -76,7 +76,9 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
     assert file.B is not None
     f, B = camera.rig
     assumed = [f"path and landmarks of {base.name}"]
-    image, disparity = file.image, file.disparity
+    image, disparity, motion = file.image, file.disparity, file.motion or base.belief.motion
+    if file.motion is None:
+        assumed.append(f"odometry noise of {base.name}")
     if image is None and camera.image is not None:
         width, height = (round(pixels * file.f / f) for pixels in camera.image)
         image = (width, height)
@@ -98,10 +100,10 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
                            "disparity_growth": file.disparity_growth, "effects": _with_bias(camera, file)}.items()
     } | {
         "belief.sensor": file.belief().model_dump() | {"disparity": disparity},
-        "belief.motion": file.motion.model_dump(),
+        "belief.motion": motion.model_dump(),
         "belief.sigma_points": file.sigma_points.model_dump(),
-        "truth.motion.sigma_v": file.motion.sigma_v,
-        "truth.motion.sigma_omega": file.motion.sigma_omega,
+        "truth.motion.sigma_v": motion.sigma_v,
+        "truth.motion.sigma_omega": motion.sigma_omega,
     }  # fmt: skip
     try:
         scenario = with_changes(base, path.stem, f"{path} in the world of {base.name}", changes)

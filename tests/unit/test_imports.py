@@ -32,7 +32,7 @@ RANK = {
     "verdicts.curves": 7, "verdicts.judge": 8, "verdicts.monitoring": 8, "verdicts.comparison": 9,
     "runs.sequential": 9,
     "terminal.table": 10,
-    "runs.findings": 11, "sweeps": 11, "challenging": 11,
+    "runs.findings": 11, "sweeps": 11, "challenging": 11, "characterising": 11,
     "reporting": 12, "gating": 12,
     "cli": 13, "testing": 13, "pytest_plugin": 13,
     "__main__": 14,

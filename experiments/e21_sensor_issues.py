@@ -231,7 +231,7 @@ def near_far_mix(study: cs.Study) -> cs.Finding:
         statistic="RMSE of position and heading of parked-ekf-uvd with eight features at a time",
         published="both are needed",
         measured="; ".join(
-            "{} {:.3f} m, {:.2f} deg ({})".format(name, *rmse(verdict), verdict.status)
+            f"{name} {rmse(verdict)[0]:.3f} m, {rmse(verdict)[1]:.2f} deg ({verdict.status})"
             for name, (verdict, _) in found.items()
         )
         + f"; p {tests[0]:.2g}, {tests[1]:.2g}",

@@ -15,9 +15,11 @@ import tomli_w
 from scipy import stats
 
 import consistency as cs
+from consistency.runs.montecarlo import simulate_log
 from consistency.scenario import data_folder
 from consistency.scenario.effects import Drift, Observations
 from consistency.simulation import World
+from consistency.store.log import read_log
 from consistency.types import Array, Trial
 
 ALARM = 1e-6
@@ -83,6 +85,15 @@ def test_heavy_tails_are_a_second_error_of_some() -> None:
         assert is_like(error[hit, i] / sigma[i], stats.norm)
     assert np.abs(np.corrcoef(error[hit].T)[np.triu_indices(3, 1)]).max() < 5.5 / np.sqrt(hit.sum())
     assert trial.source is None
+
+
+def test_a_log_may_hold_gross_errors(tmp_path: Path) -> None:
+    """Some pixels outside the image do not mean that pixels are counted from its corner."""
+    effect = {"kind": "heavy-tails", "rate": 0.05, "sigma_px": [200.0, 200.0, 0.0]}
+    scenario = cs.load_scenario("herath2007-stereo").variant("tails", truth__sensor__effects=[effect])
+    simulate_log(scenario, runs=1, seed=SEED, out=tmp_path / "log")
+    trial = read_log(tmp_path / "log").trials[0]
+    assert (np.abs(trial.z[:, 0]) > 175.0).any()
 
 
 def test_the_error_of_a_track_is_a_stationary_gauss_markov_process() -> None:

@@ -342,11 +342,12 @@ def test_a_failed_run_counts_up_to_its_end(uvd: cs.Scenario) -> None:
 def test_verdicts_tell_precision_and_recall(
     wrong: cs.Scenario, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    cs.run_trials(wrong, FILTERS, runs=3, seed=1, jobs=1, out=tmp_path / "out")
+    cs.run_trials(wrong, FILTERS, runs=4, seed=2, jobs=1, out=tmp_path / "out")
     verdicts = cs.analyse(cs.read_results(tmp_path / "out"))
     assert verdicts["ekf-uvd"].rejection is None
     score = verdicts["ekf-uvd+gate"].rejection
     assert score is not None
+    assert score.precision != score.recall
     statistics = json.loads(verdicts_json(verdicts))["ekf-uvd+gate"]["statistics"]
     assert statistics["rejection_recall"] == list(score.recall)
     assert statistics["rejection_precision"] == list(score.precision)

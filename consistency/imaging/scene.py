@@ -88,7 +88,7 @@ class Scene:
             raise InputError("scene: has no layer; give at least one")
 
     def seen(self, pose: Array, rays: Array) -> tuple[Array, Indices]:
-        """What rays hit first.
+        """What rays hit: the last layer that they meet, for layers stand from far to near.
 
         Parameters
         ----------
@@ -102,11 +102,10 @@ class Scene:
         """
         turned = rays @ rotation(*pose[3:]).T
         points, number = np.full((len(rays), 3), np.nan), np.full(len(rays), NOWHERE)
-        nearest = np.full(len(rays), np.inf)
         for k, layer in enumerate(self.layers):
             reach, a, b = layer.meet(pose[:3], turned)
-            hit = (reach > 0.0) & (reach < nearest) & (np.abs(a) <= layer.half[0]) & (np.abs(b) <= layer.half[1])
-            points[hit], number[hit], nearest[hit] = layer.points(a[hit], b[hit]), k, reach[hit]
+            hit = (reach > 0.0) & np.isfinite(reach) & (np.abs(a) <= layer.half[0]) & (np.abs(b) <= layer.half[1])
+            points[hit], number[hit] = layer.points(a[hit], b[hit]), k
         return points, number
 
 

@@ -110,12 +110,12 @@ def test_features_are_spread_over_the_image() -> None:
 
 def test_left_right_check_finds_what_only_one_image_sees() -> None:
     """Beside a near pole the left image shows wall that the right one does not."""
-    near = Layer.facing(1.0, RandomTexture.draw(np.random.default_rng(5)), (0.0, 0.0), (0.3, 9.0))
+    near = Layer.facing(1.0, RandomTexture.draw(np.random.default_rng(5)), (-1 / 3, 0.0), (0.3, 9.0))
     left, right = pair(Scene((*wall(4.0).layers, near)), 2.0)
-    # the pole is 45 px wide about 0 in the left image, 13.5 px further left in the right one: hidden are u from
-    # -22.5 - 13.5 + 3.4 to -22.5
+    # the pole is 45 px wide about u = 50 in the left image, 13.5 px further left in the right one: hidden are u from
+    # 27.5 - 13.5 + 3.4 to 27.5; u = -45 is wall in both, and its mirror image is on the pole
     v = np.arange(-90.0, 91.0, 10.0)
-    hidden, open_ = (np.stack([np.full(len(v), u), v], axis=-1) for u in (-29.0, 60.0))
+    hidden, open_ = (np.stack([np.full(len(v), u), v], axis=-1) for u in (22.0, -45.0))
     shares = []
     for uv in (hidden, open_):
         d = BlockMatching().measure(left, right, uv)

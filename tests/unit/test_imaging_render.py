@@ -162,3 +162,13 @@ def test_bad_input_is_said() -> None:
         StereoCamera(Camera(), Camera(f=160.0))
     with pytest.raises(cs.InputError, match="has no layer"):
         Scene(())
+
+
+def test_blur_spreads_a_spot_and_keeps_its_sum() -> None:
+    """2 pi radius^2 times the depth of a spot, however wide the point spread is."""
+    texture = Blobs(np.zeros((1, 1, 2)), cell=1.0, radius=0.05, depth=90.0)
+    grid = np.linspace(0.0, 1.0, 200, endpoint=False)
+    a, b = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    for blur in (0.0, 0.03, 0.06):
+        dark = (texture.ground - texture.grey(a, b, blur)).sum() / len(a)
+        assert dark == pytest.approx(90.0 * 2.0 * np.pi * 0.05**2, rel=1e-3)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 from consistency.characterising.boards import Calibrated, Corners, calibrate
@@ -158,6 +159,24 @@ def test_errors_of_poses_are_no_noise_where_poses_are_free(rng: np.random.Genera
     assert (np.abs(np.log(free.sigma / SIGMA)) < half).all()
     assert np.log(held.sigma / SIGMA).max() > 2 * half  # negative control
     assert np.isclose(free.free.sum(), 400 * (24 - 3) - 6 * 7, rtol=1e-3)
+
+
+def test_points_and_poses_together_are_where_least_squares_has_them(rng: np.random.Generator) -> None:
+    seen = seen_of(rng, 12, 4)
+    fitted = fit_points(seen, F, B, parts(seen), np.ones(3), free_poses=True)
+
+    def misfit(x: Array) -> Array:
+        poses, points = x[:24].reshape(4, 6)[seen.step], x[24:].reshape(12, 3)[seen.track]
+        turn = seen.R @ Rotation.from_rotvec(poses[:, 3:]).as_matrix()
+        local = np.einsum("nji,nj->in", turn, points - seen.t - poses[:, :3])
+        return np.asarray(((seen.z - np.stack(stereo.project(*local, F, B), axis=-1)) / fitted.sigma).ravel())
+
+    start = np.concatenate([np.zeros(24), np.tile([6.0, 0.0, 0.0], 12)])
+    best = optimize.least_squares(misfit, start, x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-12)
+    assert np.isclose(((fitted.r / fitted.sigma) ** 2).sum(), 2.0 * best.cost, rtol=1e-6)
+    assert np.allclose(fitted.r / fitted.sigma, best.fun.reshape(-1, 3), atol=1e-3)
+    hat = best.jac @ np.linalg.pinv(best.jac.T @ best.jac, rcond=1e-10) @ best.jac.T
+    assert np.allclose(fitted.free.ravel(), 1.0 - np.diag(hat), atol=1e-3)
 
 
 def test_short_tracks_are_refused(rng: np.random.Generator) -> None:

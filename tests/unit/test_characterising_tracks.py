@@ -94,6 +94,22 @@ def test_the_noise_is_recovered_however_short_the_tracks(rng: np.random.Generato
         assert estimate.high / estimate.low < 1.35
 
 
+def test_tracks_of_unlike_noise_make_the_interval_wider(rng: np.random.Generator) -> None:
+    """Half of the tracks have three times the noise: squares scatter by tracks, as chi-square does not know."""
+    seen = seen_of(rng, 200, 12)
+    ideal = fit_points(seen, F, B, parts(seen), np.ones(3)).ideal
+    unlike = Seen(
+        ideal + (seen.z - ideal) * np.where(seen.track % 2, 3.0, 1.0)[:, None], *list(vars(seen).values())[1:]
+    )
+    width = []
+    for each in (seen, unlike):
+        fitted = fit_points(each, F, B, parts(seen), np.ones(3))
+        estimate, variance = log_interval(fitted, fitted.parts == 0, float(fitted.sigma[0]), 0.01)
+        width.append(np.log(estimate.high / estimate.low))
+        assert variance >= 0.499 / fitted.free[:, 0].sum()
+    assert width[1] > 1.5 * width[0]
+
+
 def test_correlation_is_found_and_not_that_of_the_fit(rng: np.random.Generator) -> None:
     white = seen_of(rng, 800, 5)
     fitted = fit_points(white, F, B, parts(white), np.ones(3))

@@ -40,8 +40,9 @@ def _noise(c: Coordinate) -> str:
         parts.append(f"not Gaussian, with tails of Student's distribution with {nu:.3g} degrees of freedom")
         if (mixed := c.tails.mixture) is not None:
             core, wide = (value * c.sigma.value for value in (mixed.core, mixed.wide))
-            share = 100 * mixed.share
-            parts[-1] = f"not Gaussian: as if {100 - share:.3g} % had sd {core:.3g} px and {share:.2g} % {wide:.3g} px"
+            percent = 100 * mixed.share
+            mixture = f"{100 - percent:.3g} % had sd {core:.3g} px and {percent:.2g} % {wide:.3g} px"
+            parts[-1] = f"not Gaussian: as if {mixture}"
     else:
         parts.append("Gaussian" if c.tails.p_value >= GAUSSIAN else f"not Gaussian (skewness {c.tails.skewness:.2g})")
     if c.offset is not None:

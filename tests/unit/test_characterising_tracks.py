@@ -5,18 +5,23 @@ Random tests have levels of 1e-7 an interval, so that one of them fails by chanc
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
+import consistency as cs
 from consistency.characterising.boards import Calibrated, Corners, calibrate
 from consistency.characterising.landmarks import Seen, fit_points, without_gross
 from consistency.characterising.plane import residuals_about_boards
 from consistency.characterising.posed import characterise_posed, correlations, log_interval
+from consistency.characterising.recorded import seen_of as seen_of_log
 from consistency.errors import InputError
 from consistency.models import stereo
-from consistency.scenario import PicturedSensor
+from consistency.scenario import Mount, PicturedSensor
+from consistency.simulation import simulate
 from consistency.types import Array
 
 F, B = 400.0, 0.1
@@ -198,6 +203,18 @@ def test_points_and_poses_together_are_where_least_squares_has_them(rng: np.rand
 def test_short_tracks_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match="of tracks with 3 or more"):
         characterise_posed(seen_of(rng, 300, 2), SENSOR, "here")
+
+
+def test_a_log_is_seen_from_the_mount_of_its_sensor(uvd: cs.Scenario, tilted: dict[str, Any]) -> None:
+    changes = {"truth__sensor__mount": tilted, "truth__sensor__sigma": (1e-7, 1e-7, 1e-7)}
+    trial = simulate(uvd.variant("tilted", **changes))
+    assert trial.landmarks is not None
+    seen = seen_of_log([trial, trial], Mount(**tilted))
+    assert len(seen.z) == 2 * len(trial.z)
+    points = trial.landmarks[seen.track % trial.n_landmarks]
+    local = np.einsum("nji,nj->in", seen.R, points - seen.t)
+    assert np.allclose(np.stack(stereo.project(*local, 150.0, 0.09), axis=-1), seen.z, atol=1e-5)
+    assert len(np.unique(seen.track)) == 2 * len(np.unique(trial.landmark))
 
 
 # --- boards ------------------------------------------------------------------------------------------

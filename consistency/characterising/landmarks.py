@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from consistency.characterising.bundle import slopes_of, step_of_points, steps_of_both
 from consistency.characterising.residuals import GROSS, MAD, Residuals
 from consistency.models import stereo
 from consistency.types import Array, Indices
 
 SHORTEST = 3  # observations of a track: with two, most of what is seen is used up by the point
-ROUNDS, SLOWLY = 30, 100  # at most; with free poses the points and the poses wait for each other
+ROUNDS = 30
 SETTLED = 1e-6  # relative change of a sigma at which the rounds end
-NEAREST = 1e-3  # of the sigma of the disparity that a fitted one has at least
 
 
 @dataclass(frozen=True)
@@ -78,19 +78,23 @@ def fit_points(seen: Seen, f: float, B: float, parts: Indices, start: Array, fre
     """
     sigma, points = np.asarray(start, float), _first_points(seen, f, B)
     groups = list(_groups(seen))
-    N = len(seen.z)
-    r, free, neighbours = np.zeros((N, 3)), np.ones((N, 3)), np.zeros((N, 3))
-    for _ in range(SLOWLY if free_poses else ROUNDS):
-        for tracks, rows in groups:
-            step, r[rows], free[rows], neighbours[rows] = _adjusted(seen, points[tracks], rows, f, B, sigma[parts])
-            points[tracks] += step
+    steps, at = np.unique(seen.step, return_inverse=True)
+    r, free, neighbours = (np.zeros(seen.z.shape) for _ in range(3))
+    for _ in range(ROUNDS):
+        s = sigma[parts]
+        slopes = [slopes_of(seen.z[k], seen.R[k], seen.t[k], points[t], f, B, s[k]) for t, k in groups]
         if free_poses:
-            _, which = np.unique(seen.track, return_inverse=True)
-            seen, taken = posed_anew(seen, points[which], r, f, B, sigma[parts])
-            free = free - taken
-        flat, count = parts.ravel(), len(sigma)
-        left = np.maximum(np.bincount(flat, free.ravel(), count), 1e-9)
-        new = np.sqrt(np.bincount(flat, (r**2).ravel(), count) / left)
+            done, moves = steps_of_both(
+                [(each, at[k]) for each, (_, k) in zip(slopes, groups, strict=True)], len(steps)
+            )
+            seen = _moved(seen, moves[at])
+        else:
+            done = [step_of_points(each) for each in slopes]
+        for (tracks, rows), step in zip(groups, done, strict=True):
+            points[tracks] += step.points
+            r[rows], free[rows], neighbours[rows] = step.r * s[rows], step.free, step.neighbours
+        neighbours[1:] *= s[1:] * s[:-1]
+        new = np.sqrt(np.bincount(parts.ravel(), (r**2).ravel()) / np.bincount(parts.ravel(), free.ravel()))
         change = np.abs(new / sigma - 1.0).max()
         sigma = np.maximum(new, 1e-9)
         if change < SETTLED:
@@ -98,33 +102,10 @@ def fit_points(seen: Seen, f: float, B: float, parts: Indices, start: Array, fre
     return Fitted(seen, seen.z - r, r, free, parts, sigma, neighbours)
 
 
-def posed_anew(seen: Seen, points: Array, r: Array, f: float, B: float, sigma: Array) -> tuple[Seen, Array]:
-    """Each step's pose where the residuals of its points are least, and the leverage (N, 3) that this takes.
-
-    Parameters
-    ----------
-    points : (N, 3), the point of each row, m
-    r : (N, 3), residuals, px
-    sigma : (N, 3), px
-    """
-    local = np.einsum("nji,nj->ni", seen.R, points - seen.t)
-    x, y, z = local.T
-    jacobian = np.stack(stereo.project_jacobian(x, y, z, f, B), axis=-1) + np.zeros((len(x), 9))
-    zero = np.zeros_like(x)
-    turned = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-    by_pose = np.concatenate([np.broadcast_to(-np.eye(3), turned.shape), turned], axis=2)
-    A = jacobian.reshape(-1, 3, 3) @ by_pose / sigma[..., None]
-    _, where, count = np.unique(seen.step, return_inverse=True, return_counts=True)
-    order, steps = np.argsort(where, kind="stable"), len(count)
-    first = np.append(0, np.cumsum(count)[:-1])
-    normal = np.add.reduceat(np.einsum("nci,ncj->nij", A, A)[order], first, axis=0)
-    pull = np.add.reduceat(np.einsum("nci,nc->ni", A, r / sigma)[order], first, axis=0)
-    cov = np.linalg.pinv(normal, hermitian=True)
-    move = np.einsum("sij,sj->si", cov, pull)[where]
-    # all steps together may move as they like with their points: one of the poses is none that is fitted
-    taken = np.einsum("nci,nij,ncj->nc", A, cov[where], A) * (steps - 1) / steps
-    R = seen.R @ Rotation.from_rotvec(move[:, 3:]).as_matrix()
-    return replace(seen, R=R, t=seen.t + np.einsum("nij,nj->ni", seen.R, move[:, :3])), taken
+def _moved(seen: Seen, moves: Array) -> Seen:
+    """The same with poses moved by shifts and rotation vectors (N, 6) in sensor axes."""
+    t = seen.t + np.einsum("nij,nj->ni", seen.R, moves[:, :3])
+    return replace(seen, R=seen.R @ Rotation.from_rotvec(moves[:, 3:]).as_matrix(), t=t)
 
 
 def without_gross(fitted: Fitted) -> Array:
@@ -150,27 +131,3 @@ def _groups(seen: Seen) -> Iterator[tuple[Indices, Indices]]:
     for n in np.unique(count):
         tracks = np.flatnonzero(count == n)
         yield tracks, first[tracks][:, None] + np.arange(n)
-
-
-def _adjusted(
-    seen: Seen, points: Array, rows: Indices, f: float, B: float, sigma: Array
-) -> tuple[Array, Array, Array, Array]:
-    """One step of least squares for tracks of one length: steps (T, 3), residuals, free shares, covariances (T, n, 3).
-
-    The residuals are those after the step, to first order.
-    """
-    R, local = seen.R[rows], np.einsum("tnji,tnj->tni", seen.R[rows], points[:, None] - seen.t[rows])
-    x = np.maximum(local[..., 0], f * B / 1e4)
-    predicted = np.stack(stereo.project(x, local[..., 1], local[..., 2], f, B), axis=-1)
-    zero = np.zeros_like(x)
-    jacobian = np.stack(stereo.project_jacobian(x, local[..., 1], local[..., 2], f, B), axis=-1)
-    H = (jacobian + zero[..., None]).reshape(*x.shape, 3, 3) @ np.swapaxes(R, -1, -2)
-    r0, s = seen.z[rows] - predicted, sigma[rows]
-    A = H / s[..., None]
-    cov = np.linalg.pinv(np.einsum("tnci,tncj->tij", A, A), hermitian=True)
-    step = np.einsum("tij,tncj,tnc->ti", cov, A, r0 / s)
-    r = r0 - np.einsum("tnci,ti->tnc", H, step)
-    free = 1.0 - np.einsum("tnci,tij,tncj->tnc", A, cov, A)
-    shared = np.zeros_like(r)
-    shared[:, 1:] = -np.einsum("tnci,tij,tncj->tnc", H[:, 1:], cov, H[:, :-1])
-    return step, r, free, shared

@@ -65,7 +65,7 @@ def characterise_posed(
     left_out = {"of tracks too short": short, "near a limit of the sensor": limits, "of tracks grossly wrong": wrong}
     return Characterisation(
         sensor, source, (u, v, d), growth, None, rate(wrong, len(good), levels.of("tails")), tracks, len(kept.z),
-        left_out, levels, of.residuals, (FIXED, *notes, *_hidden((u, v, d)), *_shared(of)), ratio,
+        left_out, levels, of.residuals, (FIXED, *notes, *_hidden((u, v, d)), *_shared(of, free_poses)), ratio,
     )  # fmt: skip
 
 
@@ -176,7 +176,7 @@ def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, Estima
     return lags, bounds, Estimate(value, max(value - half, -1.0), min(value + half, 1.0))
 
 
-def _shared(of: Fitted) -> tuple[str, ...]:
+def _shared(of: Fitted, free_poses: bool) -> tuple[str, ...]:
     """A note on what all landmarks of a step have in common, which is the poses' or the rig's and not the noise's."""
     _, where, count = np.unique(of.seen.step, return_inverse=True, return_counts=True)
     pairs = float((count * (count - 1)).sum())
@@ -188,7 +188,5 @@ def _shared(of: Fitted) -> tuple[str, ...]:
         texts.append(f"{name} {np.sqrt(max(float((total**2 - squares).sum()) / pairs, 0.0)):.2g}")
     if not any(float(text.split()[1]) for text in texts):
         return ()
-    return (
-        f"Of the noise, what all landmarks of a step share has sd {', '.join(texts)} px: errors of the poses and shake "
-        "of the rig, which are in sigma.",
-    )
+    cause = "no pose explains it" if free_poses else "errors of the poses and shake of the rig"
+    return (f"Of the noise, what all landmarks of a step share has sd {', '.join(texts)} px: {cause}.",)

@@ -40,8 +40,9 @@ def _noise(c: Coordinate) -> str:
         parts.append(f"not Gaussian, with tails of Student's distribution with {nu:.3g} degrees of freedom")
         if (mixed := c.tails.mixture) is not None:
             core, wide = (value * c.sigma.value for value in (mixed.core, mixed.wide))
-            rest = f"{100 * mixed.share:.2g} % with sd {wide:.3g} px"
-            parts[-1] = f"not Gaussian: most with sd {core:.3g} px, {rest}, which may be mismatches"
+            percent = 100 * mixed.share
+            mixture = f"{100 - percent:.3g} % had sd {core:.3g} px and {percent:.2g} % {wide:.3g} px"
+            parts[-1] = f"not Gaussian: as if {mixture}"
     else:
         parts.append("Gaussian" if c.tails.p_value >= GAUSSIAN else f"not Gaussian (skewness {c.tails.skewness:.2g})")
     if c.offset is not None:
@@ -58,9 +59,7 @@ def _growth(of: Characterisation) -> str:
         return "Growth of sigma_d with disparity: not known, the disparities are all alike."
     ends = f"{growth.nodes[0]:.3g} and {growth.nodes[-1]:.3g} px"
     if not growth.shown:
-        return (
-            f"sigma_d is the same at all disparities between {ends}, as far as the data tell (p {growth.p_value:.2g})."
-        )
+        return f"No growth of sigma_d with disparity is shown between {ends} (p {growth.p_value:.2g})."
     values = ", ".join(f"{interval(s, 3)} at {d:.3g}" for d, s in zip(growth.nodes, growth.sigma, strict=True))
     return f"sigma_d depends on the disparity (p {growth.p_value:.2g}), in px: {values}."
 

@@ -303,6 +303,15 @@ def test_the_test_for_a_bias_pays_for_offsets_of_tracks(rng: np.random.Generator
     assert np.isclose(bias.half[0, 0], stats.norm.isf(LEVEL / 2) / np.sqrt(40), rtol=0.6)
 
 
+def test_a_bias_scatters_as_tracks_do_where_offsets_are_not_modelled(rng: np.random.Generator) -> None:
+    """40 tracks of 50 rows with offsets: 1 / 40 of their variance, 40 times what independent rows would have."""
+    rows = rows_of(rng, 40, 50, 0.5, 0.0, 1.0)
+    found = fit(rows, 1.0, memory=False)
+    _, half, cov = coordinate.bias(found, 0.01)
+    assert 10.0 < cov[0, 0] / found.regression.cov[0, 0] < 120.0
+    assert np.isclose(half[0], stats.t.isf(0.005, 39) * np.sqrt(cov[0, 0]), rtol=1e-6)
+
+
 # --- all of it ---------------------------------------------------------------------------------------
 
 

@@ -5,17 +5,23 @@ Random tests have levels of 1e-7 an interval, so that one of them fails by chanc
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from scipy import optimize
 from scipy.spatial.transform import Rotation
 
+import consistency as cs
 from consistency.characterising.boards import Calibrated, Corners, calibrate
 from consistency.characterising.landmarks import Seen, fit_points, without_gross
 from consistency.characterising.plane import residuals_about_boards
 from consistency.characterising.posed import characterise_posed, correlations, log_interval
+from consistency.characterising.recorded import seen_of as seen_of_log
 from consistency.errors import InputError
 from consistency.models import stereo
-from consistency.scenario import PicturedSensor
+from consistency.scenario import Mount, PicturedSensor
+from consistency.simulation import simulate
 from consistency.types import Array
 
 F, B = 400.0, 0.1
@@ -93,6 +99,22 @@ def test_the_noise_is_recovered_however_short_the_tracks(rng: np.random.Generato
         assert estimate.high / estimate.low < 1.35
 
 
+def test_tracks_of_unlike_noise_make_the_interval_wider(rng: np.random.Generator) -> None:
+    """Half of the tracks have three times the noise: squares scatter by tracks, as chi-square does not know."""
+    seen = seen_of(rng, 200, 12)
+    ideal = fit_points(seen, F, B, parts(seen), np.ones(3)).ideal
+    unlike = Seen(
+        ideal + (seen.z - ideal) * np.where(seen.track % 2, 3.0, 1.0)[:, None], *list(vars(seen).values())[1:]
+    )
+    width = []
+    for each in (seen, unlike):
+        fitted = fit_points(each, F, B, parts(seen), np.ones(3))
+        estimate, variance = log_interval(fitted, fitted.parts == 0, float(fitted.sigma[0]), 0.01)
+        width.append(np.log(estimate.high / estimate.low))
+        assert variance >= 0.499 / fitted.free[:, 0].sum()
+    assert width[1] > 1.5 * width[0]
+
+
 def test_correlation_is_found_and_not_that_of_the_fit(rng: np.random.Generator) -> None:
     white = seen_of(rng, 800, 5)
     fitted = fit_points(white, F, B, parts(white), np.ones(3))
@@ -160,9 +182,39 @@ def test_errors_of_poses_are_no_noise_where_poses_are_free(rng: np.random.Genera
     assert np.isclose(free.free.sum(), 400 * (24 - 3) - 6 * 7, rtol=1e-3)
 
 
+def test_points_and_poses_together_are_where_least_squares_has_them(rng: np.random.Generator) -> None:
+    seen = seen_of(rng, 12, 4)
+    fitted = fit_points(seen, F, B, parts(seen), np.ones(3), free_poses=True)
+
+    def misfit(x: Array) -> Array:
+        poses, points = x[:24].reshape(4, 6)[seen.step], x[24:].reshape(12, 3)[seen.track]
+        turn = seen.R @ Rotation.from_rotvec(poses[:, 3:]).as_matrix()
+        local = np.einsum("nji,nj->in", turn, points - seen.t - poses[:, :3])
+        return np.asarray(((seen.z - np.stack(stereo.project(*local, F, B), axis=-1)) / fitted.sigma).ravel())
+
+    start = np.concatenate([np.zeros(24), np.tile([6.0, 0.0, 0.0], 12)])
+    best = optimize.least_squares(misfit, start, x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-12)
+    assert np.isclose(((fitted.r / fitted.sigma) ** 2).sum(), 2.0 * best.cost, rtol=1e-6)
+    assert np.allclose(fitted.r / fitted.sigma, best.fun.reshape(-1, 3), atol=1e-3)
+    hat = best.jac @ np.linalg.pinv(best.jac.T @ best.jac, rcond=1e-10) @ best.jac.T
+    assert np.allclose(fitted.free.ravel(), 1.0 - np.diag(hat), atol=1e-3)
+
+
 def test_short_tracks_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match="of tracks with 3 or more"):
         characterise_posed(seen_of(rng, 300, 2), SENSOR, "here")
+
+
+def test_a_log_is_seen_from_the_mount_of_its_sensor(uvd: cs.Scenario, tilted: dict[str, Any]) -> None:
+    changes = {"truth__sensor__mount": tilted, "truth__sensor__sigma": (1e-7, 1e-7, 1e-7)}
+    trial = simulate(uvd.variant("tilted", **changes))
+    assert trial.landmarks is not None
+    seen = seen_of_log([trial, trial], Mount(**tilted))
+    assert len(seen.z) == 2 * len(trial.z)
+    points = trial.landmarks[seen.track % trial.n_landmarks]
+    local = np.einsum("nji,nj->in", seen.R, points - seen.t)
+    assert np.allclose(np.stack(stereo.project(*local, 150.0, 0.09), axis=-1), seen.z, atol=1e-5)
+    assert len(np.unique(seen.track)) == 2 * len(np.unique(trial.landmark))
 
 
 # --- boards ------------------------------------------------------------------------------------------
@@ -184,14 +236,15 @@ def boards(rng: np.random.Generator, n: int) -> list[Array]:
 
 
 def test_the_noise_of_corners_is_that_about_their_plane(rng: np.random.Generator) -> None:
-    ideal = np.stack([np.stack(stereo.project(*points.T, F, B), axis=-1) for points in boards(rng, 20)])
+    """Boards of nine corners: a pose takes 6 of 27 degrees of freedom, more than chance explains."""
+    nine = np.isin(board()[:, 0], [0.0, 0.12, 0.24]) & np.isin(board()[:, 1], [0.0, 0.06, 0.15])
+    ideal = np.stack([np.stack(stereo.project(*points[nine].T, F, B), axis=-1) for points in boards(rng, 120)])
     z = ideal + rng.standard_normal(ideal.shape) * SIGMA
-    data = residuals_about_boards(Calibrated("full", z, np.zeros((20, 54)), F, B, (0.0, 0.0), (0.0,) * 3, 0), board())
-    sd = np.sqrt(np.mean(data.r**2, axis=0))
-    assert (np.abs(np.log(sd / SIGMA)) < 5.5 / np.sqrt(2 * 1080) + 0.02).all()  # the poses are not paid for equally
-    # all three together: 3 n c - 6 n degrees of freedom
+    calibrated = Calibrated("full", z, np.zeros(z.shape[:2]), F, B, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
+    data = residuals_about_boards(calibrated, board()[nine])
     chi2 = float((data.r**2 / SIGMA**2).sum())
-    assert abs(chi2 / 3240 - 1.0) < 5.5 * np.sqrt(2 / 3240)
+    assert abs(chi2 / 3240 - 1.0) < 5.5 * np.sqrt(2 / 3240) < 6 / 27
+    assert np.allclose(data.ideal[:, 2], ideal[..., 2].ravel(), atol=2.0)
 
 
 def pixels(points: Array, f: float, k1: float, centre: tuple[float, float]) -> Array:

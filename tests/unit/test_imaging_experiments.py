@@ -97,9 +97,10 @@ def test_tracks_and_their_report(moving: ModuleType, noise: ModuleType, tmp_path
     stops = study.tables["images_stops"].sort_values("disparity")
     np.testing.assert_allclose(curves[2].y, stops[stops["residual"] == 0.005]["within"])
     np.testing.assert_allclose(curves[3].y, stops[stops["residual"] == 0.005]["pooled"])
-    bars = next(mark for mark in blocks[2].panels[0].marks if isinstance(mark, Bars))
-    assert (bars.height * np.diff(bars.edges)).sum() == pytest.approx(1.0, abs=0.05)
-    points, junctions = (mark for mark in blocks[3].panels[0].marks if isinstance(mark, Points))
+    for block in blocks[1], blocks[3]:
+        bars = next(mark for mark in block.panels[0].marks if isinstance(mark, Bars))
+        assert (bars.height * np.diff(bars.edges)).sum() == pytest.approx(1.0, abs=0.05)
+    points, junctions = (mark for mark in blocks[4].panels[0].marks if isinstance(mark, Points))
     assert len(junctions.x) == study.tables["images_fig9"]["junction"].sum()
     assert len(points.x) == (~study.tables["images_fig9"]["junction"]).sum()
 

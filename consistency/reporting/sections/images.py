@@ -18,6 +18,7 @@ from consistency.types import Array
 
 IMAGES = Part("images", "The stereo sensor in rendered images", "Rendered images")
 SAMPLES, GAUSS = Look("#c4c4c4"), replace(style(0), width=1.4)
+KEYS = (Key("samples", SAMPLES, "band"), Key("Gaussian", GAUSS))
 BINS, REACH = 80, 5.0  # of a histogram, and the standard deviations that it spans
 
 
@@ -79,6 +80,24 @@ def growth(stops: pd.DataFrame) -> Figure:
     return single("Noise of disparity", caption, panel, tuple(keys))
 
 
+def pooled(bins: pd.DataFrame) -> Figure:
+    """Errors of disparity about the means of their tracks, fig. 5a."""
+    sd, edges = float(bins["sd"].iloc[0]), np.append(bins["low"].to_numpy(), bins["high"].iloc[-1])
+    x = np.linspace(edges[0], edges[-1], 201)
+    gauss = np.exp(-0.5 * (x / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
+    panel = Panel(
+        Axis("error of d about the mean of its track (px)"),
+        Axis("density (1/px)", start=0.0),
+        (Bars(edges, bins["density"].to_numpy(), SAMPLES), Line(x, gauss, GAUSS)),
+        "Distribution of errors of disparity about the means of tracks",
+    )
+    caption = (
+        f"Errors of disparity about the means of their tracks, pooled over all stops, {int(bins['samples'].iloc[0])} "
+        f"of them, with the Gaussian of the same standard deviation, {sd:.3f} px; as Herath et al. (2007) fig. 5a."
+    )
+    return single("Errors of disparity about track means", caption, panel, KEYS)
+
+
 def biases(features: pd.DataFrame) -> Figure:
     """Mean error of each feature, fig. 8."""
     marks, keys = [], []
@@ -112,8 +131,7 @@ def tracking(errors: pd.DataFrame) -> Figure:
         "Errors of features tracked from 1 m to 6 m, an image each 0.05 m, with the Gaussian of the same standard "
         "deviation; as Herath et al. (2007) fig. 6, where sd is 1.34 px in u and 1.53 px in v."
     )
-    keys = (Key("samples", SAMPLES, "band"), Key("Gaussian", GAUSS))
-    return Figure("Errors of tracking", caption, panels, (Sheet(panels, 3.6, columns=2, keys=keys),), keys, "pair")
+    return Figure("Errors of tracking", caption, panels, (Sheet(panels, 3.6, columns=2, keys=KEYS),), KEYS, "pair")
 
 
 def _histogram(errors: Array, label: str, title: str) -> Panel:
@@ -192,6 +210,7 @@ def single(title: str, caption: str, panel: Panel, keys: tuple[Key, ...]) -> Fig
 
 TABLES = (
     Kept("images_stops", ("disparity", "within", "pooled", "residual", "sigma"), (), growth),
+    Kept("images_fig5a", ("low", "high", "density", "sd", "samples"), (), pooled),
     Kept("images_bias", ("u", "bias_d"), ("left",), biases),
     Kept("images_fig6", ("u", "v", "shake"), (), tracking),
     Kept("images_fig9", ("junction", "residual", "dissimilarity"), (), junctions),

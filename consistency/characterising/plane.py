@@ -38,11 +38,10 @@ def characterise_board(folder: Path, board: Size, square: float, model: str, gri
     corners = find_corners(folder, board, square)
     results = {name: of_model(corners, name, str(folder), grid) for name in MODELS}
     chosen = results[model]
-    missed = len(corners.missed)
-    without = f" not found in {missed} pairs ({', '.join(corners.missed)})," if missed else ""
-    found = f"The board was{without} found in {len(corners.left)} pairs." if missed else ""
+    pairs, names = len(corners.names) + len(corners.missed), ", ".join(corners.missed)
+    found = f"The board was not found in {len(corners.missed)} of {pairs} pairs ({names}); the others are used."
     beside = tuple(_line(name, of) for name, of in results.items())
-    return replace(chosen, notes=tuple(filter(None, (found, *beside, *NO_TIME))))
+    return replace(chosen, notes=((found,) if corners.missed else ()) + beside + NO_TIME)
 
 
 def of_model(corners: Corners, model: str, source: str, grid: Size) -> Characterisation:

@@ -76,7 +76,7 @@ def _bias_lines(of: Characterisation, sensor: PicturedSensor) -> list[str]:
     lines += [_pair("u_px", sensor.bias.u), _pair("v_px", sensor.bias.v)]
     for k, name in enumerate(NAMES):
         matrix = getattr(sensor.bias, f"bias_{name}")
-        if matrix is None:
+        if not matrix:  # left out
             lines.append(f"# none is shown in {name} (p {bias.p_value[k]:.2g})")
             continue
         half = bias.half[k].reshape(len(bias.grid.v), -1)

@@ -5,6 +5,7 @@ Random tests have levels of 1e-7 an interval, so that one of them fails by chanc
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.characterising.boards import Calibrated, Corners, calibrate
+from consistency.characterising.boards import Calibrated, Corners, calibrate, find_corners
 from consistency.characterising.landmarks import Seen, fit_points, without_gross
 from consistency.characterising.plane import residuals_about_boards
 from consistency.characterising.posed import characterise_posed, correlations, log_interval
@@ -245,6 +246,23 @@ def test_the_noise_of_corners_is_that_about_their_plane(rng: np.random.Generator
     chi2 = float((data.r**2 / SIGMA**2).sum())
     assert abs(chi2 / 3240 - 1.0) < 5.5 * np.sqrt(2 / 3240) < 6 / 27
     assert np.allclose(data.ideal[:, 2], ideal[..., 2].ravel(), atol=2.0)
+
+
+def test_pairs_without_the_board_are_named_and_the_others_used(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    squares = np.kron(np.indices((7, 10)).sum(axis=0) % 2, np.ones((20, 20))) * 200 + 30
+    for side, shift in (("left", 30), ("right", 10)):
+        for number in range(1, 7):
+            image = np.full((240, 320), 230, np.uint8)
+            if number != 3:
+                image[40 : 40 + 140, shift + 5 * number : shift + 5 * number + 200] = squares
+            cv2.imwrite(str(tmp_path / f"{side}{number}.png"), image)
+    corners = find_corners(tmp_path, (9, 6), 0.03)
+    assert corners.missed == ["left3.png"]
+    assert corners.names == [f"left{k}.png" for k in (1, 2, 4, 5, 6)]
+    assert corners.left.shape == (5, 54, 2)
+    assert np.allclose(corners.left - corners.right, [20.0, 0.0], atol=0.3)
+    assert np.allclose(corners.left[1] - corners.left[0], [5.0, 0.0], atol=0.3)
 
 
 def pixels(points: Array, f: float, k1: float, centre: tuple[float, float]) -> Array:

@@ -4,25 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.scenario.effects.nodes import hats
 from consistency.types import Array
 
 APART = 1.25  # factor between neighbouring nodes of disparity at least
 FEW = 30  # rows that a node takes
 ENDS = 0.005  # of the data lies beyond the first and beyond the last node of disparity
-
-
-def hats(x: Array, nodes: Array) -> Array:
-    """Weights (N, m) with which values at nodes (m,) are interpolated at ``x`` (N,): linear, constant beyond."""
-    if len(nodes) == 1:
-        return np.ones((len(x), 1))
-    place = np.interp(x, nodes, np.arange(len(nodes)))
-    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(len(nodes))))
-
-
-def bilinear(u: Array, v: Array, u_nodes: Array, v_nodes: Array) -> Array:
-    """Weights (N, L K) of nodes, row by row of v, at pixels (N,), (N,)."""
-    across, down = hats(u, u_nodes), hats(v, v_nodes)
-    return np.asarray((down[:, :, None] * across[:, None, :]).reshape(len(u), -1))
 
 
 def octaves(d: Array) -> Array:

@@ -9,9 +9,10 @@ import numpy as np
 from scipy import optimize, stats
 
 from consistency.characterising import coordinate
-from consistency.characterising.basis import FEW, bilinear
+from consistency.characterising.basis import FEW
 from consistency.characterising.likelihood import Fit
 from consistency.characterising.residuals import Residuals
+from consistency.scenario.effects.nodes import bilinear
 from consistency.types import Array
 
 GRID = (5, 4)  # nodes across and down

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.characterising import coordinate
-from consistency.characterising.basis import hats, octaves
+from consistency.characterising.basis import octaves
 from consistency.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
 from consistency.characterising.coordinate import Levels
 from consistency.characterising.likelihood import Fit, Rows, fit
@@ -16,6 +16,7 @@ from consistency.characterising.residuals import Residuals, Selection, select
 from consistency.characterising.tails import Estimate, Tails, rate, ratios, tails
 from consistency.errors import InputError
 from consistency.scenario import PicturedSensor
+from consistency.scenario.effects.nodes import hats
 from consistency.types import Array
 
 NAMES = ("u", "v", "d")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from consistency.characterising.basis import hats, octaves
+from consistency.characterising.basis import octaves
 from consistency.characterising.characterise import (
     LEAST,
     LEAST_TRACKS,
@@ -21,6 +21,7 @@ from consistency.characterising.residuals import MARGIN
 from consistency.characterising.tails import Estimate, rate, ratios, tails
 from consistency.errors import InputError
 from consistency.scenario import PicturedSensor
+from consistency.scenario.effects.nodes import hats
 from consistency.types import Array, Indices
 
 FREE = 0.1  # share of a value that the fits must leave for it to tell of the shape of the noise

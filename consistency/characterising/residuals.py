@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.characterising.basis import FEW, hats, octaves
+from consistency.characterising.basis import FEW, octaves
 from consistency.models import point, stereo
 from consistency.scenario import PicturedSensor
+from consistency.scenario.effects.nodes import hats
 from consistency.types import Array, Indices, Trial
 
 MARGIN = 4.0  # standard deviations from a limit within which the noise decides whether a row is there at all

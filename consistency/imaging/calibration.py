@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from consistency.errors import InputError
 from consistency.imaging.chain import Tracks
 from consistency.scenario.effects.bias_map import BiasMap
 from consistency.scenario.effects.disparity_growth import DisparityGrowth
+from consistency.scenario.effects.nodes import bilinear, hats
 from consistency.types import Array
 
 ROUNDS = 30  # of the fit of the growth, which settles in a few
@@ -104,7 +104,7 @@ def disparity_growth(means: TrackMeans, nodes: Array) -> Growth:
     InputError
         A node has no track near it.
     """
-    nodes = np.asarray(nodes, float)
+    nodes = _increasing(nodes)
     H = hats(means.truth[:, 2], nodes)
     _require_support(H, [f"disparity {node:g} px" for node in nodes])
     s2, dof = means.variance[:, 2], means.count - 1.0
@@ -134,9 +134,8 @@ def bias_map(means: TrackMeans, u: Array, v: Array) -> Biases:
     InputError
         A node has no track near it, or there are fewer tracks than nodes.
     """
-    u, v = np.asarray(u, float), np.asarray(v, float)
-    across, down = hats(means.truth[:, 0], u), hats(means.truth[:, 1], v)
-    H = (down[:, :, None] * across[:, None, :]).reshape(len(across), -1)
+    u, v = _increasing(u), _increasing(v)
+    H = bilinear(means.truth[:, 0], means.truth[:, 1], u, v)
     _require_support(H, [f"u = {x:g}, v = {y:g} px" for y in v for x in u])
     inverse = np.linalg.inv(H.T @ H)
     bias = inverse @ H.T @ means.mean
@@ -149,11 +148,11 @@ def bias_map(means: TrackMeans, u: Array, v: Array) -> Biases:
     return Biases(u, v, bias.reshape(shape), error.reshape(shape), inverse, rest)
 
 
-def hats(x: Array, nodes: Array) -> Array:
-    """Weights (n, K) by which values at nodes (K,) make the linear interpolant at ``x`` (n,); constant beyond."""
-    if len(nodes) < 1 or any(a >= b for a, b in pairwise(nodes)):
-        raise InputError(f"nodes: {np.asarray(nodes).tolist()} do not increase; give them in increasing order")
-    return np.stack([np.interp(x, nodes, row) for row in np.eye(len(nodes))], axis=-1)
+def _increasing(nodes: Array) -> Array:
+    nodes = np.asarray(nodes, float)
+    if len(nodes) < 1 or (np.diff(nodes) <= 0).any():
+        raise InputError(f"nodes: {nodes.tolist()} do not increase; give them in increasing order")
+    return nodes
 
 
 def _require_support(H: Array, names: list[str]) -> None:

@@ -14,7 +14,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.characterising import coordinate
-from consistency.characterising.basis import bilinear, hats, octaves
+from consistency.characterising.basis import octaves
 from consistency.characterising.bias import estimate_bias, grid_of, shrunken
 from consistency.characterising.characterise import Characterisation, characterise
 from consistency.characterising.coordinate import Levels
@@ -24,6 +24,7 @@ from consistency.characterising.tails import rate, ratios, tails
 from consistency.errors import InputError
 from consistency.scenario import PicturedSensor
 from consistency.scenario.effects.bias_map import BiasMap
+from consistency.scenario.effects.nodes import bilinear, hats
 from consistency.simulation import simulate
 from consistency.types import Array
 

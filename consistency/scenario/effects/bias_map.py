@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field, model_validator
 
-from consistency.scenario.effects.disparity_growth import require_increasing
+from consistency.scenario.effects.nodes import require_increasing
 from consistency.scenario.tables import Finite, Table
 from consistency.types import Array
 

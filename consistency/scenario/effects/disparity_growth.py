@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from consistency.scenario.effects.nodes import require_increasing
 from consistency.scenario.tables import Positive, Table
 from consistency.types import Array
 
@@ -36,15 +36,3 @@ class DisparityGrowth(Table):
     def ratio_at(self, d: Array) -> Array:
         """Ratio of the standard deviation at disparities ``d`` (...), px, to ``sigma[2]``; of the shape of ``d``."""
         return np.asarray(np.interp(d, self.disparity, self.ratio))
-
-
-def require_increasing(key: str, nodes: tuple[float, ...]) -> None:
-    """Refuse nodes of a table that are not in increasing order.
-
-    Raises
-    ------
-    ValueError
-        A node is not greater than the one before it.
-    """
-    if not all(a < b for a, b in pairwise(nodes)):
-        raise ValueError(f"{key} must increase from each number to the next, got {list(nodes)}")

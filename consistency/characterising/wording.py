@@ -6,6 +6,7 @@ import numpy as np
 
 from consistency.characterising.characterise import NAMES, Characterisation, Coordinate
 from consistency.characterising.tails import Estimate
+from consistency.diagnostics.wording import p_text
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian
 
@@ -59,9 +60,9 @@ def _growth(of: Characterisation) -> str:
         return "Growth of sigma_d with disparity: not known, the disparities are all alike."
     ends = f"{growth.nodes[0]:.3g} and {growth.nodes[-1]:.3g} px"
     if not growth.shown:
-        return f"No growth of sigma_d with disparity is shown between {ends} (p {growth.p_value:.2g})."
+        return f"No growth of sigma_d with disparity is shown between {ends} (p {p_text(growth.p_value)})."
     values = ", ".join(f"{interval(s, 3)} at {d:.3g}" for d, s in zip(growth.nodes, growth.sigma, strict=True))
-    return f"sigma_d depends on the disparity (p {growth.p_value:.2g}), in px: {values}."
+    return f"sigma_d depends on the disparity (p {p_text(growth.p_value)}), in px: {values}."
 
 
 def _bias(of: Characterisation) -> list[str]:
@@ -78,7 +79,7 @@ def _bias(of: Characterisation) -> list[str]:
     texts = []
     for k in np.flatnonzero(bias.shown):
         values = bias.believed[k, bias.grid.known]
-        texts.append(f"{NAMES[k]} {values.min():+.2f} to {values.max():+.2f} px (p {bias.p_value[k]:.1g})")
+        texts.append(f"{NAMES[k]} {values.min():+.2f} to {values.max():+.2f} px (p {p_text(bias.p_value[k])})")
     hidden = [NAMES[k] for k in np.flatnonzero(~bias.shown)]
     without = f"; none is shown in {' and '.join(hidden)}" if hidden else ""
     return [f"A constant bias over the image is shown: {', '.join(texts)}{without}.{unknown}"]

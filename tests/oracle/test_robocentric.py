@@ -16,6 +16,7 @@ from consistency.filters.compiled import problem_of
 from consistency.filters.kernel.slam import State
 from consistency.filters.methods import robocentric as rc
 from consistency.filters.sensor.conversion import Pixels
+from consistency.filters.sensor.growth import Growth
 from consistency.filters.stepping import step_through
 from consistency.filters.update.charting import aim_chained, cast_columns, cast_rows, unchain
 from consistency.filters.update.converting import Converting, converting_room
@@ -177,7 +178,7 @@ def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, o
     m, clones, number = 2, 3, np.array([2, 0, 1])
     poses, xi = rng.normal(size=(4, 3)), 0.3 * rng.normal(size=(4, 3))
     moved, C = centred.chained(poses, xi, on=on)
-    update = Converting(Pixels(1.0, 1.0, 1.0, 0.0, 0.0, False, False, False), 0.03, 20, 12, clones)
+    update = Converting(Pixels(1.0, 1.0, 1.0, Growth(np.ones(1), np.ones(1)), 0.0, 0.0, False, False, False), 0.03, 20, 12, clones)
     room = converting_room(update, 3, 3, 3, m, 30)
     room.number[:], room.on[0], size = number, on, 3 + 3 * (m + clones)
     places = np.array([3 + 3 * (m + c) for c in range(clones)] + [0])[:, None] + np.arange(3)

@@ -293,7 +293,7 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(sequential, "look", verdict_at)
     monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)
     monkeypatch.setattr(sequential, "_more", more)
-    bare = {"own": None, "landmarks": None}
+    bare = {"own": None, "landmarks": None, "rejections": None}
     monkeypatch.setattr(sequential, "curves", lambda results, name: SimpleNamespace(name=name, **bare))
     monkeypatch.setattr(sequential, "evidence_of", lambda c, runs: Evidence(c.name, run_numbers=[runs]))
     _, verdicts = sequential.run_until_decided(None, ["early", "late"])  # type: ignore[arg-type]

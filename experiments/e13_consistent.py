@@ -14,8 +14,7 @@ from consistency.filters.centred import Corrections
 from consistency.filters.methods.robocentric import PARKED, RobotCentredKalman, compiled
 from consistency.runs.findings import script, sibling
 from consistency.scenario import UniformLandmarks
-from consistency.types import Array
-from consistency.verdicts.curves import curves
+from consistency.verdicts.curves import curves, log_rmse
 
 FINDINGS = (
     "consistent-at-9cm",
@@ -255,9 +254,9 @@ def accuracy(study: cs.Study) -> cs.Finding:
     for cell in asked:
         names = [PARKED.name, *RIVALS]
         results = cs.run_trials(cell.scenario(), names, study.runs, study.seed, study.jobs)
-        ours = errors(results, PARKED.name)
+        ours = log_rmse(curves(results, PARKED.name), (0, 1))
         for name in RIVALS:
-            theirs = errors(results, name)
+            theirs = log_rmse(curves(results, name), (0, 1))
             both = np.isfinite(ours) & np.isfinite(theirs)
             enough = both.sum() > 1
             p = float(ttest_rel(ours[both], theirs[both], alternative="greater").pvalue) if enough else np.nan
@@ -282,14 +281,6 @@ def accuracy(study: cs.Study) -> cs.Finding:
         f"ratio of RMSE to {', '.join(f'{name} {ratio:.2f}' for name, ratio in medians.items())}",
         accept=f"no comparison finds it worse (one-sided paired t test, Holm over cells and filters, {LEVEL:.0%})",
     )
-
-
-def errors(results: cs.Results, name: str) -> Array:
-    """log RMSE of position (runs,), NaN where a run failed."""
-    error = curves(results, name).additive.error
-    assert error is not None
-    said: Array = 0.5 * np.log(np.square(error[:, :, :2]).sum(axis=2).mean(axis=1))
-    return said
 
 
 def row(verdict: cs.Verdict) -> tuple[str, str, float, float, int]:

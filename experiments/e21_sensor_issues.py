@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +11,7 @@ from scipy.stats import ttest_rel
 import consistency as cs
 from consistency.runs.findings import OURS, script
 from consistency.types import Array
-from consistency.verdicts.curves import Curves
+from consistency.verdicts.curves import Curves, log_rmse
 
 FINDINGS = ("fig10a", "fig10b", "guarded", "fov", "feature-count", "near-far-mix")
 LONG = True
@@ -241,14 +240,6 @@ def near_far_mix(study: cs.Study) -> cs.Finding:
 
 
 # --- of runs -----------------------------------------------------------------------------------------
-
-
-def log_rmse(curves: Curves, axes: Sequence[int]) -> Array:
-    """log RMSE of some axes in each run (runs,), NaN where it failed."""
-    error = curves.additive.error
-    assert error is not None
-    value: Array = 0.5 * np.log(np.square(error[:, :, list(axes)]).sum(axis=2).mean(axis=1))
-    return value
 
 
 def log_nees(curves: Curves) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -193,6 +194,14 @@ def _places(results: Tables, labels: Indices) -> Array:
         here = known[at] == labels
         places[here] = table[list("xyz")].to_numpy()[at[here]]
     return places
+
+
+def log_rmse(c: Curves, axes: Sequence[int]) -> Array:
+    """log RMSE of some axes of the pose together in each run, in the world, shape (R,); NaN where it failed."""
+    error = c.additive.error
+    assert error is not None
+    value: Array = 0.5 * np.log(np.square(error[:, :, list(axes)]).sum(axis=2).mean(axis=1))
+    return value
 
 
 def run_means(c: Curves) -> Array:

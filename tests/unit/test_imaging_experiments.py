@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +9,7 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 import pytest
+from scripts import experiment
 
 import consistency as cs
 from consistency.imaging.protocols import Stops, wall_texture
@@ -20,21 +19,11 @@ from consistency.reporting.drawing import Bars, Line, Points
 from consistency.reporting.sections import images as section
 
 pytest.importorskip("cv2")
-ROOT = Path(__file__).parents[2]
-
-
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"tested_{name}", ROOT / "experiments" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
 def noise(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    module = load("e24_image_noise")
+    module = experiment("e24_image_noise")
     for name, value in {"IMAGES": 6, "WALLS": 1, "RESIDUALS": (0.0, 0.005), "DRAWS": 20}.items():
         monkeypatch.setattr(module, name, value)
     stops: Callable[..., Stops] = lambda **given: Stops(**({"farthest": 1.4, "step": 0.2} | given))  # noqa: E731
@@ -44,7 +33,7 @@ def noise(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.fixture
 def moving(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    module = load("e25_image_tracks")
+    module = experiment("e25_image_tracks")
     for name, value in {"WALLS": 2, "SCENES": 1, "VIEWS": 5, "IMAGES": 4, "ROBOTS": 1, "DRAWS": 20}.items():
         monkeypatch.setattr(module, name, value)
     monkeypatch.setattr(module, "Stops", lambda step=0.1: Stops(farthest=1.2, step=max(step, 0.1), images=1))

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from scripts import experiment
 
 import consistency as cs
-from consistency.runs.findings import sibling
-
-HERE = str(Path(__file__).parents[2] / "experiments" / "e01_interval.py")
 
 
 @pytest.fixture(scope="module")
 def bias() -> ModuleType:
-    return sibling(HERE, "e20_bias_or_noise")
+    return experiment("e20_bias_or_noise")
 
 
 @pytest.fixture(scope="module")
 def issues() -> ModuleType:
-    return sibling(HERE, "e21_sensor_issues")
+    return experiment("e21_sensor_issues")
 
 
 def test_the_bias_has_the_pooled_spread_of_the_chapter(bias: ModuleType) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 from scipy import stats
+from scripts import experiment
 
 import consistency as cs
 from consistency.reporting.build import build_report
@@ -18,21 +17,10 @@ from consistency.reporting.sections import scenes, shares
 from consistency.vision import RelativePose
 from consistency.vision.synthetic import MOTION, SIZE, common_points, disparity_noise, published_rig
 
-ROOT = Path(__file__).parents[2]
-
-
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"tested_{name}", ROOT / "experiments" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
 
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    module = load("e10_front_end_synthetic")
+    module = experiment("e10_front_end_synthetic")
     for name, value in {"REPETITIONS": 4, "FEWER": 1, "OTHERS": ((3.0, 1.0),), "SAMPLES_23": 100}.items():
         monkeypatch.setattr(module, name, value)
     return module
@@ -40,7 +28,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.fixture
 def first_order(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    module = load("e12_first_order")
+    module = experiment("e12_first_order")
     for name, value in {"DEPTHS": (3.0,), "BASELINES": (1.0,), "NOISES": (0.25,), "RUNS": 12, "POINTS": 8}.items():
         monkeypatch.setattr(module, name, value)
     return module

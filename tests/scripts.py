@@ -1,0 +1,15 @@
+"""The scripts of ``experiments/`` as modules."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+from consistency.runs.findings import sibling
+
+FOLDER = Path(__file__).parents[1] / "experiments"
+
+
+def experiment(name: str) -> ModuleType:
+    """A fresh module of a script, by its name without the suffix."""
+    return sibling(str(FOLDER / "README.md"), name)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+import scripts
 
 import consistency as cs
 from consistency.reporting.front_end import ellipse, matches_png, samples_png
@@ -28,13 +27,7 @@ META = """
 
 @pytest.fixture(scope="module")
 def experiment() -> ModuleType:
-    path = ROOT / "experiments" / "e11_front_end_images.py"
-    spec = importlib.util.spec_from_file_location("tested_e11", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return scripts.experiment("e11_front_end_images")
 
 
 def test_numbers_that_run_together_are_told_apart(experiment: ModuleType, tmp_path: Path) -> None:

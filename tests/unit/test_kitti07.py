@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import os
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pandas as pd
 import pytest
+from scripts import experiment
 
 import consistency as cs
 from consistency.models.stereo import project
@@ -24,17 +22,7 @@ KITTI = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # right, down, forward 
 CENTRE, F, B = np.array([600.0, 180.0]), 700.0, 0.5
 
 
-def load(name: str) -> ModuleType:
-    path = ROOT / "experiments" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(f"tested_{name}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-experiment = load("e09_kitti07")
+experiment = experiment("e09_kitti07")
 conversion = experiment.conversion
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from scripts import experiment
 
 import consistency as cs
 
@@ -29,13 +27,7 @@ PIXELS = np.array([1.34, 1.53, 0.65])  # px, of herath2007-stereo
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    path = Path(__file__).parents[2] / "experiments" / "e18_static_limit.py"
-    spec = importlib.util.spec_from_file_location("tested_e18", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return experiment("e18_static_limit")
 
 
 def test_closed_forms_are_the_figures_from_elsewhere(script: ModuleType) -> None:

@@ -48,9 +48,10 @@ class Filter(Protocol):
     the pose and these K points, in the order of ``map``, as one Gaussian, (3 + 3 K,) and (3 + 3 K, 3 + 3 K), of the
     additive errors.
 
-    ``rejected(state)`` is for filters that leave out observations: which ones (m,) of the last step, in the order in
-    which they were offered. It is asked in each step, and the rejections are scored. An attribute ``innovates = False``
-    says that ``update`` gives no innovations, so that no guard can be put before the filter.
+    ``rejected(state)`` is for filters that leave out observations: which of all so far, (M,), in the order in which
+    they were offered. It is asked in each step, and the rejections are scored. An attribute ``innovates = False`` says
+    that ``update`` gives no innovations, so that no guard can be put before the filter. ``forget(state, label)`` gives
+    the state without a landmark; a guard asks for it where the second sighting does not agree with the first.
     """
 
     def init(self, problem: Problem) -> Any: ...

@@ -38,6 +38,10 @@ class SlamState:
         """Offset of a landmark in x."""
         return 3 + self.width * self.landmarks.index(landmark)
 
+    def beside(self, landmark: int) -> Indices:
+        """Places in x of all but a landmark."""
+        return np.delete(np.arange(len(self.x)), self.at(landmark) + np.arange(self.width))
+
     @property
     def positions(self) -> Indices:
         """Places in x of x and y of the robot and of each landmark, (1 + m, 2)."""
@@ -139,6 +143,13 @@ def augment(state: SlamState, label: int, placed: tuple[Array, Array, Array], R:
     return replace(state, x=np.append(state.x, landmark), P=P, landmarks=(*state.landmarks, label))
 
 
+def without(state: SlamState, landmark: int) -> SlamState:
+    """The state without a landmark: what it says of all else stays as it is."""
+    keep = state.beside(landmark)
+    rest = tuple(label for label in state.landmarks if label != landmark)
+    return replace(state, x=state.x[keep], P=state.P[np.ix_(keep, keep)], landmarks=rest)
+
+
 def expect(state: SlamState, seen: list[int], uvd: bool) -> tuple[Array, Array]:
     """h (s m,) and its Jacobian H (s m, n) at the state, landmarks as points in the world."""
     sensor = view(state.problem.belief.sensor, uvd)
@@ -211,6 +222,13 @@ class Noting(Protocol):
     def slam(self) -> SlamState: ...
 
 
+class SlamTwin:
+    """What every twin does with a state that is a ``SlamState``."""
+
+    def forget(self, state: SlamState, landmark: int) -> SlamState:
+        return without(state, landmark)
+
+
 class NotingTwin:
     """What a twin says of a state that is a ``SlamState`` with notes beside it."""
 
@@ -227,7 +245,7 @@ class NotingTwin:
         return joint_of(state.slam)
 
 
-class WorldPointTwin(ABC):
+class WorldPointTwin(SlamTwin, ABC):
     """SLAM on points in the world with an additive error; a twin adds how it predicts and how it corrects."""
 
     def __init__(self, name: str, uvd: bool) -> None:

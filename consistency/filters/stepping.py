@@ -97,7 +97,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
             state = filter_.predict(state, trial.control(step))
             state, info = _state_and_info(filter_.update(state, trial.observation(step)))
             if rejected is not None:
-                rejected[trial.first[step - 1] : trial.first[step]] = _value_of(filter_, "rejected", state)
+                rejected[: trial.first[step]] = _value_of(filter_, "rejected", state)
             mean, covariances = _pose_and_covariances(filter_, state, error)
             if info is not None and len(info.innovation):
                 np.linalg.cholesky(info.S)

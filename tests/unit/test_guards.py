@@ -73,6 +73,13 @@ class Counter:
 def given(filter_: Any, steps: list[dict[int, float]], settings: GuardSettings | None = None) -> list[tuple[int, ...]]:
     """Labels that a filter behind ``filter_`` is given in each step, of observations (x, 0, 0) by label."""
 
+    out: list[tuple[int, ...]] = list(after(filter_, steps, settings).inner["given"])
+    return out
+
+
+def after(filter_: Any, steps: list[dict[int, float]], settings: GuardSettings | None) -> Any:
+    """The state of ``filter_`` after observations (x, 0, 0) by label in each step."""
+
     class Problem:
         class belief:
             guard = settings
@@ -81,8 +88,7 @@ def given(filter_: Any, steps: list[dict[int, float]], settings: GuardSettings |
     for step in steps:
         z = np.array([[x, 0.0, 0.0] for x in step.values()]).reshape(-1, 3)
         state, _ = filter_.update(filter_.predict(state, None), Observation(np.array([*step], np.int64), z))
-    out: list[tuple[int, ...]] = list(state.inner["given"])
-    return out
+    return state
 
 
 # --- names -------------------------------------------------------------------------------------------
@@ -189,6 +195,59 @@ def test_a_landmark_whose_observations_are_rejected_is_given_up() -> None:
     expected = [(1,), (), (1,), (), (1,), (), ()]
     assert given(Guarded(Counter(), "gate"), steps, GuardSettings(forget_after=2)) == [*expected, ()]
     assert given(Guarded(Counter(), "gate"), steps) == [*expected, (1,)]  # never, by default
+
+
+class Recorder(Counter):
+    """Knows where landmarks were seen first, and expects them there."""
+
+    def init(self, problem: Any) -> dict[str, Any]:
+        return {"at": {}, "given": (), "forgotten": ()}
+
+    def update(self, state: dict[str, Any], observation: Observation) -> tuple[dict[str, Any], Info]:
+        seen = dict(zip(observation.landmarks.tolist(), observation.z, strict=True))
+        y = np.array([z - state["at"][label] for label, z in seen.items() if label in state["at"]]).ravel()
+        given = (*state["given"], tuple(seen))
+        return state | {"at": seen | state["at"], "given": given}, Info(y, np.eye(len(y)), np.zeros((3, len(y))))
+
+
+class Forgetful(Recorder):
+    def forget(self, state: dict[str, Any], landmark: int) -> dict[str, Any]:
+        at = {label: z for label, z in state["at"].items() if label != landmark}
+        return state | {"at": at, "forgotten": (*state["forgotten"], landmark)}
+
+
+def rejected(filter_: Any, *steps: dict[int, float]) -> tuple[list[bool], Any]:
+    """Which observations are rejected by a gate before ``filter_``, and the state that it comes to."""
+    guarded = Guarded(filter_, "gate")
+    state = after(guarded, list(steps), None)
+    return guarded.rejected(state).tolist(), state.inner
+
+
+def test_a_landmark_begins_anew_where_the_second_sighting_does_not_agree_with_the_first() -> None:
+    which, inner = rejected(Forgetful(), {1: 9.0, 2: 0.0}, {1: 0.0, 2: 0.1}, {1: 0.2, 2: 9.0})
+    assert which == [True, False, False, False, False, True]
+    assert inner["forgotten"] == (1,)
+    assert inner["given"] == ((1, 2), (1, 2), (1,))
+    assert inner["at"][1][0] == 0.0
+
+
+def test_it_does_so_until_two_agree() -> None:
+    which, inner = rejected(Forgetful(), {1: 0.0}, {1: 9.0}, {1: 0.2}, {1: 0.1}, {1: 9.0}, {1: 0.0})
+    assert which == [True, True, False, False, True, False]
+    assert inner["at"][1][0] == 0.2
+
+
+def test_a_track_that_never_agrees_is_given_up() -> None:
+    guarded = Guarded(Forgetful(), "gate")
+    state = after(guarded, [{1: 9.0 * k} for k in range(6)], GuardSettings(forget_after=3))
+    assert state.inner["forgotten"] == (1, 1, 1)
+    assert guarded.rejected(state).tolist() == [True, True, True, False, True, True]
+
+
+def test_a_filter_that_cannot_forget_keeps_what_a_landmark_began_with() -> None:
+    which, inner = rejected(Recorder(), {1: 9.0}, {1: 0.0}, {1: 9.1})
+    assert which == [False, True, False]
+    assert inner["given"] == ((1,), (), (1,))
 
 
 def test_a_filter_without_innovations_ends_as_a_failed_run(uvd: cs.Scenario) -> None:

@@ -7,14 +7,11 @@ from typing import NamedTuple
 from consistency.filters.guard.screening import (
     Tracks,
     Watch,
-    enters_unless_rejected,
     pass_gate,
-    rejected_of,
-    screen_known,
-    watch_tracks,
+    share_screening,
 )
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.slam import keep_some, make_watch, may_enter, rejected_rows, screen
+from consistency.filters.kernel.slam import keep_some
 from consistency.types import Array
 
 
@@ -26,10 +23,7 @@ class Gate(NamedTuple):
     joint: Array
 
 
-implement(make_watch, Gate)(watch_tracks)
-implement(screen, Gate)(screen_known)
-implement(may_enter, Gate)(enters_unless_rejected)
-implement(rejected_rows, Gate)(rejected_of)
+share_screening(Gate)
 
 
 @implement(keep_some, Gate)

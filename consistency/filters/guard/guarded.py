@@ -28,7 +28,8 @@ class GuardedState:
     known: frozenset[int] = frozenset()  # landmarks that the filter was given
     sightings: dict[int, int] = field(default_factory=dict)  # of each landmark
     misses: dict[int, int] = field(default_factory=dict)  # rejected one after the other, up to the last
-    rejected: Array = field(default_factory=lambda: np.zeros(0, bool))  # (m,) of the last observation
+    begun: dict[int, int] = field(default_factory=dict)  # observation with which it began, until another agrees with it
+    rejected: Array = field(default_factory=lambda: np.zeros(0, bool))  # of all observations so far
 
 
 class Guarded:
@@ -57,18 +58,32 @@ class Guarded:
         return replace(state, inner=self.filter.predict(state.inner, control))
 
     def update(self, state: GuardedState, observation: Observation) -> tuple[GuardedState, Info | None]:
-        labels = [int(label) for label in observation.landmarks]
+        labels, first, s = observation.landmarks.tolist(), len(state.rejected), observation.z.shape[1]
         sightings = state.sightings | {label: state.sightings.get(label, 0) + 1 for label in labels}
         state = replace(state, sightings=sightings)
         keep = np.array([self._is_offered(state, label) for label in labels], dtype=bool)
         known, info = self._known(state, observation, keep)
         if info is not None:
-            s = observation.z.shape[1]
             keep[known] = kept(self.kind, info.innovation, info.S, s, limits_of(state.settings, s, len(known)))
         misses = state.misses | {labels[i]: 0 if keep[i] else state.misses.get(labels[i], 0) + 1 for i in known}
-        inner, info = self.filter.update(state.inner, _some(observation, keep))
-        given = state.known.union(observation.landmarks[keep].tolist())
-        return replace(state, inner=inner, known=given, misses=misses, rejected=~keep), info
+        agreed = {labels[i] for i in known if keep[i]}
+        begun = {label: at for label, at in state.begun.items() if label not in agreed}
+        anew = [int(i) for i in known if not keep[i] and labels[i] in begun and hasattr(self.filter, "forget")]
+        keep[anew] = True
+        rejected = np.append(state.rejected, ~keep)
+        rejected[[begun[labels[i]] for i in anew]] = True
+        begins = [int(i) for i in np.flatnonzero(keep) if i in anew or labels[i] not in state.known]
+        begun |= {labels[i]: first + i for i in begins}
+        known_now = state.known.union(observation.landmarks[keep].tolist())
+        inner = self._without(state.inner, [labels[i] for i in anew])
+        inner, info = self.filter.update(inner, _some(observation, keep))
+        return replace(state, inner=inner, known=known_now, misses=misses, begun=begun, rejected=rejected), info
+
+    def _without(self, inner: Any, labels: list[int]) -> Any:
+        forgetful: Any = self.filter
+        for label in labels:
+            inner = forgetful.forget(inner, label)
+        return inner
 
     def _is_offered(self, state: GuardedState, label: int) -> bool:
         """Whether the track is old enough, and the landmark not given up."""
@@ -103,7 +118,7 @@ class Guarded:
         return self.filter.pose(state.inner)
 
     def rejected(self, state: GuardedState) -> Array:
-        """Which observations (m,) of the last step the filter was not given."""
+        """Which of all observations so far the filter was not given, or has forgotten."""
         return state.rejected
 
     def _ask(self, method: str, state: GuardedState) -> Any:

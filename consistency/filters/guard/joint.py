@@ -11,15 +11,12 @@ from consistency.filters.guard.screening import (
     Tracks,
     Watch,
     added_distance,
-    enters_unless_rejected,
     pass_gate,
-    rejected_of,
-    screen_known,
-    watch_tracks,
+    share_screening,
 )
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import keep_some, make_watch, may_enter, rejected_rows, screen
+from consistency.filters.kernel.slam import keep_some
 from consistency.types import Array
 
 
@@ -31,10 +28,7 @@ class Compatible(NamedTuple):
     joint: Array
 
 
-implement(make_watch, Compatible)(watch_tracks)
-implement(screen, Compatible)(screen_known)
-implement(may_enter, Compatible)(enters_unless_rejected)
-implement(rejected_rows, Compatible)(rejected_of)
+share_screening(Compatible)
 
 
 @implement(keep_some, Compatible)

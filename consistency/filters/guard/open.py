@@ -40,13 +40,13 @@ def screen_nothing(
     local: NamedTuple,
     work: NamedTuple,
     watch: NoWatch,
-) -> tuple[int, int]:
-    return 0, m
+) -> tuple[int, int, bool]:
+    return 0, m, False
 
 
 @implement(may_enter, Open)
-def all_may_enter(guard: Open, row: int, watch: NoWatch) -> bool:
-    return True
+def all_new_may_enter(guard: Open, row: int, is_known: bool, watch: NoWatch) -> bool:
+    return not is_known
 
 
 @implement(rejected_rows, Open)

@@ -8,15 +8,12 @@ from consistency.filters.guard.screening import (
     Tracks,
     Watch,
     added_distance,
-    enters_unless_rejected,
     pass_gate,
-    rejected_of,
-    screen_known,
-    watch_tracks,
+    share_screening,
 )
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import keep_some, make_watch, may_enter, rejected_rows, screen
+from consistency.filters.kernel.slam import keep_some
 from consistency.types import Array
 
 
@@ -29,10 +26,7 @@ class OnePoint(NamedTuple):
     support: float
 
 
-implement(make_watch, OnePoint)(watch_tracks)
-implement(screen, OnePoint)(screen_known)
-implement(may_enter, OnePoint)(enters_unless_rejected)
-implement(rejected_rows, OnePoint)(rejected_of)
+share_screening(OnePoint)
 
 
 @implement(keep_some, OnePoint)

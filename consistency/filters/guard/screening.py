@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from consistency.filters.kernel.dispatch import implement
 from consistency.filters.kernel.gain import INNOVATION
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import (
@@ -14,7 +15,11 @@ from consistency.filters.kernel.slam import (
     State,
     foresee,
     keep_some,
+    make_watch,
+    may_enter,
     observed_width,
+    rejected_rows,
+    screen,
     withhold,
 )
 from consistency.filters.kernel.work import Work
@@ -31,9 +36,11 @@ class Tracks(NamedTuple):
 class Watch(NamedTuple):
     """For M rows of data, up to m landmarks in a step, and s values of each."""
 
-    rejected: Array  # (M,) which rows the filter is not given
+    rejected: Array  # (M,) which rows the filter is not given, or has forgotten
     sightings: Indices  # (n_landmarks,)
     misses: Indices  # (n_landmarks,) rejected one after the other, up to the last
+    begun: Indices  # (n_landmarks,) row with which each landmark began, until another agrees with it; then -1
+    anew: Array  # (M,) rows with which a landmark begins anew
     kept: Array  # (m,) of the known landmarks in a step
     own: Array  # (m,) squared distance of each alone
     order: Indices  # (m,) those that pass the gate
@@ -53,6 +60,8 @@ def watch_tracks(guard: NamedTuple, s: int, m: int, rows: int, n_landmarks: int)
         np.zeros(rows, np.bool_),
         np.zeros(n_landmarks, np.int64),
         np.zeros(n_landmarks, np.int64),
+        np.full(n_landmarks, -1),
+        np.zeros(rows, np.bool_),
         np.zeros(m, np.bool_),
         np.zeros(m),
         np.zeros(m, np.int64),
@@ -77,37 +86,55 @@ def screen_known(
     local: NamedTuple,
     work: Work[NamedTuple],
     watch: Watch,
-) -> tuple[int, int]:
+) -> tuple[int, int, bool]:
     """First by the track, then by what the filter expects of the landmarks that it knows."""
-    m = _screen_tracks(guard.tracks, data, k, m, work, watch)
-    withhold(slam.covariance, data, k, watch.rejected, local)
+    m = _screen_tracks(guard.tracks, state.offset, data, k, m, work, watch)
+    withhold(slam.covariance, state, data, k, watch.rejected, watch.anew, local)
     if m == 0:
-        return 0, 0
-    code, column = foresee(slam.update, slam, state, data, k, m, local, work)
+        return 0, 0, False
+    code, _ = foresee(slam.update, slam, state, data, k, m, local, work)
     if code > 0:
-        return code, m
+        return code, m, False
     s = observed_width(slam.sensor)
-    if not keep_some(guard, s, m, work.A[: s * m, column], work.S, watch):
-        return INNOVATION, m
+    if not keep_some(guard, s, m, work.A[: s * m, state.n + state.base], work.S, watch):
+        return INNOVATION, m, False
     for i in range(m):
-        label, kept = work.label[i], watch.kept[i]
+        row, label, kept = work.known[i], work.label[i], watch.kept[i]
+        watch.rejected[row] = not kept
         watch.misses[label] = 0 if kept else watch.misses[label] + 1
-        watch.rejected[work.known[i]] = not kept
+        watch.anew[row] = not kept and watch.begun[label] >= 0
+        if kept:
+            watch.begun[label] = -1
     left = _without_rejected(m, work, watch)
     if left < m:
-        withhold(slam.covariance, data, k, watch.rejected, local)
-    return 0, left
+        withhold(slam.covariance, state, data, k, watch.rejected, watch.anew, local)
+        _begin_anew(data, k, watch)
+    return 0, left, left == m
 
 
 @inner
-def _screen_tracks(tracks: Tracks, data: Data, k: int, m: int, work: Work[NamedTuple], watch: Watch) -> int:
+def _screen_tracks(
+    tracks: Tracks, offset: Indices, data: Data, k: int, m: int, work: Work[NamedTuple], watch: Watch
+) -> int:
     """Rejects observations of tracks that are too young or given up; returns how many known landmarks are left."""
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
         watch.sightings[label] += 1
         is_given_up = 0 < tracks.forget_after <= watch.misses[label]
         watch.rejected[i] = is_given_up or watch.sightings[label] < tracks.min_age
+        if offset[label] < 0 and not watch.rejected[i]:
+            watch.begun[label] = i
     return _without_rejected(m, work, watch)
+
+
+@inner
+def _begin_anew(data: Data, k: int, watch: Watch) -> None:
+    """What a landmark began with is rejected, where it begins anew with the first that disagrees."""
+    for i in range(data.first[k], data.first[k + 1]):
+        if watch.anew[i]:
+            label = data.landmark[i]
+            watch.rejected[watch.begun[label]], watch.rejected[i] = True, False
+            watch.begun[label] = i
 
 
 @inner
@@ -121,15 +148,23 @@ def _without_rejected(m: int, work: Work[NamedTuple], watch: Watch) -> int:
 
 
 @inner
-def enters_unless_rejected(guard: NamedTuple, row: int, watch: Watch) -> bool:
+def enters_unless_rejected(guard: NamedTuple, row: int, is_known: bool, watch: Watch) -> bool:
     """A new landmark begins with an observation that was not rejected."""
-    return not watch.rejected[row]
+    return watch.anew[row] if is_known else not watch.rejected[row]
 
 
 @inner
 def rejected_of(guard: NamedTuple, watch: Watch) -> Array:
     """The rows that were rejected, (M,)."""
     return watch.rejected.copy()
+
+
+def share_screening(guard: type[NamedTuple]) -> None:
+    """A part, with ``tracks``, is a guard once it has a body of :func:`keep_some` as well."""
+    implement(make_watch, guard)(watch_tracks)
+    implement(screen, guard)(screen_known)
+    implement(may_enter, guard)(enters_unless_rejected)
+    implement(rejected_rows, guard)(rejected_of)
 
 
 @inner

@@ -105,18 +105,26 @@ def move_block(P: Array, n: int, o: int, F: Array) -> None:
 
 
 @inner
-def append_landmark(P: Array, n: int, Jp: Array, Jz: Array, R: Array) -> None:
-    """P[:n + w, n:n + w] <- covariance of a landmark put at n with all before it, Jp (w, r), Jz (w, s), R (s, s)."""
-    w, r = Jp.shape
-    for j in range(n):
+def begin_landmark(P: Array, n: int, o: int, Jp: Array, Jz: Array, R: Array) -> None:
+    """Rows and columns at ``o`` of P (n, n) <- covariance of a new landmark there, Jp (w, r), Jz (w, s), R (s, s)."""
+    w = len(Jp)
+    for j in range(o):
         for a in range(w):
-            total = 0.0
-            for c in range(r):
-                total += Jp[a, c] * P[c, j]
-            P[j, n + a] = total
+            P[j, o + a] = _across(P, j, Jp, a)
     for a in range(w):
+        for j in range(o + w, n):
+            P[o + a, j] = _across(P, j, Jp, a)
         for b in range(a, w):
-            P[n + a, n + b] = 0.5 * (_own(P, n, Jp, Jz, R, a, b) + _own(P, n, Jp, Jz, R, b, a))
+            P[o + a, o + b] = 0.5 * (_own(P, o, Jp, Jz, R, a, b) + _own(P, o, Jp, Jz, R, b, a))
+
+
+@inner
+def _across(P: Array, j: int, Jp: Array, a: int) -> float:
+    """Entry (a, j) of Jp P_pose,all, (w, n)."""
+    total = 0.0
+    for c in range(Jp.shape[1]):
+        total += Jp[a, c] * P[c, j]
+    return total
 
 
 @inner

@@ -17,6 +17,7 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     combine,
+    foresee,
     landmark_width,
     observed_width,
     retract,
@@ -97,6 +98,30 @@ def innovate(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple
 
 
 @inner
+def correct_at_once(
+    update: NamedTuple,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    is_foreseen: bool,
+    local: Factors,
+    work: Work[NamedTuple],
+) -> tuple[int, float]:
+    """The update of a filter that does not iterate: it is led by what :func:`foresee` leaves in ``work``."""
+    code, total = 0, 0.0
+    if not is_foreseen:
+        code, total = foresee(update, slam, state, data, k, m, local, work)
+    if code > 0:
+        return code, np.nan
+    code, nis = divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+    if code == 0:
+        apply(slam, state, m, local, work)
+    return code, nis
+
+
+@inner
 def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float]:
     """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. Gives a code of REASONS or 0, and NIS."""
     total = add_noise(slam, state, data, m, work)
@@ -134,39 +159,6 @@ def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float
     if np.isfinite(nis):
         return 0, nis
     return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan
-
-
-@inner
-def marginal(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> State:
-    """The robot and the ``m`` seen landmarks alone, which ``work`` then lists by their places there.
-
-    It is all that S and the innovation depend on. ``work.rows`` (r + w m, r + w m) <- its covariance, as
-    :func:`gather` would; :func:`leave_marginal` puts the list back.
-    """
-    r, w, places, rows = robot_width(slam.motion), landmark_width(slam.landmark), work.places, work.rows
-    size = r + w * m
-    for a in range(r):
-        places[a] = a
-    for i in range(m):
-        for c in range(w):
-            places[r + w * i + c] = work.at[i] + c
-        work.at[i] = r + w * i
-    for a in range(size):
-        i = places[a]
-        work.alone[a] = state.x[i]
-        for b in range(a, size):
-            j = places[b]
-            rows[a, b] = rows[b, a] = state.P[i, j] if i < j else state.P[j, i]
-    return State(work.alone, state.P, size, 0, state.offset)
-
-
-@inner
-def leave_marginal(slam: Slam, m: int, work: Work[NamedTuple]) -> int:
-    """``work`` lists landmarks by their places in the state again; returns the size of the marginal."""
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    for i in range(m):
-        work.at[i] = work.places[r + w * i]
-    return r + w * m
 
 
 @inner

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.filters.guard import open as _open  # noqa: F401, registers the bodies of a filter without a guard
 from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
-from consistency.filters.kernel.covariance import append_landmark
+from consistency.filters.kernel.covariance import begin_landmark
 from consistency.filters.kernel.gain import NOT_FINITE, POSE
 from consistency.filters.kernel.jit import Kernel, inner
 from consistency.filters.kernel.lending import keep, lend
@@ -75,18 +75,20 @@ def _find_known(data: Data, k: int, offset: Indices, work: Work[NamedTuple]) -> 
 def _insert_new(
     slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
 ) -> State:
-    """The state with the landmarks that step k + 1 sees for the first time."""
+    """The state with the landmarks that begin in step k + 1: at its end, or anew at their place."""
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     x, P, n, base, offset = state.x, state.P, state.n, state.base, state.offset
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
-        if offset[label] < 0 and may_enter(slam.guard, i, watch):
-            offset[label] = n
-            place(slam.point, slam, State(x, P, n, base, offset), k, label, data.z[i], work)
-            insert_error(slam.error, x[:r], x[n : n + w], work.Jp)
-            append_landmark(P, n, work.Jp, work.Jz, data.R[i])
+        o = offset[label]
+        if may_enter(slam.guard, i, o >= 0, watch):
+            if o < 0:
+                o = offset[label] = n
+                n += w
+            place(slam.point, slam, State(x, P, o, base, offset), k, label, data.z[i], work)
+            insert_error(slam.error, x[:r], x[o : o + w], work.Jp)
             append(slam.covariance, slam, State(x, P, n, base, offset), label, local, work)
-            n += w
+            begin_landmark(P, n, o, work.Jp, work.Jz, data.R[i])
     return State(x, P, n, base, offset)
 
 
@@ -97,11 +99,11 @@ def _step(
     """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, and the NIS."""
     predict(slam.update, slam, state, k, data.controls[k], local, work)
     m, nis = _find_known(data, k, state.offset, work), np.nan
-    code, m = screen(slam.guard, slam, state, data, k, m, local, work, watch)
+    code, m, is_foreseen = screen(slam.guard, slam, state, data, k, m, local, work, watch)
     if code > 0:
         return state, code, 0, nis
     if m > 0:
-        code, nis = correct(slam.update, slam, state, data, k, m, local, work)
+        code, nis = correct(slam.update, slam, state, data, k, m, is_foreseen, local, work)
         if code > 0:
             return state, code, 0, nis
     state = _insert_new(slam, state, data, k, local, work, watch)

@@ -345,24 +345,33 @@ def predict(
 
 
 @generic()
-def correct(
+def foresee(
     update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
 ) -> tuple[int, float]:
-    """x (n,), P (n, n) <- the joint update in step k + 1 with the ``m`` landmarks that ``work`` lists.
+    """Upper half of ``work.S`` (s m, s m) <- innovation covariance; column n + base of ``work.A`` <- innovation (s m,).
 
-    Returns a code of REASONS, 0 where all is well, and the NIS.
+    They are those of an update in step k + 1 with the ``m`` landmarks that ``work`` lists, as the twin's ``Info`` has
+    them; the state stays as it is. Returns a code of REASONS, 0 where all is well, and a sum that is finite if all is.
     """
     raise NotImplementedError
 
 
 @generic()
-def foresee(
-    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
-) -> tuple[int, int]:
-    """Upper half of ``work.S`` (s m, s m) and a column of ``work.A`` <- innovation covariance and innovation.
+def correct(
+    update: NamedTuple,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    is_foreseen: bool,
+    local: NamedTuple,
+    work: NamedTuple,
+) -> tuple[int, float]:
+    """x (n,), P (n, n) <- the joint update in step k + 1 with the ``m`` landmarks that ``work`` lists.
 
-    They are those of an update in step k + 1 with the ``m`` landmarks that ``work`` lists, as the twin's ``Info`` has
-    them; the state stays as it is. Returns a code of REASONS, 0 where all is well, and the number of the column.
+    ``is_foreseen`` says whether :func:`foresee` has been called for these, and nothing since. Returns a code of
+    REASONS, 0 where all is well, and the NIS.
     """
     raise NotImplementedError
 
@@ -387,10 +396,10 @@ def screen(
     local: NamedTuple,
     work: NamedTuple,
     watch: NamedTuple,
-) -> tuple[int, int]:
+) -> tuple[int, int, bool]:
     """``work`` lists, of the ``m`` known landmarks of step k + 1, those that the guard keeps; ``watch`` has the others.
 
-    Returns a code of REASONS, 0 where all is well, and how many are left.
+    Returns a code of REASONS, 0 where all is well, how many are left, and whether they are foreseen.
     """
     raise NotImplementedError
 
@@ -405,8 +414,8 @@ def keep_some(guard: NamedTuple, s: int, m: int, y: Array, S: Array, watch: Name
 
 
 @generic()
-def may_enter(guard: NamedTuple, row: int, watch: NamedTuple) -> bool:
-    """Whether the observation in this row of the data may begin a landmark."""
+def may_enter(guard: NamedTuple, row: int, is_known: bool, watch: NamedTuple) -> bool:
+    """Whether a landmark begins with the observation in this row of the data; anew, if it is in the state."""
     raise NotImplementedError
 
 
@@ -444,7 +453,7 @@ def prepare(
 
 @generic()
 def append(covariance: NamedTuple, slam: Slam, state: State, label: int, local: NamedTuple, work: NamedTuple) -> None:
-    """``local`` <- a new landmark at the end of ``state``, with Jacobian ``work.Jp`` (w, r)."""
+    """``local`` <- a landmark that begins at its offset in ``state``, with Jacobian ``work.Jp`` (w, r)."""
     raise NotImplementedError
 
 
@@ -461,6 +470,11 @@ def held_at(covariance: NamedTuple, label: int, local: NamedTuple) -> int:
 
 
 @generic()
-def withhold(covariance: NamedTuple, data: Data, k: int, rejected: Array, local: NamedTuple) -> None:
-    """``local`` <- as if the rows of step k + 1 that are ``rejected`` (M,) had not been seen."""
+def withhold(
+    covariance: NamedTuple, state: State, data: Data, k: int, rejected: Array, anew: Array, local: NamedTuple
+) -> None:
+    """``local`` <- as if the rows of step k + 1 that are ``rejected`` (M,) had not been seen.
+
+    The landmarks of the rows ``anew`` (M,), which are among these, are forgotten: they are about to begin anew.
+    """
     raise NotImplementedError

@@ -36,8 +36,6 @@ class Work(NamedTuple, Generic[Room]):
     Jb: Array  # (3, s) of its position in the robot frame
     pose: Array  # (r,)
     small: Array  # (r, r)
-    places: Indices  # (L,) of a marginal: places in the state of the robot and of the seen landmarks
-    alone: Array  # (L,) their values
     room: Room  # what the update alone needs
     notes: Any  # what the linearisation point alone needs, of a type of its own
 
@@ -64,8 +62,6 @@ def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[Named
         np.empty((3, s)),
         np.empty(r),
         np.empty((r, r)),
-        np.empty(r + w * m, np.int64),
-        np.empty(r + w * m),
         make_room(slam.update, r, w, s, m, n),
         make_notes(slam.point, r, w, steps, labels),
     )

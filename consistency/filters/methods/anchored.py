@@ -134,7 +134,7 @@ def combine_anchored(landmark: AnchoredInverseDepth, Hp: Array, Hl: Array, rows:
     combine_rows(Hp, Hl, rows, i, out)
 
 
-class AnchoredKalman:
+class AnchoredKalman(plain.SlamTwin):
     """EKF-SLAM on anchored landmarks, their Jacobians through the point in the world."""
 
     def __init__(self, name: str, uvd: bool) -> None:

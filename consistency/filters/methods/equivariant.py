@@ -36,14 +36,11 @@ from consistency.filters.error.polar import Polar
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.gain import (
     add_noise,
-    apply,
     combine_seen,
+    correct_at_once,
     gather,
     innovate,
-    leave_marginal,
     linearise_seen,
-    marginal,
-    whiten,
 )
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
@@ -77,25 +74,7 @@ class EquivariantOutput(NamedTuple):
 
 implement(make_room, EquivariantOutput)(joint_room)
 implement(predict, EquivariantOutput)(predict_by_error)
-
-
-@implement(correct, EquivariantOutput)
-def correct_equivariant(
-    update: EquivariantOutput,
-    slam: Slam,
-    state: State,
-    data: Data,
-    k: int,
-    m: int,
-    local: Factors,
-    work: Work[NoRoom],
-) -> tuple[int, float]:
-    gather(slam, state, m, local, work)
-    _innovate_by_output(slam, state, data, k, m, work)
-    code, nis = whiten(slam, state, data, m, work)
-    if code == 0:
-        apply(slam, state, m, local, work)
-    return code, nis
+implement(correct, EquivariantOutput)(correct_at_once)
 
 
 @implement(foresee, EquivariantOutput)
@@ -108,21 +87,15 @@ def foresee_equivariant(
     m: int,
     local: Factors,
     work: Work[NoRoom],
-) -> tuple[int, int]:
-    seen = marginal(slam, state, m, work)
-    _innovate_by_output(slam, seen, data, k, m, work)
-    add_noise(slam, seen, data, m, work)
-    return 0, leave_marginal(slam, m, work)
-
-
-@inner
-def _innovate_by_output(slam: Slam, state: State, data: Data, k: int, m: int, work: Work[NoRoom]) -> None:
-    """A <- C* P, S <- C* P C*' and the innovation of the ``m`` landmarks, from the rows of P in ``work``."""
+) -> tuple[int, float]:
+    """Innovation and S with C* in the place of the Jacobian."""
+    gather(slam, state, m, local, work)
     linearise_seen(slam, state, k, m, work)
     for i in range(m):
         _average(slam.sensor, data.z[work.known[i]], state.x[work.at[i] : work.at[i] + 3], work.Hl[i])
     combine_seen(slam, state, m, work)
     innovate(slam, state, data, m, work)
+    return 0, add_noise(slam, state, data, m, work)
 
 
 @inner
@@ -144,7 +117,7 @@ def _average(sensor: Sensor, z: Array, q: Array, H: Array) -> None:
             H[a, b] = 0.5 * (H[a, b] + along)
 
 
-class EquivariantKalman:
+class EquivariantKalman(plain.SlamTwin):
     """The equivariant filter as its definitions have it."""
 
     error = "right"

@@ -58,6 +58,9 @@ class FirstEstimateKalman(plain.NotingTwin):
         slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
         return FirstState(slam, np.concatenate([first, slam.x[known:]])), info
 
+    def forget(self, state: FirstState, landmark: int) -> FirstState:
+        return FirstState(plain.without(state.slam, landmark), state.first[state.slam.beside(landmark)])
+
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
     """Parts of ``fej-ekf-xyz``, and with landmarks in the plane where the sensor has them."""

@@ -63,6 +63,9 @@ class IdealKalman(plain.NotingTwin):
         slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
         return replace(state, slam=slam), info
 
+    def forget(self, state: IdealState, landmark: int) -> IdealState:
+        return replace(state, slam=plain.without(state.slam, landmark))
+
 
 def truth_of(problem: Problem) -> Truth:
     """The truth that a problem carries.

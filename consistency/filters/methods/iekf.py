@@ -64,7 +64,15 @@ implement(foresee, Iterated)(foresee_linearised)
 
 @implement(correct, Iterated)
 def correct_iterated(
-    update: Iterated, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[PriorRoom]
+    update: Iterated,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    is_foreseen: bool,
+    local: Factors,
+    work: Work[PriorRoom],
 ) -> tuple[int, float]:
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     involved, first_nis = r + w * m, np.nan

@@ -72,7 +72,15 @@ def predict_by_points(
 
 @implement(correct, IteratedPoints)
 def correct_by_iterated_points(
-    update: IteratedPoints, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
+    update: IteratedPoints,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    is_foreseen: bool,
+    local: Factors,
+    work: Work[SigmaRoom],
 ) -> tuple[int, float]:
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
     involved, first_nis = r + w * m, np.nan
@@ -98,7 +106,7 @@ def correct_by_iterated_points(
 @implement(foresee, IteratedPoints)
 def foresee_by_first_points(
     update: IteratedPoints, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
-) -> tuple[int, int]:
+) -> tuple[int, float]:
     """Innovation and S of the first pass, which are those of the unscented filter."""
     return foresee(update.points, slam, state, data, k, m, local, work)
 

@@ -70,6 +70,9 @@ class LinearKalman:
         slam, info = plain.update_jointly(state.slam, observation, False, correct, locate)
         return replace(state, slam=slam), info
 
+    def forget(self, state: LinearState, landmark: int) -> LinearState:
+        return replace(state, slam=plain.without(state.slam, landmark))
+
     def pose(self, state: LinearState) -> Gaussian:
         return plain.pose_of(state.slam)
 

@@ -61,6 +61,10 @@ class ConstrainedKalman(plain.NotingTwin):
         slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
         return ConstrainedState(slam, np.array(turned)), info
 
+    def forget(self, state: ConstrainedState, landmark: int) -> ConstrainedState:
+        turned = np.delete(state.turned, 1 + state.slam.landmarks.index(landmark), axis=0)
+        return ConstrainedState(plain.without(state.slam, landmark), turned)
+
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
     """Parts of ``oc-ekf-xyz``, and with landmarks in the plane where the sensor has them."""

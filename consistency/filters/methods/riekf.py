@@ -111,7 +111,7 @@ def right_pose_covariance(error: RightInvariant, x: Array, P: Array, out: Array)
     shifted_covariance(x, P, out)
 
 
-class RightInvariantKalman:
+class RightInvariantKalman(plain.SlamTwin):
     """EKF-SLAM in the right-invariant error, every Jacobian by its definition: T maps the error to the additive one."""
 
     error = "right"

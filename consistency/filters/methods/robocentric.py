@@ -229,6 +229,10 @@ class RobotCentredKalman:
         P[:n, :n], P[n:, n:] = state.P, J @ variance_at(z[None], sensor).reshape(3, 3) @ J.T
         return replace(state, x=np.append(state.x, y), P=P, places=state.places | {label: n})
 
+    def forget(self, state: CentredState, landmark: int) -> CentredState:
+        parked = {label: number for label, number in state.parked.items() if label != landmark}
+        return _without_idle_clones(_without(replace(state, parked=parked), state.places[landmark]))
+
     def pose(self, state: CentredState) -> Gaussian:
         return Gaussian(state.x[:3], state.P[:3, :3])
 
@@ -332,14 +336,11 @@ def _activated(state: CentredState, labels: list[int]) -> CentredState:
         x[at], T[at, at], by_shift = _seen_from(state, pose, state.x[at])
         T[at, clone], T[at, :3] = by_shift @ J, -by_shift @ M
     parked = {label: number for label, number in state.parked.items() if label not in labels}
-    state = replace(state, x=x, P=T @ state.P @ T.T, parked=parked)
-    for number in set(state.clones) - set(parked.values()):
-        state = _without(state, number)
-    return state
+    return _without_idle_clones(replace(state, x=x, P=T @ state.P @ T.T, parked=parked))
 
 
-def _without(state: CentredState, number: int) -> CentredState:
-    gone = state.clones[number]
+def _without(state: CentredState, gone: int) -> CentredState:
+    """The state without the block at ``gone``."""
     keep = np.delete(np.arange(len(state.x)), _block(gone))
 
     def moved_up(places: dict[int, int]) -> dict[int, int]:
@@ -347,6 +348,12 @@ def _without(state: CentredState, number: int) -> CentredState:
 
     places, clones = moved_up(state.places), moved_up(state.clones)
     return replace(state, x=state.x[keep], P=state.P[np.ix_(keep, keep)], places=places, clones=clones)
+
+
+def _without_idle_clones(state: CentredState) -> CentredState:
+    for number in set(state.clones) - set(state.parked.values()):
+        state = _without(state, state.clones[number])
+    return state
 
 
 def _parked(state: CentredState) -> CentredState:

@@ -63,6 +63,12 @@ class SubmapKalman:
         state = replace(state, small=small)
         return (self._begun(joined(state)) if state.steps == self.steps else state), info
 
+    def forget(self, state: Maps, landmark: int) -> Maps:
+        large, small = (
+            plain.without(part, landmark) if landmark in part.landmarks else part for part in (state.large, state.small)
+        )
+        return replace(state, large=large, small=small)
+
     def pose(self, state: Maps) -> Gaussian:
         return plain.pose_of(in_world(state))
 

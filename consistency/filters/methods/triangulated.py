@@ -27,14 +27,11 @@ from consistency.filters import plain
 from consistency.filters.compiled import Compiled
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.gain import (
-    apply,
     combine_seen,
-    divide_by_root,
+    correct_at_once,
     gather,
     innovate,
-    leave_marginal,
     linearise_seen,
-    marginal,
 )
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.local_state import Factors
@@ -119,27 +116,7 @@ class NoiseAtPrediction(NamedTuple):
 
 implement(make_room, NoiseAtPrediction)(joint_room)
 implement(predict, NoiseAtPrediction)(predict_by_error)
-
-
-@implement(correct, NoiseAtPrediction)
-def correct_with_noise_at_prediction(
-    update: NoiseAtPrediction,
-    slam: Slam,
-    state: State,
-    data: Data,
-    k: int,
-    m: int,
-    local: Factors,
-    work: Work[NoRoom],
-) -> tuple[int, float]:
-    gather(slam, state, m, local, work)
-    linearise_seen(slam, state, k, m, work)
-    combine_seen(slam, state, m, work)
-    total = _add_noise(update, data, m, innovate(slam, state, data, m, work), work)
-    code, nis = divide_by_root(state, 3 * m, work, total)
-    if code == 0:
-        apply(slam, state, m, local, work)
-    return code, nis
+implement(correct, NoiseAtPrediction)(correct_at_once)
 
 
 @implement(foresee, NoiseAtPrediction)
@@ -152,12 +129,11 @@ def foresee_with_noise_at_prediction(
     m: int,
     local: Factors,
     work: Work[NoRoom],
-) -> tuple[int, int]:
-    seen = marginal(slam, state, m, work)
-    linearise_seen(slam, seen, k, m, work)
-    combine_seen(slam, seen, m, work)
-    _add_noise(update, data, m, innovate(slam, seen, data, m, work), work)
-    return 0, leave_marginal(slam, m, work)
+) -> tuple[int, float]:
+    gather(slam, state, m, local, work)
+    linearise_seen(slam, state, k, m, work)
+    combine_seen(slam, state, m, work)
+    return 0, _add_noise(update, data, m, innovate(slam, state, data, m, work), work)
 
 
 @inner

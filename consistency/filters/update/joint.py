@@ -7,14 +7,11 @@ from typing import NamedTuple
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.gain import (
     add_noise,
-    apply,
     combine_seen,
+    correct_at_once,
     gather,
     innovate,
-    leave_marginal,
     linearise_seen,
-    marginal,
-    whiten,
 )
 from consistency.filters.kernel.local_state import Factors
 from consistency.filters.kernel.slam import Data, Slam, State, correct, foresee, make_room, predict, propagate
@@ -44,29 +41,16 @@ def predict_by_error(
     propagate(slam.error, slam, state, k, u, local.Phi, work)
 
 
-@implement(correct, Joint)
-def correct_joint(
-    update: Joint, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NoRoom]
-) -> tuple[int, float]:
-    """One update with Jacobians at the prediction, eq. 11-13."""
-    gather(slam, state, m, local, work)
-    linearise_seen(slam, state, k, m, work)
-    combine_seen(slam, state, m, work)
-    innovate(slam, state, data, m, work)
-    code, nis = whiten(slam, state, data, m, work)
-    if code == 0:
-        apply(slam, state, m, local, work)
-    return code, nis
+implement(correct, Joint)(correct_at_once)
 
 
 @implement(foresee, Joint)
 def foresee_linearised(
     update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NamedTuple]
-) -> tuple[int, int]:
-    """Innovation and S with Jacobians at the prediction, which is also where an iterated update begins."""
-    seen = marginal(slam, state, m, work)
-    linearise_seen(slam, seen, k, m, work)
-    combine_seen(slam, seen, m, work)
-    innovate(slam, seen, data, m, work)
-    add_noise(slam, seen, data, m, work)
-    return 0, leave_marginal(slam, m, work)
+) -> tuple[int, float]:
+    """Innovation and S with Jacobians at the prediction, eq. 11; an iterated update begins there, too."""
+    gather(slam, state, m, local, work)
+    linearise_seen(slam, state, k, m, work)
+    combine_seen(slam, state, m, work)
+    innovate(slam, state, data, m, work)
+    return 0, add_noise(slam, state, data, m, work)

@@ -40,6 +40,7 @@ def correct_converted(
     data: Data,
     k: int,
     m: int,
+    is_foreseen: bool,
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> tuple[int, float]:
@@ -74,17 +75,17 @@ def foresee_converted(
     m: int,
     local: Clones,
     work: Work[ConvertingRoom],
-) -> tuple[int, int]:
+) -> tuple[int, float]:
     """As far as the update; a chain moves clones and covariance on its way, and they are put back."""
-    column = state.n + state.base
     if not _is_any_in_doubt(m, local, work) or update.chain == 0:
-        return _aim(update, slam, state, data, m, local, work)[0], column
+        code, _, _, total = _aim(update, slam, state, data, m, local, work)
+        return code, total
     x, P, origin = state.x[: state.n].copy(), state.P[: state.n, : state.n].copy(), local.origin.copy()
-    code = _aim(update, slam, state, data, m, local, work)[0]
+    code, _, _, total = _aim(update, slam, state, data, m, local, work)
     copy(x, state.x[: state.n])
     copy_matrix(P, state.P[: state.n, : state.n])
     copy_matrix(origin, local.origin)
-    return code, column
+    return code, total
 
 
 @inner

@@ -21,7 +21,7 @@ from consistency.filters.kernel.arrays import copy, fill
 from consistency.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
 from consistency.filters.kernel.covariance import definite_root, state_index
 from consistency.filters.kernel.dispatch import implement, part
-from consistency.filters.kernel.gain import POSE, add_noise, apply, gather, innovate, leave_marginal, marginal, whiten
+from consistency.filters.kernel.gain import POSE, add_noise, correct_at_once, gather, innovate
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.linalg import semidefinite_cholesky
 from consistency.filters.kernel.local_state import Factors
@@ -131,30 +131,18 @@ def predict_unscented(
     add_motion_noise(slam.motion, work.pose, u, P)
 
 
-@implement(correct, Unscented)
-def correct_unscented(
+implement(correct, Unscented)(correct_at_once)
+
+
+@implement(foresee, Unscented)
+def foresee_by_points(
     update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
     if not innovate_by_points(update, slam, state, m, work):
         return POSE, np.nan
     innovate(slam, state, data, m, work)
-    code, nis = whiten(slam, state, data, m, work)
-    if code == 0:
-        apply(slam, state, m, local, work)
-    return code, nis
-
-
-@implement(foresee, Unscented)
-def foresee_by_points(
-    update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
-) -> tuple[int, int]:
-    seen, code = marginal(slam, state, m, work), POSE
-    if innovate_by_points(update, slam, seen, m, work):
-        innovate(slam, seen, data, m, work)
-        add_noise(slam, seen, data, m, work)
-        code = 0
-    return code, leave_marginal(slam, m, work)
+    return 0, add_noise(slam, state, data, m, work)
 
 
 @inner

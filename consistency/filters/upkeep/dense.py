@@ -63,5 +63,7 @@ def settle_nothing(covariance: Dense, slam: Slam, whole: State, state: State, lo
 
 
 @implement(withhold, Dense)
-def withhold_nothing(covariance: Dense, data: Data, k: int, rejected: Array, local: Factors) -> None:
+def withhold_nothing(
+    covariance: Dense, state: State, data: Data, k: int, rejected: Array, anew: Array, local: Factors
+) -> None:
     """Nothing was noted of what is seen."""

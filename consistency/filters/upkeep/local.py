@@ -236,5 +236,7 @@ def count_settling(whole: int, n: int, b: int, local: Factors) -> None:
 
 
 @implement(withhold, Local)
-def withhold_nothing_local(covariance: Local, data: Data, k: int, rejected: Array, local: Factors) -> None:
+def withhold_nothing_local(
+    covariance: Local, state: State, data: Data, k: int, rejected: Array, anew: Array, local: Factors
+) -> None:
     """What is active is so whether it is used or not."""

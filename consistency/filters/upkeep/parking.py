@@ -138,12 +138,16 @@ def prepare_parked(
 
 
 @implement(withhold, Parking)
-def withhold_parked(covariance: Parking, data: Data, k: int, rejected: Array, local: Clones) -> None:
+def withhold_parked(
+    covariance: Parking, state: State, data: Data, k: int, rejected: Array, anew: Array, local: Clones
+) -> None:
     """What is rejected was not seen, and no return of it is in doubt."""
     fill(local.doubted, 0)
     local.new[0] = 0
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
+        if anew[i] and local.of[label] >= 0:
+            unpark(label, state, local)
         if rejected[i]:
             local.seen[label] = local.earlier[label]
         elif local.of[label] >= 0:
@@ -195,6 +199,7 @@ def is_in_doubt(label: int, local: Clones) -> bool:
 def append_active(
     covariance: Parking, slam: Slam, state: State, label: int, local: Clones, work: Work[NamedTuple]
 ) -> None:
+    local.seen[label] = local.step[0]
     append_rows(slam, state, label, local.factors, work.Jp)
 
 

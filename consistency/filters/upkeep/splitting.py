@@ -50,8 +50,14 @@ def _entry(P: Array, i: int, j: int) -> float:
 
 @inner
 def append_rows(slam: Slam, state: State, label: int, local: Factors, Jp: Array) -> None:
-    """A new landmark at the end of the active part, with Jacobian Jp (w, r) by the robot."""
-    r, w, n, base, Phi = robot_width(slam.motion), landmark_width(slam.landmark), state.n, state.base, local.Phi
+    """A landmark that begins at its offset in the active part, with Jacobian Jp (w, r) by the robot."""
+    r, w, o, base, Phi = (
+        robot_width(slam.motion),
+        landmark_width(slam.landmark),
+        state.offset[label],
+        state.base,
+        local.Phi,
+    )
     if base == 0:
         return
     for a in range(w):
@@ -59,8 +65,8 @@ def append_rows(slam: Slam, state: State, label: int, local: Factors, Jp: Array)
             total = 0.0
             for c in range(r):
                 total += Jp[a, c] * Phi[c, j]
-            Phi[n + a, j] = total
-    local.label[(n - r) // w] = label
+            Phi[o + a, j] = total
+    local.label[(o - r) // w] = label
 
 
 @inner

@@ -44,10 +44,12 @@ def correct_converted(
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> tuple[int, float]:
-    room, rho = work.room, work.at[0] + 2
-    waits = _is_any_in_doubt(m, local, work) and m == 1
+    room, rho, in_doubt = work.room, work.at[0] + 2, _is_any_in_doubt(m, local, work)
+    waits = in_doubt and m == 1
     waits = waits and state.P[rho, rho] < (update.waiting * state.x[rho]) ** 2
-    code, clones, chained, total = _aim(update, slam, state, data, m, local, work)
+    code, clones, chained, total = 0, room.on[0] + 1, False, 0.0  # as foreseen: the robot hangs on the last clone
+    if in_doubt or not is_foreseen:
+        code, clones, chained, total = _aim(update, slam, state, data, m, local, work)
     if code > 0:
         return code, np.nan
     code, nis = divide_by_root(state, 3 * m, work, total)

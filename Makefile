@@ -24,8 +24,10 @@ calibrate: .venv/.done
 calibrate-quick: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --quick
 
+RECURSIVE := ekf-uvd ukf-uvd parked-ekf-uvd robocentric-ekf-uvd anchored-ekf-uvd eqf-uvd ri-ekf-uvd fej-ekf-uvd oc-ekf-uvd \
+	ckf-uvd iekf-uvd ispkf-uvd
 regime: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/consistency sweep regime --out reports/regime
+	OPENBLAS_NUM_THREADS=1 $(BIN)/consistency sweep regime $(addprefix --filter ,$(RECURSIVE)) --out reports/regime
 	cp reports/regime/map.json reports/reference/regime.json
 
 bench: .venv/.done

@@ -17,7 +17,7 @@ NODES, CORNERS = 2, 3  # least numbers across and down, of nodes of a bias map a
 class Options:
     """What is known of a source beside its files."""
 
-    grid: tuple[int, int] = GRID
+    grid: tuple[int, int] | None = None
     at_rest: bool = False
     free_poses: bool = False
     calibration: Path | None = None
@@ -28,11 +28,11 @@ class Options:
     board: tuple[int, int] | None = None  # inner corners across and down
     square: float | None = None  # m
     distortion: str | None = None
-    seed: int = 0
+    seed: int | None = None
 
     def of_images(self) -> list[str]:
         """Options that are given and mean nothing for a log."""
-        names = ("calibration", "truth", "format", "left", "right", "board", "square", "distortion")
+        names = ("calibration", "truth", "format", "left", "right", "board", "square", "distortion", "seed")
         return [f"--{name}" for name in names if getattr(self, name) is not None]
 
 
@@ -49,7 +49,7 @@ def characterise_source(source: Path, options: Options) -> Measured:
     if is_log(source):
         if given := options.of_images():
             raise InputError(f"{given[0]}: goes with images, but {source} is a log")
-        return characterise_log(source, options.grid, options.at_rest, options.free_poses)
+        return characterise_log(source, options.grid or GRID, options.at_rest, options.free_poses)
     if (options.board is None) != (options.square is None):
         raise InputError(
             "--board and --square go together: without the size of its squares, the depth of a plane is not known, and "
@@ -59,12 +59,14 @@ def characterise_source(source: Path, options: Options) -> Measured:
         return _of_sequence(source, options)
     if not 0.0 < options.square < WIDEST:
         raise InputError(f"--square {options.square:g}: must be a positive number of metres, below {WIDEST:g}")
+    if options.seed is not None:
+        raise InputError("--seed: goes with images without a board; nothing is drawn at random from one")
     if options.at_rest or options.truth is not None:
         raise InputError("--board: goes neither with --at-rest nor with --truth; the poses of the board are fitted")
     from consistency.characterising.plane import characterise_board
 
     model = options.distortion or "full"
-    return Measured(characterise_board(source, options.board, options.square, model, options.grid), {})
+    return Measured(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
 
 
 def _of_sequence(source: Path, options: Options) -> Measured:
@@ -72,10 +74,12 @@ def _of_sequence(source: Path, options: Options) -> Measured:
 
     if options.distortion is not None:
         raise InputError("--distortion: goes with --board; other images bring their calibration")
+    if options.grid is not None:
+        raise InputError("--grid: goes with a log or with --board; images of an unknown scene give no bias map")
     o = options
     return Measured(
         characterise_images(
-            source, Sources(o.calibration, o.truth, o.format, o.left, o.right, o.at_rest, o.free_poses, o.seed)
+            source, Sources(o.calibration, o.truth, o.format, o.left, o.right, o.at_rest, o.free_poses, o.seed or 0)
         ),
         {},
     )

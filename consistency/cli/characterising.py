@@ -17,7 +17,9 @@ def characterise(
     ],
     out: Annotated[Path, typer.Option("--out", help="sensor.toml to write, for a belief or a log.")],
     report: Annotated[Path | None, typer.Option("--report", help="Folder to write with report.html and .pdf.")] = None,
-    grid: Annotated[str, typer.Option("--grid", metavar="KxL", help="Nodes of the bias map, across and down.")] = "5x4",
+    grid: Annotated[
+        str | None, typer.Option("--grid", metavar="KxL", help="Nodes of the bias map, across and down [5x4].")
+    ] = None,
     at_rest: Annotated[bool, typer.Option("--at-rest", help="The sensor stood still all the time.")] = False,
     free_poses: Annotated[
         bool, typer.Option("--free-poses", help="Fit the pose of each step, so that its error is no noise.")
@@ -36,7 +38,7 @@ def characterise(
     distortion: Annotated[
         str | None, typer.Option("--distortion", help="Lens model for a board: full, poor or none [full].")
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of RANSAC.")] = 0,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of RANSAC, for images without a board [0].")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --out and --report.")] = False,
 ) -> None:
@@ -52,7 +54,7 @@ def characterise(
     if report is not None:
         require_free(report, overwrite, "characterisation", "--report")
     size = None if board is None else counts(board, "--board", CORNERS)
-    nodes = counts(grid, "--grid", NODES)
+    nodes = None if grid is None else counts(grid, "--grid", NODES)
     options = Options(
         nodes, at_rest, free_poses, calibration, truth, format, left, right, size, square, distortion, seed
     )

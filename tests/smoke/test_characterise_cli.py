@@ -173,6 +173,8 @@ BAD = {
     "no truth": ((6, 6), ("--calibration", "CALIB"), "noise cannot be told from motion"),
     "one pair at rest": ((1, 1), ("--at-rest", "--calibration", "CALIB"), "holds 1 stereo pairs"),
     "grid": ((6, 6), (*BOARD, "--grid", "1x4"), "--grid 1x4: must be two numbers of at least 2"),
+    "grid without a board": ((6, 6), ("--at-rest", "--grid", "5x4"), "--grid: goes with a log or with --board"),
+    "seed of a board": ((6, 6), (*BOARD, "--seed", "1"), "--seed: goes with images without a board"),
 }
 
 

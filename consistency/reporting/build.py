@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from consistency.diagnostics import Settings
 from consistency.errors import InputError
 from consistency.reporting.answer import answer
 from consistency.reporting.blocks import Chapter, Document
@@ -15,10 +16,10 @@ from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.section import STUDY, Section
 from consistency.reporting.sections import SECTIONS
 from consistency.runs.findings import read_findings
-from consistency.store.results import read_results
+from consistency.store.results import open_results
 from consistency.store.storage import read_manifest
-from consistency.verdicts.curves import curves
-from consistency.verdicts.judge import analyse, design_of
+from consistency.verdicts.curves import curves, nis_ratio, steps_of
+from consistency.verdicts.judge import design_of, verdict_by
 
 
 def build_report(folder: Path) -> Report:
@@ -43,26 +44,28 @@ def build_report(folder: Path) -> Report:
 
 def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
     """One folder of results; ``styles`` are the numbers of filters that other studies have."""
-    results = read_results(folder)
-    scenario = results.scenario
-    verdicts = analyse(results)
-    by_filter = {name: curves(results, name) for name in results.filters}
-    runs = np.unique(np.concatenate([c.runs for c in by_filter.values()]))
-    steps = max((len(c.t) for c in by_filter.values()), default=0)
-    for name in results.filters:
-        styles.setdefault(name, len(styles))
+    results = open_results(folder)
+    scenario, design, steps = results.scenario, design_of(results), steps_of(results)
+    runs = np.unique(np.concatenate([results.runs_of(name) for name in results.filters]))
+    shown_run = int(runs[0]) if len(runs) else 0
+
+    def track(name: str) -> Track:
+        c, number = curves(results, name, steps), styles.setdefault(name, len(styles))
+        verdict = verdict_by(c, Settings(), design)
+        return Track(
+            name, number, f"{index}:{number}", verdict, c.of_run(shown_run), nis_ratio(c, verdict.runs), c.failures,
+            results,
+        )  # fmt: skip
+
     return Study(
         name=scenario.name if scenario else Path(str(results.manifest.get("log", folder.name))).name,
         summary=scenario.summary if scenario else "Recorded log",
         runs=len(runs),
-        shown_run=int(runs[0]) if len(runs) else 0,
+        shown_run=shown_run,
         steps=np.arange(1, steps + 1),
-        tracks=tuple(
-            Track(name, styles[name], f"{index}:{styles[name]}", verdicts[name], by_filter[name])
-            for name in results.filters
-        ),
+        tracks=tuple(track(name) for name in results.filters),
         results=results,
-        until_decided=design_of(results) is not None,
+        until_decided=design is not None,
     )
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from consistency.diagnostics import Verdict
 from consistency.reporting.drawing import Key, Owner
 from consistency.reporting.looks import Look, style
-from consistency.store.results import Results
+from consistency.store.results import Tables
 from consistency.types import Array, Failure, Indices
-from consistency.verdicts.curves import Curves
+from consistency.verdicts.curves import Curves, curves
 
 SINGLE_RUN = 1
 DECADE = 10.0  # values that span more are drawn on a log axis
@@ -27,7 +27,10 @@ class Track:
     style: int  # the same number for the same filter in the whole report
     tag: str  # of the filter in this study, for what belongs to it on a page
     verdict: Verdict
-    curves: Curves  # NaN where the filter had no estimate
+    shown: Curves  # of the shown run alone; NaN where the filter had no estimate
+    nis_ratio: Array  # (T,), NIS of the runs of the verdict over their degrees of freedom
+    failures: tuple[Failure, ...]  # of all runs, also of those after the look that decided
+    results: Tables
 
     @property
     def look(self) -> Look:
@@ -38,9 +41,9 @@ class Track:
         return Owner(self.name, self.tag)
 
     @property
-    def failures(self) -> tuple[Failure, ...]:
-        """Failures of all runs, also of those after the look that decided."""
-        return self.curves.failures
+    def curves(self) -> Curves:
+        """All R runs, read anew each time: a report holds those of one filter at a time, if any."""
+        return curves(self.results, self.name)
 
     @property
     def innovations_judged(self) -> bool:
@@ -58,7 +61,7 @@ class Study:
     shown_run: int  # the one that is drawn where only one can be
     steps: Indices  # (T,), 1..T
     tracks: tuple[Track, ...]
-    results: Results
+    results: Tables
     until_decided: bool  # each verdict is that of the look that decided it
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,6 +78,20 @@ class Curves:
     own: Errors | None = None  # in that convention, where it is not the additive one
     landmarks: Landmarks | None = None  # None where no run has a map
     rejections: Rejections | None = None  # None of a filter without a guard
+
+    def of_run(self, run: int) -> Curves:
+        """One run alone, R = 1, or none where there is no such run; maps and rejections are left out."""
+        at = np.flatnonzero(self.runs == run)
+
+        def some(values: Array | None) -> Any:
+            return None if values is None else values[at]
+
+        own = None if self.own is None else Errors(*map(some, self.own))
+        return replace(
+            self, runs=self.runs[at], covariance=self.covariance[at], error=some(self.error), nees=some(self.nees),
+            nis=self.nis[at], nis_dof=self.nis_dof[at], own=own, landmarks=None, rejections=None,
+            failures=tuple(failure for failure in self.failures if failure.run == run),
+        )  # fmt: skip
 
     @property
     def additive(self) -> Errors:
@@ -213,6 +227,15 @@ def run_means(c: Curves) -> Array:
     means = np.where(counted.any(axis=1), total / np.maximum(counted.sum(axis=1), 1), np.inf)
     means[np.isin(c.runs, [failure.run for failure in c.failures])] = np.inf
     return np.asarray(means)
+
+
+def nis_ratio(c: Curves, runs: int) -> Array:
+    """NIS of the first ``runs`` runs over their degrees of freedom in each step, (T,)."""
+    nis, nis_dof = c.nis[:runs], c.nis_dof[:runs]
+    known = np.isfinite(nis) & (nis_dof > 0)
+    dof = np.where(known, nis_dof, 0).sum(axis=0)
+    total = np.where(known, nis, 0.0).sum(axis=0)
+    return np.asarray(np.where(dof > 0, total / np.maximum(dof, 1), np.nan))
 
 
 def wins(a: Curves, b: Curves) -> tuple[int, float]:

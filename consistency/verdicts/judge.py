@@ -83,9 +83,13 @@ def analyse(
     settings = settings_of(confidence) if settings is None else settings
     verdicts, steps = {}, steps_of(results)
     for name in filters or results.filters:
-        c = curves(results, name, steps)
-        verdicts[name] = verdict_of(c, settings) if design is None else until_decided(c, design)
+        verdicts[name] = verdict_by(curves(results, name, steps), settings, design)
     return verdicts
+
+
+def verdict_by(c: Curves, settings: Settings, design: Design | None) -> Verdict:
+    """The verdict of one filter, as that run was looked at where there is a ``design``."""
+    return verdict_of(c, settings) if design is None else until_decided(c, design)
 
 
 def verdict_of(c: Curves, settings: Settings) -> Verdict:

@@ -102,7 +102,7 @@ def judged(track: Track, error, covariance, settings: Settings = SURE, **given) 
     verdict = judge(evidence, settings)
     assert verdict.scale is not None
     assert verdict.location is not None
-    return replace(track, verdict=verdict, curves=replace(track.curves, failures=verdict.failures))
+    return replace(track, verdict=verdict, failures=verdict.failures)
 
 
 def shown(report: Report) -> str:
@@ -794,11 +794,12 @@ def test_many_long_studies_stay_below_six_megabytes(results, tmp_path):
     def long(track: Track) -> Track:
         scale = replace(track.verdict.scale, anees=peak, band=np.tile([2.0, 4.0], (steps, 1)))
         location = replace(track.verdict.location, simultaneous=np.tile([1.0, 5.0], (steps, 1)))
-        curves = replace(
-            track.curves, runs=np.zeros(1, int), t=np.arange(1.0, steps + 1), error=rng.random((1, steps, 3)),
-            covariance=np.tile(np.eye(3), (1, steps, 1, 1)), nis=peak[None], nis_dof=np.ones((1, steps), int),
+        shown = replace(
+            track.shown, runs=np.zeros(1, int), t=np.arange(1.0, steps + 1), error=rng.random((1, steps, 3)),
+            covariance=np.tile(np.eye(3), (1, steps, 1, 1)),
         )  # fmt: skip
-        return replace(track, curves=curves, verdict=replace(track.verdict, scale=scale, location=location))
+        verdict = replace(track.verdict, scale=scale, location=location)
+        return replace(track, shown=shown, nis_ratio=peak, verdict=verdict)
 
     study = replace(
         report.studies[0], steps=np.arange(1, steps + 1), tracks=tuple(long(t) for t in report.studies[0].tracks * 4)

@@ -13,7 +13,6 @@ from consistency.reporting.model import Study, Track, wide
 from consistency.reporting.section import STUDY, Section
 from consistency.reporting.wording import listed
 from consistency.types import Array
-from consistency.verdicts.curves import Curves
 
 LEAST = 0.1  # correlation drawn on either side of zero, so that noise does not look large
 ONE = Look("#333333", width=0.8)
@@ -53,20 +52,8 @@ def read(study: Study) -> Innovations:
     """NIS and autocorrelation of the runs of each verdict."""
     return Innovations(
         study,
-        tuple(
-            Innovation(track, nis_ratio(track.curves, track.verdict.runs), lags(track), slot)
-            for slot, track in enumerate(study.tracks)
-        ),
+        tuple(Innovation(track, track.nis_ratio, lags(track), slot) for slot, track in enumerate(study.tracks)),
     )
-
-
-def nis_ratio(c: Curves, runs: int) -> Array:
-    """NIS of the first ``runs`` runs over their degrees of freedom in each step, (steps,)."""
-    nis, nis_dof = c.nis[:runs], c.nis_dof[:runs]
-    known = np.isfinite(nis) & (nis_dof > 0)
-    dof = np.where(known, nis_dof, 0).sum(axis=0)
-    total = np.where(known, nis, 0.0).sum(axis=0)
-    return np.asarray(np.where(dof > 0, total / np.maximum(dof, 1), np.nan))
 
 
 def lags(track: Track) -> Lags | None:

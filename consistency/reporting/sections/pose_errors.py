@@ -40,20 +40,19 @@ def read(study: Study) -> PoseErrors | None:
     """Errors of the shown run; None where the truth is not known."""
     if not study.has_truth:
         return None
-    by_track = (_pose_error(track, study.shown_run) for track in study.tracks)
+    by_track = (_pose_error(track) for track in study.tracks)
     return PoseErrors(study, tuple(of for of in by_track if of is not None))
 
 
-def _pose_error(track: Track, run: int) -> PoseError | None:
-    c = track.curves
+def _pose_error(track: Track) -> PoseError | None:
+    c = track.shown
     if c.error is None:
         return None
-    row = int(np.searchsorted(c.runs, run))
-    if row == len(c.runs) or c.runs[row] != run:
+    if not len(c.runs):
         empty = np.full((len(c.t), 3), np.nan)
         return PoseError(track, empty, empty)
-    variance = np.diagonal(c.covariance[row], axis1=-2, axis2=-1)
-    return PoseError(track, DEGREES * c.error[row], DEGREES * np.sqrt(np.maximum(variance, 0.0)))
+    variance = np.diagonal(c.covariance[0], axis1=-2, axis2=-1)
+    return PoseError(track, DEGREES * c.error[0], DEGREES * np.sqrt(np.maximum(variance, 0.0)))
 
 
 def figures(errors: PoseErrors) -> tuple[Figure, ...]:

@@ -12,7 +12,7 @@ from consistency.reporting.looks import ODOMETRY, TRUTH, Look
 from consistency.reporting.model import Study, Track
 from consistency.reporting.section import STUDY, Section
 from consistency.simulation import simulate
-from consistency.types import Array
+from consistency.types import Array, Indices
 
 LANDMARK = Look("#8c8c8c", marker="*", size=4.0)
 ALONE = Look(ODOMETRY, (6.0, 3.0), width=1.1)
@@ -44,19 +44,24 @@ def read(study: Study) -> World:
 
 
 def _path(study: Study, filter_name: str) -> Array:
-    estimates = study.results.estimates
     path = np.full((len(study.steps), 2), np.nan)
-    rows = estimates[(estimates["filter"] == filter_name) & (estimates["run"] == study.shown_run)]
-    path[rows["step"].to_numpy() - 1] = rows[["x", "y"]].to_numpy(float)
+    step, values = _of_shown_run(study, "estimates", filter_name)
+    path[step - 1] = values
     return path
 
 
 def _truth(study: Study) -> Array | None:
-    truth = study.results.truth
-    if truth is None:
-        return None
-    path = truth.loc[truth["run"] == study.shown_run].sort_values("step")[["x", "y"]].to_numpy(float)
-    return path if len(path) else None
+    step, path = _of_shown_run(study, "truth")
+    return path[np.argsort(step, kind="stable")] if len(path) else None
+
+
+def _of_shown_run(study: Study, table: str, filter_name: str | None = None) -> tuple[Indices, Array]:
+    """Steps (N,) and positions (N, 2), m."""
+    rows = [np.zeros((0, 3))]
+    for batch in study.results.batches(table, ["run", "step", "x", "y"], filter_name):
+        rows.append(np.stack([batch["step"], batch["x"], batch["y"]], axis=-1)[batch["run"] == study.shown_run])
+    found = np.concatenate(rows)
+    return found[:, 0].astype(np.int64), found[:, 1:]
 
 
 def _odometry(study: Study) -> Array | None:

@@ -12,6 +12,7 @@ import pytest
 from scripts import experiment
 
 import consistency as cs
+from consistency.imaging.chain import MISMATCH, POINT, Tracks
 from consistency.imaging.protocols import Stops, wall_texture
 from consistency.imaging.scene import Layer, Scene
 from consistency.reporting.build import build_report
@@ -119,3 +120,32 @@ def test_without_opencv_the_experiments_are_left_out(
         monkeypatch.setattr(module, "opencv", missing)
         assert module.main(cs.Study(jobs=1)) == []
     assert capsys.readouterr().err.count("images need OpenCV") == 2
+
+
+def tracks_with(errors: np.ndarray, track: np.ndarray, label: np.ndarray | None = None) -> Tracks:
+    """Kept observations with these errors (M, 3) about a truth that is not zero."""
+    zero, truth = np.zeros(len(track), int), np.tile([10.0, 20.0, 5.0], (len(track), 1))
+    label = zero + POINT if label is None else label
+    return Tracks(zero, zero, track, truth + errors, truth, truth, zero.astype(float), label, zero)
+
+
+def test_scatter_about_the_means_of_tracks(moving: ModuleType) -> None:
+    errors = np.array([[1.0, 0, 5], [3.0, 0, 5], [2.0, 3, 5], [7.0, 7, 7], [9.0, 9, 9], [50.0, 50, 50]])
+    labels = np.array([POINT] * 5 + [MISMATCH])
+    squares, spare = moving.scatter(tracks_with(errors, np.array([4, 4, 4, 8, 8, 8]), labels))
+    np.testing.assert_allclose(squares, [[2.0, 6.0, 0.0], [2.0, 2.0, 2.0]])
+    assert spare.tolist() == [2, 1]
+
+
+def test_noise_ratios_are_those_simulated(moving: ModuleType, rng: np.random.Generator) -> None:
+    """60 tracks of 20 images, sd 3, 1 and 0.5 times that at rest; each by six standard errors (below 1e-8)."""
+    track, sd = np.repeat(np.arange(60), 20), np.array([3.0, 1.0, 0.5])
+    offsets = rng.standard_normal((60, 3))[track]  # constant along a track: no noise
+    fast, slow = (tracks_with(k * 0.1 * rng.standard_normal((1200, 3)) + offsets, track) for k in (sd, 1.0))
+    table = moving.noise_ratios(fast, slow, rng)
+    error = np.sqrt(2.0 / (2.0 * 60 * 19))  # of the ratio of two sd
+    np.testing.assert_allclose(table["ratio"] / sd, 1.0, atol=6 * error)
+    np.testing.assert_allclose(table["moving"], 0.1 * sd, rtol=6 * error)
+    half = (table["high"] - table["low"]) / 2 / table["ratio"]
+    np.testing.assert_allclose(half, 2.935 * error, rtol=0.4)  # quantile of 0.5 % / 3
+    assert (table["low"] < table["ratio"]).all()

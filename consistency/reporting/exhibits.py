@@ -13,7 +13,7 @@ from consistency.reporting.drawing import Figure, Key, Panel, Sheet
 from consistency.reporting.model import Report
 from consistency.reporting.section import Part, Section
 from consistency.reporting.tables import extra_table
-from consistency.reporting.wording import number
+from consistency.reporting.wording import number, p_cell
 
 OF_FINDINGS = (
     Column("Finding", width="2.5cm"),
@@ -22,7 +22,7 @@ OF_FINDINGS = (
     Column("Measured", width="1.9fr"),
     Column("Verdict", width="1.75cm"),
 )
-STATUS = "status"  # in place of a format: the word of a verdict
+STATUS, P_VALUE = "status", "p"  # in place of a format: the word of a verdict, a p value
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def listing(data: pd.DataFrame, heads: Mapping[str, tuple[str, str]], label: str
 
     Parameters
     ----------
-    heads : column: head, and the format of a number; "" for text, :data:`STATUS` for the word of a verdict
+    heads : column: head, and the format of a number, :data:`P_VALUE`, :data:`STATUS`, or "" for text
     """
     columns = tuple(Column(head, number=form not in ("", STATUS)) for head, form in heads.values())
     rows = [
@@ -140,6 +140,8 @@ def listing(data: pd.DataFrame, heads: Mapping[str, tuple[str, str]], label: str
 def _cell(value: Any, form: str) -> Cell:
     if form == STATUS:
         return Status(str(value))
+    if form == P_VALUE:
+        return "–" if pd.isna(value) else p_cell(value)
     return number(value, form) if form else str(value)
 
 

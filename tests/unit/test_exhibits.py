@@ -14,7 +14,7 @@ import consistency as cs
 from consistency.reporting.blocks import Block, Column, Heading, Stack, Status, Table
 from consistency.reporting.build import build_report
 from consistency.reporting.drawing import Figure, Line, Points, Rule
-from consistency.reporting.exhibits import STATUS, Exhibit, Source, listing, section
+from consistency.reporting.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, section
 from consistency.reporting.section import Part
 from consistency.reporting.sections import biases, image_tracks, images, sensor_issues
 
@@ -70,11 +70,13 @@ def test_an_exhibit_has_its_own_findings_and_none_without_a_table(tmp_path: Path
 
 
 def test_a_listing_writes_text_numbers_and_verdicts() -> None:
-    data = pd.DataFrame({"name": ["a"], "x": [2.0 / 3.0], "status": ["biased"], "y": [np.nan]})
-    heads = {"status": ("Verdict", STATUS), "name": ("Name", ""), "x": ("X", ".2f"), "y": ("Y", ".1f")}
+    data = pd.DataFrame({"name": ["a"], "x": [2.0 / 3.0], "status": ["biased"], "y": [np.nan], "p": [1e-9]})
+    heads = {"status": ("Verdict", STATUS), "name": ("Name", ""), "x": ("X", ".2f"), "y": ("Y", ".1f"),
+             "p": ("p", P_VALUE)}  # fmt: skip
     table = listing(data, heads, "label", "caption")
-    assert rows_of(table) == ((Status("biased"), "a", "0.67", "–"),)
-    assert table.columns == (Column("Verdict"), Column("Name"), Column("X", number=True), Column("Y", number=True))
+    assert rows_of(table) == ((Status("biased"), "a", "0.67", "–", "< 1e-6"),)
+    numbers = tuple(Column(head, number=True) for head in ("X", "Y", "p"))
+    assert table.columns == (Column("Verdict"), Column("Name"), *numbers)
 
 
 OUTCOME = {"status": "biased", "anees": 4.0, "precision": np.nan, "recall": np.nan}
@@ -114,10 +116,9 @@ def test_lenses_and_features_are_drawn(tmp_path: Path) -> None:
     assert [key.text for key in figures["Field of view"].keys][1] == "one, k1 left over 0.1"
     position, turn = (panel.marks[0] for panel in figures["Errors over the number of features"].panels)
     np.testing.assert_allclose([position.x, position.y, turn.y], [[2, 8], [0.1, 0.2], [2.0, 1.0]])
-    far = figures["Near and far features"].panels[0].marks[1]
-    assert (far.x.tolist(), far.y.tolist()) == ([1.0], [0.2])
-    (of_counts,) = (block for block in blocks if isinstance(block, Table) and block.label == "Counts of features")
-    assert [row[-1] for row in rows_of(of_counts)] == ["–", "0.001"]
+    tables_of = {block.label: rows_of(block) for block in blocks if isinstance(block, Table)}
+    assert [row[-1] for row in tables_of["Counts of features"]] == ["–", "0.001"]
+    assert tables_of["Outcomes"][1] == ("far", Status("biased"), "4.00", "0.200", "1.00")
 
 
 def test_a_bias_map_is_drawn_row_by_row(tmp_path: Path) -> None:
@@ -133,6 +134,7 @@ def test_a_bias_map_is_drawn_row_by_row(tmp_path: Path) -> None:
     (panel,) = figures["Bias of disparity by lens model"].panels
     np.testing.assert_allclose([mark.y[0] for mark in panel.marks if isinstance(mark, Line)], [60.0, 0.0, -10.0])
     assert panel.title == "lens model: none"
+    assert panel.y.window == pytest.approx((-69.0, 69.0))
     rule, first, second = figures["ANEES by belief"].panels[0].marks
     assert (rule.at, first.y.tolist(), second.x.tolist()) == (3.0, [3.0, 4.0], [2])
 

@@ -7,7 +7,7 @@ import pandas as pd
 
 from consistency.reporting.blocks import Table
 from consistency.reporting.drawing import Axis, Figure, Key, Line, Panel, Points, Rule
-from consistency.reporting.exhibits import STATUS, Exhibit, Source, groups, listing, section, several, single
+from consistency.reporting.exhibits import P_VALUE, STATUS, Exhibit, Source, groups, listing, section, several, single
 from consistency.reporting.looks import EXPECTED, style
 from consistency.reporting.section import Part
 
@@ -44,7 +44,7 @@ def over_steps(curves: pd.DataFrame) -> Figure:
 
 def of_map(nodes: pd.DataFrame) -> Figure:
     """The bias that is taken for noise, as fig. 8."""
-    keys, panel = _rows(nodes, "bias_d", "Bias of disparity over the image")
+    keys, panel = _rows(nodes)
     caption = (
         "The bias of disparity that makes up the pooled standard deviation of the chapter, by place in the image; "
         "as Herath et al. (2007) fig. 8. Rows above the middle mirror those below."
@@ -52,7 +52,9 @@ def of_map(nodes: pd.DataFrame) -> Figure:
     return single("Bias of disparity", caption, panel, keys)
 
 
-def _rows(nodes: pd.DataFrame, column: str, alt: str, title: str = "") -> tuple[tuple[Key, ...], Panel]:
+def _rows(
+    nodes: pd.DataFrame, title: str = "", window: tuple[float, float] | None = None
+) -> tuple[tuple[Key, ...], Panel]:
     """A line over u for each row of nodes; of many rows, for some from the middle down."""
     chosen = np.unique(nodes["v"])
     if len(chosen) > ROWS:
@@ -62,10 +64,11 @@ def _rows(nodes: pd.DataFrame, column: str, alt: str, title: str = "") -> tuple[
     keys = []
     for k, v in enumerate(chosen):
         part = nodes[nodes["v"] == v].sort_values("u")
-        u, bias = part["u"].to_numpy(), part[column].to_numpy()
+        u, bias = part["u"].to_numpy(), part["bias_d"].to_numpy()
         marks += [Line(u, bias, style(k)), Points(u, bias, style(k), tips=(("u", "@x{0}"), ("bias", "@y{0.00} px")))]
         keys.append(Key(f"v = {v:.0f} px", style(k), marked=True))
-    return tuple(keys), Panel(Axis("u (px)"), Axis("bias of d (px)"), tuple(marks), alt, title=title)
+    alt = f"Bias of disparity over the image {title}".strip()
+    return tuple(keys), Panel(Axis("u (px)"), Axis("bias of d (px)", window=window), tuple(marks), alt, title=title)
 
 
 def survivors(filters: pd.DataFrame) -> Table:
@@ -85,7 +88,7 @@ def believed(rows: pd.DataFrame) -> Table:
     heads = {
         "model": ("Lens model", ""), "belief": ("Belief", ""), "filter": ("Filter", ""), "status": ("Verdict", STATUS),
         "anees": ("Mean NEES", ".2f"), "rmse_position_m": ("RMSE (m)", ".3f"),
-        "rmse_heading_deg": ("RMSE (deg)", ".2f"), "p": ("p", ".2g"),
+        "rmse_heading_deg": ("RMSE (deg)", ".2f"), "p": ("p", P_VALUE),
     }  # fmt: skip
     caption = "p: that noise alone does not give the greater NEES"
     return listing(rows, heads, "Filters with each lens model", caption)
@@ -102,10 +105,8 @@ def sensors(rows: pd.DataFrame) -> Table:
 
 def lens_maps(nodes: pd.DataFrame) -> Figure:
     """Bias maps of disparity, lens model by lens model."""
-    drawn = [
-        _rows(part, "bias_d", f"Bias of disparity, lens model {model}", f"lens model: {model}")
-        for model, part in groups(nodes, "model")
-    ]
+    reach = 1.15 * max(float(nodes["bias_d"].abs().max()), 0.1)
+    drawn = [_rows(part, f"lens model: {model}", (-reach, reach)) for model, part in groups(nodes, "model")]
     caption = (
         "Bias of disparity that is shown with each lens model, along the rows of nodes; zero where none is shown, and "
         "at nodes of which nothing is known. Rows of the models differ by some pixels."

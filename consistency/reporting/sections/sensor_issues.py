@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pandas as pd
 
-from consistency.reporting.blocks import Block, Table
+from consistency.reporting.blocks import Table
 from consistency.reporting.drawing import Axis, Figure, Key, Line, Panel, Points, Rule
-from consistency.reporting.exhibits import STATUS, Exhibit, Source, groups, listing, section, several, single
+from consistency.reporting.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, section, several
 from consistency.reporting.looks import COLOURS, EXPECTED, Look, style
 from consistency.reporting.sections.biases import SENSOR
 from consistency.types import Array
@@ -108,23 +106,8 @@ def counts(rows: pd.DataFrame) -> Figure:
 
 def of_counts(rows: pd.DataFrame) -> Table:
     """The numbers of the figure, with the test from one count to the next."""
-    heads = OUTCOME | {"p": ("p, fewer no worse", ".2g")}
+    heads = OUTCOME | {"p": ("p, fewer no worse", P_VALUE)}
     return listing(rows, heads, "Counts of features", "p of the test against the row above")
-
-
-def mix(rows: pd.DataFrame) -> Block:
-    """Position and heading with near features, far ones, and both."""
-    marks = [
-        Points(part["rmse_heading_deg"].to_numpy(), part["rmse_position_m"].to_numpy(), replace(style(k), size=7.0))
-        for k, (_, part) in enumerate(groups(rows, "case"))
-    ]
-    keys = tuple(Key(case, replace(style(k), size=7.0), "points") for k, (case, _) in enumerate(groups(rows, "case")))
-    panel = Panel(
-        Axis("RMSE of heading (deg)", start=0.0), Axis("RMSE of position (m)", start=0.0), tuple(marks),
-        "Position over heading",
-    )  # fmt: skip
-    caption = "Errors of parked-ekf-uvd with eight features at a time, near, far or both; sec. 4.2."
-    return single("Near and far features", caption, panel, keys)
 
 
 NUMBERS = ("anees", "rmse_position_m", "rmse_heading_deg", "precision", "recall")
@@ -152,7 +135,6 @@ EXHIBITS = (
             (Source("feature_count", (*NUMBERS, "count", "p"), TEXTS, counts, (*NO_GUARD, "p")),
              Source("feature_count", (*NUMBERS, "count", "p"), TEXTS, of_counts, (*NO_GUARD, "p")))),
     Exhibit(("near-far-mix",), "near-far-mix: near and far features",
-            (Source("near_far_mix", NUMBERS, TEXTS, mix, NO_GUARD),
-             Source("near_far_mix", NUMBERS, TEXTS, outcomes, NO_GUARD))),
+            (Source("near_far_mix", NUMBERS, TEXTS, outcomes, NO_GUARD),)),
 )  # fmt: skip
 SECTION = section(SENSOR, EXHIBITS)

@@ -7,6 +7,7 @@ deviation of the chapter, and what is drawn anew in each image is as small as a 
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 from numpy.random import default_rng
 from scipy.optimize import brentq
 from scipy.stats import bootstrap
@@ -15,7 +16,7 @@ import consistency as cs
 from consistency.runs.findings import OURS, script
 from consistency.scenario.effects.distortion import Distortion
 from consistency.types import Array
-from consistency.verdicts.curves import run_means
+from consistency.verdicts.curves import Curves, run_means
 
 FINDINGS = ("bias-or-noise", "bias-survivors")
 LONG = True
@@ -86,8 +87,9 @@ def variants(k: float) -> dict[str, cs.Scenario]:
 
 def share(study: cs.Study, worlds: dict[str, cs.Scenario]) -> cs.Finding:
     """What of the excess of ekf-uvd goes with the map."""
-    means = {name: run_means(study.judged(world, "ekf-uvd")[1]) for name, world in worlds.items()}
-    status = {name: study.judged(world, "ekf-uvd")[0].status for name, world in worlds.items()}
+    found = {name: study.judged(world, "ekf-uvd") for name, world in worlds.items()}
+    means = {name: run_means(curves) for name, (_, curves) in found.items()}
+    status = {name: verdict.status for name, (verdict, _) in found.items()}
     shares = {name: interval_of_share(means["as noise"], means[name], study.seed) for name in ("mapped", "known")}
     _, low, _ = shares["mapped"]
     said = {
@@ -97,6 +99,11 @@ def share(study: cs.Study, worlds: dict[str, cs.Scenario]) -> cs.Finding:
         "known": "bias mapped and noise known",
         "ignored": "noise known and bias not",
     }
+    gone = {name: shares.get(name, (np.nan, np.nan, np.nan)) for name in worlds}
+    rows = [(said[name], status[name], means[name].mean(), *gone[name]) for name in worlds]
+    study.tables["bias_or_noise"] = pd.DataFrame(rows, columns=["belief", "status", "anees", "share", "low", "high"])
+    study.tables["bias_or_noise_map"] = nodes_of(worlds["mapped"])
+    study.tables["bias_or_noise_nees"] = pd.concat(over_steps(said[name], found[name][1]) for name in worlds)
     return study.finding(
         low > MOST,
         scenario="herath2007-stereo, 5 variants",
@@ -111,6 +118,22 @@ def share(study: cs.Study, worlds: dict[str, cs.Scenario]) -> cs.Finding:
         + ", ".join(f"{means[name].mean():.2f} with {text} ({status[name]})" for name, text in said.items()),
         accept=f"95 % bootstrap interval of the share lies above {MOST:.0%}",
     )
+
+
+def nodes_of(world: cs.Scenario) -> pd.DataFrame:
+    """The bias of disparity that is believed at each node of the map, px."""
+    bias = world.belief.sensor.bias
+    assert bias is not None
+    v, u = (axis.ravel() for axis in np.meshgrid(bias.v, bias.u, indexing="ij"))
+    return pd.DataFrame({"u": u, "v": v, "bias_d": bias.at(u, v)[:, 2]})
+
+
+def over_steps(belief: str, curves: Curves) -> pd.DataFrame:
+    """Mean NEES of all runs in each step."""
+    assert curves.nees is not None
+    known = np.isfinite(curves.nees).any(axis=0)
+    nees = np.nanmean(curves.nees[:, known], axis=0)
+    return pd.DataFrame({"belief": belief, "step": np.flatnonzero(known) + 1, "nees": nees})
 
 
 def interval_of_share(before: Array, after: Array, seed: int) -> tuple[float, float, float]:
@@ -131,7 +154,13 @@ def survivors(study: cs.Study, worlds: dict[str, cs.Scenario]) -> cs.Finding:
     found = {
         name: cs.analyse(study.results(world, [name]), [name], confidence=1.0 - FALSE_ALARM)[name] for name in FILTERS
     }
-    beside = {name: study.judged(white, name)[0].statistic for name in FILTERS}
+    before = {name: study.judged(white, name)[0] for name in FILTERS}
+    beside = {name: verdict.statistic for name, verdict in before.items()}
+    rows = [
+        (name, before[name].status, beside[name], verdict.status, verdict.statistic) for name, verdict in found.items()
+    ]
+    columns = ["filter", "status_noise", "anees_noise", "status_bias", "anees_bias"]
+    study.tables["bias_survivors"] = pd.DataFrame(rows, columns=columns)
     return study.finding(
         all(verdict.status != "consistent" for verdict in found.values()),
         scenario=world.name,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -25,6 +26,7 @@ RESIDUAL = 0.0023  # k1 left by rectification, opposite in the two cameras, as i
 COUNTS = (2, 4, 8, 16)  # features at a time
 NEAR = 2.25  # m, between near and far: a disparity of 6 px
 
+POSE = ("x", "y", "heading")
 NO_WORSE = {"consistent": 0, "undecided": 1}  # verdicts in order; any other is a fault
 
 
@@ -48,6 +50,8 @@ def spurious(study: cs.Study) -> cs.Finding:
     """An unguarded filter among mismatches."""
     clean, broken = (study.judged(world, "ekf-uvd") for world in ("herath2007-stereo", "herath2007-mismatch"))
     p = greater(log_nees(broken[1]), log_nees(clean[1]))
+    study.tables["fig10a"] = outcomes({"without mismatches": clean, "5 % mismatches": broken})
+    study.tables["fig10a_errors"] = first_run(broken[1])
     return study.finding(
         p < LEVEL and broken[0].status not in NO_WORSE,
         scenario="herath2007-mismatch",
@@ -65,6 +69,8 @@ def ransac(study: cs.Study) -> cs.Finding:
     """The same filter behind a guard, as the chapter has it."""
     plain, behind = (study.judged("herath2007-mismatch", name) for name in ("ekf-uvd", "ekf-uvd+ransac"))
     p = greater(log_nees(plain[1]), log_nees(behind[1]))
+    study.tables["fig10b"] = outcomes({"ekf-uvd": plain, "ekf-uvd+ransac": behind})
+    study.tables["fig10b_errors"] = first_run(behind[1])
     return study.finding(
         p < LEVEL,
         scenario="herath2007-mismatch",
@@ -185,6 +191,8 @@ def feature_count(study: cs.Study) -> cs.Finding:
     errors = {count: log_rmse(curves, (0, 1)) for count, (_, curves) in found.items()}
     steps = list(pairwise(COUNTS))
     tests = {pair: greater(errors[pair[0]], errors[pair[1]]) for pair in steps}
+    table = outcomes({f"{count} at a time": judged for count, judged in found.items()})
+    study.tables["feature_count"] = table.assign(count=COUNTS, p=[np.nan, *tests.values()])
     return study.finding(
         all(p < LEVEL for p in tests.values()),
         scenario=f"herath2007-selection, {len(COUNTS)} counts",
@@ -218,6 +226,7 @@ def near_far_mix(study: cs.Study) -> cs.Finding:
     """As many features near, far, or both."""
     worlds = {"near": selected(8, (0.5, NEAR)), "far": selected(8, (NEAR, 4.0)), "both": selected(8)}
     found = {name: study.judged(world, "parked-ekf-uvd") for name, world in worlds.items()}
+    study.tables["near_far_mix"] = outcomes(found)
     place = {name: log_rmse(curves, (0, 1)) for name, (_, curves) in found.items()}
     heading = {name: log_rmse(curves, (2,)) for name, (_, curves) in found.items()}
     tests = greater(place["far"], place["near"]), greater(heading["near"], heading["far"])
@@ -259,6 +268,28 @@ def rmse(verdict: cs.Verdict) -> tuple[float, float]:
     """RMSE of position (m) and of heading (degrees)."""
     assert verdict.accuracy is not None
     return verdict.accuracy.rmse_position, float(np.degrees(verdict.accuracy.rmse_heading))
+
+
+def outcomes(cases: Mapping[str, tuple[cs.Verdict, Curves]]) -> pd.DataFrame:
+    """Verdict, ANEES and RMSE of each case; precision and recall of its guard, NaN without one."""
+    rows = []
+    for case, (verdict, _) in cases.items():
+        score = verdict.rejection
+        guard = (np.nan, np.nan) if score is None else (score.precision.value, score.recall.value)
+        rows.append((case, verdict.status, verdict.statistic, *rmse(verdict), *guard))
+    columns = ["case", "status", "anees", "rmse_position_m", "rmse_heading_deg", "precision", "recall"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def first_run(curves: Curves) -> pd.DataFrame:
+    """Errors of the first run and their stated standard deviations in each step, m and degrees."""
+    assert curves.error is not None
+    scale = np.array([1.0, 1.0, np.degrees(1.0)])
+    error = scale * curves.error[0]
+    sigma = scale * np.sqrt(np.maximum(np.diagonal(curves.covariance[0], axis1=-2, axis2=-1), 0.0))
+    columns = {name: error[:, k] for k, name in enumerate(POSE)}
+    bounds = {f"sigma_{name}": sigma[:, k] for k, name in enumerate(POSE)}
+    return pd.DataFrame({"step": np.arange(1, len(error) + 1), **columns, **bounds})
 
 
 def rank(verdict: cs.Verdict) -> int:

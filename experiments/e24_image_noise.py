@@ -52,7 +52,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     if any(study.wants(name) for name in FINDINGS[:4]):
         tracks = {k1: protocol(study, k1) for k1 in (0.0, RESIDUAL)}
         tables = [by_stop(part).assign(residual=k1) for k1, part in tracks.items()]
-        study.tables["images_stops"] = table = pd.concat(tables, ignore_index=True).assign(sigma=SIGMA)
+        study.tables["images_stops"] = table = pd.concat(tables, ignore_index=True).assign(sigma=SIGMA, needed=KEPT)
         own = table[table["residual"] == RESIDUAL]
         questions = (figure_4(study, own), figure_5a(study, tracks[RESIDUAL]), figure_5b(study, own, table))
         findings += [*questions, figure_5c(study, own)]
@@ -133,6 +133,9 @@ def figure_5a(study: cs.Study, tracks: Tracks) -> cs.Finding:
     scaled = (errors / np.where(sd > 0.0, sd, 1.0))[sd[:, 0] > 0.0]  # far away all 30 may be one sixteenth of a px
     # of n white errors about their own mean, two correlate by -1 / (n - 1)
     lags = [float((scaled[:, k:] * scaled[:, :-k]).mean() + 1.0 / IMAGES) for k in range(1, LAGS + 1)]
+    study.tables["images_fig5a_lags"] = pd.DataFrame(
+        {"lag": np.arange(1, LAGS + 1), "autocorrelation": lags, "limit": WHITE}
+    )
     stop = kept.sequence.reshape(-1, IMAGES + 1)[:, 0]
     low, high = bootstrap(generator(study, 5), [errors[stop == k].ravel() for k in np.unique(stop)], stats.kurtosis)
     white = max(map(abs, lags)) <= WHITE

@@ -49,6 +49,32 @@ def simulated(rng: np.random.Generator, growth: Growth, biases: Biases, sigma: f
     return tracks_of(truth, truth + bias + own + noise, track)
 
 
+def observed(growth: Growth, biases: Biases, sigma: float, at: Array, n: int = 30, seed: int = 0) -> Tracks:
+    """Observations of landmarks at these places (u, v, d) by a scenario whose truth holds the tables.
+
+    The robot hardly moves. What a table over the place does not tell stays the same along a track.
+    """
+    x = 13.5 / at[:, 2]
+    points = np.column_stack([x, -at[:, 0] * x / 150.0, -at[:, 1] * x / 150.0])
+    effects = (
+        {"kind": "local-bias", **biases.table().model_dump()},
+        {"kind": "track-error", "sigma": biases.rest.tolist(), "correlation": 1.0 - 1e-9},
+    )
+    world = cs.load_scenario("herath2007-stereo").variant(
+        "calibrated",
+        summary="a wall before a robot that stands, seen by the sensor of the tables",
+        truth__steps=n,
+        truth__path={"shape": "circle", "radius": 1.0, "start": (0.0, 0.0), "heading": 0.0, "speed": 1e-9},
+        truth__landmarks={"layout": "listed", "points": points.tolist()},
+        truth__sensor__sigma=(0.02, 0.02, sigma),
+        truth__sensor__range=(0.1, 20.0),
+        truth__sensor__disparity_growth=growth.table(sigma).model_dump(),
+        truth__sensor__effects=effects,
+    )
+    trial = cs.simulate(world, seed=seed)
+    return tracks_of(at[trial.landmark], trial.z, trial.landmark)
+
+
 def off(a: Array, b: Array, covariance: Array) -> float:
     """p value of a chi-square test that two estimates are of one thing."""
     e = np.ravel(a - b)
@@ -124,17 +150,18 @@ def test_hats_interpolate_and_hold() -> None:
 
 
 def test_both_levels_agree() -> None:
-    """Tables from images make observations whose tables are those of other images: sd over disparity and bias map.
+    """Tables from images in a scenario make observations whose tables are those of other images.
 
-    Chi-square tests (false alarm 1e-7 each, were all errors Gaussian); one node of each table moved by two fifths of
-    the largest value is told apart.
+    Chi-square tests (false alarm 1e-7 each, were all errors Gaussian). One node of the growth moved by two fifths of
+    its largest value, or of the map by a half, is told apart.
     """
     pytest.importorskip("cv2")
     stops, nodes = Stops(farthest=3.0, nearest=1.0, step=0.2, images=3), np.array([4.5, 8.0, 13.5])
     first, second = (image_means(seed, stops) for seed in (11, 12))
     growth, biases = disparity_growth(first, nodes), bias_map(first, *FINE)
     other, placed = disparity_growth(second, nodes), bias_map(second, *FINE)
-    made = track_means(simulated(np.random.default_rng(13), growth, biases, 0.65, second.truth, 4))
+    made = track_means(observed(growth, biases, 0.65, second.truth, 4))
+    assert len(made.count) == len(second.count)
     sd, bias = disparity_growth(made, nodes), bias_map(made, *FINE)
     both = other.covariance + growth.covariance
     assert off(other.sd, sd.sd, both + sd.covariance) > 1e-7
@@ -146,7 +173,7 @@ def test_both_levels_agree() -> None:
         )
         assert off(placed.bias[..., k], bias.bias[..., k], scatter) > 1e-7
         wrong = placed.bias[..., k].copy()
-        wrong[2, 1] += 0.4 * np.abs(wrong).max()
+        wrong[2, 1] += 0.5 * np.abs(wrong).max()
         assert off(wrong, bias.bias[..., k], scatter) < 1e-3
 
 

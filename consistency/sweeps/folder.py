@@ -19,11 +19,11 @@ from consistency.errors import InputError
 from consistency.runs.montecarlo import worker_count
 from consistency.scenario import Scenario
 from consistency.store.atomic import write_whole
+from consistency.store.stopping import stoppable
 from consistency.store.storage import manifest_of, read_manifest, write_folder
 from consistency.sweeps.axes import Axis
 from consistency.sweeps.cell import CellResult, Outcome, plain_numbers, result_from, run_cell
 from consistency.sweeps.plan import Cell, Rule, Sweep
-from consistency.sweeps.stopping import remembered
 
 KIND, CELL_KIND = "sweep", "cell"
 CELLS = "cells"  # folder of the cells in that of the sweep
@@ -261,11 +261,11 @@ def run_sweep(
     if len(todo) < len(share):
         print(f"{len(share) - len(todo)} of {len(share)} are there already", file=sys.stderr, flush=True)
     started = time.monotonic()
-    with remembered() as stopped:
+    with stoppable() as stop:
         for count, work in enumerate(todo, 1):
             begun = time.monotonic()
             outcome = run_cell(folder.sweep, work.cell, work.filter, jobs)
-            if stopped():  # and the cell took it for an error of its own
+            if stop.number is not None:  # and the cell took it for an error of its own
                 raise KeyboardInterrupt
             folder.write(work, outcome, time.monotonic() - begun)
             left = _left((time.monotonic() - started) / count * (len(todo) - count))

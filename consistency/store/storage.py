@@ -173,7 +173,9 @@ class NewFolder:
             yield
 
     def put_in_place(self, manifest: dict[str, Any]) -> dict[str, Any]:
-        """Write the manifest, with names, rows and digests of the tables, and move the folder to its place as a whole.
+        """Write the manifest, with what tables there are, and move the folder to its place as a whole.
+
+        Of results, the manifest has the rows and digests of the tables. Logs are inputs, which may be edited.
 
         Raises
         ------
@@ -184,7 +186,8 @@ class NewFolder:
         tables = sorted(path.stem for path in self.path.glob("*.parquet") if path.stem in COLUMNS)
         with self.writing():
             manifest = manifest | {"tables": tables}
-            manifest |= {"contents": {name: _content_of(self.path, name) for name in tables}} if tables else {}
+            if self.kind == "results":
+                manifest["contents"] = {name: _content_of(self.path, name) for name in tables}
             (self.path / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
             self.path.chmod(0o755)
             for path in (*self.path.iterdir(), self.path):

@@ -15,20 +15,24 @@ Advance = Callable[[int], None]
 class _Forgiving:
     """Standard error, where what cannot be written is dropped: the terminal or a pipe's reader may be gone."""
 
+    def __init__(self) -> None:
+        self._stream: Any = sys.stderr
+
     def write(self, text: str) -> int:
         with suppress(OSError, ValueError, AttributeError):
-            sys.stderr.write(text)
+            self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         with suppress(OSError, ValueError, AttributeError):
-            sys.stderr.flush()
+            self._stream.flush()
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(sys.stderr, name)
+        if name == "rich_proxied_file":  # by which a console would write past this one
+            raise AttributeError(name)
+        return getattr(self._stream, name)
 
 
-_STREAM: Any = _Forgiving()
 KERNELS = "kernels"  # unit of what is compiled: said even where all else is quiet
 _quiet = ContextVar("quiet", default=False)
 
@@ -46,7 +50,7 @@ def quiet() -> Iterator[None]:
 def say(text: str) -> None:
     """One line on standard error, unless it is to be quiet, or nobody can read it."""
     if not _quiet.get():
-        print(text, file=_STREAM, flush=True)
+        print(text, file=_Forgiving(), flush=True)
 
 
 @contextmanager
@@ -74,7 +78,7 @@ def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    with Progress(*columns, console=Console(file=_STREAM)) as bar:
+    with Progress(*columns, console=Console(file=_Forgiving())) as bar:
         task = bar.add_task(label, total=total, rate="")
 
         def advance(count: int) -> None:
@@ -106,6 +110,6 @@ def _lines(label: str, total: int, unit: str, every: float = 5.0) -> Advance:
                 speed = f", {now - started:.0f} s with the start"
             else:
                 speed = f", {_speed(rate, unit)}, {(total - done) / rate:.0f} s left"
-            print(f"{label}: {done} of {total} {unit}{speed}", file=_STREAM, flush=True)
+            print(f"{label}: {done} of {total} {unit}{speed}", file=_Forgiving(), flush=True)
 
     return advance

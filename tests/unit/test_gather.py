@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import tracemalloc
@@ -17,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from edited import accept_changes
 
 import consistency as cs
 from consistency.runs import gather, montecarlo
@@ -62,14 +62,6 @@ def damage(path: Path) -> None:
     bytes_ = bytearray(path.read_bytes())
     bytes_[column.data_page_offset + column.total_compressed_size // 2] ^= 1
     path.write_bytes(bytes_)
-
-
-def accept_changes(folder: Path) -> None:
-    """Take the digests out of the manifest, as one does who means what was changed."""
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text())
-    del manifest["contents"]
-    path.write_text(json.dumps(manifest))
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import functools
 import hashlib
 import itertools
 import json
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from consistency.store.storage import manifest_of, read_manifest, write_folder
 from consistency.sweeps.axes import Axis
 from consistency.sweeps.cell import CellResult, Outcome, plain_numbers, result_from, run_cell
 from consistency.sweeps.plan import Cell, Rule, Sweep
+from consistency.terminal.progress import say
 
 KIND, CELL_KIND = "sweep", "cell"
 CELLS = "cells"  # folder of the cells in that of the sweep
@@ -259,7 +259,7 @@ def run_sweep(
     folder.begin()
     todo = [work for work in share if _is_missing(folder, work)]
     if len(todo) < len(share):
-        print(f"{len(share) - len(todo)} of {len(share)} are there already", file=sys.stderr, flush=True)
+        say(f"{len(share) - len(todo)} of {len(share)} are there already")
     started = time.monotonic()
     with stoppable() as stop:
         for count, work in enumerate(todo, 1):
@@ -269,7 +269,7 @@ def run_sweep(
                 raise KeyboardInterrupt
             folder.write(work, outcome, time.monotonic() - begun)
             left = _left((time.monotonic() - started) / count * (len(todo) - count))
-            print(f"{count} of {len(todo)}: {work.text}: {_said(outcome.result)}{left}", file=sys.stderr, flush=True)
+            say(f"{count} of {len(todo)}: {work.text}: {_said(outcome.result)}{left}")
     missing = sum(_is_missing(folder, work) for work in folder.all_work())
     return folder, missing
 

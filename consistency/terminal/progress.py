@@ -78,7 +78,8 @@ def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    with Progress(*columns, console=Console(file=_Forgiving())) as bar:
+    stream: Any = _Forgiving()
+    with Progress(*columns, console=Console(file=stream)) as bar:
         task = bar.add_task(label, total=total, rate="")
 
         def advance(count: int) -> None:

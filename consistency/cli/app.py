@@ -204,8 +204,8 @@ def run(
             world = load_scenario(str(scenario))
             runs, seed = 50 if runs is None else runs, 0 if seed is None else seed
             resolve_filters(filters, world.belief)
-            require_free(out, overwrite or resume)
             if until_decided:
+                require_free(out, overwrite or resume)
                 previous = open_results(out) if resume else None
                 results, verdicts = run_until_decided(
                     world, filters, seed=seed, jobs=jobs, timeout=timeout, previous=previous, **planned

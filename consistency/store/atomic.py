@@ -25,7 +25,7 @@ def write_whole(path: Path, content: bytes, mode: int | None = None) -> None:
 
 def make_durable(path: Path) -> None:
     """Bring a file, or the names in a folder, to disk, so that a power cut does not take them. Raises OSError."""
-    if path.is_dir() and os.name == "nt":  # folders cannot be opened there
+    if os.name == "nt":  # what is only read cannot be synchronised there
         return
     handle = os.open(path, os.O_RDONLY)
     try:

@@ -285,10 +285,12 @@ def require_unchanged(folder: Path, manifest: dict[str, Any]) -> None:
     Raises
     ------
     InputError
-        A table was edited, replaced or damaged, or is missing.
+        A table was edited, replaced or damaged, or is missing; the manifest names none of this bench.
     """
     contents = manifest.get("contents", {})
-    for name in contents if isinstance(contents, dict) else ():
+    if not isinstance(contents, dict) or not contents.keys() <= COLUMNS.keys():
+        raise InputError(f"{folder / 'manifest.json'}: key 'contents' must have tables as keys; write the folder again")
+    for name in contents:
         path = folder / f"{name}.parquet"
         try:
             content = _content_of(folder, name)

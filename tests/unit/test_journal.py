@@ -522,6 +522,15 @@ def test_a_folder_of_before_has_no_digests(whole: Path, tmp_path: Path) -> None:
     assert open_results(tmp_path / "out").finished_runs(FILTER) == set(range(RUNS))
 
 
+@pytest.mark.parametrize("contents", [[], {"poses": {}}, "all"])
+def test_contents_that_are_none_of_this_bench(whole: Path, tmp_path: Path, contents: Any) -> None:
+    shutil.copytree(whole, tmp_path / "out")
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    (tmp_path / "out" / "manifest.json").write_text(json.dumps(manifest | {"contents": contents}))
+    with pytest.raises(cs.InputError, match=r"manifest\.json: key 'contents' must have tables as keys"):
+        open_results(tmp_path / "out")
+
+
 def test_another_processor_is_named(uvd: cs.Scenario, whole: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "out"
     shutil.copytree(whole, out)

@@ -539,7 +539,9 @@ def main(arguments: list[str] | None = None) -> Any:
         except UsageError as error:
             command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
             _end(f"{error.format_message()} See: {command} --help", 2)
-        except BrokenPipeError:
+        except (BrokenPipeError, SystemExit) as error:  # libraries end with status 1, which is a verdict's here
+            if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
+                raise
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else its last words are said at the exit
             sys.exit(141)
         except (KeyboardInterrupt, Abort):

@@ -114,11 +114,22 @@ def test_killed_and_resumed(fresh: Path) -> None:
     process.communicate()
     done = kept(fresh)
     assert 0 < done < RUNS
-    refused = begin(fresh)
-    _, error = refused.communicate(timeout=300)
-    assert refused.returncode == 2
-    assert f"unfinished work is there, with {done} finished runs; add --resume" in one_sentence(error)
     resume(fresh)
+
+
+@pytest.mark.slow
+def test_killed_and_begun_anew(fresh: Path) -> None:
+    process = begin(fresh)
+    wait_for(working(fresh), process)
+    process.kill()
+    process.communicate()
+    status, error = end(begin(fresh))
+    assert status == 2
+    said = f"unfinished work is there, with {kept(fresh)} finished runs; add --resume"
+    assert said in one_sentence(error)
+    status, error = end(begin(fresh, "--overwrite"))
+    assert status == 0, error
+    require_same(fresh)
 
 
 @pytest.mark.slow
@@ -221,11 +232,13 @@ def test_a_limit_on_the_size_of_files(fresh: Path) -> None:
 def test_three_processes_on_one_place(fresh: Path) -> None:
     first = begin(fresh)
     wait_for(working(fresh), first)
+    os.kill(first.pid, signal.SIGSTOP)
     for options in ((), ("--overwrite",), ("--resume",)):
         other = begin(fresh, *options)
         _, error = other.communicate(timeout=300)
         assert other.returncode == 2
         assert "another process is at work on it" in one_sentence(error)
+    os.kill(first.pid, signal.SIGCONT)
     assert end(first)[0] == 0
     require_same(fresh)
 

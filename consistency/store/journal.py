@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from filelock import FileLock, Timeout
 
 from consistency.errors import InputError
@@ -31,10 +30,11 @@ SYNC_EVERY = 5.0  # s: a power cut costs at most the runs of so long, a killed p
 class Journal:
     """Finished runs in one file that only grows.
 
-    A record is a head, JSON with the number of the run and the names and lengths of its parts, and the parts: columns
-    of tables, each an Arrow stream. It is written at once when its run is finished, and synchronised to disk within
-    ``SYNC_EVERY`` seconds. Records come in any order of their runs and are read in that of the numbers. What is not
-    whole, or does not agree with its checksum, is dropped when the file is opened; ``dropped`` says how many bytes.
+    A record is a head, JSON with the number of the run and what its parts are, and the parts: columns of tables, their
+    numbers as they are in memory, for encoding would take longer than writing. It is written at once when its run is
+    finished, and synchronised to disk within ``SYNC_EVERY`` seconds. Records come in any order of their runs and are
+    read in that of the numbers. What is not whole, or does not agree with its checksum, is dropped when the file is
+    opened; ``dropped`` says how many bytes.
 
     Attributes
     ----------
@@ -75,9 +75,13 @@ class Journal:
         """Keep a finished run: its columns by the names of the parts, and ``notes``, which JSON can hold."""
         if self._fault is not None:
             raise self._fault
-        pieces = [(name, _encoded(columns)) for name, columns in parts.items()]
-        about = {"run": run, "parts": [(name, len(piece)) for name, piece in pieces]}
-        offset = self._write(about | ({"notes": dict(notes)} if notes else {}), [piece for _, piece in pieces])
+        about: dict[str, Any] = {"run": run, "parts": []} | ({"notes": dict(notes)} if notes else {})
+        pieces = []
+        for name, columns in parts.items():
+            kinds, piece = _encoded(columns)
+            about["parts"].append((name, len(next(iter(columns.values()))), kinds, len(piece)))
+            pieces.append(piece)
+        offset = self._write(about, pieces)
         if notes:
             self.notes[run] = dict(notes)
         self._offsets[run] = offset
@@ -91,9 +95,9 @@ class Journal:
             at = self._offsets[run] + HEAD.size
             (length,) = COUNT.unpack(self._read(COUNT.size, at))
             about, at = json.loads(self._read(length, at + COUNT.size)), at + COUNT.size + length
-            for part, size in about["parts"]:
+            for part, rows, kinds, size in about["parts"]:
                 if part == name:
-                    yield run, _decoded(self._read(size, at))
+                    yield run, _decoded(self._read(size, at), kinds, rows)
                 at += size
 
     def close(self) -> None:
@@ -104,7 +108,7 @@ class Journal:
         self._sync()
         self._file.close()
 
-    def _write(self, about: dict[str, Any], pieces: list[Any]) -> int:
+    def _write(self, about: dict[str, Any], pieces: list[bytes]) -> int:
         """Write a record and give its offset; one that cannot be written whole leaves nothing."""
         text = json.dumps(about).encode()
         body = b"".join([COUNT.pack(len(text)), text, *pieces])
@@ -168,17 +172,20 @@ class Journal:
                 self._fault = error
 
 
-def _encoded(columns: Columns) -> Any:
-    batch, sink = pa.RecordBatch.from_pydict(columns), pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, batch.schema) as stream:
-        stream.write_batch(batch)
-    return sink.getvalue()
+def _encoded(columns: Columns) -> tuple[list[tuple[str, str]], bytes]:
+    """Names and types of columns, and their numbers one column after the other."""
+    arrays = [np.ascontiguousarray(values) for values in columns.values()]
+    return [(name, array.dtype.str) for name, array in zip(columns, arrays, strict=True)], b"".join(
+        map(memoryview, arrays)
+    )
 
 
-def _decoded(piece: bytes) -> Columns:
-    with pa.ipc.open_stream(pa.py_buffer(piece)) as stream:
-        batch = stream.read_next_batch()
-    return {name: np.asarray(batch.column(name)) for name in batch.schema.names}
+def _decoded(piece: bytes, kinds: list[list[str]], rows: int) -> Columns:
+    columns, at = {}, 0
+    for name, kind in kinds:
+        columns[name] = np.frombuffer(piece, kind, rows, at)
+        at += columns[name].nbytes
+    return columns
 
 
 # --- beside an output folder -----------------------------------------------------------------------

@@ -174,10 +174,8 @@ class Journal:
 
 def _encoded(columns: Columns) -> tuple[list[tuple[str, str]], bytes]:
     """Names and types of columns, and their numbers one column after the other."""
-    arrays = [np.ascontiguousarray(values) for values in columns.values()]
-    return [(name, array.dtype.str) for name, array in zip(columns, arrays, strict=True)], b"".join(
-        map(memoryview, arrays)
-    )
+    kinds = [(name, values.dtype.str) for name, values in columns.items()]
+    return kinds, b"".join([values.tobytes() for values in columns.values()])
 
 
 def _decoded(piece: bytes, kinds: list[list[str]], rows: int) -> Columns:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-import signal
+import os
 import sys
-import threading
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from consistency.errors import InputError
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
+Abort: Any = typer.Abort
 
 app = typer.Typer(
     help="Does a stereo-SLAM filter tell the truth about its own uncertainty?",
@@ -173,6 +173,7 @@ def run(
     from consistency.store.log import read_log
     from consistency.store.results import Results, StoredResults, open_results
     from consistency.store.storage import require_free
+    from consistency.terminal.progress import say
     from consistency.terminal.table import print_verdicts
     from consistency.verdicts.judge import analyse
 
@@ -203,24 +204,26 @@ def run(
             world = load_scenario(str(scenario))
             runs, seed = 50 if runs is None else runs, 0 if seed is None else seed
             resolve_filters(filters, world.belief)
-            require_free(out, overwrite or resume)
-            previous = open_results(out) if resume else None
             if until_decided:
+                require_free(out, overwrite or resume)
+                previous = open_results(out) if resume else None
                 results, verdicts = run_until_decided(
                     world, filters, seed=seed, jobs=jobs, timeout=timeout, previous=previous, **planned
                 )
             else:
-                results = run_trials(world, filters, runs, seed, jobs, timeout, previous, out=out, overwrite=overwrite)
+                results = run_trials(
+                    world, filters, runs, seed, jobs, timeout, out=out, overwrite=overwrite, resume=resume
+                )
     except Interrupted as stop:
         done = stop.results.manifest["finished_runs"]
         if not done:
-            print("stopped before a run was finished; nothing written", file=sys.stderr)
+            say("stopped before a run was finished; nothing written")
         else:
             if isinstance(stop.results, Results):
                 stop.results.write(out, overwrite or resume, keep_others=resume)
             how = "add --resume to the same command to go on" if log is None else "run it again for the rest"
-            print(f"stopped: {done} finished runs are in {out}; {how}", file=sys.stderr)
-        raise typer.Exit(130) from None
+            say(f"stopped: {done} finished runs are in {out}; {how}")
+        raise typer.Exit(stop.status) from None
     if isinstance(results, Results):
         results.write(out, overwrite or resume, keep_others=resume)
     print_verdicts(verdicts or analyse(results))
@@ -520,26 +523,43 @@ def monitor(
 
 
 def main(arguments: list[str] | None = None) -> Any:
-    """Entry point: unusable input ends in one line and exit status 2; SIGTERM is taken as Ctrl-C."""
-    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # else the folder in the making would stay
-    try:
-        sys.exit(app(arguments, standalone_mode=False))
-    except MemoryError:
-        print("consistency: not enough memory; take fewer steps, landmarks or runs", file=sys.stderr)
-        sys.exit(2)
-    except InputError as error:
-        print(f"consistency: {error}", file=sys.stderr)
-        sys.exit(2)
-    except UsageError as error:
-        command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
-        print(f"consistency: {error.format_message()} See: {command} --help", file=sys.stderr)
-        sys.exit(2)
-    except BrokenPipeError:
-        sys.exit(141)
-    except KeyboardInterrupt:
-        print("consistency: stopped", file=sys.stderr)
-        sys.exit(130)
+    """Entry point: unusable input ends in one line and exit status 2; SIGTERM and SIGHUP are taken as Ctrl-C."""
+    from consistency.store.stopping import STOPS, stoppable
+
+    _open_closed_streams()
+    with stoppable(also=STOPS) as stop:
+        try:
+            status = app(arguments, standalone_mode=False)
+            sys.stdout.flush()
+            sys.exit(status)
+        except MemoryError:
+            _end("not enough memory; take fewer steps, landmarks or runs", 2)
+        except InputError as error:
+            _end(str(error), 2)
+        except UsageError as error:
+            command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
+            _end(f"{error.format_message()} See: {command} --help", 2)
+        except (BrokenPipeError, SystemExit) as error:  # libraries end with status 1, which is a verdict's here
+            if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
+                raise
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else its last words are said at the exit
+            sys.exit(141)
+        except (KeyboardInterrupt, Abort):
+            _end("stopped", stop.status)
+
+
+def _end(sentence: str, status: int) -> NoReturn:
+    from consistency.terminal.progress import say
+
+    say(f"consistency: {sentence}")
+    sys.exit(status)
+
+
+def _open_closed_streams() -> None:
+    """Let output that the shell has closed go nowhere, and not into the next file that is opened."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115
 
 
 if __name__ == "__main__":

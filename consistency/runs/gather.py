@@ -6,16 +6,16 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import astuple
 from itertools import pairwise
 from operator import itemgetter
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
 from consistency.errors import InputError
+from consistency.store.journal import Journal
 from consistency.store.parquet import COLUMNS, Columns, Writer, write_table
 from consistency.store.results import (
     MAP_NUMBERS,
@@ -32,44 +32,48 @@ from consistency.store.results import (
     rejections_table,
     truth_table,
 )
-from consistency.store.storage import NewFolder, undisturbed
+from consistency.store.stopping import undisturbed
+from consistency.store.storage import NewFolder
 from consistency.types import Failure
 
 
-class Pieces(Protocol):
-    """Rows of a table, a run at a time, in the order in which they came."""
+class Keeps(Protocol):
+    """Runs, each with the columns of its parts by name, and with notes."""
 
-    def append(self, columns: Columns, /) -> None: ...
-    def __iter__(self) -> Iterator[Columns]: ...
+    notes: dict[int, dict[str, Any]]
+
+    @property
+    def runs(self) -> set[int]: ...
+    def append(self, run: int, parts: Mapping[str, Columns], notes: Mapping[str, Any], /) -> None: ...
+    def pieces(self, name: str, /) -> Iterator[tuple[int, Columns]]: ...
 
 
-class Spool:
-    """Pieces in a file: numbers as they are, neither encoded nor compressed."""
+class InMemory:
+    """What a :class:`Journal` keeps, in memory."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._file: Any = None
+    def __init__(self) -> None:
+        self.notes: dict[int, dict[str, Any]] = {}
+        self._parts: dict[int, Mapping[str, Columns]] = {}
 
-    def append(self, columns: Columns, /) -> None:
-        batch = pa.RecordBatch.from_pydict(columns)
-        if self._file is None:
-            self._file = pa.ipc.new_stream(str(self.path), batch.schema)
-        self._file.write_batch(batch)
+    @property
+    def runs(self) -> set[int]:
+        return set(self._parts)
 
-    def __iter__(self) -> Iterator[Columns]:
-        if self._file is not None:
-            self._file.close()
-            with pa.OSFile(str(self.path)) as file, pa.ipc.open_stream(file) as stream:
-                for batch in stream:
-                    yield {name: batch.column(name).to_numpy() for name in batch.schema.names}
+    def append(self, run: int, parts: Mapping[str, Columns], notes: Mapping[str, Any], /) -> None:
+        if notes:
+            self.notes[run] = dict(notes)
+        self._parts[run] = parts
+
+    def pieces(self, name: str, /) -> Iterator[tuple[int, Columns]]:
+        return ((run, self._parts[run][name]) for run in sorted(self._parts) if name in self._parts[run])
 
 
 class Gathered:
-    """Outcomes of runs of some filters, kept in memory, or where ``new`` is given on disk.
+    """Outcomes of runs of some filters, kept in memory, or where a folder and a journal are given on disk.
 
-    Outcomes come in order of their runs. ``errors`` has the convention of each filter's own error, where it is not the
-    additive one; only then are there columns for it. ``previous`` are results to which they are added, of which the
-    runs ``kept`` count.
+    Outcomes come in any order; what is in the journal already counts as theirs. ``errors`` has the convention of each
+    filter's own error, where it is not the additive one; only then are there columns for it. ``previous`` are results
+    to which they are added, of which the runs ``kept`` count.
 
     Raises
     ------
@@ -82,43 +86,28 @@ class Gathered:
         filters: Sequence[str],
         errors: Mapping[str, str],
         new: NewFolder | None = None,
+        journal: Journal | None = None,
         previous: Tables | None = None,
         kept: Iterable[int] = (),
     ) -> None:
         self.filters, self.new, self.previous, self.kept = list(filters), new, previous, frozenset(kept)
         self.errors = dict(errors)
         self._require_readable()
-        self.runs: set[int] = set()
-        self._failures: list[Failure] = []
-        self._rejections: list[Rejected] = []
-        self._spools: list[Spool] = []
-        self._estimates = {name: self._pieces() for name in self.filters}
-        self._maps = {name: self._pieces() for name in self.filters}
-        self._truth = self._pieces()
-
-    def _pieces(self) -> Pieces:
-        if self.new is None:
-            return []
-        self._spools.append(Spool(self.new.path / f"{len(self._spools)}.spool"))
-        return self._spools[-1]
+        self._now: Keeps = InMemory() if journal is None else journal
 
     def add(self, outcome: Outcome) -> None:
         """Keep what a run left."""
+        parts = {f"estimates {name}": columns for name, columns in outcome.estimates.items()}
+        parts |= {f"map {name}": columns for name, columns in outcome.maps.items()}
+        parts |= {} if outcome.truth is None else {"truth": outcome.truth}
+        notes = {"failures": [astuple(failure) for failure in outcome.failures], "rejections": outcome.rejections}
         with nullcontext() if self.new is None else self.new.writing():
-            for name, columns in outcome.estimates.items():
-                self._estimates[name].append(columns)
-            for name, columns in outcome.maps.items():
-                self._maps[name].append(columns)
-            if outcome.truth is not None:
-                self._truth.append(outcome.truth)
-        self._failures += outcome.failures
-        self._rejections += outcome.rejections
-        self.runs.add(outcome.run)
+            self._now.append(outcome.run, parts, {key: rows for key, rows in notes.items() if rows})
 
     @property
-    def finished(self) -> int:
+    def finished(self) -> set[int]:
         """Runs that are there, those of before too."""
-        return len(self.runs | self.kept)
+        return self._now.runs | self.kept
 
     def results(self, manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results | StoredResults:
         """The results; a folder is written and put in its place, unless no run is finished."""
@@ -139,6 +128,7 @@ class Gathered:
         self, new: NewFolder, manifest: dict[str, Any], failures: pd.DataFrame, landmarks: pd.DataFrame | None
     ) -> StoredResults:
         with new.writing():
+            new.path.mkdir(parents=True, exist_ok=True)
             self._write(new, "estimates", self._of, OWN_NUMBERS if self.errors else NUMBERS)
             if any(next(self._map_of(name), None) is not None for name in self.filters):
                 self._write(new, "map", self._map_of, MAP_NUMBERS)
@@ -154,8 +144,6 @@ class Gathered:
                 write_table(new.path / "landmarks.parquet", "landmarks", landmarks)
             if (rejections := self._all_rejections()) is not None:
                 write_table(new.path / "rejections.parquet", "rejections", rejections)
-            for spool in self._spools:
-                spool.path.unlink(missing_ok=True)
         return StoredResults(new.folder, failures, landmarks, new.put_in_place(manifest), rejections)
 
     def _write(
@@ -169,19 +157,23 @@ class Gathered:
                 writer.end_group()
 
     def _of(self, filter_name: str) -> Iterator[Columns]:
-        return self._merged(self._estimates_before(filter_name), self._estimates[filter_name])
+        return self._merged(self._estimates_before(filter_name), f"estimates {filter_name}")
 
     def _map_of(self, filter_name: str) -> Iterator[Columns]:
-        return self._merged(self._maps_before(filter_name), self._maps[filter_name])
+        return self._merged(self._maps_before(filter_name), f"map {filter_name}")
 
     def _true(self) -> Iterator[Columns]:
-        return self._merged(self._true_before(), self._truth)
+        return self._merged(self._true_before(), "truth")
 
-    def _merged(self, before: Iterator[tuple[int, Columns]], now: Pieces) -> Iterator[Columns]:
-        """Pieces of both in order of their runs; those of a run that was cut off are left out."""
-        numbered = ((int(columns["run"][0]), columns) for columns in now if len(columns["run"]))
-        finished = (piece for piece in numbered if piece[0] in self.runs)
-        return (columns for _, columns in heapq.merge(before, finished, key=itemgetter(0)))
+    def _merged(self, before: Iterator[tuple[int, Columns]], part: str) -> Iterator[Columns]:
+        """Pieces of before and of now in order of their runs, without those that have no row."""
+        now = ((run, columns) for run, columns in self._now.pieces(part) if run not in self.kept)
+        merged = heapq.merge(before, now, key=itemgetter(0))
+        return (columns for _, columns in merged if len(columns["run"]))
+
+    def _noted(self, key: str) -> Iterator[Any]:
+        """Rows of a table that the runs of now left as notes."""
+        return (row for run, notes in self._now.notes.items() if run not in self.kept for row in notes.get(key, ()))
 
     def _require_readable(self) -> None:
         for name in self.filters:
@@ -216,7 +208,7 @@ class Gathered:
         rank = {name: i for i, name in enumerate(self.filters)}
         before = [] if self.previous is None else self.previous.failures.itertuples(index=False)
         failures = [f for f in (Failure(*row) for row in before) if f.run in self.kept and f.filter in rank]
-        failures += [failure for failure in self._failures if failure.run in self.runs]
+        failures += [Failure(*row) for row in self._noted("failures")]
         return failures_table(sorted(failures, key=lambda f: (rank[f.filter], f.run, f.step)))
 
     def _all_rejections(self) -> pd.DataFrame | None:
@@ -225,5 +217,5 @@ class Gathered:
         before = None if self.previous is None else self.previous.rejections
         rows = [] if before is None else [Rejected(*row) for row in before.itertuples(index=False)]
         rows = [row for row in rows if row.run in self.kept and row.filter in rank]
-        rows += [row for row in self._rejections if row.run in self.runs]
+        rows += [Rejected(*row) for row in self._noted("rejections")]
         return rejections_table(sorted(rows, key=lambda row: (rank[row.filter], row.run)))

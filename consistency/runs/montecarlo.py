@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
@@ -21,11 +21,13 @@ from consistency.filters.stepping import error_of, name_of, optimal_gain, run_fi
 from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Filter, WholeTrial
 from consistency.runs.gather import Gathered
+from consistency.runs.resuming import place_for
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.store.log import Log, write_log
 from consistency.store.results import Outcome, Results, StoredResults, Tables, outcome_of
-from consistency.store.storage import NewFolder, manifest_of, require_free
+from consistency.store.stopping import stoppable
+from consistency.store.storage import manifest_of, require_free
 from consistency.terminal.progress import KERNELS, progress
 from consistency.types import Trial
 
@@ -34,11 +36,11 @@ AHEAD = 8  # runs a worker that may be finished before an earlier one is
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C in :func:`run_trials`; ``results`` holds the runs that were finished."""
+    """Ctrl-C in :func:`run_trials`; ``results`` holds the runs that were finished, ``status`` is for the exit."""
 
-    def __init__(self, results: Results | StoredResults) -> None:
+    def __init__(self, results: Results | StoredResults, status: int = 130) -> None:
         super().__init__("interrupted")
-        self.results = results
+        self.results, self.status = results, status
 
 
 # fmt: off
@@ -46,11 +48,13 @@ class Interrupted(KeyboardInterrupt):
 def run_trials(
     scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
     timeout: float | None = ..., previous: Tables | None = ..., out: None = ..., overwrite: bool = ...,
+    resume: bool = ...,
 ) -> Results: ...
 @overload
 def run_trials(
     scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
     timeout: float | None = ..., previous: Tables | None = ..., *, out: str | Path, overwrite: bool = ...,
+    resume: bool = ...,
 ) -> StoredResults: ...
 # fmt: on
 def run_trials(
@@ -63,6 +67,7 @@ def run_trials(
     previous: Tables | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
+    resume: bool = False,
 ) -> Results | StoredResults:
     """Simulate ``runs`` trials of ``scenario`` and put each through every filter.
 
@@ -73,9 +78,11 @@ def run_trials(
     jobs : workers; -1 for one a core. Compiled filters share threads, others get processes.
     timeout : seconds a trial, for filters that are not compiled
     previous : results of the same scenario, filters and seed to go on from; its runs are not done again
-    out : folder that the results are written to as they come, so that memory does not grow with the runs; it
-        appears as a whole at the end
-    overwrite : replace ``out``, where it is an output folder of this bench; that of ``previous`` is replaced anyway
+    out : folder for the results, which appears as a whole at the end. Finished runs are kept in a journal beside it
+        as they come, so that memory does not grow with the runs, and none is lost, whatever ends the process
+    overwrite : replace ``out``, where it is an output folder of this bench, and drop unfinished work on it; that of
+        ``previous`` is replaced anyway
+    resume : go on with what is in ``out`` and in its journal
 
     Returns
     -------
@@ -85,25 +92,25 @@ def run_trials(
     ------
     InputError
         An unknown filter, one that does not fit the sensor, a number out of range, nothing in view, or a folder that
-        cannot be written.
+        cannot be written, holds unfinished work, or is worked on by another process.
     Interrupted
-        Ctrl-C; carries what is finished, and the folder, if any, is written.
+        Ctrl-C, or a signal that is taken as such; carries what is finished, and the folder, if any, is written.
     """
     instances = resolve_filters(filters, scenario.belief)
     _require_counts(runs, seed)
     world = require_landmarks_in_view(scenario)
     names = [name_of(f) for f in instances]
     errors = _own_errors(instances)
-    done = set() if previous is None else _same_study(previous, scenario, names, errors, seed).finished_runs(names)
-    if done and max(done) >= runs:
-        raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
-    todo = [run for run in range(runs) if run not in done]
-    work = _Work(lambda run: world.trial(run, seed), instances, scenario.belief, jobs, timeout)
-    manifest_fields = {"seed": seed, "runs": runs} | _scenario_entry(scenario)
-    with _place(None if out is None else Path(out), overwrite, previous) as new:
-        return _finish(
-            work, todo, Gathered(names, errors, new, previous, done), manifest_fields, _landmarks_table(scenario)
-        )
+    study = {"scenario_hash": scenario.hash, "filters": names, "error": errors, "seed": seed}
+    with place_for(study, None if out is None else Path(out), previous, resume, overwrite) as place:
+        done = place.finished
+        if done and max(done) >= runs:
+            raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
+        todo = [run for run in range(runs) if run not in done]
+        work = _Work(lambda run: world.trial(run, seed), instances, scenario.belief, jobs, timeout)
+        manifest_fields = {"seed": seed, "runs": runs, "machines": place.machines} | _scenario_entry(scenario)
+        gathered = Gathered(names, errors, place.new, place.journal, place.previous, place.kept)
+        return _finish(work, todo, gathered, manifest_fields, _landmarks_table(scenario))
 
 
 def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None) -> Results:
@@ -233,55 +240,39 @@ def _finish(
     work: _Work, runs: list[int], gathered: Gathered, manifest_fields: dict[str, Any], landmarks: pd.DataFrame | None
 ) -> Results | StoredResults:
     """Do the runs and hand over the results, or, after Ctrl-C, what there is of them."""
-    started, complete = time.monotonic(), True
-    try:
-        if runs:
-            work.compile(runs[0])
-            started = time.monotonic()
-        with one_blas_thread(), closing(work.outcomes(runs)) as outcomes, progress("runs", len(runs)) as advance:
-            for outcome in outcomes:
-                gathered.add(outcome)
-                advance(1)
-    except KeyboardInterrupt:
-        complete = False
-    manifest_fields = manifest_fields | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
-    manifest_fields |= {"error": gathered.errors} if gathered.errors else {}
-    manifest = manifest_of(
-        filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **manifest_fields
-    )
-    if complete:
-        return gathered.results(manifest, landmarks)
-    raise Interrupted(gathered.results(manifest | {"finished_runs": gathered.finished}, landmarks))
-
-
-@contextmanager
-def _place(out: Path | None, overwrite: bool, previous: Tables | None) -> Iterator[NewFolder | None]:
-    """The folder for the results, if one is asked for; that of ``previous`` is taken over, with what else is in it."""
-    if out is None:
-        yield None
-        return
-    same = isinstance(previous, StoredResults) and previous.folder.resolve() == out.resolve()
-    with NewFolder(out, "results", overwrite or same, keep_others=same) as new:
-        yield new
+    with stoppable() as stop:
+        started, complete = time.monotonic(), True
+        try:
+            if runs:
+                work.compile(runs[0])
+                started = time.monotonic()
+            with one_blas_thread(), closing(work.outcomes(runs)) as outcomes, progress("runs", len(runs)) as advance:
+                for outcome in outcomes:
+                    gathered.add(outcome)
+                    advance(1)
+                    if stop.number is not None:  # and whoever was called took it for an error of its own
+                        raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            complete = False
+        except Exception:
+            if stop.number is None:
+                raise
+            complete = False
+        manifest_fields = manifest_fields | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
+        manifest_fields |= {"error": gathered.errors} if gathered.errors else {}
+        manifest = manifest_of(
+            filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **manifest_fields
+        )
+        if complete:
+            return gathered.results(manifest, landmarks)
+        results = gathered.results(manifest | {"finished_runs": len(gathered.finished)}, landmarks)
+        raise Interrupted(results, stop.status)
 
 
 def _own_errors(filters: Sequence[Filter]) -> dict[str, str]:
     """Convention of each filter's own error, of those where it is not the additive one."""
     errors = {name_of(f): error_of(f) for f in filters}
     return {name: error for name, error in errors.items() if error != ADDITIVE}
-
-
-def _same_study(previous: Tables, scenario: Scenario, names: list[str], errors: dict[str, str], seed: int) -> Tables:
-    """The results to go on from, refused unless scenario, filters with their errors, and seed are the same."""
-    for key, now, before in (
-        ("scenario", scenario.hash, previous.manifest.get("scenario_hash")),
-        ("filter", names, previous.manifest.get("filters")),
-        ("error of a filter", errors, previous.manifest.get("error", {})),
-        ("seed", seed, previous.manifest.get("seed")),
-    ):
-        if now != before:
-            raise InputError(f"the results to resume have another {key}; use the same command as before")
-    return previous
 
 
 def simulate_log(scenario: Scenario, runs: int, seed: int, out: Path, overwrite: bool = False) -> None:

@@ -91,7 +91,7 @@ def _more(
         results = run_trials(scenario, filters, runs, seed, jobs, timeout, previous)
     except Interrupted as stop:
         manifest = stop.results.manifest | {"until_decided": plan}
-        raise Interrupted(replace(stop.results, manifest=manifest)) from None
+        raise Interrupted(replace(stop.results, manifest=manifest), stop.status) from None
     return replace(results, manifest=results.manifest | {"until_decided": plan})
 
 

@@ -14,11 +14,24 @@ def write_whole(path: Path, content: bytes, mode: int | None = None) -> None:
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
         partial.chmod(0o666 & ~_umask() if mode is None else mode)
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def make_durable(path: Path) -> None:
+    """Bring a file, or the names in a folder, to disk, so that a power cut does not take them. Raises OSError."""
+    if os.name == "nt":  # what is only read cannot be synchronised there
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _umask() -> int:

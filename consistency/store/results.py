@@ -33,7 +33,7 @@ from consistency.store.parquet import (
     read_parquet,
     require_table,
 )
-from consistency.store.storage import read_manifest, write_folder
+from consistency.store.storage import read_manifest, require_unchanged, write_folder
 from consistency.types import Array, Estimates, Failure, Indices, Map, Trial
 
 POSE = ["x", "y", "heading"]
@@ -468,7 +468,8 @@ def open_results(folder: str | Path) -> StoredResults:
     Raises
     ------
     InputError
-        A file is missing, cut short, or lacks a column; what is in its rows is checked when they are read.
+        A file is missing, cut short, not as it was written, or lacks a column; what is in its rows is checked when they
+        are read.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -477,6 +478,7 @@ def open_results(folder: str | Path) -> StoredResults:
     written = manifest.get("tables", [])
     for name in ("estimates", *(name for name in ("truth", "map") if name in written)):
         require_table(folder, name)
+    require_unchanged(folder, manifest)
     landmarks = read_parquet(folder, "landmarks") if "landmarks" in written else None
     rejections = read_parquet(folder, "rejections") if "rejections" in written else None
     results = StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest, rejections)

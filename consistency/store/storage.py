@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import itertools
 import json
 import os
 import platform
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -23,7 +23,10 @@ import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
-from consistency.store.parquet import COLUMNS, write_table
+from consistency.store.atomic import make_durable
+from consistency.store.machine import this_machine
+from consistency.store.parquet import COLUMNS, require_table, write_table
+from consistency.store.stopping import undisturbed
 
 SCHEMA_VERSION = 1
 PACKAGES = (
@@ -43,6 +46,7 @@ def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
         "schema_version": SCHEMA_VERSION,
         "kind": kind,
         "versions": dict(_versions()),
+        "machines": [this_machine()],
         "command": shlex.join(["consistency" if program == "__main__.py" else program, *sys.argv[1:]]),
         "git_commit": _git_commit(),
         "wall_time_s": None if wall is None else round(wall, 3),
@@ -103,7 +107,9 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results", option: s
     With ``overwrite`` only a folder that this bench wrote may be replaced, and only by one of its own
     ``kind`` (results, log, findings).
     """
-    if folder.exists() or folder.is_symlink():
+    with writing(folder, option):
+        there = folder.exists() or folder.is_symlink()
+    if there:
         if not overwrite:
             raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite")
         try:
@@ -114,11 +120,17 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results", option: s
             raise InputError(
                 f"{option} {folder}: is not an output folder of this bench; not overwritten ({error})"
             ) from None
+    with writing(folder, option), tempfile.TemporaryDirectory(dir=_above(folder), prefix=f".{folder.name}."):
+        pass
+
+
+@contextmanager
+def writing(folder: Path, option: str = "--out") -> Iterator[None]:
+    """Where the system refuses, say it of the option."""
     try:
-        with tempfile.TemporaryDirectory(dir=_above(folder), prefix=f".{folder.name}."):
-            pass
+        yield
     except OSError as error:
-        raise InputError(f"{option} {folder}: cannot be written ({error.strerror})") from None
+        raise InputError(f"{option} {folder}: cannot be written ({error.strerror or error})") from error
 
 
 def _above(folder: Path) -> Path:
@@ -129,14 +141,22 @@ def _above(folder: Path) -> Path:
 class NewFolder:
     """An output folder in the making, beside its place; as a context it is gone at the end unless it was put there.
 
-    ``path`` is where its files are written. Whatever is refused is refused at the beginning, see
-    :func:`require_free`. With ``overwrite`` an output folder of this bench is replaced; with ``keep_others`` the files
-    in it that are not written again stay.
+    ``path`` is where its files are written: in the folder ``within``, or where none is given in one of its own.
+    Whatever is refused is refused at the beginning, see :func:`require_free`. With ``overwrite`` an output folder of
+    this bench is replaced; with ``keep_others`` the files in it that are not written again stay. ``is_placed`` says
+    whether it stands where it stays.
     """
 
-    def __init__(self, folder: Path, kind: str, overwrite: bool = False, keep_others: bool = False) -> None:
+    def __init__(
+        self, folder: Path, kind: str, overwrite: bool = False, keep_others: bool = False, within: Path | None = None
+    ) -> None:
         require_free(folder, overwrite, kind)
         self.folder, self.kind, self.overwrite, self.keep_others = folder, kind, overwrite, keep_others
+        self.within, self.is_placed = within, False
+        if within is not None:
+            self.path = within / "tables"
+            shutil.rmtree(self.path, ignore_errors=True)  # of a process that was ended
+            return
         with self.writing():
             self.path = Path(tempfile.mkdtemp(dir=_above(folder), prefix=f".{folder.name}."))
 
@@ -149,36 +169,48 @@ class NewFolder:
     @contextmanager
     def writing(self) -> Iterator[None]:
         """Where the system refuses, say it of the option ``--out``."""
-        try:
+        with writing(self.folder):
             yield
-        except OSError as error:
-            raise InputError(f"--out {self.folder}: cannot be written ({error.strerror or error})") from error
 
     def put_in_place(self, manifest: dict[str, Any]) -> dict[str, Any]:
-        """Write the manifest, with the names of the tables, and move the folder to its place as a whole."""
-        require_free(self.folder, self.overwrite, self.kind)  # the work may have taken hours
+        """Write the manifest, with what tables there are, and move the folder to its place as a whole.
+
+        Of results, the manifest has the rows and digests of the tables. Logs are inputs, which may be edited.
+
+        Raises
+        ------
+        InputError
+            The place was taken meanwhile; the folder then stands beside it, by the name that is said. The system
+            refuses.
+        """
         tables = sorted(path.stem for path in self.path.glob("*.parquet") if path.stem in COLUMNS)
         with self.writing():
             manifest = manifest | {"tables": tables}
+            if self.kind == "results":
+                manifest["contents"] = {name: _content_of(self.path, name) for name in tables}
             (self.path / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
             self.path.chmod(0o755)
+            for path in (*self.path.iterdir(), self.path):
+                make_durable(path)
             self.folder.parent.mkdir(parents=True, exist_ok=True)
-            _put_in_place(self.path, self.folder, self.keep_others)
+        try:
+            require_free(self.folder, self.overwrite, self.kind)  # the work may have taken hours
+        except InputError as error:
+            raise InputError(f"{error}; the finished work is in {self._put_beside()}") from None
+        with self.writing():
+            _put_in_place(self.path, self.folder, self.keep_others, self.within)
+            make_durable(self.folder.parent)
+        self.is_placed = True
         return manifest
 
-
-@contextmanager
-def undisturbed() -> Iterator[None]:
-    """No Ctrl-C, and no SIGTERM, before what is being written is whole: it would cost the work of hours."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler or signal.SIG_DFL)
+    def _put_beside(self) -> Path:
+        """Move the folder to the first free name: the place was taken while the work was done."""
+        names = (self.folder.with_name(f"{self.folder.name}-{number}") for number in itertools.count(2))
+        beside = next(path for path in names if not (path.exists() or path.is_symlink()))
+        with self.writing():
+            os.replace(self.path, beside)
+        self.is_placed = True
+        return beside
 
 
 def write_folder(
@@ -202,7 +234,7 @@ def write_folder(
         new.put_in_place(manifest)
 
 
-def _put_in_place(partial: Path, folder: Path, keep_others: bool) -> None:
+def _put_in_place(partial: Path, folder: Path, keep_others: bool, within: Path | None) -> None:
     if not folder.exists():
         os.replace(partial, folder)
         return
@@ -211,10 +243,21 @@ def _put_in_place(partial: Path, folder: Path, keep_others: bool) -> None:
             if not (partial / path.name).exists():
                 copy = shutil.copytree if path.is_dir() else shutil.copy2
                 copy(path, partial / path.name)
-    aside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    os.replace(folder, aside / "old")
+    aside = within or Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    shutil.rmtree(aside / "replaced", ignore_errors=True)
+    os.replace(folder, aside / "replaced")
     os.replace(partial, folder)
-    shutil.rmtree(aside)
+    if within is None:
+        shutil.rmtree(aside)
+
+
+def _content_of(folder: Path, name: str) -> dict[str, Any]:
+    return {"rows": require_table(folder, name).metadata.num_rows, "sha256": _digest(folder / f"{name}.parquet")}
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 # --- reading -------------------------------------------------------------------------------------
@@ -234,3 +277,27 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: key 'schema_version' must be {SCHEMA_VERSION}; write the folder again")
     return manifest
+
+
+def require_unchanged(folder: Path, manifest: dict[str, Any]) -> None:
+    """Refuse tables that are not those that were written with the manifest; one of before has nothing to say.
+
+    Raises
+    ------
+    InputError
+        A table was edited, replaced or damaged, or is missing; the manifest names none of this bench.
+    """
+    contents = manifest.get("contents", {})
+    if not isinstance(contents, dict) or not contents.keys() <= COLUMNS.keys():
+        raise InputError(f"{folder / 'manifest.json'}: key 'contents' must have tables as keys; write the folder again")
+    for name in contents:
+        path = folder / f"{name}.parquet"
+        try:
+            content = _content_of(folder, name)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+        if content != contents[name]:
+            raise InputError(
+                f"{path}: is not as it was written, but damaged or edited; write the folder again, or, if the change "
+                f"is meant, take '{name}' out of the key 'contents' of manifest.json"
+            )

@@ -6,7 +6,6 @@ import functools
 import hashlib
 import itertools
 import json
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,11 +18,12 @@ from consistency.errors import InputError
 from consistency.runs.montecarlo import worker_count
 from consistency.scenario import Scenario
 from consistency.store.atomic import write_whole
+from consistency.store.stopping import stoppable
 from consistency.store.storage import manifest_of, read_manifest, write_folder
 from consistency.sweeps.axes import Axis
 from consistency.sweeps.cell import CellResult, Outcome, plain_numbers, result_from, run_cell
 from consistency.sweeps.plan import Cell, Rule, Sweep
-from consistency.sweeps.stopping import remembered
+from consistency.terminal.progress import say
 
 KIND, CELL_KIND = "sweep", "cell"
 CELLS = "cells"  # folder of the cells in that of the sweep
@@ -259,17 +259,17 @@ def run_sweep(
     folder.begin()
     todo = [work for work in share if _is_missing(folder, work)]
     if len(todo) < len(share):
-        print(f"{len(share) - len(todo)} of {len(share)} are there already", file=sys.stderr, flush=True)
+        say(f"{len(share) - len(todo)} of {len(share)} are there already")
     started = time.monotonic()
-    with remembered() as stopped:
+    with stoppable() as stop:
         for count, work in enumerate(todo, 1):
             begun = time.monotonic()
             outcome = run_cell(folder.sweep, work.cell, work.filter, jobs)
-            if stopped():  # and the cell took it for an error of its own
+            if stop.number is not None:  # and the cell took it for an error of its own
                 raise KeyboardInterrupt
             folder.write(work, outcome, time.monotonic() - begun)
             left = _left((time.monotonic() - started) / count * (len(todo) - count))
-            print(f"{count} of {len(todo)}: {work.text}: {_said(outcome.result)}{left}", file=sys.stderr, flush=True)
+            say(f"{count} of {len(todo)}: {work.text}: {_said(outcome.result)}{left}")
     missing = sum(_is_missing(folder, work) for work in folder.all_work())
     return folder, missing
 

@@ -5,10 +5,34 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from typing import Any
 
 Advance = Callable[[int], None]
+
+
+class _Forgiving:
+    """Standard error, where what cannot be written is dropped: the terminal or a pipe's reader may be gone."""
+
+    def __init__(self) -> None:
+        self._stream: Any = sys.stderr
+
+    def write(self, text: str) -> int:
+        with suppress(OSError, ValueError, AttributeError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError, ValueError, AttributeError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "rich_proxied_file":  # by which a console would write past this one
+            raise AttributeError(name)
+        return getattr(self._stream, name)
+
+
 KERNELS = "kernels"  # unit of what is compiled: said even where all else is quiet
 _quiet = ContextVar("quiet", default=False)
 
@@ -24,9 +48,9 @@ def quiet() -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """One line on standard error, unless it is to be quiet."""
+    """One line on standard error, unless it is to be quiet, or nobody can read it."""
     if not _quiet.get():
-        print(text, file=sys.stderr, flush=True)
+        print(text, file=_Forgiving(), flush=True)
 
 
 @contextmanager
@@ -34,7 +58,7 @@ def progress(label: str, total: int, unit: str = "runs") -> Iterator[Advance]:
     """Yields a function to call with the number of units just done; writes to standard error."""
     if _quiet.get() and unit != KERNELS:
         yield lambda _: None
-    elif sys.stderr.isatty():
+    elif sys.stderr is not None and sys.stderr.isatty():
         with _bar(label, total, unit) as advance:
             yield advance
     else:
@@ -54,7 +78,8 @@ def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    stream: Any = _Forgiving()
+    with Progress(*columns, console=Console(file=stream)) as bar:
         task = bar.add_task(label, total=total, rate="")
 
         def advance(count: int) -> None:
@@ -86,6 +111,6 @@ def _lines(label: str, total: int, unit: str, every: float = 5.0) -> Advance:
                 speed = f", {now - started:.0f} s with the start"
             else:
                 speed = f", {_speed(rate, unit)}, {(total - done) / rate:.0f} s left"
-            print(f"{label}: {done} of {total} {unit}{speed}", file=sys.stderr, flush=True)
+            print(f"{label}: {done} of {total} {unit}{speed}", file=_Forgiving(), flush=True)
 
     return advance

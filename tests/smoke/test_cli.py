@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -214,7 +215,7 @@ def test_a_failed_run_is_in_results_verdict_and_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, name: str) -> None:
     """Interrupted after the first runs, then resumed: the bytes of an uninterrupted run."""
     code = f"""
@@ -232,7 +233,7 @@ mc._one = interrupt
 main({["run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--jobs", "1", "--out", "out"]!r})
 """
     stopped = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert stopped.returncode == 130, stopped.stderr
+    assert stopped.returncode == 128 + getattr(signal, name), stopped.stderr
     assert "--resume" in stopped.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     done = cs.read_results(tmp_path / "out").manifest["finished_runs"]

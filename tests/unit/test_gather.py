@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from edited import accept_changes
 
 import consistency as cs
 from consistency.runs import gather, montecarlo
@@ -206,6 +207,7 @@ def test_a_folder_that_another_program_wrote(written: Path, tmp_path: Path) -> N
     memory.write(tmp_path / "out")
     mixed = memory.estimates.sample(frac=1.0, random_state=1)
     mixed.to_parquet(tmp_path / "out" / "estimates.parquet", index=False)
+    accept_changes(tmp_path / "out")
     assert verdicts_json(cs.analyse(open_results(tmp_path / "out"))) == verdicts_json(cs.analyse(memory))
 
 
@@ -216,6 +218,7 @@ def test_a_bad_number_is_found_where_it_is(written: Path, tmp_path: Path) -> Non
     estimates.loc[701, "P_xx"] = np.inf  # of the second filter, in another row group
     memory.write(tmp_path / "out")
     parquet.write_table(tmp_path / "out" / "estimates.parquet", "estimates", estimates)
+    accept_changes(tmp_path / "out")
     stored = open_results(tmp_path / "out")
     assert cs.analyse(stored, ["ekf-uvd"])
     with pytest.raises(cs.InputError, match=r"estimates\.parquet: column 'P_xx', row 701: not a finite number"):
@@ -237,6 +240,9 @@ def test_changed_bytes_are_refused(written: Path, tmp_path: Path, name: str) -> 
     cs.read_results(written).write(tmp_path / "out")
     path = tmp_path / "out" / f"{name}.parquet"
     damage(path)
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: is not as it was written, but damaged or edited"):
+        open_results(tmp_path / "out")
+    accept_changes(tmp_path / "out")
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
         cs.analyse(open_results(tmp_path / "out"))
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
@@ -249,6 +255,7 @@ def test_a_row_of_no_filter_is_refused(written: Path, tmp_path: Path) -> None:
     estimates = memory.estimates.copy()
     estimates.loc[7, "filter"] = None
     estimates.to_parquet(tmp_path / "out" / "estimates.parquet", index=False)
+    accept_changes(tmp_path / "out")
     for read in (open_results, cs.read_results):
         with pytest.raises(cs.InputError, match=r"estimates\.parquet: a column of text, row 7: nothing there"):
             cs.analyse(read(tmp_path / "out"))
@@ -329,6 +336,7 @@ def test_what_cannot_be_resumed_is_refused_before_any_work(
     out = tmp_path / "out"
     cs.read_results(written).write(out)
     damage(out / f"{name}.parquet")
+    accept_changes(out)
     stop_at(9, RuntimeError("work"))
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
         cs.run_trials(uvd, FILTERS, runs=10, seed=3, jobs=1, previous=open_results(out), out=out)
@@ -357,10 +365,28 @@ def test_ctrl_c_waits_while_the_folder_is_written(
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_in_the_middle_leaves_nothing(uvd: cs.Scenario, tmp_path: Path, stop_at: Any, jobs: int) -> None:
+def test_an_error_in_the_middle_leaves_the_finished_runs(
+    uvd: cs.Scenario, written: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, jobs: int
+) -> None:
+    out = tmp_path / "deep" / "out"
     stop_at(5, RuntimeError("out of ideas"))
     with pytest.raises(RuntimeError, match="out of ideas"):
-        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=tmp_path / "deep" / "out")
+        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=out)
+    monkeypatch.undo()
+    assert [path.name for path in out.parent.iterdir()] == [".out.unfinished"]
+    done: list[int] = []
+    trial = World.trial
+    monkeypatch.setattr(World, "trial", lambda self, run, seed: (done.append(run), trial(self, run, seed))[1])
+    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=out, resume=True)
+    assert set(done) == {5, 6, 7, 8}
+    assert content(out) == content(written)
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+
+
+def test_an_error_in_the_first_run_leaves_nothing(uvd: cs.Scenario, tmp_path: Path, stop_at: Any) -> None:
+    stop_at(0, RuntimeError("out of ideas"))
+    with pytest.raises(RuntimeError, match="out of ideas"):
+        cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=tmp_path / "deep" / "out")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -372,7 +398,7 @@ def test_stopped_before_the_first_run_nothing_is_written(uvd: cs.Scenario, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("where", ["Spool.append", "Writer.add"])
+@pytest.mark.parametrize("where", ["Journal.append", "Writer.add"])
 def test_a_full_disk_keeps_what_was_there(
     uvd: cs.Scenario, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
@@ -383,10 +409,19 @@ def test_a_full_disk_keeps_what_was_there(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(getattr(gather, where.split(".")[0]), where.split(".")[1], full)
-    with pytest.raises(cs.InputError, match=r"--out .*out: cannot be written \(No space left on device\)"):
-        cs.run_trials(uvd, FILTERS, runs=3, seed=3, jobs=2, out=tmp_path / "out", overwrite=True)
+    kept = "; 3 finished runs are kept, and the same command with --resume goes on" if where == "Writer.add" else ""
+    said = rf"--out .*out: cannot be written \(No space left on device\){kept}$"
+    with pytest.raises(cs.InputError, match=said):
+        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=2, out=tmp_path / "out", overwrite=True)
     assert content(tmp_path / "out") == before
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert {path.name for path in tmp_path.iterdir()} == {"out", *[".out.unfinished"] * bool(kept)}
+    monkeypatch.undo()
+    if kept:  # the disk was freed: what was there is replaced, as was asked for at the beginning
+        monkeypatch.setattr(World, "trial", None)
+        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=1, out=tmp_path / "out", resume=True)
+        monkeypatch.undo()
+        cs.run_trials(uvd, FILTERS, runs=3, seed=4, jobs=1, out=tmp_path / "whole")
+        assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
 def test_a_folder_that_is_there_is_refused_before_any_work(uvd: cs.Scenario, written: Path, stop_at: Any) -> None:
@@ -402,9 +437,11 @@ def test_a_folder_that_came_meanwhile_is_not_replaced(uvd: cs.Scenario, tmp_path
             (tmp_path / "out" / "thesis.txt").write_text("all of it")
             return super().init(problem)
 
-    with pytest.raises(cs.InputError, match="exists already"):
+    with pytest.raises(cs.InputError, match=r"exists already; .*; the finished work is in .*out-2$"):
         cs.run_trials(uvd, [Comes()], runs=2, jobs=1, out=tmp_path / "out")
-    assert [path.name for path in tmp_path.rglob("*")] == ["out", "thesis.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "out-2"]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.txt"]
+    assert open_results(tmp_path / "out-2").finished_runs(["halts"]) == {0, 1}
 
 
 def test_a_folder_may_be_named_by_text(uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,16 +19,16 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # A room may import rooms of lower rank and itself; rooms of equal rank do not know each other. Rooms whose modules have
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
-    "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0,
+    "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0, "store.machine": 0, "store.stopping": 0,
     "geometry": 1,
     "models": 2,
     "scenario": 3,
     "protocols": 4,
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
-    "store.parquet": 4, "store.storage": 5, "store.results": 6, "store.log": 7,
+    "store.parquet": 4, "store.storage": 5, "store.journal": 6, "store.results": 6, "store.log": 7,
     "imaging": 6,
     "recording": 7,
-    "runs.gather": 7, "runs.montecarlo": 8, "frontend": 8,
+    "runs.gather": 7, "runs.resuming": 7, "runs.montecarlo": 8, "frontend": 8,
     "verdicts.curves": 7, "verdicts.judge": 8, "verdicts.monitoring": 8, "verdicts.comparison": 9,
     "runs.sequential": 9,
     "terminal.table": 10,

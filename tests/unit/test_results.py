@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from edited import accept_changes
 
 import consistency as cs
 from consistency.runs.montecarlo import simulate_log
@@ -63,6 +65,7 @@ def folder(written: Path, tmp_path: Path) -> Path:
 def change(folder: Path, name: str, edit: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
     path = folder / f"{name}.parquet"
     edit(pd.read_parquet(path)).to_parquet(path, index=False)
+    accept_changes(folder)
 
 
 def put(column: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.DataFrame]:
@@ -82,7 +85,9 @@ def test_read_gives_back_what_was_written(results: cs.Results, written: Path) ->
     back = cs.read_results(written)
     for name in TABLES:
         pd.testing.assert_frame_equal(getattr(back, name), getattr(results, name), check_exact=True)
-    tables = {"tables": sorted(TABLES)}
+    digests = {name: hashlib.sha256((written / f"{name}.parquet").read_bytes()).hexdigest() for name in TABLES}
+    contents = {name: {"rows": len(getattr(results, name)), "sha256": digests[name]} for name in TABLES}
+    tables = {"tables": sorted(TABLES), "contents": contents}
     assert back.manifest == json.loads(json.dumps(results.manifest)) | tables
     assert len(back.failures) > 0
     assert back.filters == ["ekf-xyz", "sleepy"]

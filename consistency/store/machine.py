@@ -1,0 +1,29 @@
+"""Which processor computes, and by which code of BLAS: the last bits of results depend on both."""
+
+from __future__ import annotations
+
+import functools
+import platform
+from pathlib import Path
+
+from threadpoolctl import threadpool_info
+
+
+@functools.cache
+def _found() -> tuple[tuple[str, str], ...]:
+    cores = sorted({str(library.get("architecture")) for library in threadpool_info() if library["user_api"] == "blas"})
+    return ("cpu", _cpu()), ("blas", ", ".join(cores) or "unknown")
+
+
+def this_machine() -> dict[str, str]:
+    """``cpu``: model of the processor; ``blas``: for which architecture the loaded BLAS has chosen its code."""
+    return dict(_found())
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine() or "unknown"

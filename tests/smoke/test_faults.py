@@ -1,0 +1,268 @@
+"""Whatever ends the process, at random moments: finished runs are kept, and a resume gives the bytes of one go.
+
+A process of the command line each; all but the first take a minute or more in all. The same faults inside one process
+are in ``tests/unit/test_journal.py``.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from consistency.scenario import data_folder
+from consistency.store.journal import Journal
+from consistency.store.results import open_results
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals")
+RUNS = 1000  # of some milliseconds each
+FILTER = "kf"
+UNFINISHED = ".out.unfinished"
+
+
+@pytest.fixture(scope="module")
+def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a short world and results of one go."""
+    folder = tmp_path_factory.mktemp("faults")
+    text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
+    (folder / "world.toml").write_text(text.replace(f"steps = {steps_of(text)}", "steps = 40"))
+    status, error = end(begin(folder, out="whole"))
+    assert status == 0, error
+    return folder
+
+
+def steps_of(text: str) -> str:
+    return next(line.split("=")[1].strip() for line in text.splitlines() if line.startswith("steps"))
+
+
+def begin(at: Path, *options: str, out: str = "out", runs: int = RUNS, **popen: Any) -> subprocess.Popen[str]:
+    """The command, in a session of its own, with signals as in a terminal."""
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += "from consistency.cli import main; main()"
+    command = [sys.executable, "-c", code, "run", "world.toml", "--filter", FILTER, "--out", out]
+    command += ["--runs", str(runs), "--jobs", "2", *options]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | popen
+    return subprocess.Popen(command, cwd=at, text=True, start_new_session=True, **pipes)
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Exit status and what was said on standard error."""
+    error = process.communicate(timeout=300)[1] or ""
+    return process.returncode, error
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    end = time.monotonic() + 120.0
+    while not condition() and process.poll() is None and time.monotonic() < end:
+        time.sleep(0.002)
+
+
+def working(at: Path, size: int = 200_000) -> Callable[[], bool]:
+    """Whether the journal has grown so large."""
+    journal = at / UNFINISHED / "journal"
+    return lambda: journal.exists() and journal.stat().st_size > size
+
+
+def kept(at: Path) -> int:
+    journal = Journal(at / UNFINISHED / "journal")
+    journal.close()
+    return len(journal.runs)
+
+
+@pytest.fixture
+def fresh(at: Path) -> Path:
+    for path in at.iterdir():
+        if path.name.startswith(("out", ".out")):
+            shutil.rmtree(path)
+    return at
+
+
+def require_same(at: Path, out: str = "out") -> None:
+    for path in (at / "whole").glob("*.parquet"):
+        assert (at / out / path.name).read_bytes() == path.read_bytes(), path.name
+    assert not (at / f".{out}.unfinished").exists()
+
+
+def resume(at: Path) -> None:
+    process = begin(at, "--resume")
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 0, error
+    require_same(at)
+
+
+def one_sentence(error: str) -> str:
+    """What was said beside progress."""
+    lines = [line for line in error.splitlines() if not line.startswith("runs: ")]
+    assert len(lines) == 1, error
+    return lines[0]
+
+
+def test_killed_and_resumed(fresh: Path) -> None:
+    process = begin(fresh)
+    wait_for(working(fresh), process)
+    process.kill()
+    process.communicate()
+    done = kept(fresh)
+    assert 0 < done < RUNS
+    resume(fresh)
+
+
+@pytest.mark.slow
+def test_killed_and_begun_anew(fresh: Path) -> None:
+    process = begin(fresh)
+    wait_for(working(fresh), process)
+    process.kill()
+    process.communicate()
+    status, error = end(begin(fresh))
+    assert status == 2
+    said = f"unfinished work is there, with {kept(fresh)} finished runs; add --resume"
+    assert said in one_sentence(error)
+    status, error = end(begin(fresh, "--overwrite"))
+    assert status == 0, error
+    require_same(fresh)
+
+
+@pytest.mark.slow
+def test_twenty_kills_at_random_moments(fresh: Path) -> None:
+    """Half of them while runs are done, half while the tables are written or put in place."""
+    moments, done = random.Random(), 0
+    for kill in range(20):
+        late = kill >= 10
+        process = begin(fresh, *["--resume"] * (kill > 0))
+        tables, journal = fresh / UNFINISHED / "tables", fresh / UNFINISHED / "journal"
+        size = journal.stat().st_size if journal.exists() else 0
+        wait_for(tables.exists if late else working(fresh, size + 3_000), process)
+        time.sleep(moments.uniform(0.0, 0.15))
+        process.kill()
+        process.communicate()
+        if not journal.exists():  # it was just done
+            assert open_results(fresh / "out").finished_runs([FILTER]) == set(range(RUNS))
+            continue
+        now = kept(fresh)
+        assert now >= done
+        done = now
+    resume(fresh)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "twice"])
+def test_a_signal_keeps_what_is_finished(fresh: Path, name: str) -> None:
+    process = begin(fresh)
+    wait_for(working(fresh), process)
+    number = signal.SIGINT if name == "twice" else getattr(signal, name)
+    os.kill(process.pid, number)
+    if name == "twice":
+        time.sleep(0.005)
+        os.kill(process.pid, number)
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 128 + number, error
+    done = len(open_results(fresh / "out").finished_runs([FILTER]))
+    assert one_sentence(error).startswith(f"stopped: {done} finished runs are in out; add --resume")
+    assert not (fresh / UNFINISHED).exists()
+    resume(fresh)
+
+
+@pytest.mark.slow
+def test_a_terminal_that_is_closed(fresh: Path) -> None:
+    """SIGHUP to all, and nothing can be written any more."""
+    process = begin(fresh)
+    wait_for(working(fresh), process)
+    for stream in (process.stdout, process.stderr):
+        assert stream is not None
+        stream.close()
+    os.killpg(process.pid, signal.SIGHUP)
+    assert process.wait(300) == 129
+    assert open_results(fresh / "out").finished_runs([FILTER])
+    resume(fresh)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["pipe", "closed"])
+def test_output_that_nobody_reads(fresh: Path, how: str) -> None:
+    """As ``2>&1 | head -1`` and ``>&- 2>&-``."""
+    if how == "pipe":
+        process = begin(fresh, stderr=subprocess.STDOUT)
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.wait(300) == 141
+    else:
+        code = "from consistency.cli import main; main()"
+        command = f"{sys.executable} -c '{code}' run world.toml --filter {FILTER} --out out --runs {RUNS} >&- 2>&-"
+        assert subprocess.run(["bash", "-c", command], cwd=fresh, timeout=300, check=False).returncode == 0
+    require_same(fresh)
+
+
+@pytest.mark.slow
+def test_standard_output_alone_is_closed(fresh: Path) -> None:
+    process = begin(fresh)
+    assert process.stdout is not None
+    process.stdout.close()
+    process.stdout = None
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 141
+    assert [line for line in error.splitlines() if not line.startswith("runs: ")] == []
+    require_same(fresh)
+
+
+@pytest.mark.slow
+def test_a_limit_on_the_size_of_files(fresh: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
+
+    process = begin(fresh, preexec_fn=limit)
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 2
+    done = kept(fresh)
+    said = f"--out out: cannot be written (File too large); {done} finished runs are kept, and the same command"
+    assert said in one_sentence(error)
+    resume(fresh)
+
+
+@pytest.mark.slow
+def test_three_processes_on_one_place(fresh: Path) -> None:
+    first = begin(fresh)
+    wait_for(working(fresh), first)
+    os.kill(first.pid, signal.SIGSTOP)
+    for options in ((), ("--overwrite",), ("--resume",)):
+        other = begin(fresh, *options)
+        _, error = other.communicate(timeout=300)
+        assert other.returncode == 2
+        assert "another process is at work on it" in one_sentence(error)
+    os.kill(first.pid, signal.SIGCONT)
+    assert end(first)[0] == 0
+    require_same(fresh)
+
+
+@pytest.mark.slow
+def test_a_place_that_is_taken_meanwhile(fresh: Path) -> None:
+    process = begin(fresh)
+    wait_for(working(fresh), process)
+    shutil.copytree(fresh / "whole", fresh / "out")
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 2
+    assert one_sentence(error).endswith("the finished work is in out-2")
+    require_same(fresh, "out-2")
+    assert not (fresh / UNFINISHED).exists()
+
+
+@pytest.mark.slow
+def test_results_that_are_removed_meanwhile(fresh: Path) -> None:
+    """Those that a resume goes on from: the runs that it has done are kept."""
+    assert end(begin(fresh, runs=50))[0] == 0
+    process = begin(fresh, "--resume")
+    wait_for(working(fresh), process)
+    shutil.rmtree(fresh / "out")
+    process.communicate(timeout=300)
+    assert process.returncode == 2
+    assert kept(fresh) == RUNS - 50
+    resume(fresh)

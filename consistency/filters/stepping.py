@@ -139,8 +139,8 @@ def reason_of(exception: BaseException) -> str:
 
 def _nis(info: Info) -> float:
     """NIS of an update whose innovation (k,) and S (k, k) are finite, and S positive definite."""
-    innovation = _array(info.innovation, (len(info.innovation),), "innovation")
-    S = _array(info.S, (len(innovation), len(innovation)), "S")
+    innovation = _array(info.innovation, (len(info.innovation),), "update")
+    S = _array(info.S, (len(innovation), len(innovation)), "update")
     if not (np.isfinite(innovation).all() and np.isfinite(S).all()):
         raise _Unusable("the innovation or its covariance is not finite")
     np.linalg.cholesky(S)
@@ -248,7 +248,7 @@ def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:
 def _array(value: Any, shape: tuple[int, ...], method: str = "pose") -> Array:
     given = np.asarray(value)
     if given.dtype.kind not in "biufO":
-        raise TypeError(f"{method} gave numbers of type {given.dtype}, not real ones")
+        raise TypeError(f"{method}() gave numbers of type {given.dtype}, not real ones")
     array = np.array(value, dtype=float)
     if array.shape != shape:
         raise ValueError(f"{method}() gave an array of shape {array.shape}, not {shape}")

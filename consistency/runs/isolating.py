@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import os
 import pickle
+import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,7 @@ from consistency.types import Estimates, Trial
 ONE_THREAD = dict.fromkeys(  # of BLAS in a process of a filter: the last bits depend on it
     ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
+KILL = getattr(signal, "SIGKILL", signal.SIGTERM)
 GLANCE = 1.0  # s between looks at whether a supervisor still lives
 _lock = threading.Lock()
 _idle: list[_Supervisor] = []  # started by earlier studies, as starting one takes seconds
@@ -72,8 +74,8 @@ class Isolation:
         """Kill the processes that work; supervisors that do not are kept for a later study."""
         with _lock:
             self._is_open = False
-            for supervisor in self._busy:
-                supervisor.process.kill()
+            for supervisor in self._busy:  # whose thread waits for a reply
+                supervisor.stop()
             _idle.extend(supervisor for supervisor in self._free if supervisor.tell(None))
             self._free.clear()
 
@@ -121,6 +123,9 @@ class Isolation:
             self._busy.add(supervisor)
         try:
             yield supervisor
+        except BaseException:  # Ctrl-C: it is still at work
+            supervisor.kill()
+            raise
         finally:
             with _lock:
                 self._busy.discard(supervisor)
@@ -160,11 +165,20 @@ class _Supervisor:
                     raise EOFError
             reply: Reply = pickle.loads(self.link.recv_bytes())
         except (EOFError, OSError):
-            self.link.close()
-            self.process.kill()
-            self.process.join()
+            self.kill()
             return None
         return reply
+
+    def kill(self) -> None:
+        """End it at once; what runs under it ends with it."""
+        self.link.close()
+        self.stop()
+        self.process.join()
+
+    def stop(self) -> None:
+        """Send the signal that ends it, and leave the rest to who waits for its reply."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.process.pid, KILL)
 
 
 def _guest(filter_: Filter) -> Guest:

@@ -150,8 +150,7 @@ class _Host:
                     return whole
             was_stopped = False
         except (EOFError, OSError):
-            self.process.join(GLANCE)
-            code = self.process.exitcode
+            code = self._exit_code()
             reason, was_stopped = _reason(code), code is not None and -code in STOPPED
         self.end()
         estimates = record.estimates(guest.name, trial.run, guest.error, reason=reason, guarded=guest.guarded)
@@ -170,6 +169,14 @@ class _Host:
             if self.process.exitcode is not None:
                 raise EOFError
         return None
+
+    def _exit_code(self) -> int | None:
+        """Of a process that is about to end; None where it goes on."""
+        until = time.monotonic() + GLANCE
+        while self.process.exitcode is None and time.monotonic() < until:
+            time.sleep(0.002)
+        code: int | None = self.process.exitcode
+        return code
 
     def end(self) -> None:
         """Kill it, with all processes that it has started."""

@@ -18,6 +18,7 @@ import consistency as cs
 from consistency.types import Control, Gaussian, Observation
 
 STEP = 7  # in which they misbehave
+MEMORY = 0.0625  # GiB that they have
 
 
 class Unreadable(Exception):
@@ -108,6 +109,10 @@ def takes_memory_at_once(*_: Any) -> None:
     np.ones(2**40)
 
 
+def takes_a_little_too_much(*_: Any) -> None:
+    np.ones(int(1.5 * MEMORY * 2**27))
+
+
 def takes_memory_in_lists(self: Still, _: Any) -> None:
     while True:
         self.kept.append([0.5] * 1000)
@@ -175,6 +180,7 @@ KINDS: dict[str, tuple[Callable[..., Any], str]] = {
     "unreadable exception": (raises(Unreadable()), "Unreadable: its message cannot be read (ValueError)"),
     "takes memory": (takes_memory, "out of memory: Unable to allocate 8.00 MiB"),
     "takes memory at once": (takes_memory_at_once, "out of memory: Unable to allocate 8.00 TiB"),
+    "takes a little too much": (takes_a_little_too_much, "out of memory: Unable to allocate 96.0 MiB"),
     "takes memory in lists": (takes_memory_in_lists, "out of memory"),
     "complex pose": (answers(mean=np.full(3, 1 + 1j)), "TypeError: pose() gave numbers of type complex128, not real"),
     "text for a pose": (answers(mean=["1", "2", "3"]), "TypeError: pose() gave numbers of type <U1, not real"),

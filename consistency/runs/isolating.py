@@ -61,7 +61,7 @@ class Isolation:
         self.compiled = [filter_ for filter_ in filters if isinstance(filter_, Compiled)]
         alone = [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]
         self._guests = {name_of(filter_): _guest(filter_) for filter_ in alone}
-        self._study = Study(self._guests, belief, timeout, memory, tuple(sys.path), os.getcwd())
+        self._study = Study(self._guests, belief, timeout, memory, tuple(sys.path), _folder())
         self._free: list[_Supervisor] = []
         self._busy: set[_Supervisor] = set()
         self._is_open = False
@@ -191,6 +191,13 @@ def _guest(filter_: Filter) -> Guest:
             "make in init(problem) what cannot be"
         ) from None
     return Guest(name, error_of(filter_), rejects(filter_), pickled)
+
+
+def _folder() -> str:
+    try:
+        return os.getcwd()
+    except FileNotFoundError:
+        return os.sep
 
 
 @atexit.register  # before multiprocessing waits for its children

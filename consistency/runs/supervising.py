@@ -18,7 +18,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -238,6 +238,9 @@ def _host(study: Study, guest: Guest, room: _Room, link: Connection) -> None:
             reply = Reply(None, refusal=str(error))
         if os.getpid() != own_pid:
             os._exit(1)  # a copy that the filter has made of its process
+        for stream in (sys.stdout, sys.stderr):  # the process will be killed, not ended
+            with contextlib.suppress(Exception):
+                stream.flush()
         link.send_bytes(pickle.dumps(reply))
 
 
@@ -247,7 +250,6 @@ def _run(guest: Guest, trial: Trial, belief: Belief, record: Record) -> Estimate
     The filter is as it was sent, so that no run depends on those that this process did before.
     """
     try:
-        trial = replace(trial)  # whose arrays are read-only again
         return run_filter(pickle.loads(guest.pickled), trial, belief, record)
     except InputError:
         raise

@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from multiprocessing import current_process
 
 from joblib.externals.loky.backend import get_context
 from joblib.externals.loky.backend.reduction import dumps
@@ -137,6 +138,11 @@ class _Supervisor:
     """The near end of :func:`consistency.runs.supervising.supervise`, which runs in a process without ``__main__``."""
 
     def __init__(self) -> None:
+        if current_process().daemon:
+            raise InputError(
+                "filters that are not compiled run in processes of their own, which a worker of multiprocessing.Pool "
+                "cannot start; use concurrent.futures or joblib"
+            )
         context = get_context("loky")
         self.link, end = context.Pipe()
         self.process = context.Process(target=supervise, args=(end,), env=ONE_THREAD)

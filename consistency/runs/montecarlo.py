@@ -202,6 +202,10 @@ class _Work:
     def __call__(self, run: int) -> Outcome:
         return _one(self.make_trial(run), self.isolation)
 
+    @property
+    def filters(self) -> list[Filter]:
+        return self.isolation.filters
+
     def compile(self, run: int) -> None:
         """Compile what a run needs and is not yet compiled, and say so."""
         compile_for(self.isolation.compiled, self.make_trial(run), self.isolation.belief)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -9,18 +10,20 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, loops, raises, segfaults
+from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, raises, segfaults
 from threadpoolctl import threadpool_info
 
 import consistency as cs
 from consistency.filters.stepping import run_filter
 from consistency.runs import isolating
+from consistency.runs.gather import Gathered
 from consistency.runs.isolating import Isolation
 from consistency.runs.montecarlo import Interrupted
 from consistency.store.results import outcome_of
@@ -69,10 +72,12 @@ def test_a_filter_that_misbehaves_is_contained(
     pd.testing.assert_frame_equal(rows(results.estimates, "bad"), expected, check_exact=True)
 
 
-def test_a_filter_that_copies_its_process_is_heard_once(world: cs.Scenario, doomed: Control) -> None:
+def test_a_filter_that_copies_its_process_is_heard_once(
+    world: cs.Scenario, doomed: Control, calm: pd.DataFrame
+) -> None:
     results = cs.run_trials(world, [Still("bad", forks, doomed)], runs=RUNS, jobs=1, timeout=LONG)
     assert len(results.failures) == 0
-    assert len(results.estimates) == RUNS * world.truth.steps
+    pd.testing.assert_frame_equal(results.estimates, rows(calm, "calm").assign(filter="bad"), check_exact=True)
 
 
 # --- each filter has arrays of its own ---------------------------------------------------------
@@ -150,6 +155,29 @@ def test_ctrl_c_in_this_process_is_ctrl_c(world: cs.Scenario, doomed: Control) -
         run_filter(Still("bad", raises(KeyboardInterrupt()), doomed), cs.simulate(world, DOOMED), world.belief)
 
 
+class Cut(dict[str, Any]):
+    """Ctrl-C comes while a run is taken in."""
+
+    def items(self) -> Any:
+        raise KeyboardInterrupt
+
+
+def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world: cs.Scenario, doomed: Control) -> None:
+    with Isolation([Still("bad", segfaults, doomed)], world.belief) as isolation:
+        whole, cut = (
+            (trial, isolation.run(trial)) for trial in (cs.simulate(world, run) for run in (DOOMED, DOOMED + 1))
+        )
+    gathered = Gathered(["bad"], {})
+    gathered.add(outcome_of(*whole))
+    with pytest.raises(KeyboardInterrupt):
+        gathered.add(replace(outcome_of(*cut), maps=Cut()))
+    results = gathered.results({"filters": ["bad"]}, None)
+    assert results.estimates["run"].unique().tolist() == [DOOMED]
+    assert results.truth is not None
+    assert results.truth["run"].unique().tolist() == [DOOMED]
+    assert results.failures[["run", "step"]].to_numpy().tolist() == [[DOOMED, STEP]]
+
+
 class Counts(Still):
     """Each run says how many runs its object has seen."""
 
@@ -165,15 +193,20 @@ def test_no_run_depends_on_those_before_it(world: cs.Scenario) -> None:
     pd.testing.assert_frame_equal(results[0].estimates, results[1].estimates, check_exact=True)
 
 
-def test_trials_of_growing_length_have_room(world: cs.Scenario) -> None:
-    short, long = (cs.simulate(world.variant(f"w{n}", truth__steps=n)) for n in (5, 60))
+def test_trials_that_differ_share_a_process(world: cs.Scenario) -> None:
+    """More steps than before have room, and nothing is left of what was said in an earlier trial."""
+    short, long = (cs.simulate(world.variant(f"w{n}", truth__steps=n)) for n in (12, 60))
+    blind = [
+        replace(trial, first=np.zeros_like(trial.first), landmark=trial.landmark[:0], z=trial.z[:0])
+        for trial in (short, long)
+    ]
+    assert len(short.landmark)
     with Isolation([Still("calm")], world.belief) as isolation:
-        for trial in (short, long, short):
-            [said] = isolation.run(trial)
-            [expected] = [run_filter(Still("calm"), trial, world.belief)]
-            np.testing.assert_array_equal(said.pose, expected.pose)
-            np.testing.assert_array_equal(said.nis, expected.nis)
+        for trial in (short, *blind, short, long):
+            [said], expected = isolation.run(trial), run_filter(Still("calm"), trial, world.belief)
             assert said.failure is None
+            for name in ("pose", "covariance", "nis", "nis_dof"):
+                np.testing.assert_array_equal(getattr(said, name), getattr(expected, name))
 
 
 # --- killed from outside ---------------------------------------------------------------------------
@@ -255,25 +288,34 @@ def test_blas_has_one_thread(world: cs.Scenario, monkeypatch: pytest.MonkeyPatch
     assert (results.estimates["x"] == 1.0).all()
 
 
-def test_ctrl_c_ends_what_hangs(world: cs.Scenario, doomed: Control, monkeypatch: pytest.MonkeyPatch) -> None:
+def hangs(folder: Path) -> Callable[..., None]:
+    """Leaves its process number in ``folder``, and does not end."""
+
+    def act(*_: Any) -> None:
+        (folder / str(os.getpid())).touch()
+        while True:
+            pass
+
+    return act
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_ends_what_hangs(world: cs.Scenario, doomed: Control, tmp_path: Path, jobs: int) -> None:
     """What is finished is handed over, and no process is left."""
-    children: list[int] = []
-    ask = isolating._Supervisor.ask
 
-    def interrupted(self: Any, message: bytes) -> Any:
-        children.append(self.process.pid)
-        if len(children) == DOOMED + 1:
-            threading.Timer(1.0, signal.raise_signal, [signal.SIGINT]).start()
-        return ask(self, message)
+    def interrupt() -> None:
+        while not list(tmp_path.iterdir()):
+            time.sleep(0.05)
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
-    monkeypatch.setattr(isolating._Supervisor, "ask", interrupted)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    began = time.monotonic()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=interrupt, daemon=True).start()
     with pytest.raises(Interrupted) as stop:
-        cs.run_trials(world, [Still("bad", loops, doomed)], runs=RUNS, jobs=1)
-    assert time.monotonic() - began < 20.0
-    assert stop.value.results.manifest["finished_runs"] == DOOMED
-    assert is_gone(children[-1])
+        cs.run_trials(world, [Still("bad", hangs(tmp_path), doomed)], runs=RUNS, jobs=jobs)
+    signal.signal(signal.SIGINT, before)
+    finished = stop.value.results.manifest["finished_runs"]
+    assert finished == DOOMED if jobs == 1 else finished <= DOOMED
+    assert all(is_gone(int(path.name)) for path in tmp_path.iterdir())
 
 
 SCRIPT = """
@@ -319,6 +361,14 @@ def test_a_filter_that_hangs_ends_with_the_study(tmp_path: Path) -> None:
 def test_a_filter_that_cannot_be_pickled_is_refused(world: cs.Scenario) -> None:
     with pytest.raises(cs.InputError, match=r"'lock' runs in a process of its own and cannot be pickled.*init"):
         cs.run_trials(world, [Still("lock", kept=[threading.Lock()])], runs=1, jobs=1)
+
+
+def test_a_worker_of_a_pool_is_refused(world: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A daemonic process can start no other."""
+    isolating._dismiss()
+    monkeypatch.setitem(vars(multiprocessing.current_process())["_config"], "daemon", True)
+    with pytest.raises(cs.InputError, match=r"worker of multiprocessing.Pool cannot start; use"):
+        cs.run_trials(world, [Still("calm")], runs=1, jobs=1)
 
 
 @pytest.mark.parametrize("option", ["timeout", "memory"])

@@ -161,7 +161,10 @@ def run(
     jobs: Jobs = -1,
     timeout: Annotated[
         float | None,
-        typer.Option("--timeout", help="Seconds a run, seen after each step; Python filters only."),
+        typer.Option("--timeout", help="Seconds a run, after which it is killed; filters that are not compiled only."),
+    ] = None,
+    memory: Annotated[
+        float | None, typer.Option("--memory", metavar="GIB", help="GiB that such a filter may allocate in a run.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run in --out.")] = False,
     overwrite: Overwrite = False,
@@ -199,7 +202,7 @@ def run(
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")
             require_free(out, overwrite)
-            results = run_log(recorded, filters, jobs, timeout)
+            results = run_log(recorded, filters, jobs, timeout, memory)
         else:
             world = load_scenario(str(scenario))
             runs, seed = 50 if runs is None else runs, 0 if seed is None else seed
@@ -208,11 +211,20 @@ def run(
                 require_free(out, overwrite or resume)
                 previous = open_results(out) if resume else None
                 results, verdicts = run_until_decided(
-                    world, filters, seed=seed, jobs=jobs, timeout=timeout, previous=previous, **planned
+                    world, filters, seed=seed, jobs=jobs, timeout=timeout, previous=previous, memory=memory, **planned
                 )
             else:
                 results = run_trials(
-                    world, filters, runs, seed, jobs, timeout, out=out, overwrite=overwrite, resume=resume
+                    world,
+                    filters,
+                    runs,
+                    seed,
+                    jobs,
+                    timeout,
+                    out=out,
+                    overwrite=overwrite,
+                    resume=resume,
+                    memory=memory,
                 )
     except Interrupted as stop:
         done = stop.results.manifest["finished_runs"]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,14 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.filters.compiled import problem_for
 from consistency.filters.kernel.linalg import definiteness
+from consistency.filters.record import Record
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 from consistency.protocols import Filter, WholeTrial
 from consistency.scenario import Belief
-from consistency.types import Array, Estimates, Failure, Gaussian, Info, Map, Trial
+from consistency.types import Array, Estimates, Gaussian, Info, Map, Trial
 
 SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
+LONGEST = 1000  # characters of an exception's message that are kept
 
 
 def optimal_gain(filter_: Filter) -> bool:
@@ -46,11 +48,16 @@ def error_of(filter_: Filter) -> str:
     return error
 
 
-def run_filter(filter_: Filter, trial: Trial, belief: Belief, timeout: float | None = None) -> Estimates:
+def rejects(filter_: Filter) -> bool:
+    """Does the filter say which observations it left out?"""
+    return callable(getattr(filter_, "rejected", None))
+
+
+def run_filter(filter_: Filter, trial: Trial, belief: Belief, record: Record | None = None) -> Estimates:
     """A whole trial through a filter, compiled where it can be.
 
-    An exception, a time-out (``timeout`` seconds a trial), an estimate that is not finite or a pose
-    covariance that is not positive definite ends the run as a :class:`Failure` of that step.
+    An exception, an estimate that is not finite or a pose covariance that is not positive definite ends the run as a
+    :class:`Failure` of that step.
 
     Raises
     ------
@@ -62,18 +69,19 @@ def run_filter(filter_: Filter, trial: Trial, belief: Belief, timeout: float | N
         if estimates.error != error or (estimates.own is None) != (error == ADDITIVE):
             raise InputError(f"filter '{name_of(filter_)}': its estimates must be of the error '{error}' and carry it")
         return estimates
-    return step_through(filter_, trial, belief, timeout)
+    return step_through(filter_, trial, belief, record)
 
 
 class _Unusable(Exception):
     """What a filter gave cannot be used; the message is the whole reason."""
 
 
-def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float | None = None) -> Estimates:
+def step_through(filter_: Filter, trial: Trial, belief: Belief, record: Record | None = None) -> Estimates:
     """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``.
 
     ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``rejected`` in each step
-    of one that has it, ``map`` and ``joint`` after the last step.
+    of one that has it, ``map`` and ``joint`` after the last step. The filter has arrays of its own, so that it changes
+    nothing for others. What it says is written into ``record`` step by step, where one is given.
 
     Raises
     ------
@@ -81,49 +89,65 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, timeout: float |
         The filter's error is no convention, or nothing gives its covariance; it needs the truth and there is none.
     """
     T, name, error = trial.steps, name_of(filter_), error_of(filter_)
-    pose, covariance = np.full((T, 3), np.nan), np.full((T, 3, 3), np.nan)
-    own = None if error == ADDITIVE else covariance.copy()
-    nis, dof = np.full(T, np.nan), np.zeros(T, np.int64)
-    rejected = np.zeros(len(trial.landmark), bool) if callable(getattr(filter_, "rejected", None)) else None
-    rank = _Rank(error)
-    reason, step, map_ = "", 0, None
-    started = time.monotonic()
-    problem = problem_for(filter_, trial, belief)
+    record = record or Record.empty(T, len(trial.landmark))
+    given, rank = own_arrays(trial), _Rank(error)
+    reason, map_ = "", None
+    problem = problem_for(filter_, given, belief)
     state: Any = None
     for step in range(1, T + 1):
+        record.at[0] = step
         try:
             if step == 1:
                 state = filter_.init(problem)
-            state = filter_.predict(state, trial.control(step))
-            state, info = _state_and_info(filter_.update(state, trial.observation(step)))
-            if rejected is not None:
-                rejected[: trial.first[step]] = _value_of(filter_, "rejected", state)
+            state = filter_.predict(state, given.control(step))
+            state, info = _state_and_info(filter_.update(state, given.observation(step)))
+            if rejects(filter_):
+                record.rejected[: trial.first[step]] = _value_of(filter_, "rejected", state)
             mean, covariances = _pose_and_covariances(filter_, state, error)
             if info is not None and len(info.innovation):
-                np.linalg.cholesky(info.S)
-                nis[step - 1], dof[step - 1] = info.nis, len(info.innovation)
+                record.nis[step - 1], record.dof[step - 1] = _nis(info), len(info.innovation)
             _require_finite(mean, *covariances)
             rank.require(covariances)
-            if timeout is not None and time.monotonic() - started > timeout:
-                raise _Unusable(f"time-out after {timeout:g} s")
             map_ = _map(filter_, state, trial) if step == T else None
-        except Exception as exception:  # whatever a user's filter throws is a result
-            reason = _reason(exception)
-            nis[step - 1], dof[step - 1] = np.nan, 0
+        except (Exception, GeneratorExit, SystemExit) as exception:  # whatever a user's filter throws is a result
+            reason = reason_of(exception)
             break
-        pose[step - 1], covariance[step - 1] = mean, covariances[0]
-        if own is not None:
-            own[step - 1] = covariances[1]
-    failure = Failure(name, trial.run, step, reason) if reason else None
-    return Estimates(name, trial.run, pose, covariance, nis, dof, failure, error, own, map_, rejected)
+        record.pose[step - 1], record.covariance[step - 1], record.own[step - 1] = mean, covariances[0], covariances[-1]
+    return record.estimates(name, trial.run, error, reason=reason, map_=map_, guarded=rejects(filter_))
 
 
-def _reason(exception: Exception) -> str:
+def own_arrays(trial: Trial) -> Trial:
+    """The trial with read-only arrays that no one else has."""
+    copies: dict[str, Any] = {name: a.copy() for name, a in vars(trial).items() if isinstance(a, np.ndarray)}
+    return replace(trial, **copies)
+
+
+def reason_of(exception: BaseException) -> str:
+    """Why a run failed, in one sentence, whatever the exception is."""
     if isinstance(exception, _Unusable):
         return str(exception)
     if isinstance(exception, np.linalg.LinAlgError):
         return "the innovation covariance is not positive definite"
-    return f"{type(exception).__name__}: {exception}".encode(errors="backslashreplace").decode()
+    try:
+        text = str(exception)
+    except BaseException as error:
+        text = f"its message cannot be read ({type(error).__name__})"
+    what = "out of memory" if isinstance(exception, MemoryError) else type(exception).__name__
+    text = text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
+    return f"{what}: {text}".encode(errors="backslashreplace").decode()
+
+
+def _nis(info: Info) -> float:
+    """NIS of an update whose innovation (k,) and S (k, k) are finite, and S positive definite."""
+    innovation = _array(info.innovation, (len(info.innovation),), "update")
+    S = _array(info.S, (len(innovation), len(innovation)), "update")
+    if not (np.isfinite(innovation).all() and np.isfinite(S).all()):
+        raise _Unusable("the innovation or its covariance is not finite")
+    np.linalg.cholesky(S)
+    nis = info.nis
+    if not np.isfinite(nis):
+        raise _Unusable("the NIS is not finite")
+    return nis
 
 
 def _pose_and_covariances(filter_: Filter, state: Any, error: str) -> tuple[Array, list[Array]]:
@@ -222,6 +246,9 @@ def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:
 
 
 def _array(value: Any, shape: tuple[int, ...], method: str = "pose") -> Array:
+    given = np.asarray(value)
+    if given.dtype.kind not in "biufO":
+        raise TypeError(f"{method}() gave numbers of type {given.dtype}, not real ones")
     array = np.array(value, dtype=float)
     if array.shape != shape:
         raise ValueError(f"{method}() gave an array of shape {array.shape}, not {shape}")

@@ -17,10 +17,11 @@ import pandas as pd
 from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter, usable_names
 from consistency.filters.compiled import one_blas_thread
-from consistency.filters.stepping import error_of, name_of, optimal_gain, run_filter
+from consistency.filters.stepping import error_of, name_of, optimal_gain
 from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Filter, WholeTrial
 from consistency.runs.gather import Gathered
+from consistency.runs.isolating import Isolation
 from consistency.runs.resuming import place_for
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import draw_landmarks, require_landmarks_in_view
@@ -48,13 +49,13 @@ class Interrupted(KeyboardInterrupt):
 def run_trials(
     scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
     timeout: float | None = ..., previous: Tables | None = ..., out: None = ..., overwrite: bool = ...,
-    resume: bool = ...,
+    resume: bool = ..., memory: float | None = ...,
 ) -> Results: ...
 @overload
 def run_trials(
     scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
     timeout: float | None = ..., previous: Tables | None = ..., *, out: str | Path, overwrite: bool = ...,
-    resume: bool = ...,
+    resume: bool = ..., memory: float | None = ...,
 ) -> StoredResults: ...
 # fmt: on
 def run_trials(
@@ -68,6 +69,7 @@ def run_trials(
     out: str | Path | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    memory: float | None = None,
 ) -> Results | StoredResults:
     """Simulate ``runs`` trials of ``scenario`` and put each through every filter.
 
@@ -75,14 +77,15 @@ def run_trials(
     ----------
     filters : names of built-in filters, or objects with ``init``, ``predict``, ``update`` and ``pose``
     seed : the results are a function of (scenario, filter, seed, run) alone
-    jobs : workers; -1 for one a core. Compiled filters share threads, others get processes.
-    timeout : seconds a trial, for filters that are not compiled
+    jobs : workers; -1 for one a core. Compiled filters share threads, each other filter has processes of its own.
+    timeout : seconds a trial, after which the process of a filter that is not compiled is killed
     previous : results of the same scenario, filters and seed to go on from; its runs are not done again
     out : folder for the results, which appears as a whole at the end. Finished runs are kept in a journal beside it
         as they come, so that memory does not grow with the runs, and none is lost, whatever ends the process
     overwrite : replace ``out``, where it is an output folder of this bench, and drop unfinished work on it; that of
         ``previous`` is replaced anyway
     resume : go on with what is in ``out`` and in its journal
+    memory : GiB that a filter that is not compiled may allocate in a trial; Linux only
 
     Returns
     -------
@@ -101,23 +104,30 @@ def run_trials(
     world = require_landmarks_in_view(scenario)
     names = [name_of(f) for f in instances]
     errors = _own_errors(instances)
+    isolation = Isolation(instances, scenario.belief, timeout, memory)
     study = {"scenario_hash": scenario.hash, "filters": names, "error": errors, "seed": seed}
     with place_for(study, None if out is None else Path(out), previous, resume, overwrite) as place:
         done = place.finished
         if done and max(done) >= runs:
             raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
         todo = [run for run in range(runs) if run not in done]
-        work = _Work(lambda run: world.trial(run, seed), instances, scenario.belief, jobs, timeout)
+        work = _Work(lambda run: world.trial(run, seed), isolation, jobs)
         manifest_fields = {"seed": seed, "runs": runs, "machines": place.machines} | _scenario_entry(scenario)
         gathered = Gathered(names, errors, place.new, place.journal, place.previous, place.kept)
         return _finish(work, todo, gathered, manifest_fields, _landmarks_table(scenario))
 
 
-def run_log(log: Log, filters: Sequence[str | Filter], jobs: int = -1, timeout: float | None = None) -> Results:
+def run_log(
+    log: Log,
+    filters: Sequence[str | Filter],
+    jobs: int = -1,
+    timeout: float | None = None,
+    memory: float | None = None,
+) -> Results:
     """Put every run of a recorded log through every filter; raises as :func:`run_trials`."""
     instances = resolve_filters(filters, log.belief)
     trials = {trial.run: trial for trial in log.trials}
-    work = _Work(trials.__getitem__, instances, log.belief, jobs, timeout)
+    work = _Work(trials.__getitem__, Isolation(instances, log.belief, timeout, memory), jobs)
     manifest_fields = {"seed": None, "runs": len(trials), "log": log.name, "log_sha256": log.sha256}
     manifest_fields |= {"belief": log.belief.model_dump(mode="json")}
     results = _finish(
@@ -188,52 +198,49 @@ class _Work:
     """What is done for each run."""
 
     make_trial: Callable[[int], Trial]
-    filters: list[Filter]
-    belief: Belief
+    isolation: Isolation
     jobs: int
-    timeout: float | None
 
     def __post_init__(self) -> None:
         worker_count(self.jobs)
-        if self.timeout is not None and not self.timeout > 0:
-            raise InputError(f"timeout must be positive, got {self.timeout}")
 
     def __call__(self, run: int) -> Outcome:
-        return _one(self.make_trial(run), self.filters, self.belief, self.timeout)
+        return _one(self.make_trial(run), self.isolation)
+
+    @property
+    def filters(self) -> list[Filter]:
+        return self.isolation.filters
 
     def compile(self, run: int) -> None:
         """Compile what a run needs and is not yet compiled, and say so."""
-        compile_for(self.filters, self.make_trial(run), self.belief)
+        compile_for(self.isolation.compiled, self.make_trial(run), self.isolation.belief)
 
     def outcomes(self, runs: list[int]) -> Outcomes:
         """In order of the runs, whoever does them; BLAS has one thread in each worker, for the bits depend on it."""
         workers = min(worker_count(self.jobs), len(runs))
-        if workers <= 1:
-            return (self(run) for run in runs)
-        if all(isinstance(f, WholeTrial) for f in self.filters):  # kernels release the GIL; Python needs processes
-            return self._in_threads(runs, workers)
-        return self._in_processes(runs, workers)
+        if workers > 1:
+            yield from self._in_threads(runs, workers)
+        else:
+            with self.isolation:
+                yield from (self(run) for run in runs)
 
     def _in_threads(self, runs: list[int], workers: int) -> Outcomes:
+        """Kernels release the GIL, and who waits for a process does."""
         pool, waiting = ThreadPoolExecutor(workers), deque[Future[Outcome]]()
         try:
-            for run in runs:
-                waiting.append(pool.submit(self, run))
-                if len(waiting) > AHEAD * workers:
+            with self.isolation:  # left first, so that no thread waits for a process that hangs
+                for run in runs:
+                    waiting.append(pool.submit(self, run))
+                    if len(waiting) > AHEAD * workers:
+                        yield waiting.popleft().result()
+                while waiting:
                     yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def _in_processes(self, runs: list[int], workers: int) -> Outcomes:
-        tasks = (joblib.delayed(_one)(self.make_trial(run), self.filters, self.belief, self.timeout) for run in runs)
-        with joblib.parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
-            yield from joblib.Parallel(return_as="generator")(tasks)
 
-
-def _one(trial: Trial, filters: list[Filter], belief: Belief, timeout: float | None) -> Outcome:
-    return outcome_of(trial, [run_filter(f, trial, belief, timeout) for f in filters])
+def _one(trial: Trial, isolation: Isolation) -> Outcome:
+    return outcome_of(trial, isolation.run(trial))
 
 
 def _finish(
@@ -258,7 +265,9 @@ def _finish(
             if stop.number is None:
                 raise
             complete = False
-        manifest_fields = manifest_fields | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
+        manifest_fields = manifest_fields | {
+            "optimal_gain": [name_of(f) for f in work.isolation.filters if optimal_gain(f)]
+        }
         manifest_fields |= {"error": gathered.errors} if gathered.errors else {}
         manifest = manifest_of(
             filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **manifest_fields

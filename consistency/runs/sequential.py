@@ -29,6 +29,7 @@ def run_until_decided(
     jobs: int = -1,
     timeout: float | None = None,
     previous: Tables | None = None,
+    memory: float | None = None,
 ) -> tuple[Results, dict[str, Verdict]]:
     """Simulate and judge at the inspections of a :class:`Design` until every filter is decided.
 
@@ -56,7 +57,7 @@ def run_until_decided(
     results: Results | None = None
     for runs, spent in design.inspections():
         if runs > done:
-            results = _more(scenario, filters, runs, seed, jobs, timeout, results or previous, plan)
+            results = _more(scenario, filters, runs, seed, jobs, timeout, memory, results or previous, plan)
         source = results or previous
         assert source is not None
         open_ = [name for name in source.filters if name not in decided]
@@ -83,12 +84,13 @@ def _more(
     seed: int,
     jobs: int,
     timeout: float | None,
+    memory: float | None,
     previous: Tables | None,
     plan: dict[str, Any],
 ) -> Results:
     """Results of ``runs`` runs, with the plan in their manifest."""
     try:
-        results = run_trials(scenario, filters, runs, seed, jobs, timeout, previous)
+        results = run_trials(scenario, filters, runs, seed, jobs, timeout, previous, memory=memory)
     except Interrupted as stop:
         manifest = stop.results.manifest | {"until_decided": plan}
         raise Interrupted(replace(stop.results, manifest=manifest), stop.status) from None

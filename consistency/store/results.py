@@ -242,10 +242,15 @@ def joined(parts: Sequence[Results]) -> Results:
 
 
 def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:
-    """Rows of the tables for one trial; a failed run has none from the failed step on."""
+    """Rows of the tables for one trial; a failed run has none from the failed step on.
+
+    A run whose NEES or NIS is too large for a number has failed in that step.
+    """
+    rows = [_rows(trial, e) for e in estimates]
+    estimates = [e for e, _ in rows]
     return Outcome(
         trial.run,
-        {e.filter: _columns(trial, e) for e in estimates},
+        {e.filter: columns for e, columns in rows},
         None if trial.truth is None else _truth_columns(trial, trial.truth),
         tuple(e.failure for e in estimates if e.failure),
         {e.filter: _map_columns(trial, e, e.map) for e in estimates if e.map is not None and e.failure is None},
@@ -255,18 +260,37 @@ def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:
 
 def _rejected(trial: Trial, estimates: Estimates, rejected: Array) -> Rejected:
     """Counts over the observations up to the end of the run, or to the step before its failure."""
-    last = estimates.failure.step - 1 if estimates.failure else trial.steps
-    rows = slice(trial.first[last])
+    rows = slice(trial.first[_last(trial, estimates)])
     spurious, rejected = trial.spurious[rows], rejected[rows]
     counts = (len(rejected), spurious.sum(), rejected.sum(), (rejected & spurious).sum())
     return Rejected(estimates.filter, trial.run, *(int(count) for count in counts))
 
 
-def _columns(trial: Trial, estimates: Estimates) -> Columns:
-    last = estimates.failure.step - 1 if estimates.failure else trial.steps
+def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
+    """Rows of ``estimates``, with what they are of: a run fails in the first step whose NEES or NIS is not finite."""
+    last, own = _last(trial, estimates), estimates.own
+    first = _full_rank((estimates.covariance if own is None else own)[:last])
+    columns = _columns(trial, estimates, last, first)
+    bad = {"NIS": (columns["nis_dof"] > 0) & ~np.isfinite(columns["nis"])}
+    if trial.truth is not None:
+        values = columns["nees"] + columns.get("own_nees", 0.0)
+        bad["NEES"] = (columns["step"] > first) & ~np.isfinite(values)
+    step, name = min(((int(rows.argmax()) + 1, name) for name, rows in bad.items() if rows.any()), default=(0, ""))
+    if not step:
+        return estimates, columns
+    failure = Failure(estimates.filter, estimates.run, step, f"the {name} is not finite")
+    return replace(estimates, failure=failure, map=None), {key: values[: step - 1] for key, values in columns.items()}
+
+
+def _last(trial: Trial, estimates: Estimates) -> int:
+    """Steps with an estimate."""
+    return estimates.failure.step - 1 if estimates.failure else trial.steps
+
+
+def _columns(trial: Trial, estimates: Estimates, last: int, first: int) -> Columns:
+    """Columns of steps 1..``last``; there is a NEES after step ``first``."""
     pose, P = estimates.pose[:last], estimates.covariance[:last]
     true = None if trial.truth is None else trial.truth[1 : last + 1]
-    first = _full_rank(P if estimates.own is None else estimates.own[:last])
     columns = {
         "run": np.full(last, estimates.run),
         "step": np.arange(1, last + 1),
@@ -297,8 +321,9 @@ def _nees(error: Array | None, P: Array, first: int) -> Array:
     value = np.full(len(P), np.nan)
     if error is not None:
         # the filter has answered for P: what nees() checks need not be checked again
-        w = whiten(error[first:], P[first:])
-        value[first:] = np.einsum("ki,ki->k", w, w)
+        with np.errstate(over="ignore"):
+            w = whiten(error[first:], P[first:])
+            value[first:] = np.einsum("ki,ki->k", w, w)
     return value
 
 

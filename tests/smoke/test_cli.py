@@ -178,8 +178,8 @@ class ThrowsInRun7:
 
     name = "throws-in-run-7"
 
-    def __init__(self) -> None:
-        self.inner = cs.get_filter("ekf-uvd")
+    def __init__(self, mark: float) -> None:
+        self.inner, self.mark = cs.get_filter("ekf-uvd"), mark
 
     def init(self, problem: object) -> object:
         self.steps = 0
@@ -190,7 +190,7 @@ class ThrowsInRun7:
 
     def update(self, state: object, observation: cs.Observation) -> object:
         self.steps += 1
-        if self.steps == 20 and np.isclose(observation.z.sum(), MARK["sum"]):
+        if self.steps == 20 and np.isclose(observation.z.sum(), self.mark):
             raise RuntimeError("diverged")
         return self.inner.update(state, observation)
 
@@ -198,13 +198,10 @@ class ThrowsInRun7:
         return self.inner.pose(state)
 
 
-MARK: dict[str, float] = {}
-
-
 def test_a_failed_run_is_in_results_verdict_and_report(tmp_path: Path) -> None:
     scenario = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
-    MARK["sum"] = float(cs.simulate(scenario, run=7, seed=0).observation(20).z.sum())
-    results = cs.run_trials(scenario, [ThrowsInRun7(), "ekf-uvd"], runs=50, jobs=1)
+    mark = float(cs.simulate(scenario, run=7, seed=0).observation(20).z.sum())
+    results = cs.run_trials(scenario, [ThrowsInRun7(mark), "ekf-uvd"], runs=50, jobs=1)
     assert results.failures.values.tolist() == [["throws-in-run-7", 7, 20, "RuntimeError: diverged"]]
     verdict = cs.analyse(results)["throws-in-run-7"]
     assert not verdict.consistent

@@ -28,7 +28,7 @@ RANK = {
     "store.parquet": 4, "store.storage": 5, "store.journal": 6, "store.results": 6, "store.log": 7,
     "imaging": 6,
     "recording": 7,
-    "runs.gather": 7, "runs.resuming": 7, "runs.montecarlo": 8, "frontend": 8,
+    "runs.supervising": 6, "runs.gather": 7, "runs.isolating": 7, "runs.resuming": 7, "runs.montecarlo": 8, "frontend": 8,
     "verdicts.curves": 7, "verdicts.judge": 8, "verdicts.monitoring": 8, "verdicts.comparison": 9,
     "runs.sequential": 9,
     "terminal.table": 10,

@@ -1,0 +1,298 @@
+"""The far side of isolation: a supervisor, and the processes under it in which filters run and may die.
+
+A supervisor does nothing that can hang or crash. For each filter of a study it keeps a process, which works off trials
+until it dies or must be killed; then there is a new one. What the filter says lies in memory that both see, so that the
+steps before the end are not lost. On Linux such a process is forked, which takes milliseconds: the supervisor has one
+thread and BLAS another none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+import numpy as np
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+from consistency.errors import InputError
+from consistency.filters.record import Record
+from consistency.filters.stepping import reason_of, run_filter
+from consistency.scenario import Belief
+from consistency.types import Array, Estimates, Trial
+
+IDLE = 300.0  # s without a study, after which a supervisor ends
+GLANCE = 0.5  # s between looks at whether a process still lives, whose pipe a child of its own may hold open
+STOPPED = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))  # from outside, as no filter ends by itself
+GIB = 2**30
+LOADING = 60.0  # s that loading a filter may take where there is a time-out
+READY = b"ready"
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+
+
+@dataclass(frozen=True)
+class Guest:
+    """A filter of the study, and what its supervisor needs to know of it."""
+
+    name: str
+    error: str
+    guarded: bool  # whether it says which observations it left out
+    pickled: bytes
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a supervisor is told before the first trial."""
+
+    guests: dict[str, Guest]  # by name
+    belief: Belief
+    timeout: float | None  # s a trial
+    memory: float | None  # GiB beyond what the process has before the trial
+    path: tuple[str, ...]  # where modules are looked for
+    folder: str
+
+
+@dataclass(frozen=True)
+class Task:
+    """A trial for a filter."""
+
+    guest: str
+    trial: Trial
+
+
+@dataclass(frozen=True)
+class Reply:
+    """Estimates of a trial; or a run that was stopped from outside, as ``estimates`` say; or bad input."""
+
+    estimates: Estimates | None
+    was_stopped: bool = False
+    refusal: str = ""
+
+
+def supervise(link: Connection) -> None:
+    """Take studies and trials from ``link`` and reply to each trial, until the other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    hosts: dict[str, _Host] = {}
+    study: Study | None = None
+    try:
+        while study is not None or link.poll(IDLE):
+            message = link.recv_bytes()
+            told: Study | Task | None = pickle.loads(message)
+            if isinstance(told, Task):
+                assert study is not None
+                host = _host_for(told, study, hosts)
+                link.send_bytes(pickle.dumps(host.run(told.trial, message, link)))
+            else:
+                study = told
+                _end(hosts)
+    except (EOFError, OSError):
+        pass
+    finally:
+        _end(hosts)
+
+
+def _host_for(task: Task, study: Study, hosts: dict[str, _Host]) -> _Host:
+    """The process that has the filter, a new one where there is none that can take the trial."""
+    host = hosts.get(task.guest)
+    if host is None or not host.can_take(task.trial):
+        if host is not None:
+            host.end()
+        host = hosts[task.guest] = _Host(study, study.guests[task.guest], task.trial)
+    return host
+
+
+def _end(hosts: dict[str, _Host]) -> None:
+    for host in hosts.values():
+        host.end()
+    hosts.clear()
+
+
+class _Host:
+    """A process with one filter in it, seen from its supervisor."""
+
+    def __init__(self, study: Study, guest: Guest, trial: Trial) -> None:
+        self.guest, self.timeout = guest, study.timeout
+        self.room = _Room(trial.steps, 2 * len(trial.landmark))
+        self.link, end = _context.Pipe()
+        self.process = _context.Process(target=_host, args=(study, guest, self.room, end))
+        self.process.start()
+        end.close()
+
+    def can_take(self, trial: Trial) -> bool:
+        fits = self.room.steps >= trial.steps and self.room.observations >= len(trial.landmark)
+        return fits and self.process.exitcode is None
+
+    def run(self, trial: Trial, message: bytes, parent: Connection) -> Reply:
+        """Estimates of a trial, cut off where the process died or was killed at the time-out."""
+        guest, timeout, record = self.guest, self.timeout, self.room.record(trial).begun()
+        try:
+            reason = "time-out while it was loaded"
+            if self._says(parent, None if timeout is None else max(timeout, LOADING)) is not None:
+                self.link.send_bytes(message)
+                reason = "" if timeout is None else f"time-out after {timeout:g} s"
+                if (reply := self._says(parent, timeout)) is not None:
+                    whole: Reply = pickle.loads(reply)
+                    return whole
+            was_stopped = False
+        except (EOFError, OSError):
+            code = self._exit_code()
+            reason, was_stopped = _reason(code), code is not None and -code in STOPPED
+        self.end()
+        estimates = record.estimates(guest.name, trial.run, guest.error, reason=reason, guarded=guest.guarded)
+        return Reply(estimates, was_stopped)
+
+    def _says(self, parent: Connection, seconds: float | None) -> bytes | None:
+        """What the process says, None if nothing in time; EOFError where it is dead, SystemExit where ``parent`` is."""
+        until = np.inf if seconds is None else time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            ready = wait([self.link, parent], min(left, GLANCE))
+            if parent in ready:
+                raise SystemExit  # it writes nothing while it waits for a reply
+            if ready:
+                said: bytes = self.link.recv_bytes()
+                return said
+            if self.process.exitcode is not None:
+                raise EOFError
+        return None
+
+    def _exit_code(self) -> int | None:
+        """Of a process that is about to end; None where it goes on."""
+        until = time.monotonic() + GLANCE
+        while self.process.exitcode is None and time.monotonic() < until:
+            time.sleep(0.002)
+        code: int | None = self.process.exitcode
+        return code
+
+    def end(self) -> None:
+        """Kill it, with all processes that it has started."""
+        self.link.close()
+        with contextlib.suppress(ProcessLookupError, PermissionError, AttributeError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.kill()
+        self.process.join()
+
+
+class _Room:
+    """Memory for a :class:`Record` that two processes see."""
+
+    def __init__(self, steps: int, observations: int) -> None:
+        self.steps, self.observations = steps, observations
+        self._numbers = _context.RawArray("d", 23 * steps)
+        self._at, self._rejected = _context.RawArray("q", 1), _context.RawArray("b", max(observations, 1))
+
+    def record(self, trial: Trial) -> Record:
+        """The part of it that a trial needs."""
+        T, numbers = trial.steps, np.frombuffer(self._numbers)
+        parts = np.split(numbers[: 23 * T], np.cumsum([3 * T, 9 * T, 9 * T, T]))
+        pose, covariance, own, nis, dof = parts
+        rejected: Array = np.frombuffer(self._rejected, bool)[: len(trial.landmark)]
+        at = np.frombuffer(self._at, np.int64)
+        return Record(at, pose.reshape(T, 3), covariance.reshape(T, 3, 3), own.reshape(T, 3, 3), nis, dof, rejected)
+
+
+def _reason(code: int | None) -> str:
+    """How a process ended that was to go on."""
+    if code is None:
+        return "its process closed its pipe to the bench"
+    if code >= 0:
+        return f"its process ended with exit status {code}"
+    outside = ", from outside or for want of memory" if -code in STOPPED else ""
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    return f"its process was killed by {name}{outside}"
+
+
+# --- in the process of a filter -----------------------------------------------------------------
+
+
+def _host(study: Study, guest: Guest, room: _Room, link: Connection) -> None:
+    """Work off trials with one filter until the supervisor closes the pipe."""
+    _settle(study)
+    own_pid = os.getpid()
+    with contextlib.suppress(Exception):
+        pickle.loads(guest.pickled)  # what it imports takes no time of the first trial
+    while True:
+        link.send_bytes(READY)
+        try:
+            trial = pickle.loads(link.recv_bytes()).trial
+        except EOFError:
+            return
+        try:
+            with _limited(study.memory):
+                reply = Reply(_run(guest, trial, study.belief, room.record(trial)))
+        except InputError as error:
+            reply = Reply(None, refusal=str(error))
+        if os.getpid() != own_pid:
+            os._exit(1)  # a copy that the filter has made of its process
+        for stream in (sys.stdout, sys.stderr):  # the process will be killed, not ended
+            with contextlib.suppress(Exception):
+                stream.flush()
+        link.send_bytes(pickle.dumps(reply))
+
+
+def _run(guest: Guest, trial: Trial, belief: Belief, record: Record) -> Estimates:
+    """Estimates of a trial; whatever the filter throws ends it as a failed run.
+
+    The filter is as it was sent, so that no run depends on those that this process did before.
+    """
+    try:
+        return run_filter(pickle.loads(guest.pickled), trial, belief, record)
+    except InputError:
+        raise
+    except BaseException as error:
+        _lift_limit()
+        reason = reason_of(error) if record.at[0] else f"cannot be loaded in a process of its own: {reason_of(error)}"
+        return record.estimates(guest.name, trial.run, guest.error, reason=reason, guarded=guest.guarded)
+
+
+def _settle(study: Study) -> None:
+    """Die with the supervisor, leave no core, and find the modules that the user finds."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with contextlib.suppress(OSError, AttributeError):
+        os.setpgid(0, 0)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if resource is not None:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+    sys.path[:] = study.path
+    importlib.invalidate_caches()
+    with contextlib.suppress(OSError):
+        os.chdir(study.folder)
+
+
+@contextlib.contextmanager
+def _limited(memory: float | None) -> Iterator[None]:
+    """Inside, ``memory`` GiB can be allocated beyond what the process has; more is a MemoryError."""
+    if memory is not None and resource is not None:
+        most = _private_bytes() + int(memory * GIB)
+        resource.setrlimit(resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+    try:
+        yield
+    finally:
+        _lift_limit()
+
+
+def _lift_limit() -> None:
+    if resource is not None:
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
+
+
+def _private_bytes() -> int:
+    """Private writable memory of this process, mapped or used: what RLIMIT_DATA limits (Linux 4.7 and later)."""
+    with open("/proc/self/status", encoding="ascii") as lines:
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmData"))

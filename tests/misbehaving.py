@@ -1,0 +1,196 @@
+"""Filters that do to their process what filters should not; light, because each process imports it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import consistency as cs
+from consistency.types import Control, Gaussian, Observation
+
+STEP = 7  # in which they misbehave
+MEMORY = 0.0625  # GiB that they have
+
+
+class Unreadable(Exception):
+    def __str__(self) -> str:
+        raise ValueError("no words")
+
+
+@dataclass
+class Still:
+    """Stays where it was and says so; in one step of one run, known by its first control, it does as it is told."""
+
+    name: str
+    act: Callable[[Still, Any], Any] | None = None
+    control: Control | None = None
+    step: int = 0
+    is_doomed: bool = False
+    kept: list[Any] = field(default_factory=list)
+
+    def init(self, problem: Any) -> Any:
+        self.problem = problem
+        return problem.start
+
+    def predict(self, state: Any, control: Control) -> Any:
+        self.step += 1
+        self.is_doomed = control == self.control if self.step == 1 else self.is_doomed
+        return state
+
+    def update(self, state: Any, observation: Observation) -> Any:
+        k = len(observation.landmarks)
+        info = cs.Info(np.full(k, 0.5), np.eye(k), np.zeros((3, k)))
+        self.answer = state, info
+        self.estimate = Gaussian(state, np.eye(3))
+        if self.act is not None and self.is_doomed and self.step == STEP:
+            self.act(self, observation)
+        return self.answer
+
+    def pose(self, state: Any) -> Gaussian:
+        return self.estimate
+
+
+def raises(exception: BaseException) -> Callable[..., None]:
+    def act(*_: Any) -> None:
+        raise exception
+
+    return act
+
+
+def answers(**changes: Any) -> Callable[..., None]:
+    """Says something else for the innovation, S or the pose."""
+
+    def act(self: Still, _: Any) -> None:
+        state, info = self.answer
+        parts = {"innovation": info.innovation, "S": info.S, "mean": state, "covariance": np.eye(3)} | changes
+        self.answer = state, cs.Info(parts["innovation"], parts["S"], info.gain)
+        self.estimate = Gaussian(parts["mean"], parts["covariance"])
+
+    return act
+
+
+def loops(*_: Any) -> None:
+    while True:
+        pass
+
+
+def sleeps_in_c(*_: Any) -> None:
+    ctypes.PyDLL(None).sleep(100)  # with the GIL
+
+
+def segfaults(*_: Any) -> None:
+    ctypes.string_at(0)
+
+
+def recurses_in_c(*_: Any) -> None:
+    sys.setrecursionlimit(10**8)
+
+    def again() -> None:
+        sorted([1], key=lambda _: again())
+
+    again()
+
+
+def takes_memory(self: Still, _: Any) -> None:
+    while True:
+        self.kept.append(np.ones(2**20))
+
+
+def takes_memory_at_once(*_: Any) -> None:
+    np.ones(2**40)
+
+
+def takes_a_little_too_much(*_: Any) -> None:
+    np.ones(int(1.5 * MEMORY * 2**27))
+
+
+def takes_memory_in_lists(self: Still, _: Any) -> None:
+    while True:
+        self.kept.append([0.5] * 1000)
+
+
+def closes_all_files(*_: Any) -> None:
+    os.closerange(3, 256)
+    time.sleep(100)
+
+
+def forks(*_: Any) -> None:
+    os.fork()
+
+
+def forks_and_dies(*_: Any) -> None:
+    if os.fork():
+        os._exit(5)
+    time.sleep(100)
+
+
+def reads(*_: Any) -> None:
+    input()
+
+
+def kills_its_thread(*_: Any) -> None:
+    thread = threading.Thread(target=os._exit, args=(4,))
+    thread.start()
+    thread.join()
+
+
+def stops_itself(*_: Any) -> None:
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def ignores_signals(*_: Any) -> None:
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGALRM):
+        signal.signal(number, signal.SIG_IGN)
+    loops()
+
+
+TIME_OUT = "time-out after 1 s"
+NO_INNOVATION = "the innovation or its covariance is not finite"
+KINDS: dict[str, tuple[Callable[..., Any], str]] = {
+    "loops": (loops, TIME_OUT),
+    "sleeps in C": (sleeps_in_c, TIME_OUT),
+    "ignores signals": (ignores_signals, TIME_OUT),
+    "stops itself": (stops_itself, TIME_OUT),
+    "segfaults": (segfaults, "its process was killed by SIGSEGV"),
+    "aborts": (lambda *_: os.abort(), "its process was killed by SIGABRT"),
+    "overflows the stack": (recurses_in_c, "its process was killed by SIGSEGV"),
+    "os._exit(3)": (lambda *_: os._exit(3), "its process ended with exit status 3"),
+    "os._exit(0)": (lambda *_: os._exit(0), "its process ended with exit status 0"),
+    "a thread ends the process": (kills_its_thread, "its process ended with exit status 4"),
+    "kills itself": (
+        lambda *_: os.kill(os.getpid(), signal.SIGKILL),
+        "its process was killed by SIGKILL, from outside or for want of memory",
+    ),
+    "closes all files": (closes_all_files, "its process closed its pipe to the bench"),
+    "forks and dies": (forks_and_dies, "its process ended with exit status 5"),
+    "reads the keyboard": (reads, "EOFError: EOF when reading a line"),
+    "sys.exit": (lambda *_: sys.exit("enough"), "SystemExit: enough"),
+    "GeneratorExit": (raises(GeneratorExit("gone")), "GeneratorExit: gone"),
+    "KeyboardInterrupt": (raises(KeyboardInterrupt("mine")), "KeyboardInterrupt: mine"),
+    "BaseException": (raises(BaseException("odd")), "BaseException: odd"),
+    "unreadable exception": (raises(Unreadable()), "Unreadable: its message cannot be read (ValueError)"),
+    "takes memory": (takes_memory, "out of memory: Unable to allocate 8.00 MiB"),
+    "takes memory at once": (takes_memory_at_once, "out of memory: Unable to allocate 8.00 TiB"),
+    "takes a little too much": (takes_a_little_too_much, "out of memory: Unable to allocate 96.0 MiB"),
+    "takes memory in lists": (takes_memory_in_lists, "out of memory"),
+    "complex pose": (answers(mean=np.full(3, 1 + 1j)), "TypeError: pose() gave numbers of type complex128, not real"),
+    "text for a pose": (answers(mean=["1", "2", "3"]), "TypeError: pose() gave numbers of type <U1, not real"),
+    "too few numbers": (answers(mean=np.zeros(2)), "ValueError: pose() gave an array of shape (2,), not (3,)"),
+    "NaN innovation": (answers(innovation=np.full(1, np.nan), S=np.eye(1)), NO_INNOVATION),
+    "infinite S": (answers(innovation=np.ones(1), S=np.full((1, 1), np.inf)), NO_INNOVATION),
+    "infinite NIS": (answers(innovation=np.full(1, 1e200), S=np.eye(1)), "the NIS is not finite"),
+    "wrong S": (
+        answers(innovation=np.ones(2), S=np.eye(3)),
+        "ValueError: update() gave an array of shape (3, 3), not (2, 2)",
+    ),
+    "error of 1e160 sigma": (answers(mean=np.full(3, 1e160)), "the NEES is not finite"),
+}  # fmt: skip

@@ -20,12 +20,12 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
     "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0,
-    "geometry": 1,
+    "geometry": 1, "reading": 1,
     "models": 2,
     "scenario": 3,
     "protocols": 4,
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
-    "store.parquet": 4, "store.storage": 5, "store.results": 6, "store.log": 7,
+    "store.parquet": 4, "store.storage": 5, "store.soundness": 5, "store.results": 6, "store.log": 7,
     "imaging": 6,
     "recording": 7,
     "runs.gather": 7, "runs.montecarlo": 8, "frontend": 8,

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from consistency.errors import InputError
+from consistency.reading import one_line
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
 
@@ -529,7 +530,7 @@ def main(arguments: list[str] | None = None) -> Any:
         print("consistency: not enough memory; take fewer steps, landmarks or runs", file=sys.stderr)
         sys.exit(2)
     except InputError as error:
-        print(f"consistency: {error}", file=sys.stderr)
+        print(f"consistency: {one_line(error, 4000)}", file=sys.stderr)
         sys.exit(2)
     except UsageError as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
@@ -537,6 +538,11 @@ def main(arguments: list[str] | None = None) -> Any:
         sys.exit(2)
     except BrokenPipeError:
         sys.exit(141)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"consistency: {one_line(error.filename)}: cannot be used ({error.strerror})", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         print("consistency: stopped", file=sys.stderr)
         sys.exit(130)

@@ -70,6 +70,14 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def is_folder(path: Path) -> bool:
+    """Whether a folder is there; False of a name that no folder can have."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
 def read_text(path: Path, refusal: str, largest: int | None = LARGEST, encoding: str = "utf-8") -> str:
     """All of a text file.
 

@@ -1,9 +1,9 @@
 """Damaged files through every reader: ``python tests/fuzz.py CASES [SEED]``; docs/development.md says how.
 
-Each case damages one file of a valid folder and has it read as the command line reads it. Allowed are exit status 2 with
-one sentence on stderr, and status 0; a damage that must be refused may not end in status 0. Not allowed are any other
-exception, a warning, more than a gigabyte, and more than 20 s. The process that reads is a child, so that a crash is a
-finding, too.
+Each case damages one file of a valid folder and has it read as the command line reads it. Allowed are exit status 2
+with one sentence on stderr, and status 0; a damage that must be refused may not end in status 0, and where a file has
+checksums status 0 means that nothing else was read. Not allowed are any other exception, a warning, more than a
+gigabyte, and more than 20 s. The process that reads is a child, so that a crash is a finding, too.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ class Slow(BaseException):
 def outcome(read: Any, folder: Path) -> tuple[int, str, str, str]:
     """Exit status, stdout, stderr, and what is wrong with them whatever the file held."""
     from consistency.errors import InputError
+    from consistency.reading import one_line
 
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
@@ -48,7 +49,7 @@ def outcome(read: Any, folder: Path) -> tuple[int, str, str, str]:
             status = int(stop.code or 0)
         except InputError as error:
             status = 2
-            print(f"consistency: {error}", file=sys.stderr)
+            print(f"consistency: {one_line(error, 4000)}", file=sys.stderr)
         except Slow:
             wrong = f"more than {PATIENCE} s"
         except BaseException:

@@ -179,11 +179,12 @@ def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, I
 
 def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
-    gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
-    bad = np.flatnonzero(gap > ASYMMETRY * np.abs(covariance).max(axis=(-2, -1)))  # false for NaN
-    if len(bad):
-        raise InputError(f"{place(int(bad[0]))}: the covariance is not symmetric; write P = (P + P') / 2")
-    return np.asarray(0.5 * (covariance + np.swapaxes(covariance, -1, -2)))
+    with np.errstate(invalid="ignore"):  # of infinite ones
+        gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
+        bad = np.flatnonzero(gap > ASYMMETRY * np.abs(covariance).max(axis=(-2, -1)))  # false for NaN
+        if len(bad):
+            raise InputError(f"{place(int(bad[0]))}: the covariance is not symmetric; write P = (P + P') / 2")
+        return np.asarray(0.5 * (covariance + np.swapaxes(covariance, -1, -2)))
 
 
 def smallest_correlation(covariance: Array) -> Array:

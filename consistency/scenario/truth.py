@@ -11,7 +11,7 @@ from consistency.scenario.tables import Count, Finite, Interval, NonNegative, Po
 
 MOST_STEPS = 1_000_000  # a trial of so many steps takes some hundred MiB
 MOST_LANDMARKS = 1_000_000
-MOST_LOOKS = 500_000_000  # landmarks times steps: each is one byte while what is in view is searched
+MOST_LOOKS = 200_000_000  # landmarks times steps: each is one byte while what is in view is searched
 
 
 class _Path(Table):

@@ -24,6 +24,7 @@ from consistency.types import Failure
 
 RUNS, STEPS, LANDMARKS = 9, 12, 5
 FILTERS = ("one", "two")
+COLUMNS = ("run", "step", "t", "x", "y", "heading", "P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh")
 EUROC = """T_BS:
   cols: 4
   rows: 4
@@ -95,7 +96,7 @@ def write_results(folder: Path, rng: np.random.Generator) -> None:
         pose = (truth[:, 1:] - error[k]).reshape(-1, 3)
         flat = P[k].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
         table = pd.DataFrame(np.column_stack([run, step, 0.1 * step, pose, flat, nees[k].ravel()]))
-        table.columns = "run step t x y heading P_xx P_xy P_xh P_yy P_yh P_hh nees".split()
+        table.columns = [*COLUMNS, "nees"]
         rows.append(table.assign(filter=name, nis=rng.chisquare(4, len(table)), nis_dof=4))
     estimates = pd.concat(rows, ignore_index=True).astype({"run": int, "step": int})
     estimates = estimates[(estimates["filter"] != "two") | (estimates["run"] != 3) | (estimates["step"] < 8)]
@@ -126,8 +127,10 @@ def _columns(rng: np.random.Generator) -> pd.DataFrame:
     rows = 2 * STEPS
     P = _matrices(rng, rows).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     step = np.tile(np.arange(1, STEPS + 1), 2)
-    table = pd.DataFrame(np.column_stack([np.repeat([0, 1], STEPS), step, 0.1 * step, rng.standard_normal((rows, 3)), P]))
-    table.columns = "run step t x y heading P_xx P_xy P_xh P_yy P_yh P_hh".split()
+    table = pd.DataFrame(
+        np.column_stack([np.repeat([0, 1], STEPS), step, 0.1 * step, rng.standard_normal((rows, 3)), P])
+    )
+    table.columns = list(COLUMNS)
     table = table.astype({"run": int, "step": int})
     return table.assign(nis=rng.chisquare(3, rows), nis_dof=3)
 
@@ -226,7 +229,9 @@ def command(*arguments: str) -> Callable[[Path], object]:
 
 
 def _digest(*values: Any) -> str:
-    return hashlib.sha256(repr([np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for v in values]).encode()).hexdigest()
+    return hashlib.sha256(
+        repr([np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for v in values]).encode()
+    ).hexdigest()
 
 
 def _log(folder: Path) -> None:
@@ -271,35 +276,39 @@ def _cameras(calibration: str | None = None) -> Callable[[Path], object]:
 
 
 RESULTS = tuple(f"{name}.parquet" for name in ("estimates", "truth", "map", "rejections", "failures", "landmarks"))
+TREE, TWICE = {"tree": m.json_tree}, {"twice": m.json_twice}
+TOML, LINE_TWICE = m.ANY | {"tree": m.toml_tree}, {"twice": m.toml_line_twice}
+OPTIMAL = ("--innovations", "optimal")
 TARGETS = (
-    Target("results", ("manifest.json",), command("analyse", "{}"), m.ANY | {"tree": m.json_tree}, {"twice": m.json_twice}),
+    Target("results", ("manifest.json",), command("analyse", "{}"), m.ANY | TREE, TWICE),
     Target("results", RESULTS, command("analyse", "{}"), m.ANY | m.COLUMNS, {}),
     Target("results", RESULTS[:2], command("analyse", "{}"), {}, m.ROWS),
     Target("results", RESULTS[2:5], command("analyse", "{}"), {}, {"row_twice": m.row_twice}),
     Target("results", RESULTS[3:5], command("analyse", "{}"), {}, {"row_gone": m.row_gone, "cut_short": m.cut_short}),
-    Target("results", RESULTS[:1], command("monitor", "{}", "--filter", "one", "--run", "2", "--innovations", "optimal"),
+    Target("results", RESULTS[:1], command("monitor", "{}", "--filter", "one", "--run", "2", *OPTIMAL),
            m.COLUMNS, m.ROWS),
     Target("results", RESULTS[:2], command("compare", "{}"), m.ANY | m.COLUMNS, m.ROWS),
     Target("log", ("controls.parquet", "observations.parquet", "truth.parquet", "landmarks.parquet"), _log,
            m.ANY | m.COLUMNS, {"row_twice": m.row_twice}),
-    Target("log", ("sensor.toml",), _log, m.ANY | {"tree": m.toml_tree}, {"twice": m.toml_line_twice}),
-    Target("table", ("est.csv", "truth.csv"), command("analyse", "{}/est.csv", "--truth", "{}/truth.csv"),
-           m.ANY | m.TEXT, {}),
-    Target("table", ("est.parquet", "truth.parquet"), command("analyse", "{}/est.parquet", "--truth", "{}/truth.parquet"),
-           m.ANY | m.COLUMNS, {"row_twice": m.row_twice}),
-    Target("table", ("nis.csv",), command("monitor", "{}/nis.csv", "--innovations", "optimal"), m.ANY | m.TEXT, {}),
+    Target("log", ("sensor.toml",), _log, TOML, LINE_TWICE),
+    Target("table", ("est.csv", "truth.csv"),
+           command("analyse", "{}/est.csv", "--truth", "{}/truth.csv"), m.ANY | m.TEXT, {}),
+    Target("table", ("est.parquet", "truth.parquet"),
+           command("analyse", "{}/est.parquet", "--truth", "{}/truth.parquet"), m.ANY | m.COLUMNS, {"row_twice": m.row_twice}),
+    Target("table", ("nis.csv",), command("monitor", "{}/nis.csv", *OPTIMAL), m.ANY | m.TEXT, {}),
     Target("archive", ("est.npz",), command("analyse", "{}/est.npz"), m.ANY | m.ARCHIVE, {}),
     Target("archive", ("pair.npz",), command("analyse", "{}/pair.npz"), m.ANY | m.ARCHIVE, {}),
     Target("archive", ("nees.npz",), command("analyse", "{}/nees.npz"), m.ANY | m.ARCHIVE, {}),
-    Target("archive", ("est.npz",), command("monitor", "{}/est.npz", "--run", "1", "--innovations", "optimal"),
+    Target("archive", ("est.npz",), command("monitor", "{}/est.npz", "--run", "1", *OPTIMAL),
            m.ANY | m.ARCHIVE, {}),
     Target("tum", ("est.tum", "truth.tum", "cov.txt"),
-           command("analyse", "{}/est.tum", "--truth", "{}/truth.tum", "--covariance", "{}/cov.txt"), m.ANY | m.TEXT, {}),
-    Target("scenario", ("world.toml",), _scenario, m.ANY | {"tree": m.toml_tree}, {"twice": m.toml_line_twice}),
-    Target("sweep", ("sweep.toml", "world.toml"), _sweep, m.ANY | {"tree": m.toml_tree}, {"twice": m.toml_line_twice}),
-    Target("baseline", ("base.json",), command("compare", "{}/base.json"), m.ANY | {"tree": m.json_tree},
-           {"twice": m.json_twice}),
-    Target("findings", ("findings.json",), _findings, m.ANY | {"tree": m.json_tree}, {"twice": m.json_twice}),
+           command("analyse", "{}/est.tum", "--truth", "{}/truth.tum", "--covariance", "{}/cov.txt"),
+           m.ANY | m.TEXT, {}),
+    Target("scenario", ("world.toml",), _scenario, TOML, LINE_TWICE),
+    Target("sweep", ("sweep.toml", "world.toml"), _sweep, TOML, LINE_TWICE),
+    Target("baseline", ("base.json",), command("compare", "{}/base.json"), m.ANY | TREE,
+           TWICE),
+    Target("findings", ("findings.json",), _findings, m.ANY | TREE, TWICE),
     Target("kitti", ("calib.txt", "times.txt", "poses.txt"), _cameras(), m.ANY | m.TEXT, {}),
     Target("euroc", ("mav0/cam0/sensor.yaml", "mav0/cam1/data.csv", "mav0/state_groundtruth_estimate0/data.csv"),
            _cameras(), m.ANY | m.TEXT, {}),

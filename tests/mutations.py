@@ -52,7 +52,9 @@ def splice(path: Path, rng: Rng) -> None:
     """A piece of the file at another place, or left out."""
     content = path.read_bytes()
     start, end, to = sorted(int(k) for k in rng.integers(len(content), size=3))
-    path.write_bytes(content[:start] + content[end:to] + (content[start:end] if rng.random() < 0.5 else b"") + content[to:])
+    path.write_bytes(
+        content[:start] + content[end:to] + (content[start:end] if rng.random() < 0.5 else b"") + content[to:]
+    )
 
 
 def garbage(path: Path, rng: Rng) -> None:
@@ -90,7 +92,8 @@ def loop(path: Path, rng: Rng) -> None:
 def deep(path: Path, rng: Rng) -> None:
     """Nested 20,000 deep."""
     n = 20_000
-    text = pick(rng, ["[" * n + "]" * n, '{"a":' * n + "1" + "}" * n, "a = " + "[" * n, ".".join("a" * n) + " = 1\n"])
+    texts = ["[" * n + "]" * n, '{"a":' * n + "1" + "}" * n, "a = " + "[" * n, ".".join("a" * n) + " = 1\n", "- " * n]
+    text = pick(rng, texts)
     path.write_text(text, encoding="utf-8")
 
 
@@ -269,13 +272,13 @@ def claimed(path: Path, rng: Rng) -> None:
 
 
 def bomb(path: Path, rng: Rng) -> None:
-    """Zeros of 2 GiB in 2 MiB."""
+    """Zeros of 0.6 GiB in 0.6 MiB."""
     with zipfile.ZipFile(path) as old:
         names = old.namelist()
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file, file.open(names[0], "w") as member:
-        head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({2**28},), }}".ljust(117) + "\n"
+        head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({5 * 2**24},), }}".ljust(117) + "\n"
         member.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode())
-        for _ in range(2**7):
+        for _ in range(40):
             member.write(bytes(2**24))
 
 
@@ -373,12 +376,12 @@ def notes(path: Path, rng: Rng) -> None:
 
 
 def long_run(path: Path, rng: Rng) -> None:
-    """Two hundred million rows in a small file."""
+    """Ten million rows in a small file."""
     table = pq.read_table(path).slice(0, 1)
     columns = {name: pa.repeat(table.column(name)[0], 10**6) for name in table.column_names}
     big = pa.table(columns)
     with pq.ParquetWriter(path, big.schema, compression="zstd") as writer:
-        for _ in range(200):
+        for _ in range(10):
             writer.write_table(big)
 
 

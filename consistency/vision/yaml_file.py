@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import re
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from consistency.vision.features import opencv
 
 UNREADABLE = "cannot be read as YAML"
 LARGEST = 2**20  # bytes of a calibration
+DEEPEST = 100  # brackets in brackets
+_STACKED = re.compile(rf"(?:[-?:] ){{{DEEPEST}}}")  # lists in lists on one line
 SIGNATURE = "%YAML"  # how a file of FileStorage begins: %YAML:1.0 up to OpenCV 4, %YAML 1.2 since
 MATRIX = {"rows", "cols", "dt", "data"}  # keys of a matrix in it
 
@@ -30,10 +34,19 @@ def read_yaml(path: Path) -> dict[str, Any]:
         PyYAML or OpenCV is not installed, or the file is not YAML with keys.
     """
     text = read_text(path, UNREADABLE, LARGEST)
+    with reading(path, UNREADABLE):
+        _require_shallow(text)
     data = _stored(path, text) if text.startswith(SIGNATURE) else _plain(path, text)
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no 'key: value' lines")
     return {str(key): value for key, value in data.items()}
+
+
+def _require_shallow(text: str) -> None:
+    """Refuse what parsers would be slow at, or call themselves too often for."""
+    depth = max(accumulate((char in "[{") - (char in "]}") for char in text), default=0)
+    if depth > DEEPEST or _STACKED.search(text):
+        raise RecursionError
 
 
 def _plain(path: Path, text: str) -> Any:

@@ -61,7 +61,8 @@ def make_folder(path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("suffix", "damage"),
-    [(".nbi", truncate), (".nbi", empty), (".nbc", flip), (".nbc", make_folder), (kept.MARK, flip), (".nbc", Path.unlink)],
+    [(".nbi", truncate), (".nbi", empty), (".nbc", flip), (".nbc", make_folder), (kept.MARK, flip),
+     (".nbc", Path.unlink)],
     ids=["index cut", "index empty", "code flipped", "code a folder", "list flipped", "code gone"],
 )  # fmt: skip
 def test_damaged_code_is_compiled_anew_and_said_once(

@@ -195,9 +195,9 @@ def smallest_correlation(covariance: Array) -> Array:
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     none = np.abs(variance) <= ZERO
     scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
-    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
     finite = np.isfinite(covariance).all(axis=(-2, -1))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # of infinite ones
+        correlation = covariance / (scale[..., :, None] * scale[..., None, :])
         wrong = ((variance < 0) & ~none).any(axis=-1)
         wrong |= (np.abs(correlation) > 1.0 + ROUNDED).any(axis=(-2, -1))
     out = np.full(len(covariance), np.nan)

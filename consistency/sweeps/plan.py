@@ -227,7 +227,7 @@ def _require_cells(sweep: Sweep) -> None:
                 )
     count = math.prod(len(axis.values) for axis in sweep.axes)
     if count > MOST_CELLS:
-        raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values or several sweeps")
+        raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
     try:
         names = [cell.name for cell in sweep.cells]
     except (ValidationError, ValueError) as error:

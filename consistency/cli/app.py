@@ -7,12 +7,11 @@ import signal
 import sys
 import threading
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from consistency.errors import InputError
-from consistency.reading import one_line
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
 
@@ -520,6 +519,13 @@ def monitor(
         raise typer.Exit(1)
 
 
+def _refuse(text: str) -> NoReturn:
+    from consistency.reading import one_line
+
+    print(f"consistency: {one_line(text, 4000)}", file=sys.stderr)
+    sys.exit(2)
+
+
 def main(arguments: list[str] | None = None) -> Any:
     """Entry point: unusable input ends in one line and exit status 2; SIGTERM is taken as Ctrl-C."""
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL and threading.current_thread() is threading.main_thread():
@@ -530,8 +536,7 @@ def main(arguments: list[str] | None = None) -> Any:
         print("consistency: not enough memory; take fewer steps, landmarks or runs", file=sys.stderr)
         sys.exit(2)
     except InputError as error:
-        print(f"consistency: {one_line(error, 4000)}", file=sys.stderr)
-        sys.exit(2)
+        _refuse(str(error))
     except UsageError as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
         print(f"consistency: {error.format_message()} See: {command} --help", file=sys.stderr)
@@ -541,8 +546,7 @@ def main(arguments: list[str] | None = None) -> Any:
     except OSError as error:
         if error.filename is None:
             raise
-        print(f"consistency: {one_line(error.filename)}: cannot be used ({error.strerror})", file=sys.stderr)
-        sys.exit(2)
+        _refuse(f"{error.filename}: cannot be used ({error.strerror})")
     except KeyboardInterrupt:
         print("consistency: stopped", file=sys.stderr)
         sys.exit(130)

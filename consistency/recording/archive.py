@@ -143,7 +143,12 @@ def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[
         raise InputError(f"{path}: key 'nis' has shape {nis.shape}, needs {shape}")
     dof = whole_numbers(path, arrays, "nis_dof", shape)
     known = np.isfinite(nis)
-    if (nis < 0).any() or np.isinf(nis).any() or not (dof[known] == np.round(np.abs(dof[known]))).all():
+    if (
+        (nis < 0).any()
+        or np.isinf(nis).any()
+        or not (dof[known] == np.round(np.abs(dof[known]))).all()
+        or np.isinf(dof).any()
+    ):
         raise InputError(f"{path}: keys 'nis', 'nis_dof': nis must be 0 or more, nis_dof whole numbers of 0 or more")
     return nis, np.where(known, dof, 0.0)
 

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from consistency.errors import InputError
-from consistency.reading import is_file, one_line, reading, require_room
+from consistency.reading import HUGE, is_file, one_line, reading, require_room
 from consistency.types import Array
 
 COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
@@ -47,6 +47,7 @@ OPTIONAL = {  # columns of a table that may be missing
     "map": {"joint_nees": "float64"},
 }
 NULLABLE = {"nees", "nis", *OPTIONAL["estimates"], *OPTIONAL["map"]}
+GIVEN = {"truth", "landmarks", "controls", "observations"}  # tables of the world, which no filter makes diverge
 UNBOUNDED = {"joint_nees"}  # infinite where the joint covariance of a run is not positive definite
 BY_FILTER = {"estimates", "map"}  # tables whose row groups hold one filter each
 REPEATED = {"t", "dt"}  # floating-point columns of few different values
@@ -161,7 +162,8 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
             _require_text(path, read.column(column))
         else:
             _check_column(path, table[column], kind)
-    checked: pd.DataFrame = table.astype(dtypes)
+    with reading(path):
+        checked: pd.DataFrame = table.astype(dtypes)
     return checked
 
 
@@ -258,8 +260,10 @@ def _check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0)
         values = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
     if column.name in NULLABLE:
         values = np.where(column.isna() | (values == np.inf) & (column.name in UNBOUNDED), 0.0, values)
-    if not np.isfinite(values).all():
-        row = int(np.flatnonzero(~np.isfinite(values))[0])
+    largest = HUGE if path.stem in GIVEN and kind == "float64" else np.inf
+    right = np.isfinite(values) & (np.abs(values) <= largest)
+    if not right.all():
+        row = int(np.argmin(right))
         value = one_line(column.iloc[row], 60)
         raise InputError(f"{path}: column '{column.name}', row {first + row}: not a finite number ({value})")
     if kind == "int64" and ((values != np.round(values)) | (np.abs(values) > WHOLE)).any():

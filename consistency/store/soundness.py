@@ -207,6 +207,8 @@ def _require_maps(folder: Path, there: dict[str, Steps], failed: dict[str, Steps
 
 
 def _require_rejections(path: Path, table: pd.DataFrame, there: dict[str, Steps], failed: dict[str, Steps]) -> None:
+    if table.empty:
+        raise InputError(f"{path}: has no rows; {AGAIN}")
     for name, rows in table.groupby("filter"):
         runs = {*there.get(str(name), ()), *failed.get(str(name), ())}
         if rows["run"].duplicated().any() or set(rows["run"]) != runs:

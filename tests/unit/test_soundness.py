@@ -79,6 +79,7 @@ TABLES: list[tuple[str, Edit, str]] = [
     ("map", value("filter == 'two' and run == 4", "run", 3), r"map\.parquet: 'two' has no finished run 3"),
     ("map", value("filter == 'two' and run == 4", "filter", "three"), r"map\.parquet: 5 of \d+ rows are of no filter"),
     ("rejections", only("run != 2"), r"rejections\.parquet: must have each run of 'two' once"),
+    ("rejections", only("run < 0"), r"rejections\.parquet: has no rows"),
     ("rejections", twice, r"must have each run of 'two' once"),
     ("rejections", value("run == 2", "rejected", 50), r"counts of rejected observations"),
     ("rejections", value("run == 2", "rejected_spurious", 4), r"counts of rejected observations"),

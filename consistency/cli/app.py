@@ -556,14 +556,19 @@ def main(arguments: list[str] | None = None) -> Any:
                 raise
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else its last words are said at the exit
             sys.exit(141)
+        except OSError as error:
+            if error.filename is None:
+                raise
+            _end(f"{error.filename}: cannot be used ({error.strerror})", 2)
         except (KeyboardInterrupt, Abort):
             _end("stopped", stop.status)
 
 
 def _end(sentence: str, status: int) -> NoReturn:
+    from consistency.reading import one_line
     from consistency.terminal.progress import say
 
-    say(f"consistency: {sentence}")
+    say(f"consistency: {one_line(sentence, 4000)}")
     sys.exit(status)
 
 

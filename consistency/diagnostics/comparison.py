@@ -87,7 +87,8 @@ def summary(
     counted = np.isfinite(nees)
     squared = covered = np.empty((len(nees), 0))
     if error is not None and covariance is not None:
-        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        with np.errstate(invalid="ignore"):  # a variance below zero covers nothing
+            sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
         inside = np.abs(np.where(counted[..., None], error, 0.0)) <= 2.0 * np.where(counted[..., None], sigma, 0.0)
         count = counted.sum(axis=1)[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -100,6 +100,8 @@ def chief_axes(sample: Sample, steps: slice = slice(None)) -> str | None:
 
 
 def _stands_out(own: Array, others: Array, axes: int) -> bool:
+    if others.mean() <= 0.0:  # beside it they are below rounding
+        return True
     gap = float(np.log(own.mean()) - np.log(others.mean()))
     error = float((own / own.mean() - others / others.mean()).std(ddof=1) / np.sqrt(len(own)))
     if abs(np.log(own.mean())) <= abs(np.log(others.mean())):

@@ -26,7 +26,7 @@ def _whiten(e: Array, P: Array) -> Array:
     out = np.empty(e.shape)
     L: list[list[Array]] = []  # rows of arrays over the batch: n is small, the batch is not
     w: list[Array] = []
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for i in range(e.shape[-1]):
             row: list[Array] = []
             for j in range(i):

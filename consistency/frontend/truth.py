@@ -8,13 +8,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.errors import InputError
+from consistency.reading import is_file, reading
 from consistency.recording.record import associate
-from consistency.recording.tum import read_trajectory
+from consistency.recording.tum import UNIT, read_trajectory
 from consistency.types import Array
-from consistency.vision.sequence import Sequence
+from consistency.vision.sequence import Sequence, read_table
 
 MAX_DT = 0.01  # s between an image and its truth, as in `consistency analyse`
 PLACES = ("poses.txt", "mav0/state_groundtruth_estimate0/data.csv")
+NO_TABLE = "not a table of finite numbers"
 ROTATION = 1e-3  # largest entry of R'R - I; KITTI writes seven digits
 
 
@@ -35,16 +37,17 @@ def read_truth(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     InputError
         The file is missing, damaged, of another length or form, or a frame has no truth within 10 ms.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"--truth {path}: no such file")
-    if path.suffix.lower() == ".csv":
-        R, t = _euroc(path, sequence)
-    elif _columns(path) == 12:
-        R, t = _kitti(path, len(sequence))
-    else:
-        lines = read_trajectory(path, true=True)
-        own = _matched(path, sequence.t, lines.t)
-        R, t = Rotation.from_quat(lines.values[own, 4:8]).as_matrix(), lines.values[own, 1:4]
+    with reading(path, "holds no poses"):
+        if path.suffix.lower() == ".csv":
+            R, t = _euroc(path, sequence)
+        elif _columns(path) == 12:
+            R, t = _kitti(path, len(sequence))
+        else:
+            lines = read_trajectory(path, true=True)
+            own = _matched(path, sequence.t, lines.t)
+            R, t = Rotation.from_quat(lines.values[own, 4:8]).as_matrix(), lines.values[own, 1:4]
     return R @ sequence.rectification.turn.T, t
 
 
@@ -53,19 +56,10 @@ def _columns(path: Path) -> int:
         return next((len(line.split()) for line in file if line.strip() and not line.startswith("#")), 0)
 
 
-def _numbers(path: Path, delimiter: str | None) -> Array:
-    try:
-        return np.loadtxt(path, delimiter=delimiter, ndmin=2)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a table of numbers ({error})") from None
-
-
 def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
-    rows = _numbers(path, None)
+    rows = read_table(path, None, NO_TABLE)
     if len(rows) != frames:
         raise InputError(f"{path}: {len(rows)} poses for {frames} frames; must hold one a frame")
-    if not np.isfinite(rows).all():
-        raise InputError(f"{path}: holds a number that is not finite")
     poses = rows.reshape(-1, 3, 4)
     U, singular, Vt = np.linalg.svd(poses[:, :, :3])
     if np.abs(singular - 1.0).max() > ROTATION or (np.linalg.det(U @ Vt) < 0).any():
@@ -74,9 +68,11 @@ def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
 
 
 def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
-    rows = _numbers(path, ",")
+    rows = read_table(path, ",", NO_TABLE)
     if rows.shape[1] < 8 or not np.isfinite(rows[:, :8]).all() or (np.diff(rows[:, 0]) <= 0).any():
         raise InputError(f"{path}: must hold increasing nanoseconds, position and quaternion w x y z, all finite")
+    if (np.abs(np.linalg.norm(rows[:, 4:8], axis=1) - 1.0) > UNIT).any():
+        raise InputError(f"{path}: columns 5 to 8 must be a quaternion w x y z of length 1")
     body = sequence.calibration.body_from_left
     if body is None:
         raise InputError(f"{path}: is the truth of a body, but {sequence.calibration.source} has no T_BS to the camera")

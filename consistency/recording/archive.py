@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,9 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, planar_error
+from consistency.reading import is_file, reading, require_room
 from consistency.recording.record import Recording, Track, assemble, symmetric
+from consistency.recording.sheet import bounded
 from consistency.types import Array, Failure
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
@@ -77,18 +78,18 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
     InputError
         The file is missing, or not an archive of arrays.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not hasattr(archive, "files"):
-                raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
-            return {key: archive[key] for key in archive.files}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
-        what = "damaged or cut short" if path.read_bytes()[:2] == b"PK" else "or holds Python objects"
-        raise InputError(f"{path}: is not a NumPy archive, {what}; write it with numpy.savez") from None
+    if not is_file(path):
+        raise InputError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+    with path.open("rb") as file:
+        what = "damaged or cut short" if file.read(2) == b"PK" else "or holds Python objects"
+    refusal = f"is not a NumPy archive, {what}; write it with numpy.savez"
+    with reading(path, refusal), np.load(path, allow_pickle=False) as archive:
+        if not hasattr(archive, "files"):
+            raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
+        if len(set(archive.files)) < len(archive.files):
+            raise ValueError("a key is there twice")
+        require_room(path, sum(member.file_size for member in archive.zip.infolist()))
+        return {key: archive[key] for key in archive.files}
 
 
 def _array(path: Path, arrays: dict[str, Array], key: str, dimensions: int) -> Array:
@@ -101,7 +102,18 @@ def _array(path: Path, arrays: dict[str, Array], key: str, dimensions: int) -> A
         array = array[None]
     if array.ndim != dimensions or not array.size:
         raise InputError(f"{path}: key '{key}' has shape {array.shape}, needs ({', '.join(names)})")
-    return np.asarray(array, float)
+    return bounded(np.asarray(array, float))
+
+
+def whole_numbers(path: Path, arrays: dict[str, Array], key: str, shape: tuple[int, ...]) -> Array:
+    """Numbers of one key, as many as ``shape``, or one for all; raises InputError."""
+    array = arrays[key]
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{path}: key '{key}' holds {array.dtype}, not numbers")
+    try:
+        return np.broadcast_to(bounded(np.asarray(array, float)), shape)
+    except ValueError:
+        raise InputError(f"{path}: key '{key}' must be one number or of shape {shape}") from None
 
 
 def _require_truth(path: Path, truth: Array, estimates: Array) -> None:
@@ -129,12 +141,14 @@ def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[
     nis = _array(path, arrays, "nis", 2)
     if nis.shape != shape:
         raise InputError(f"{path}: key 'nis' has shape {nis.shape}, needs {shape}")
-    try:
-        dof = np.broadcast_to(np.asarray(arrays["nis_dof"], float), shape)
-    except ValueError:
-        raise InputError(f"{path}: key 'nis_dof' must be one number or of shape {shape}") from None
+    dof = whole_numbers(path, arrays, "nis_dof", shape)
     known = np.isfinite(nis)
-    if (nis < 0).any() or np.isinf(nis).any() or not (dof[known] == np.round(np.abs(dof[known]))).all():
+    if (
+        (nis < 0).any()
+        or np.isinf(nis).any()
+        or not (dof[known] == np.round(np.abs(dof[known]))).all()
+        or np.isinf(dof).any()
+    ):
         raise InputError(f"{path}: keys 'nis', 'nis_dof': nis must be 0 or more, nis_dof whole numbers of 0 or more")
     return nis, np.where(known, dof, 0.0)
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.recording.archive import load_arrays, run_lengths, step_times
+from consistency.recording.archive import load_arrays, run_lengths, step_times, whole_numbers
 from consistency.recording.record import listed
-from consistency.recording.sheet import Sheet, read_sheet
+from consistency.recording.sheet import Sheet, bounded, read_sheet
 from consistency.recording.table import row_order
 from consistency.types import Array
 
@@ -130,13 +130,10 @@ def _of_archive(path: Path, run: int | None) -> NisLog:
     for key in NEEDED:
         if arrays[key].dtype.kind not in "fiu":
             raise InputError(f"{path}: key '{key}' holds {arrays[key].dtype}, not numbers")
-    nis = np.atleast_2d(np.asarray(arrays["nis"], float))
+    nis = np.atleast_2d(bounded(np.asarray(arrays["nis"], float)))
     if nis.ndim != 2 or not nis.size:
         raise InputError(f"{path}: key 'nis' has shape {nis.shape}, needs (steps,) or (runs, steps)")
-    try:
-        dof = np.broadcast_to(np.asarray(arrays["nis_dof"], float), nis.shape)
-    except ValueError:
-        raise InputError(f"{path}: key 'nis_dof' must be one number or of shape {nis.shape}") from None
+    dof = whole_numbers(path, arrays, "nis_dof", nis.shape)
     row = choose(path, "run", list(range(len(nis))), run)
     steps = run_lengths(path, arrays, *nis.shape)[row]
     t = step_times(path, arrays, nis.shape[1])[:steps]

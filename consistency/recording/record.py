@@ -179,11 +179,12 @@ def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, I
 
 def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
-    gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
-    bad = np.flatnonzero(gap > ASYMMETRY * np.abs(covariance).max(axis=(-2, -1)))  # false for NaN
-    if len(bad):
-        raise InputError(f"{place(int(bad[0]))}: the covariance is not symmetric; write P = (P + P') / 2")
-    return np.asarray(0.5 * (covariance + np.swapaxes(covariance, -1, -2)))
+    with np.errstate(invalid="ignore"):  # of infinite ones
+        gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
+        bad = np.flatnonzero(gap > ASYMMETRY * np.abs(covariance).max(axis=(-2, -1)))  # false for NaN
+        if len(bad):
+            raise InputError(f"{place(int(bad[0]))}: the covariance is not symmetric; write P = (P + P') / 2")
+        return np.asarray(0.5 * (covariance + np.swapaxes(covariance, -1, -2)))
 
 
 def smallest_correlation(covariance: Array) -> Array:
@@ -194,9 +195,9 @@ def smallest_correlation(covariance: Array) -> Array:
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     none = np.abs(variance) <= ZERO
     scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
-    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
     finite = np.isfinite(covariance).all(axis=(-2, -1))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # of infinite ones
+        correlation = covariance / (scale[..., :, None] * scale[..., None, :])
         wrong = ((variance < 0) & ~none).any(axis=-1)
         wrong |= (np.abs(correlation) > 1.0 + ROUNDED).any(axis=(-2, -1))
     out = np.full(len(covariance), np.nan)

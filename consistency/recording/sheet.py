@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from consistency.errors import InputError
+from consistency.reading import HUGE, is_file, one_line, reading
+from consistency.reading import read_text as read_whole
+from consistency.store.parquet import read_frame
 from consistency.types import Array, Indices
 
 
@@ -40,8 +41,10 @@ class Sheet:
     def numbers(self, column: str, finite: bool = False, whole: bool = False) -> Array:
         """A column as floats, NaN where empty; refused where it is text, or not finite or whole as asked for."""
         cells = self.data[column]
-        values: Array = pd.to_numeric(cells, errors="coerce").to_numpy(float)
-        bad = np.isnan(values) & ~cells.isna().to_numpy()
+        with reading(self.path, f"column '{column}' cannot be read as numbers"):
+            values: Array = pd.to_numeric(cells, errors="coerce").to_numpy(float, na_value=np.nan)
+            values = bounded(values)
+            bad = np.isnan(values) & ~cells.isna().to_numpy()
         what = "not a number"
         if not bad.any() and (finite or whole):
             bad, what = ~np.isfinite(values), "not a finite number"
@@ -49,7 +52,7 @@ class Sheet:
             bad, what = values != np.round(values), "not a whole number"
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
-            raise InputError(f"{self.place(row)}: column '{column}': {what} ({cells.iloc[row]})")
+            raise InputError(f"{self.place(row)}: column '{column}': {what} ({one_line(cells.iloc[row], 60)})")
         return values
 
     def rows(self, keep: Array) -> Sheet:
@@ -75,6 +78,11 @@ class Lines:
         return f"{self.path}, line {self.line[row]}"
 
 
+def bounded(values: Array) -> Array:
+    """Numbers, where those that no sensor measures are infinite: what a filter that broke down writes."""
+    return np.where(np.abs(values) > HUGE, np.copysign(np.inf, values), values)
+
+
 def read_sheet(path: Path) -> Sheet:
     """A CSV file (comma, semicolon or tab; # comments) or a Parquet file."""
     sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
@@ -84,25 +92,20 @@ def read_sheet(path: Path) -> Sheet:
 
 
 def _read_parquet(path: Path) -> Sheet:
-    try:
-        data = pq.read_table(path).to_pandas()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}: cannot be read as Parquet ({str(error).splitlines()[0]})") from None
-    return Sheet(path, data.reset_index(drop=True), np.arange(len(data)), "row")
+    if not is_file(path):
+        raise InputError(f"{path}: no such file")
+    data = read_frame(path, "cannot be read as Parquet")
+    names = [str(name) for name in data.columns]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"{path}: column '{one_line(twice[0])}' is there twice")
+    return Sheet(path, data, np.arange(len(data)), "row")
 
 
 def read_text(path: Path) -> list[tuple[int, str]]:
     """Lines with their numbers, without comments and empty lines."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; known are .csv, .parquet, .npz, and .txt or .tum") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    text = read_whole(path, "not a text file; known are .csv, .parquet, .npz, and .txt or .tum", None, "utf-8-sig")
     numbered = enumerate(text.splitlines(), 1)
     return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
 
@@ -124,13 +127,13 @@ def _read_csv(path: Path) -> Sheet:
     body = "\n".join(line for _, line in lines[1:])
     if not body:
         raise InputError(f"{path}: holds no row under its header")
-    try:
+    with reading(path, "cannot be read as CSV"):
         data = pd.read_csv(
             io.StringIO(body), sep=separator, header=None, names=names, index_col=False,
-            skipinitialspace=True, float_precision="round_trip",
+            skipinitialspace=True, float_precision="round_trip", low_memory=False,
         )  # fmt: skip
-    except pd.errors.ParserError as error:
-        raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]})") from None
+    if len(data) != len(lines) - 1:
+        raise InputError(f"{path}: cannot be read as CSV (a quoted field goes over several lines)")
     return Sheet(path, data, np.array([number for number, _ in lines[1:]]), "line")
 
 
@@ -152,7 +155,7 @@ def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
             raise InputError(
                 f"{path}, line {number}: not a number in '{line.strip()[:60]}'; should be {layout}"
             ) from None
-    lines = Lines(path, np.array(rows), np.array([number for number, _ in numbered]))
+    lines = Lines(path, bounded(np.array(rows)), np.array([number for number, _ in numbered]))
     wrong = np.flatnonzero(~np.isfinite(lines.t))
     if len(wrong):
         raise InputError(f"{lines.place(int(wrong[0]))}: the timestamp is not finite")

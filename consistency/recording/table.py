@@ -292,7 +292,7 @@ def _nis(sheet: Sheet) -> tuple[Array | None, Array | None]:
     if "nis_dof" not in sheet:
         raise InputError(f"{sheet.path}: column 'nis_dof' is missing; it is the number of measurements in each nis")
     nis, dof = sheet.numbers("nis"), sheet.numbers("nis_dof")
-    bad = (nis < 0) | np.isinf(nis) | (np.isfinite(nis) & ~((dof >= 0) & (dof == np.round(dof))))
+    bad = (nis < 0) | np.isinf(nis) | (np.isfinite(nis) & ~((dof >= 0) & np.isfinite(dof) & (dof == np.round(dof))))
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise InputError(

@@ -32,7 +32,10 @@ def build_report(folder: Path) -> Report:
     """
     manifest = read_manifest(folder)
     if "studies" in manifest:
-        parts = [folder / str(name) for name in manifest["studies"]]
+        names = manifest["studies"]
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{folder / 'manifest.json'}: key 'studies' must be names of folders; write it again")
+        parts = [folder / name for name in names]
     elif "filters" in manifest:
         parts = [folder]
     else:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from consistency.errors import InputError
+from consistency.reading import one_line, reading
+from consistency.store.parquet import read_frame
 
 
 def extra_table(
@@ -31,20 +31,21 @@ def extra_table(
     """
     if not path.exists():
         return None
-    try:
-        table: pd.DataFrame = pq.read_table(path).to_pandas()
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}: cannot be read, damaged or cut short ({str(error).splitlines()[0]})") from None
+    table = read_frame(path, "cannot be read, damaged or cut short")
     wanted = [*numbers, *texts]
     if absent := [column for column in wanted if column not in table.columns]:
         raise InputError(f"{path}: column '{absent[0]}' is missing; needed: {', '.join(wanted)}")
+    if not table.columns.is_unique:
+        raise InputError(f"{path}: a column is there twice; write the folder again")
     if table.empty:
         raise InputError(f"{path}: has no rows; write the folder again")
     for column in numbers:
-        values = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
+        with reading(path, f"column '{column}' cannot be read as numbers"):
+            values = pd.to_numeric(table[column], errors="coerce").to_numpy(float, na_value=np.nan)
         bad = ~np.isfinite(values) & (table[column].notna().to_numpy() | (column not in missing))
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
-            raise InputError(f"{path}: column '{column}', row {row}: not a finite number ({table[column].iloc[row]})")
+            value = one_line(table[column].iloc[row], 60)
+            raise InputError(f"{path}: column '{column}', row {row}: not a finite number ({value})")
         table[column] = values
     return table[wanted]

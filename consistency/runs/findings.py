@@ -17,6 +17,7 @@ from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.diagnostics import Verdict
 from consistency.errors import InputError
+from consistency.reading import read_json, reading
 from consistency.runs.montecarlo import run_trials, worker_count
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.store.results import Results, joined
@@ -278,8 +279,5 @@ def read_findings(folder: Path) -> list[dict[str, Any]]:
     path = folder / "findings.json"
     if not path.exists():
         return []
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        return [asdict(Finding(**entry)) for entry in data]
-    except (json.JSONDecodeError, UnicodeDecodeError, TypeError) as error:
-        raise InputError(f"{path}: not a list of findings ({error})") from None
+    with reading(path, "not a list of findings"):
+        return [asdict(Finding(**entry)) for entry in read_json(path)]

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 from pydantic import model_validator
 
 from consistency.errors import InputError
+from consistency.reading import is_folder, one_line
 from consistency.scenario.belief import Belief
 from consistency.scenario.tables import Table, read_table
 from consistency.scenario.truth import Truth
@@ -83,11 +84,11 @@ def load_scenario(name: str | Path) -> Scenario:
     path = Path(name)
     if str(name) in scenario_names():
         path = data_folder("scenarios") / f"{name}.toml"
-    elif path.is_dir():
+    elif is_folder(path):
         raise InputError(f"{path}: a folder; give a .toml file in it, or to filter a log --log {path}")
     elif path.suffix != ".toml":
         near = difflib.get_close_matches(str(name), scenario_names(), n=1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         known = ", ".join(scenario_names())
-        raise InputError(f"unknown scenario '{name}'{hint}; known: {known}; or give the path of a .toml file")
+        raise InputError(f"unknown scenario '{one_line(name)}'{hint}; known: {known}; or give the path of a .toml file")
     return read_table(path, Scenario, name=path.stem)

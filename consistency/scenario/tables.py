@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -10,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from consistency.errors import InputError
+from consistency.reading import HUGE, one_line, read_toml, reading
 
 T = TypeVar("T", bound="Table")
 
@@ -24,11 +24,11 @@ UNITS = {
 LIST_OF_KINDS = "effects"  # a list of tables, each of the kind that its key 'kind' names
 SIGMA_UNITS = {"uvd": "_px", "xyz": "_m", "linear": "_m", "relative-xy": "_m", "range-bearing": ""}  # m and rad
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Positive = Annotated[float, Field(gt=0, le=HUGE, allow_inf_nan=False, strict=True)]
+NonNegative = Annotated[float, Field(ge=0, le=HUGE, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(ge=-HUGE, le=HUGE, allow_inf_nan=False, strict=True)]
 Rate = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(gt=0, strict=True)]
+Count = Annotated[int, Field(gt=0, le=2**31 - 1, strict=True)]
 Triple = tuple[Finite, Finite, Finite]
 Sigmas = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
 Interval = tuple[Finite, Finite]
@@ -72,25 +72,21 @@ class Table(BaseModel):
 
 def read_table(path: Path, model: type[T], **extra: Any) -> T:
     """Read and validate one TOML file, raising :class:`InputError` that names file, key and remedy."""
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML ({error})") from None
+    data = read_toml(path)
     if taken := sorted(set(data) & set(extra)):
         raise InputError(f"{path}: key '{taken[0]}': not allowed here, it follows from the file's name")
-    try:
-        return model.model_validate(data | extra)
-    except ValidationError as error:
-        raise InputError(f"{path}: {explain(error, model)}") from None
+    with reading(path, "holds what cannot be used"):
+        try:
+            return model.model_validate(data | extra)
+        except ValidationError as error:
+            raise InputError(f"{path}: {explain(error, model)}") from None
 
 
 def explain(error: ValidationError, model: type[Table]) -> str:
     """One complaint of pydantic in one line: key, what is wrong, what is allowed; unknown keys first."""
     complaints = sorted(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
     first, more = complaints[0], len(complaints) - 1
-    keys = _keys(first["loc"])
+    keys = [one_line(key, 60) for key in _keys(first["loc"])]
     where = f"key '{'.'.join(keys)}': " if keys else ""
     if first["type"] == "extra_forbidden":
         allowed = _allowed(model, [str(part) for part in first["loc"][:-1]])
@@ -109,8 +105,16 @@ def explain(error: ValidationError, model: type[Table]) -> str:
     else:
         text = first["msg"].removeprefix("Value error, ")
         if first["type"] != "value_error":
-            text += f" (got {first['input']!r})"
+            text += f" (got {shown(first['input'])})"
     return where + text + (f" (and {more} more)" if more > 0 else "")
+
+
+def shown(value: Any) -> str:
+    """A value for a message: on one line, and not all of a long one."""
+    try:
+        return one_line(repr(value))
+    except ValueError:  # Python spells out no whole number of thousands of digits
+        return "a number too long to show"
 
 
 def _keys(location: tuple[int | str, ...]) -> list[str]:

@@ -9,6 +9,10 @@ from pydantic import Field, model_validator
 from consistency.scenario.sensor import TrueSensor_
 from consistency.scenario.tables import Count, Finite, Interval, NonNegative, Positive, Table, Triple
 
+MOST_STEPS = 1_000_000  # a trial of so many steps takes some hundred MiB
+MOST_LANDMARKS = 1_000_000
+MOST_LOOKS = 200_000_000  # landmarks times steps: each is one byte while what is in view is searched
+
 
 class _Path(Table):
     """Where the robot drives: it starts at ``start`` and repeats the shape until the steps are done."""
@@ -70,7 +74,7 @@ class UniformLandmarks(Table):
     """``count`` landmarks drawn once, uniformly in a box, from ``seed``."""
 
     layout: Literal["uniform"]
-    count: Count
+    count: Annotated[Count, Field(le=MOST_LANDMARKS)]
     seed: Annotated[int, Field(ge=0, strict=True)]
     x: Interval
     y: Interval
@@ -94,7 +98,7 @@ class CircularLandmarks(Table):
     """``count`` landmarks at equal distances on a circle at height 0, the first in the direction of x."""
 
     layout: Literal["circular"]
-    count: Count
+    count: Annotated[Count, Field(le=MOST_LANDMARKS)]
     centre: tuple[Finite, Finite]
     radius: Positive
 
@@ -103,7 +107,7 @@ class AnnularLandmarks(Table):
     """``count`` landmarks drawn once in each of some rings at height 0, uniformly in radius and direction."""
 
     layout: Literal["annular"]
-    count: Count
+    count: Annotated[Count, Field(le=MOST_LANDMARKS)]
     seed: Annotated[int, Field(ge=0, strict=True)]
     centre: tuple[Finite, Finite]
     rings: Annotated[list[Interval], Field(min_length=1)]
@@ -137,7 +141,7 @@ class Truth(Table):
     """What is the case."""
 
     dt: Positive
-    steps: Count
+    steps: Annotated[Count, Field(le=MOST_STEPS)]
     path: Path_
     landmarks: Landmarks_
     motion: TrueMotion
@@ -149,6 +153,17 @@ class Truth(Table):
             raise ValueError("motion.model and sensor.model must be 'linear' together")
         if self.motion.model == "linear" and self.motion.noise_on != "motion":
             raise ValueError("a linear world needs motion.noise_on = 'motion'")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_in_memory(self) -> Truth:
+        layout = self.landmarks
+        rings = len(layout.rings) if isinstance(layout, AnnularLandmarks) else 1
+        count = len(layout.points) if isinstance(layout, ListedLandmarks) else layout.count * rings
+        if count > MOST_LANDMARKS or count * self.steps > MOST_LOOKS:
+            raise ValueError(
+                f"steps times landmarks must be at most {MOST_LOOKS}, got {self.steps} times {count}; take fewer"
+            )
         return self
 
     @model_validator(mode="after")

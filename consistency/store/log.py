@@ -14,6 +14,7 @@ import pandas as pd
 import tomli_w
 
 from consistency.errors import InputError
+from consistency.reading import reading
 from consistency.scenario import (
     Belief,
     BelievedMotion,
@@ -101,7 +102,8 @@ def read_log(folder: str | Path) -> Log:
         for run in sorted({int(run) for run in controls["run"]})
     ]
     files = [path, *sorted(folder.glob("*.parquet"))]
-    digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    with reading(folder):
+        digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
     return Log(str(folder), trials, belief, tables["landmarks"], digests)
 
 

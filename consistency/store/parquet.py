@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from consistency.errors import InputError
+from consistency.reading import HUGE, is_file, one_line, reading, require_room
 from consistency.types import Array
 
 COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
@@ -47,10 +47,12 @@ OPTIONAL = {  # columns of a table that may be missing
     "map": {"joint_nees": "float64"},
 }
 NULLABLE = {"nees", "nis", *OPTIONAL["estimates"], *OPTIONAL["map"]}
+GIVEN = {"truth", "landmarks", "controls", "observations"}  # tables of the world, which no filter makes diverge
 UNBOUNDED = {"joint_nees"}  # infinite where the joint covariance of a run is not positive definite
 BY_FILTER = {"estimates", "map"}  # tables whose row groups hold one filter each
 REPEATED = {"t", "dt"}  # floating-point columns of few different values
 ROWS = 65_536  # of a row group, and of a batch that is read
+WHOLE = 2**53  # beyond it a floating-point number counts no more
 TYPES = {"str": pa.string(), "int64": pa.int64(), "float64": pa.float64()}
 
 Columns = dict[str, Array]  # columns of a table by name, equally long
@@ -150,17 +152,18 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
         The file is missing, damaged, lacks a column or holds what the column may not.
     """
     path = folder / f"{name}.parquet"
-    with _refusals(path):
-        file = require_table(folder, name)
-        dtypes = _kinds(name, file.schema_arrow.names)
-        read = file.read(list(dtypes))
+    file = require_table(folder, name)
+    dtypes = _kinds(name, file.schema_arrow.names)
+    with reading(path):
+        read = _plain(file.read(list(dtypes)))
         table = read.to_pandas()
     for column, kind in dtypes.items():
         if kind == "str":
             _require_text(path, read.column(column))
         else:
             _check_column(path, table[column], kind)
-    checked: pd.DataFrame = table.astype(dtypes)
+    with reading(path):
+        checked: pd.DataFrame = table.astype(dtypes)
     return checked
 
 
@@ -172,11 +175,13 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
     first = 0
     for group in range(file.num_row_groups):
         about = file.metadata.row_group(group)
-        if filter_name is not None and not _may_hold(about, filter_name):
+        with reading(path):
+            passed_over = filter_name is not None and not _may_hold(about, filter_name)
+        if passed_over:
             first += about.num_rows
             continue
-        with _refusals(path):
-            for batch in file.iter_batches(ROWS, [group], needed):
+        with reading(path):
+            for batch in map(_plain, file.iter_batches(ROWS, [group], needed)):
                 table = {column: batch.column(column).to_pandas() for column in columns}
                 for column, values in table.items():
                     values.name = column
@@ -192,28 +197,43 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
 def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
     """The opened file of a table, refused where it is missing, damaged or lacks a column, those in ``also`` too."""
     path = folder / f"{name}.parquet"
-    with _refusals(path):
-        file = pq.ParquetFile(path, page_checksum_verification=True)
-    needed = dict.fromkeys((*COLUMNS[name], *also))
-    if missing := [column for column in needed if column not in file.schema_arrow.names]:
+    if not is_file(path):
+        raise InputError(f"{path}: {'is no file' if path.exists() else 'missing'}; write the folder again")
+    file = open_parquet(path)
+    needed, names = dict.fromkeys((*COLUMNS[name], *also)), file.schema_arrow.names
+    if missing := [column for column in needed if column not in names]:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
+    if twice := [column for column in needed if names.count(column) > 1]:
+        raise InputError(f"{path}: column '{twice[0]}' is there twice")
     return file
+
+
+def open_parquet(path: Path, refusal: str = "cannot be read, damaged or cut short") -> Any:
+    """A Parquet file, opened and checked for the room that it takes; raises :class:`InputError`."""
+    with reading(path, refusal):
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        about = file.metadata
+        pages = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
+        require_room(path, max(pages, about.num_rows * about.num_columns * 8))
+    return file
+
+
+def read_frame(path: Path, refusal: str) -> pd.DataFrame:
+    """All of a Parquet file of unknown columns, by columns alone; raises :class:`InputError`."""
+    file = open_parquet(path, refusal)
+    with reading(path, refusal):
+        table: pd.DataFrame = _plain(file.read()).to_pandas()
+        return table
+
+
+def _plain(table: Any) -> Any:
+    """A table or batch without the notes of other programs, which may turn columns into an index or other types."""
+    return table.replace_schema_metadata(None)
 
 
 def columns_of(folder: Path, name: str) -> list[str]:
     """Names of the columns of a table; refused as :func:`require_table` does."""
     return list(require_table(folder, name).schema_arrow.names)
-
-
-@contextmanager
-def _refusals(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; write the folder again") from None
-    except (OSError, pa.ArrowException) as error:
-        first = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot be read, damaged or cut short ({first})") from None
 
 
 def _may_hold(group: Any, filter_name: str) -> bool:
@@ -224,6 +244,9 @@ def _may_hold(group: Any, filter_name: str) -> bool:
 
 
 def _require_text(path: Path, names: Any, first: int = 0) -> None:
+    kind = names.type.value_type if pa.types.is_dictionary(names.type) else names.type
+    if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+        raise InputError(f"{path}: a column of text holds {one_line(kind, 40)}; write the folder again")
     if names.null_count:
         row = first + pc.index(names.is_null(), True).as_py()
         raise InputError(f"{path}: a column of text, row {row}: nothing there")
@@ -231,12 +254,18 @@ def _require_text(path: Path, names: Any, first: int = 0) -> None:
 
 def _check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
     """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
-    values = pd.to_numeric(column, errors="coerce").to_numpy(float)
+    with reading(path, f"column '{column.name}' cannot be read as numbers"):
+        if column.dtype.kind in "bmMc":
+            raise TypeError(column.dtype)
+        values = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
     if column.name in NULLABLE:
         values = np.where(column.isna() | (values == np.inf) & (column.name in UNBOUNDED), 0.0, values)
-    if not np.isfinite(values).all():
-        row = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise InputError(f"{path}: column '{column.name}', row {first + row}: not a finite number ({column.iloc[row]})")
-    if kind == "int64" and (values != np.round(values)).any():
-        row = int(np.flatnonzero(values != np.round(values))[0])
+    largest = HUGE if path.stem in GIVEN and kind == "float64" else np.inf
+    right = np.isfinite(values) & (np.abs(values) <= largest)
+    if not right.all():
+        row = int(np.argmin(right))
+        value = one_line(column.iloc[row], 60)
+        raise InputError(f"{path}: column '{column.name}', row {first + row}: not a finite number ({value})")
+    if kind == "int64" and ((values != np.round(values)) | (np.abs(values) > WHOLE)).any():
+        row = int(np.flatnonzero((values != np.round(values)) | (np.abs(values) > WHOLE))[0])
         raise InputError(f"{path}: column '{column.name}', row {first + row}: not a whole number ({values[row]})")

@@ -33,6 +33,7 @@ from consistency.store.parquet import (
     read_parquet,
     require_table,
 )
+from consistency.store.soundness import require_manifest, require_rows
 from consistency.store.storage import read_manifest, require_unchanged, write_folder
 from consistency.types import Array, Estimates, Failure, Indices, Map, Trial
 
@@ -123,6 +124,8 @@ class Tables(ABC):
             return Scenario.model_validate(data) if data else None
         except ValidationError as error:
             raise InputError(f"manifest.json: key 'scenario': {explain(error, Scenario)}") from None
+        except (OverflowError, RecursionError) as error:
+            raise InputError(f"manifest.json: key 'scenario': holds what cannot be used ({error})") from None
 
     def _repr_html_(self) -> str:
         """What is there, for a notebook; ``consistency.analyse`` judges it."""
@@ -493,14 +496,13 @@ def open_results(folder: str | Path) -> StoredResults:
     Raises
     ------
     InputError
-        A file is missing, cut short, not as it was written, or lacks a column; what is in its rows is checked when they
-        are read.
+        A file is missing, cut short, not as it was written, or lacks a column, a filter, a run or a step; the numbers
+        in its rows are checked when they are read.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
-    if "filters" not in manifest:
-        raise InputError(f"{folder}: holds no estimates; it was not written by 'consistency run'")
-    written = manifest.get("tables", [])
+    require_manifest(folder, manifest)
+    written = manifest["tables"]
     for name in ("estimates", *(name for name in ("truth", "map") if name in written)):
         require_table(folder, name)
     require_unchanged(folder, manifest)
@@ -509,6 +511,7 @@ def open_results(folder: str | Path) -> StoredResults:
     results = StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest, rejections)
     if OWN_NUMBERS in map(results.numbers_of, results.filters):
         require_table(folder, "estimates", OWN_NUMBERS)
+    require_rows(folder, manifest, results.scenario, results.failures, rejections, landmarks)
     return results
 
 

@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
+from consistency.reading import one_line, read_json
 from consistency.store.atomic import make_durable
 from consistency.store.machine import this_machine
 from consistency.store.parquet import COLUMNS, require_table, write_table
@@ -107,8 +108,10 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results", option: s
     With ``overwrite`` only a folder that this bench wrote may be replaced, and only by one of its own
     ``kind`` (results, log, findings).
     """
-    with writing(folder, option):
+    try:
         there = folder.exists() or folder.is_symlink()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{option} {one_line(folder)}: no folder can have that name ({one_line(error, 60)})") from None
     if there:
         if not overwrite:
             raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite")
@@ -268,12 +271,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / "manifest.json"
     if not folder.is_dir():
         raise InputError(f"{folder}: {'a file, not a folder' if folder.exists() else 'no such folder'}")
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except OSError:
-        raise InputError(f"{path}: missing; give a folder that 'consistency' wrote") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from None
+    if not path.exists():
+        raise InputError(f"{path}: missing; give a folder that 'consistency' wrote")
+    manifest = read_json(path)
     if not isinstance(manifest, dict) or manifest.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: key 'schema_version' must be {SCHEMA_VERSION}; write the folder again")
     return manifest

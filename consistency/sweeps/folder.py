@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from consistency.errors import InputError
+from consistency.reading import reading
 from consistency.runs.montecarlo import worker_count
 from consistency.scenario import Scenario
 from consistency.store.atomic import write_whole
@@ -99,10 +98,8 @@ class SweepFolder:
             if before.get(key) != value:
                 what = "source code of the bench" if key == "code" else key
                 raise StaleCell(f"{path}: made with another {what} ({before.get(key)}, now {value})")
-        try:
+        with reading(path / "manifest.json", "key 'result' is damaged; remove that folder"):
             return result_from(manifest["result"])
-        except (KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{path}/manifest.json: key 'result' is damaged ({error}); remove that folder") from None
 
     def require_usable(self, overwrite: bool) -> None:
         """Refuse, before any work, a folder of something else, and cells that were made with other inputs.
@@ -208,16 +205,13 @@ def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
     InputError
         It is damaged.
     """
-    try:
+    with reading(path, "key 'sweep' is damaged; write it again"):
         data = manifest["sweep"]
         return Sweep(
             str(data["name"]), str(data["summary"]), Scenario.model_validate(data["base"]),
             tuple(Axis(key, tuple(values)) for key, values in data["grid"].items()),
             tuple(data["filters"]), int(data["seed"]), Rule.model_validate(data["rule"]),
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError, AttributeError, ValidationError) as error:
-        text = str(error).splitlines()[0]
-        raise InputError(f"{path}: key 'sweep' is damaged ({type(error).__name__}: {text}); write it again") from None
 
 
 def open_sweep(path: Path) -> SweepFolder:

@@ -7,6 +7,7 @@ import hashlib
 import itertools
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,6 +25,7 @@ from consistency.scenario import Count, Positive, Scenario, Table, data_folder, 
 from consistency.store.results import POSE
 from consistency.sweeps.axes import QUANTITIES, Axis, leaves, require_key, with_changes
 
+MOST_CELLS = 20_000  # each is a scenario in memory, and a folder
 LONGEST = 150  # characters of a folder's name
 REFERENCE = {"uvd": "ekf-uvd", "xyz": "ekf-xyz", "linear": "kf"}  # filter whose step costs 1, by the sensor's model
 
@@ -223,10 +225,13 @@ def _require_cells(sweep: Sweep) -> None:
                 raise InputError(
                     f"keys 'grid.{taken[key]}' and 'grid.{axis.key}' both set {key}; leave one of them out"
                 )
+    count = math.prod(len(axis.values) for axis in sweep.axes)
+    if count > MOST_CELLS:
+        raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
     try:
         names = [cell.name for cell in sweep.cells]
     except (ValidationError, ValueError) as error:
         text = explain(error, Scenario) if isinstance(error, ValidationError) else str(error)
         raise InputError(f"key 'grid': some values do not go together: {text}") from None
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    if twice := sorted(name for name, times in Counter(names).items() if times > 1):
         raise InputError(f"key 'grid': two values are too much alike to be told apart ({twice[0]})")

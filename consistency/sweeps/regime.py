@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
+from consistency.reading import read_json, reading
 from consistency.scenario import data_folder
 from consistency.store.atomic import write_whole
 from consistency.store.storage import SCHEMA_VERSION, manifest_of
@@ -128,19 +129,12 @@ def read_regime(path: Path | None = None) -> Regime:
             )
     if path.is_dir():
         return regime_of(open_sweep(path))
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"--map {path}: cannot be read ({error.strerror})") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"--map {path}: not valid JSON ({error})") from None
+    data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != MAP_KIND or data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"--map {path}: is no map; give a folder of 'consistency sweep', or its map.json")
     sweep = sweep_from(data, path)
-    try:
+    with reading(f"--map {path}", "key 'rows' is damaged; write the map again"):
         results = dict(_rows(data))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"--map {path}: key 'rows' is damaged ({error}); write the map again") from None
     return Regime(sweep, results, {k: v for k, v in data.items() if k not in ("rows", "columns", "sweep")})
 
 

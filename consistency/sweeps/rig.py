@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from consistency.errors import InputError
+from consistency.reading import read_toml
 from consistency.scenario import ListedEffect, LocalBias, Scenario, UvdSensor, explain, load_scenario, read_table
 from consistency.store.log import SensorFile
 from consistency.sweeps.axes import QUANTITIES, Axis, Changes, density_of, leaves, say_value, with_changes
@@ -62,8 +62,8 @@ def read_rig(request: Request, base: Scenario) -> Rig:
 def _is_sensor(path: Path) -> bool:
     """A file that says a sensor's model at its top; what cannot be read is left to who reads it."""
     try:
-        return "model" in tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return "model" in read_toml(path)
+    except InputError:
         return False
 
 

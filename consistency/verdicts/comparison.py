@@ -6,19 +6,22 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.diagnostics.comparison import FailedRuns
 from consistency.errors import InputError
+from consistency.reading import HUGE, read_json, reading
 from consistency.store.atomic import write_whole
 from consistency.store.results import POSE, Results, read_results
 from consistency.store.storage import SCHEMA_VERSION, manifest_of, plain
 from consistency.verdicts.curves import curves
 
 DETECT = 1.5  # ratio that a sentence speaks of
+HIGHEST_DOF = 1000  # of an error in a baseline
 
 
 @dataclass(frozen=True)
@@ -128,31 +131,48 @@ def read_baseline(path: Path) -> Baseline:
     """
     if path.is_dir():
         return baseline_of(read_results(path), str(path))
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from None
+    data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")
-    try:
-        filters = {
-            name: RunSummary(
-                np.asarray(s["runs"], np.int64),
-                int(s["dof"]),
-                *(np.asarray(s[key], float).reshape(len(s["runs"]), *rest) for key, rest in SHAPES.items()),
-            )
-            for name, s in data["filters"].items()
-        }
-        failures = {name: int(s["failures"]) for name, s in data["filters"].items()}
-        first, second = data["origin"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged ({type(error).__name__}: {error}); write it again") from None
-    return Baseline(str(path), data.get("scenario"), (first, second), filters, failures, data)
+    with reading(path, "damaged; write it again"):
+        rows = _Rows.model_validate(data)
+        filters = {name: row.summary() for name, row in rows.filters.items()}
+    failures = {name: row.failures for name, row in rows.filters.items()}
+    return Baseline(str(path), rows.scenario, (rows.origin[0], rows.origin[1]), filters, failures, data)
 
 
-SHAPES: dict[str, tuple[int, ...]] = {"nees": (), "squared": (-1,), "covered": (-1,)}
+Number = Annotated[float, Field(ge=0.0, le=HUGE**4)] | None  # None where a run has no value
+Row = Annotated[list[Number], Field(max_length=HIGHEST_DOF)]
+
+
+class _Summary(BaseModel):
+    """One filter in the file: values of R runs."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    runs: list[Annotated[int, Field(ge=0, lt=2**63)]]  # (R,)
+    dof: Annotated[int, Field(ge=1, le=HIGHEST_DOF)]
+    nees: list[Number]  # (R,)
+    squared: list[Row]  # (R, n)
+    covered: list[Row]  # (R, n)
+    failures: Annotated[int, Field(ge=0)]
+
+    def summary(self) -> RunSummary:
+        """As the referee takes it; raises ValueError where the parts do not fit together."""
+        if len(set(self.runs)) < len(self.runs):
+            raise ValueError("a run is there twice")
+        nees, squared, covered = (np.array(values, float) for values in (self.nees, self.squared, self.covered))
+        if not len(self.runs) == len(nees) == len(squared) == len(covered) or squared.shape != covered.shape:
+            raise ValueError("its lists are not equally long")
+        return RunSummary(np.array(self.runs, np.int64), self.dof, nees, squared, covered)
+
+
+class _Rows(BaseModel):
+    """What a file of :func:`write_baseline` holds beside its provenance."""
+
+    model_config = ConfigDict(strict=True)
+    scenario: str | None
+    origin: Annotated[list[Any], Field(min_length=2, max_length=2)]
+    filters: dict[str, _Summary]
 
 
 def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = 0.05) -> list[Compared]:

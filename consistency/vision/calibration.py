@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.reading import HUGE, one_line, read_text, reading
 from consistency.types import Array
 from consistency.vision.yaml_file import matrix, read_yaml
 
@@ -57,13 +58,14 @@ def read_calibration(path: Path, left: str = "", right: str = "") -> Calibration
     InputError
         The file is missing or damaged, a key is missing or unknown, a number is not finite, a rotation is none.
     """
-    if path.is_dir():
-        return read_euroc(path)
-    if not path.is_file():
-        raise InputError(f"--calibration {path}: no such file")
-    if path.suffix.lower() in (".yaml", ".yml"):
-        return read_opencv(path)
-    return read_kitti(path, left, right)
+    with reading(path, "holds no calibration of two cameras"):
+        if path.is_dir():
+            return read_euroc(path)
+        if not path.is_file():
+            raise InputError(f"--calibration {path}: no such file")
+        if path.suffix.lower() in (".yaml", ".yml"):
+            return read_opencv(path)
+        return read_kitti(path, left, right)
 
 
 def read_kitti(path: Path, left: str = "", right: str = "") -> Calibration:
@@ -72,22 +74,26 @@ def read_kitti(path: Path, left: str = "", right: str = "") -> Calibration:
     P = K [I | t] of each camera in the common rectified axes; colour images (image_2, image_3) go with P2 and P3.
     """
     rows: dict[str, Array] = {}
-    try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from None
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    lines = [line for line in read_text(path, "cannot be read").splitlines() if line.strip()]
     for number, line in enumerate(lines):
         key, _, values = line.rpartition(":")
+        name = key.strip() or f"P{number}"
+        if name in rows:
+            raise InputError(f"{path}: key '{one_line(name)}' is there twice")
         try:
-            rows[key.strip() or f"P{number}"] = np.array(values.split(), float)
+            rows[name] = np.array(values.split(), float)
         except ValueError:
             raise InputError(f"{path}: line {number + 1}: must be 'P0:' and 12 numbers, or 12 numbers") from None
     names = ("P2", "P3") if left.endswith("2") and right.endswith("3") else ("P0", "P1")
     for name in names:
         if name not in rows:
-            raise InputError(f"{path}: key '{name}' is missing; there: {', '.join(rows) or 'nothing'}")
-        if rows[name].size != 12 or not np.isfinite(rows[name]).all():
+            raise InputError(f"{path}: key '{name}' is missing; there: {one_line(', '.join(rows)) or 'nothing'}")
+        if rows[name].size != 12 or not (np.abs(rows[name]) < HUGE).all():
             raise InputError(f"{path}: key '{name}': must be 12 finite numbers, P (3 x 4) row by row")
+        if np.linalg.matrix_rank(rows[name].reshape(3, 4)[:, :3]) < 3:
+            raise InputError(f"{path}: key '{name}': the matrix of its camera is singular; must be P = K [I | t]")
     P_left, P_right = (rows[name].reshape(3, 4) for name in names)
     T = np.linalg.solve(P_right[:, :3], P_right[:, 3]) - np.linalg.solve(P_left[:, :3], P_left[:, 3])
     none = np.zeros(4)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.reading import HUGE, is_file, read_text, reading
 from consistency.types import Array
 from consistency.vision.calibration import Calibration, read_calibration
 from consistency.vision.features import opencv
@@ -103,7 +104,9 @@ def read_sequence(
     if t is None:
         _require_no_gap(files[0])
     cameras = read_calibration(calibration or home or folder, *(side[0].parent.name for side in files))
-    rectification = rectify(cameras, _size_of(files[0][0]))
+    size = _size_of(files[0][0])
+    with reading(cameras.source, "its cameras cannot be rectified"):
+        rectification = rectify(cameras, size)
     times = np.arange(len(files[0])) / (rate or RATE) if t is None else t
     return Sequence(folder, kind, *files, times, t is not None, cameras, rectification)
 
@@ -191,13 +194,21 @@ def _kitti_times(folder: Path) -> Array | None:
     path = folder / "times.txt"
     if not path.is_file():
         return None
-    try:
-        t = np.loadtxt(path, ndmin=1)
-    except (ValueError, UnicodeDecodeError, OSError):
-        t = np.empty((0, 0))
-    if t.ndim != 1 or not np.isfinite(t).all():
+    t = read_table(path, None, "must hold one time in seconds a line")
+    if t.shape[1] != 1:
         raise InputError(f"{path}: must hold one time in seconds a line")
-    return t
+    return np.asarray(t[:, 0])
+
+
+def read_table(path: Path, delimiter: str | None, refusal: str) -> Array:
+    """A text file of finite numbers, (lines, columns); raises :class:`InputError` with the ``refusal``."""
+    text = read_text(path, refusal)
+    with reading(path, refusal):
+        lines = [line for line in text.splitlines() if line.split("#", 1)[0].strip()]
+        values = np.loadtxt(lines, delimiter=delimiter, ndmin=2) if lines else np.empty((0, 0))
+        if not (np.abs(values) < HUGE).all():
+            raise ValueError("a number that is not finite")
+    return np.asarray(values)
 
 
 def _euroc(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
@@ -215,17 +226,18 @@ def _camera(folder: Path) -> dict[int, Path]:
     if not images.is_dir():
         raise InputError(f"{folder}: no such folder of images")
     table = folder / "data.csv"
-    try:
+    with reading(folder, "times must be whole nanoseconds, each once, in data.csv or as the images' names"):
         if table.is_file():
-            with table.open(encoding="utf-8", newline="") as file:
-                rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-            by_time = {int(row[0]): images / row[1].strip() for row in rows}
+            lines = read_text(table, "cannot be read").splitlines()
+            rows = [row for row in csv.reader(lines) if row and not row[0].startswith("#")]
+            pairs = [(int(row[0]), images / row[1].strip()) for row in rows]
         else:
-            by_time = {int(path.stem): path for path in _images(images)}
-    except (ValueError, IndexError, OSError, UnicodeDecodeError):
-        raise InputError(f"{folder}: times must be whole nanoseconds, in data.csv or as the images' names") from None
+            pairs = [(int(path.stem), path) for path in _images(images)]
+        by_time = dict(pairs)
+        if len(by_time) < len(pairs) or not all(0 <= time < 2**63 for time in by_time):
+            raise ValueError("a time is there twice, or is none")
     for path in by_time.values():
-        if not path.is_file():
+        if not is_file(path):
             raise InputError(f"{table}: names {path.name}, which is not in {images}")
     return dict(sorted(by_time.items()))
 

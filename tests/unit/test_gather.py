@@ -202,13 +202,16 @@ def test_verdicts_from_a_folder_are_those_from_memory(written: Path) -> None:
 
 @pytest.mark.usefixtures("few_rows")
 def test_a_folder_that_another_program_wrote(written: Path, tmp_path: Path) -> None:
-    """One row group for all filters, rows in any order."""
+    """One row group for all filters, rows of filters in turn; but the steps of each in order."""
     memory = cs.read_results(written)
     memory.write(tmp_path / "out")
-    mixed = memory.estimates.sample(frac=1.0, random_state=1)
+    mixed = memory.estimates.sort_values(["run", "step"], kind="stable")
     mixed.to_parquet(tmp_path / "out" / "estimates.parquet", index=False)
     accept_changes(tmp_path / "out")
     assert verdicts_json(cs.analyse(open_results(tmp_path / "out"))) == verdicts_json(cs.analyse(memory))
+    mixed.sample(frac=1.0, random_state=1).to_parquet(tmp_path / "out" / "estimates.parquet", index=False)
+    with pytest.raises(cs.InputError, match=r"estimates\.parquet: step \d+ of run \d+ .* is not what comes next"):
+        open_results(tmp_path / "out")
 
 
 @pytest.mark.usefixtures("few_rows")
@@ -292,7 +295,8 @@ def test_resuming_keeps_failures_and_fills_gaps(uvd: cs.Scenario, tmp_path: Path
     tables = (("estimates", whole.estimates), ("truth", whole.truth), ("map", whole.map))
     gaps = {n: t[~t["run"].isin([1, 4, 8])] for n, t in tables}
     failures = whole.failures[~whole.failures["run"].isin([1, 4, 8])]
-    part = cs.Results(gaps["estimates"], failures, gaps["truth"], whole.landmarks, whole.manifest, gaps["map"])
+    manifest = whole.manifest | {"complete": False, "finished_runs": 6, "failures": len(failures)}
+    part = cs.Results(gaps["estimates"], failures, gaps["truth"], whole.landmarks, manifest, gaps["map"])
     part.write(tmp_path / "out")
     cs.run_trials(uvd, filters, runs=9, seed=3, jobs=1, previous=open_results(tmp_path / "out"), out=tmp_path / "out")
     assert content(tmp_path / "out") == content(tmp_path / "whole")

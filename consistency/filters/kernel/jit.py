@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
@@ -15,8 +16,7 @@ from filelock import FileLock
 from numba.extending import register_jitable
 
 from consistency.filters.kernel.dispatch import INNER, OPTIONS, PACKAGE, Function, outside_files
-
-MARK = "compiled"  # a file beside what is kept
+from consistency.filters.kernel.kept import LOCK, clear, is_damaged, is_whole, mark
 
 
 def inner(function: Function) -> Function:
@@ -79,15 +79,17 @@ class Kernel:
         entry, folder = self._entry(signature)
         if not entry.overloads:
             with _one_at_a_time(folder):
-                entry.compile(signature)
-                _mark(folder)
+                if is_whole(folder):
+                    entry.compile(signature)
+                else:
+                    entry = self._anew(signature)
         compiled: Callable[..., Any] = entry
         return compiled
 
     def is_ready(self, *args: Any) -> bool:
         """Whether a call with these arguments starts at once, or spends seconds on compiling first."""
         entry, folder = self._entry(_signature(args))
-        return bool(entry.overloads) or (folder / MARK).exists()
+        return bool(entry.overloads) or is_whole(folder)
 
     @property
     def signatures(self) -> list[Any]:
@@ -99,8 +101,30 @@ class Kernel:
         """How many signatures this process has read from disk."""
         return sum(sum(entry.stats.cache_hits.values()) for entry, _ in self._entries.values())
 
+    def _anew(self, signature: tuple[Any, ...]) -> Any:
+        """The entry, compiled whatever the folder keeps, and kept where the folder takes it."""
+        entry, folder = self._entry(signature)
+        if is_damaged(folder):
+            print(f"consistency: {folder}: compiled code is damaged there; it is compiled anew", file=sys.stderr)
+        removed = clear(folder)
+        if not removed:
+            entry = numba.njit(**OPTIONS)(self.function)
+            self._entries[self._key(signature)] = entry, folder
+        try:
+            entry.compile(signature)
+        except OSError:  # a full disk: the code serves this process
+            if not entry.overloads:
+                raise
+        else:
+            if removed:
+                mark(folder)
+        return entry
+
+    def _key(self, signature: tuple[Any, ...]) -> tuple[Any, ...]:
+        return signature, tuple(outside_files())
+
     def _entry(self, signature: tuple[Any, ...]) -> tuple[Any, Path]:
-        key = signature, tuple(outside_files())
+        key = self._key(signature)
         if key not in self._entries:
             name = hashlib.sha256(f"{self.function.__qualname__}{signature}".encode()).hexdigest()[:16]
             folder = _cache_folder(key[1]) / name
@@ -124,15 +148,10 @@ def _signature(args: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(typeof(arg) for arg in args)
 
 
-def _mark(folder: Path) -> None:
-    if folder.is_dir() and os.access(folder, os.W_OK):
-        (folder / MARK).touch()
-
-
 def _one_at_a_time(folder: Path) -> AbstractContextManager[Any]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / ".lock").touch()
+        with (folder / LOCK).open("ab"):
+            return FileLock(folder / LOCK)
     except OSError:
         return nullcontext()
-    return FileLock(folder / ".lock")

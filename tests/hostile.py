@@ -1,0 +1,321 @@
+"""Valid files of every kind that the bench reads, and what reads each: what the fuzzer damages."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mutations as m
+import numpy as np
+import pandas as pd
+import tomli_w
+
+import consistency as cs
+from consistency.cli import main
+from consistency.store.log import read_log
+from consistency.store.results import Rejected, failures_table, rejections_table
+from consistency.store.storage import manifest_of
+from consistency.types import Failure
+
+RUNS, STEPS, LANDMARKS = 9, 12, 5
+FILTERS = ("one", "two")
+COLUMNS = ("run", "step", "t", "x", "y", "heading", "P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh")
+EUROC = """T_BS:
+  cols: 4
+  rows: 4
+  data: [1.0, 0.0, 0.0, {x}, 0.0, 1.0, 0.0, 0.2, 0.0, 0.0, 1.0, 0.3, 0.0, 0.0, 0.0, 1.0]
+resolution: [480, 320]
+intrinsics: [320.0, 320.0, 240.0, 160.0]
+distortion_model: radial-tangential
+distortion_coefficients: [0.0, 0.0, 0.0, 0.0]
+"""
+OPENCV = """%YAML:1.0
+---
+K1: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 700., 0., 600., 0., 700., 180., 0., 0., 1. ]
+K2: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 700., 0., 600., 0., 700., 180., 0., 0., 1. ]
+T: !!opencv-matrix
+   rows: 3
+   cols: 1
+   dt: d
+   data: [ -0.5, 0., 0. ]
+"""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of input.
+
+    Parameters
+    ----------
+    name : of a folder of valid files
+    files : those that are damaged
+    read : prints what the folder holds, or ends as the command line does
+    kinds : damages that may be refused, or change what is read
+    refused : damages that must be refused, by file where they are not of all
+    """
+
+    name: str
+    files: tuple[str, ...]
+    read: Callable[[Path], object]
+    kinds: dict[str, m.Mutation]
+    refused: dict[str, m.Mutation]
+
+
+def _matrices(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    root = 0.05 * np.eye(3) + 0.01 * rng.standard_normal((*shape, 3, 3))
+    return root @ np.swapaxes(root, -1, -2)
+
+
+def _world() -> cs.Scenario:
+    changes = {"truth__steps": STEPS, "truth__landmarks__count": 60}
+    return cs.load_scenario("herath2007-xyz").variant("tiny", **changes)
+
+
+def write_results(folder: Path, rng: np.random.Generator) -> None:
+    """A results folder as 'consistency run' writes it, one run of the second filter failed."""
+    P = _matrices(rng, 2, RUNS, STEPS)
+    truth = np.cumsum(rng.standard_normal((RUNS, STEPS + 1, 3)) * 0.1, axis=1)
+    error = (np.linalg.cholesky(P) @ rng.standard_normal((2, RUNS, STEPS, 3, 1)))[..., 0]
+    nees = np.einsum("...i,...ij,...j->...", error, np.linalg.inv(P), error)
+    run, step = (grid.ravel() for grid in np.meshgrid(range(RUNS), range(1, STEPS + 1), indexing="ij"))
+    rows = []
+    for k, name in enumerate(FILTERS):
+        pose = (truth[:, 1:] - error[k]).reshape(-1, 3)
+        flat = P[k].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+        table = pd.DataFrame(np.column_stack([run, step, 0.1 * step, pose, flat, nees[k].ravel()]))
+        table.columns = [*COLUMNS, "nees"]
+        rows.append(table.assign(filter=name, nis=rng.chisquare(4, len(table)), nis_dof=4))
+    estimates = pd.concat(rows, ignore_index=True).astype({"run": int, "step": int})
+    estimates = estimates[(estimates["filter"] != "two") | (estimates["run"] != 3) | (estimates["step"] < 8)]
+    places = rng.standard_normal((LANDMARKS, 3))
+    landmarks = pd.DataFrame(places, columns=list("xyz")).assign(landmark=range(LANDMARKS))
+    map_ = pd.concat(
+        [
+            landmarks.assign(filter=name, run=r, P_xx=0.01, P_xy=0.0, P_xz=0.0, P_yy=0.01, P_yz=0.0, P_zz=0.01)
+            .assign(nees=rng.chisquare(3, LANDMARKS), joint_nees=rng.chisquare(3, LANDMARKS))
+            for name in FILTERS for r in range(RUNS) if (name, r) != ("two", 3)
+        ]
+    )  # fmt: skip
+    path = np.column_stack([np.repeat(range(RUNS), STEPS + 1), np.tile(range(STEPS + 1), RUNS)])
+    true = pd.DataFrame(np.column_stack([path, 0.1 * path[:, 1], truth.reshape(-1, 3)]))
+    true.columns = ["run", "step", "t", "x", "y", "heading"]
+    failures = failures_table([Failure("two", 3, 8, "the pose covariance is not positive definite")])
+    rejections = rejections_table([Rejected("two", r, 40, 4, 3, 2) for r in range(RUNS)])
+    scenario = _world()
+    manifest = manifest_of(
+        filters=list(FILTERS), wall=0.1, complete=True, seed=0, runs=RUNS, optimal_gain=["one"], failures=1,
+        scenario=scenario.model_dump(mode="json"), scenario_hash=scenario.hash,
+    )  # fmt: skip
+    cs.Results(estimates, failures, true, landmarks, manifest, map_, rejections).write(folder)
+
+
+def _columns(rng: np.random.Generator) -> pd.DataFrame:
+    """Estimates of two runs with their covariance and NIS."""
+    rows = 2 * STEPS
+    P = _matrices(rng, rows).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    step = np.tile(np.arange(1, STEPS + 1), 2)
+    table = pd.DataFrame(
+        np.column_stack([np.repeat([0, 1], STEPS), step, 0.1 * step, rng.standard_normal((rows, 3)), P])
+    )
+    table.columns = list(COLUMNS)
+    table = table.astype({"run": int, "step": int})
+    return table.assign(nis=rng.chisquare(3, rows), nis_dof=3)
+
+
+def _poses(rng: np.random.Generator) -> np.ndarray:
+    turn = rng.standard_normal((STEPS, 4)) * 0.01 + [0, 0, 0, 1]
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    return np.column_stack([0.1 * np.arange(STEPS), rng.standard_normal((STEPS, 3)), turn])
+
+
+def _images(folder: Path, names: tuple[str, str]) -> None:
+    """Three grey pairs without an image library: PGM."""
+    for name in names:
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        for k in range(3):
+            (folder / name / f"{k:06d}.pgm").write_bytes(b"P5 480 320 255\n" + bytes(480 * 320))
+
+
+def write_all(folder: Path, seed: int = 1) -> None:
+    """One folder for each target."""
+    rng = np.random.default_rng(seed)
+    write_results(folder / "results", rng)
+    for name in ("table", "archive", "tum", "scenario", "sweep", "baseline", "findings", "kitti", "euroc", "opencv"):
+        (folder / name).mkdir(parents=True)
+    table = _columns(rng)
+    truth = table[["run", "step", "t", "x", "y", "heading"]].copy()
+    truth[["x", "y", "heading"]] += 0.05 * rng.standard_normal((len(truth), 3))
+    for name, each in (("est", table), ("truth", truth)):
+        each.to_csv(folder / "table" / f"{name}.csv", index=False)
+        each.to_parquet(folder / "table" / f"{name}.parquet", index=False)
+    table[table["run"] == 0][["step", "nis", "nis_dof"]].to_csv(folder / "table" / "nis.csv", index=False)
+    error = 0.05 * rng.standard_normal((4, STEPS, 3))
+    extra = {"nis": rng.chisquare(3, (4, STEPS)), "nis_dof": np.array(3), "t": np.arange(STEPS) * 0.1}
+    np.savez(folder / "archive" / "est.npz", errors=error, covariances=_matrices(rng, 4, STEPS), **extra)
+    pose = rng.standard_normal((4, STEPS, 3))
+    both = {"estimates": pose, "truth": pose + error, "covariances": _matrices(rng, 4, STEPS)}
+    np.savez(folder / "archive" / "pair.npz", **both, lengths=np.full(4, STEPS))
+    np.savez(folder / "archive" / "nees.npz", nees=rng.chisquare(3, (4, STEPS)), dof=3)
+    poses = _poses(rng)
+    np.savetxt(folder / "tum" / "truth.tum", poses, fmt="%.12f")
+    poses[:, 1:4] += 0.01 * rng.standard_normal((STEPS, 3))
+    np.savetxt(folder / "tum" / "est.tum", poses, fmt="%.12f")
+    P = np.tile(np.diag(np.full(6, 1e-4)).ravel(), (STEPS, 1))
+    np.savetxt(folder / "tum" / "cov.txt", np.column_stack([poses[:, 0], P]), fmt="%.12g")
+    scenario = _world().model_dump(mode="json", exclude_none=True)
+    scenario.pop("name")
+    (folder / "scenario" / "world.toml").write_text(tomli_w.dumps(scenario), encoding="utf-8")
+    (folder / "sweep" / "world.toml").write_text(tomli_w.dumps(scenario), encoding="utf-8")
+    grid = {"truth.path.speed": [0.1, 0.2], "odometry": [0.5, 1.0, 2.0]}
+    sweep = {"summary": "s", "base": "world.toml", "filters": ["ekf-xyz"], "rule": {"max_runs": 96}, "grid": grid}
+    (folder / "sweep" / "sweep.toml").write_text(tomli_w.dumps(sweep), encoding="utf-8")
+    _quietly(["simulate", str(folder / "scenario" / "world.toml"), "--runs", "2", "--out", str(folder / "log")])
+    _quietly(["baseline", str(folder / "results"), "--out", str(folder / "baseline" / "base.json")])
+    entry = dict.fromkeys(("id", "source", "claim", "statistic", "published", "measured", "accept"), "x")
+    entry |= {"verdict": "reproduced", "runs": 5, "seed": 0, "scenario": "s"}
+    (folder / "findings" / "findings.json").write_text(json.dumps([entry]), encoding="utf-8")
+    _write_cameras(folder)
+
+
+def _quietly(arguments: list[str]) -> None:
+    import contextlib
+    import io
+
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main(arguments)
+
+
+def _write_cameras(folder: Path) -> None:
+    _images(folder / "kitti", ("image_0", "image_1"))
+    row = "700 0 240 {x} 0 700 160 0 0 0 1 0"
+    text = f"P0: {row.format(x=0)}\nP1: {row.format(x=-350)}\n"
+    (folder / "kitti" / "calib.txt").write_text(text, encoding="utf-8")
+    (folder / "kitti" / "times.txt").write_text("0.0\n0.1\n0.2\n", encoding="utf-8")
+    poses = "".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(3))
+    (folder / "kitti" / "poses.txt").write_text(poses, encoding="utf-8")
+    _images(folder / "opencv", ("left", "right"))
+    (folder / "opencv" / "stereo.yaml").write_text(OPENCV, encoding="utf-8")
+    for camera, x in (("cam0", 0.0), ("cam1", 0.11)):
+        at = folder / "euroc" / "mav0" / camera
+        _images(at, ("data", "data"))
+        (at / "sensor.yaml").write_text(EUROC.format(x=x), encoding="utf-8")
+        rows = [f"{10**18 + k * 50_000_000},{k:06d}.pgm" for k in range(3)]
+        (at / "data.csv").write_text("#timestamp [ns],filename\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    at = folder / "euroc" / "mav0" / "state_groundtruth_estimate0"
+    at.mkdir()
+    rows = [f"{10**18 + k * 50_000_000},{k},0,0,1,0,0,0" for k in range(3)]
+    (at / "data.csv").write_text("#t,p,p,p,qw,qx,qy,qz\n" + "\n".join(rows) + "\n", encoding="utf-8")
+
+
+# --- what reads them -------------------------------------------------------------------------------
+
+
+def command(*arguments: str) -> Callable[[Path], object]:
+    """The command line, with {} in the place of the folder."""
+    return lambda folder: main([each.replace("{}", str(folder)) for each in arguments])
+
+
+def _digest(*values: Any) -> str:
+    return hashlib.sha256(
+        repr([np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for v in values]).encode()
+    ).hexdigest()
+
+
+def _log(folder: Path) -> None:
+    log = read_log(folder)
+    for trial in log.trials:
+        print(trial.run, _digest(trial.start, trial.controls, trial.z, trial.landmark, trial.truth), log.belief)
+
+
+def _scenario(folder: Path) -> None:
+    from consistency.simulation import require_landmarks_in_view
+
+    scenario = cs.load_scenario(folder / "world.toml")
+    print(scenario.hash)
+    if scenario.truth.steps * getattr(scenario.truth.landmarks, "count", 1) < 100_000:
+        print(_digest(require_landmarks_in_view(scenario).trial(0, 0).z))
+
+
+def _sweep(folder: Path) -> None:
+    from consistency.sweeps.plan import load_sweep
+
+    print([cell.scenario.hash for cell in load_sweep(folder / "sweep.toml").cells])
+
+
+def _findings(folder: Path) -> None:
+    from consistency.runs.findings import read_findings
+
+    print(read_findings(folder))
+
+
+def _cameras(calibration: str | None = None) -> Callable[[Path], object]:
+    def read(folder: Path) -> None:
+        from consistency.frontend.truth import find_truth, read_truth
+        from consistency.vision.sequence import read_sequence
+
+        sequence = read_sequence(folder, None if calibration is None else folder / calibration)
+        rig = sequence.rectification.rig
+        print(sequence.t.tolist(), rig)
+        if (path := find_truth(sequence)) is not None:
+            print(_digest(*read_truth(path, sequence)))
+
+    return read
+
+
+RESULTS = tuple(f"{name}.parquet" for name in ("estimates", "truth", "map", "rejections", "failures", "landmarks"))
+TREE, TWICE = {"tree": m.json_tree}, {"twice": m.json_twice}
+TOML, LINE_TWICE = m.ANY | {"tree": m.toml_tree}, {"twice": m.toml_line_twice}
+OPTIMAL = ("--innovations", "optimal")
+TARGETS = (
+    Target("results", ("manifest.json",), command("analyse", "{}"), m.ANY | TREE, TWICE),
+    Target("results", RESULTS, command("analyse", "{}"), m.ANY | m.COLUMNS, {}),
+    Target("results", RESULTS[:2], command("analyse", "{}"), {}, m.ROWS),
+    Target("results", RESULTS[2:5], command("analyse", "{}"), {}, {"row_twice": m.row_twice}),
+    Target("results", RESULTS[3:5], command("analyse", "{}"), {}, {"row_gone": m.row_gone, "cut_short": m.cut_short}),
+    Target("results", RESULTS[:1], command("monitor", "{}", "--filter", "one", "--run", "2", *OPTIMAL),
+           m.COLUMNS, m.ROWS),
+    Target("results", RESULTS[:2], command("compare", "{}"), m.ANY | m.COLUMNS, m.ROWS),
+    Target("log", ("controls.parquet", "observations.parquet", "truth.parquet", "landmarks.parquet"), _log,
+           m.ANY | m.COLUMNS, {"row_twice": m.row_twice}),
+    Target("log", ("sensor.toml",), _log, TOML, LINE_TWICE),
+    Target("table", ("est.csv", "truth.csv"),
+           command("analyse", "{}/est.csv", "--truth", "{}/truth.csv"), m.ANY | m.TEXT, {}),
+    Target("table", ("est.parquet", "truth.parquet"),
+           command("analyse", "{}/est.parquet", "--truth", "{}/truth.parquet"),
+           m.ANY | m.COLUMNS, {"row_twice": m.row_twice}),
+    Target("table", ("nis.csv",), command("monitor", "{}/nis.csv", *OPTIMAL), m.ANY | m.TEXT, {}),
+    Target("archive", ("est.npz",), command("analyse", "{}/est.npz"), m.ANY | m.ARCHIVE, {}),
+    Target("archive", ("pair.npz",), command("analyse", "{}/pair.npz"), m.ANY | m.ARCHIVE, {}),
+    Target("archive", ("nees.npz",), command("analyse", "{}/nees.npz"), m.ANY | m.ARCHIVE, {}),
+    Target("archive", ("est.npz",), command("monitor", "{}/est.npz", "--run", "1", *OPTIMAL),
+           m.ANY | m.ARCHIVE, {}),
+    Target("tum", ("est.tum", "truth.tum", "cov.txt"),
+           command("analyse", "{}/est.tum", "--truth", "{}/truth.tum", "--covariance", "{}/cov.txt"),
+           m.ANY | m.TEXT, {}),
+    Target("scenario", ("world.toml",), _scenario, TOML, LINE_TWICE),
+    Target("sweep", ("sweep.toml", "world.toml"), _sweep, TOML, LINE_TWICE),
+    Target("baseline", ("base.json",), command("compare", "{}/base.json"), m.ANY | TREE,
+           TWICE),
+    Target("findings", ("findings.json",), _findings, m.ANY | TREE, TWICE),
+    Target("kitti", ("calib.txt", "times.txt", "poses.txt"), _cameras(), m.ANY | m.TEXT, {}),
+    Target("euroc", ("mav0/cam0/sensor.yaml", "mav0/cam1/data.csv", "mav0/state_groundtruth_estimate0/data.csv"),
+           _cameras(), m.ANY | m.TEXT, {}),
+    Target("opencv", ("stereo.yaml",), _cameras("stereo.yaml"), m.ANY | m.TEXT, {}),
+)  # fmt: skip
+
+
+def clean(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)

@@ -13,6 +13,7 @@ from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
+from consistency.filters.compiled import problem_of
 from consistency.filters.guard import deciding, joint
 from consistency.filters.guard.deciding import kept
 from consistency.filters.guard.parts import guard_part
@@ -20,7 +21,7 @@ from consistency.filters.guard.settings import KINDS, limits_of
 from consistency.filters.kernel.slam import keep_some, make_watch
 from consistency.filters.stepping import step_through
 from consistency.scenario import GuardSettings
-from consistency.types import Array, Estimates, Indices
+from consistency.types import Array, Estimates, Indices, Observation
 
 Small = Callable[..., cs.Scenario]
 SETTINGS = GuardSettings(confidence=0.95, threshold=1.5)
@@ -179,7 +180,8 @@ def first_sightings(trial: cs.Trial) -> Indices:
 
 def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
     trial, filter_ = corrupted(cs.simulate(scenario, run=2), rng), cs.get_filter(name)
-    trial.z[0] *= 2.0  # a landmark that begins with the first row of all begins anew, too
+    wrong = np.concatenate([2.0 * trial.z[:1], trial.z[1:]])  # a landmark begins anew with the first row of all, too
+    trial = replace(trial, z=wrong)
     ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
     assert ours.filter == twin.filter == name
     assert ours.rejected is not None
@@ -223,24 +225,30 @@ def test_a_guarded_kernel_is_its_twin_while_it_updates_locally(
     agree(name, small("herath2007-stereo", truth__steps=500), rng)
 
 
+AGAIN = {33: (483, 484), 42: (495, 496), 30: (48, 52)}  # steps, from 0, of the second sighting and of those after it
+
+
 @pytest.mark.parametrize("name", ["parked-ekf-uvd+gate", "ekf-uvd+gate"])
 def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None:
-    """Seen once, wrongly, and again when the loop closes: nothing of it is left, neither its clone nor its place."""
+    """Seen once, wrongly, and again when the loop closes: nothing of it is left, neither its clone nor its place.
+
+    One is seen again shortly before landmarks are parked, and stays in use.
+    """
     scenario = small("herath2007-stereo", truth__steps=500)
     whole = cs.simulate(scenario, run=2)
     step = np.repeat(np.arange(whole.steps), np.diff(whole.first))
     keep, z = np.ones(len(step), bool), whole.z.copy()
-    for label in (33, 42):
+    for label, again in AGAIN.items():
         sighted = np.flatnonzero(whole.landmark == label)
-        again = int(np.argmax(np.diff(step[sighted]))) + 1
-        assert step[sighted[again]] - step[sighted[0]] > 100
+        hidden = (step[sighted] < again[0]) | ((step[sighted] > again[0]) & (step[sighted] < again[1]))
+        assert step[sighted].tolist().count(again[0]) == 1
         z[sighted[0], 2] *= 2.0
-        keep[sighted[1:again]] = False
+        keep[sighted[1:]] = ~hidden[1:]
     first = np.append(0, np.cumsum(np.bincount(step[keep], minlength=whole.steps)))
     trial = replace(whole, first=first, landmark=whole.landmark[keep], z=z[keep])
     filter_ = cs.get_filter(name)
     ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
-    wrong = first_sightings(trial)[np.isin(np.unique(trial.landmark), (33, 42))]
+    wrong = first_sightings(trial)[np.isin(np.unique(trial.landmark), [*AGAIN])]
     assert ours.rejected is not None
     assert twin.rejected is not None
     assert ours.rejected[wrong].all()
@@ -248,7 +256,24 @@ def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None
     assert difference(ours, twin) < 1e-8
     assert ours.map is not None
     assert trial.landmarks is not None
-    for label in (33, 42):  # where they are: 1e-9 of a chi-square with 3 degrees of freedom lies beyond 45
+    for label in AGAIN:  # where they are: 1e-9 of a chi-square with 3 degrees of freedom lies beyond 45
         at = ours.map.landmarks.tolist().index(label)
         gap = ours.map.mean[at] - trial.landmarks[label]
         assert gap @ np.linalg.solve(ours.map.covariance[at], gap) < 45
+
+
+def test_a_parked_landmark_that_is_forgotten_takes_its_clone_along(small: Small) -> None:
+    scenario = small("herath2007-stereo", truth__steps=120)
+    trial = cs.simulate(scenario, run=2)
+    twin = cs.get_filter("parked-ekf-uvd").twin
+    state = twin.init(problem_of(trial, scenario.belief))
+    for step in range(1, 121):
+        seen = trial.observation(step)
+        one = seen.landmarks == trial.landmark[0]
+        state = twin.predict(state, trial.control(step))
+        state, _ = twin.update(state, Observation(seen.landmarks[one], seen.z[one]))
+    label = int(trial.landmark[0])
+    assert state.parked
+    assert len(state.x) == 9
+    state = twin.forget(state, label)
+    assert (len(state.x), state.P.shape, state.clones, state.places, state.parked) == (3, (3, 3), {}, {}, {})

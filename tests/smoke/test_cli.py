@@ -221,6 +221,7 @@ import consistency.runs.montecarlo as mc
 from consistency.cli import main
 one, count = mc._one, []
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell runs in the background
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup
 def interrupt(trial, *rest):
     count.append(trial.run)
     if len(count) == 4:

@@ -48,6 +48,7 @@ def steps_of(text: str) -> str:
 def begin(at: Path, *options: str, out: str = "out", runs: int = RUNS, **popen: Any) -> subprocess.Popen[str]:
     """The command, in a session of its own, with signals as in a terminal."""
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"  # ignored under nohup
     code += "from consistency.cli import main; main()"
     command = [sys.executable, "-c", code, "run", "world.toml", "--filter", FILTER, "--out", out]
     command += ["--runs", str(runs), "--jobs", "2", *options]

@@ -81,9 +81,8 @@ def odd_results(results):
     rows = [(first, run, 30, "not positive definite") for run in (0, 1)]
     rows += [(second, run, 1, "<b>broken</b> $ # " + 150 * "x") for run in range(4)]
     failures = pd.DataFrame(rows, columns=["filter", "run", "step", "reason"])
-    return replace(
-        results, estimates=estimates, failures=failures, manifest=results.manifest | {"filters": list(ODD.values())}
-    )
+    manifest = results.manifest | {"filters": list(ODD.values()), "failures": len(failures)}
+    return replace(results, estimates=estimates, failures=failures, manifest=manifest, map=None)
 
 
 STEPS = 60  # of the small worlds
@@ -503,7 +502,8 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     small = results.estimates.assign(filter="small", nees=20 * results.estimates["nees"])
     small[list(COVARIANCE)] /= 20.0
     plan = {"dof": 3, "detect": 1.5, "false_alarm": 0.05, "power": 0.95, "max_runs": 24}
-    manifest = results.manifest | {"filters": ["kf", "small"], "until_decided": plan}
+    manifest = results.manifest | {"filters": ["kf", "small"], "until_decided": plan, "failures": 1}
+    small = small[(small["run"] != 20) | (small["step"] < 30)]
     estimates = pd.concat([results.estimates, small], ignore_index=True)
     late = pd.DataFrame([("small", 20, 30, "diverged")], columns=["filter", "run", "step", "reason"])
     replace(results, estimates=estimates, failures=late, manifest=manifest).write(tmp_path / "run")
@@ -763,7 +763,10 @@ def test_only_failed_runs_give_a_filter_bands_of_its_own(results, tmp_path):
     )
     rows = [("ekf-xyz", 0, 30, "not positive definite")]
     failures = pd.DataFrame(rows, columns=["filter", "run", "step", "reason"])
-    replace(results, estimates=results.estimates[~late], failures=failures).write(tmp_path / "run")
+    manifest = results.manifest | {"failures": 1}
+    replace(results, estimates=results.estimates[~late], failures=failures, manifest=manifest, map=None).write(
+        tmp_path / "run"
+    )
     report = build_report(tmp_path / "run")
     curves = anees.read(report.studies[0])
     assert [curve.own_band for curve in curves.curves] == [True, False]

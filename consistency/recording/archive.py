@@ -176,7 +176,7 @@ def _of_nees(path: Path, arrays: dict[str, Array]) -> Recording:
     """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
     nees = _array(path, arrays, "nees", 2).copy()
     dof = arrays["dof"]
-    if dof.ndim or dof.dtype.kind not in "fiu" or dof < 1 or dof != round(float(dof)):
+    if dof.ndim or dof.dtype.kind not in "fiu" or not 1 <= dof < 2**31 or dof != round(float(dof)):
         raise InputError(f"{path}: key 'dof' must be one whole number of 1 or more, the dimension of the error")
     if (nees < 0).any():
         run, step = np.argwhere(nees < 0)[0]

@@ -19,13 +19,6 @@ def test_a_few_hundred_damaged_files() -> None:
     assert min(statuses[0], statuses[2]) > 20
 
 
-@pytest.mark.slow
-def test_thousands_of_damaged_files() -> None:
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    _, wrong = fuzz(6000, seed)
-    assert wrong == [], f"python tests/fuzz.py 6000 {seed}"
-
-
 def test_the_fuzzer_sees_what_is_wrong(tmp_path: Path) -> None:
     """Negative control: a traceback, a warning, a sentence that is none, memory, and nothing wrong."""
 

@@ -48,7 +48,8 @@ return found;
 def report(small, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("report") / "run"
     results = cs.run_trials(small("herath2007-stereo"), ["ekf-xyz", "ekf-uvd"], runs=12, seed=0, jobs=1)
-    results.estimates["filter"] = results.estimates["filter"].replace("ekf-uvd", ODD)
+    for table in (results.estimates, results.map):
+        table["filter"] = table["filter"].replace("ekf-uvd", ODD)
     results.manifest["filters"] = ["ekf-xyz", ODD]
     results.write(folder)
     write_reports(folder, folder / "report.html", None, overwrite=False)

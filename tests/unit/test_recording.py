@@ -821,6 +821,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
         "a.npz, run 0, step 1: the covariance is not symmetric",
     ),
     "npz dof": (npz(nees=np.ones((2, 3)), dof=2.5), ("a.npz",), "key 'dof' must be one whole number"),
+    "npz dof without end": (npz(nees=np.ones((2, 3)), dof=np.inf), ("a.npz",), "key 'dof' must be one whole number"),
     "npz negative": (npz(nees=-np.ones((2, 3)), dof=2), ("a.npz",), "key 'nees', run 0, step 1: -1 is negative"),
     "npz convention": (
         npz(errors=ERRORS, covariances=MATRICES),

@@ -215,17 +215,9 @@ def run(
                 )
             else:
                 results = run_trials(
-                    world,
-                    filters,
-                    runs,
-                    seed,
-                    jobs,
-                    timeout,
-                    out=out,
-                    overwrite=overwrite,
-                    resume=resume,
-                    memory=memory,
-                )
+                    world, filters, runs, seed, jobs, timeout,
+                    out=out, overwrite=overwrite, resume=resume, memory=memory,
+                )  # fmt: skip
     except Interrupted as stop:
         done = stop.results.manifest["finished_runs"]
         if not done:

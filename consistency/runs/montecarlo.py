@@ -265,9 +265,7 @@ def _finish(
             if stop.number is None:
                 raise
             complete = False
-        manifest_fields = manifest_fields | {
-            "optimal_gain": [name_of(f) for f in work.isolation.filters if optimal_gain(f)]
-        }
+        manifest_fields = manifest_fields | {"optimal_gain": [name_of(f) for f in work.filters if optimal_gain(f)]}
         manifest_fields |= {"error": gathered.errors} if gathered.errors else {}
         manifest = manifest_of(
             filters=gathered.filters, wall=time.monotonic() - started, complete=complete, **manifest_fields

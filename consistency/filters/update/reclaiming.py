@@ -47,7 +47,7 @@ def correct_converted(
     room, rho, in_doubt = work.room, work.at[0] + 2, _is_any_in_doubt(m, local, work)
     waits = in_doubt and m == 1
     waits = waits and state.P[rho, rho] < (update.waiting * state.x[rho]) ** 2
-    code, clones, chained, total = 0, room.on[0] + 1, False, 0.0  # as foreseen: the robot hangs on the last clone
+    code, clones, chained, total = 0, 0, False, 0.0  # as foreseen; clones are scratch then
     if in_doubt or not is_foreseen:
         code, clones, chained, total = _aim(update, slam, state, data, m, local, work)
     if code > 0:

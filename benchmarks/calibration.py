@@ -198,9 +198,10 @@ def _kalman_runs(count: int, seed: int, folder: Path) -> Path:
         of_chunk = int(np.random.default_rng((seed, chunk)).integers(2**31))
         c = curves(cs.run_trials(scenario, ["kf"], runs=runs, seed=of_chunk), "kf")
         assert c.error is not None
-        assert (c.covariance == c.covariance[0]).all()
+        covariance = np.asarray(c.covariance)
+        assert (covariance == covariance[0]).all()
         errors.append(c.error[:, 1:])
-    np.save(folder / "covariance.npy", c.covariance[0, 1:])
+    np.save(folder / "covariance.npy", covariance[0, 1:])
     np.save(folder / "error.npy", np.concatenate(errors))
     return folder
 

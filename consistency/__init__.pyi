@@ -10,6 +10,9 @@ from .errors import InputError as InputError
 from .filters import filter_names as filter_names
 from .filters import get_filter as get_filter
 from .filters.guard.guarded import guarded as guarded
+from .notebook.records import Record as Record
+from .notebook.records import judge as judge
+from .notebook.records import read as read
 from .runs.findings import Study as Study
 from .runs.montecarlo import run_trials as run_trials
 from .scenario import Scenario as Scenario

@@ -132,7 +132,7 @@ def measured(results: Results, name: str) -> Measured:
     c = curves(results, name)
     assert c.error is not None
     assert c.nees is not None
-    error, P, nees = c.error[0, SETTLED:], c.covariance[0, SETTLED:], c.nees[0, SETTLED:]
+    error, P, nees = c.error[0, SETTLED:], np.asarray(c.covariance)[0, SETTLED:], c.nees[0, SETTLED:]
     bound = anees_interval(3, 1, 1 - 2 * ALARM / len(nees))[1]  # one-sided
     outside = np.abs(error) > 2 * np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     dof = int(c.nis_dof[np.isfinite(c.nis)].sum())

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import json
 import shutil
 from collections.abc import Callable
@@ -66,6 +68,7 @@ class Target:
     read : prints what the folder holds, or ends as the command line does
     kinds : damages that may be refused, or change what is read
     refused : damages that must be refused, by file where they are not of all
+    seldom : whether a case takes so long that each kind of damage is tried once where others are three times
     """
 
     name: str
@@ -73,6 +76,7 @@ class Target:
     read: Callable[[Path], object]
     kinds: dict[str, m.Mutation]
     refused: dict[str, m.Mutation]
+    seldom: bool = False
 
 
 def _matrices(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -184,20 +188,22 @@ def write_all(folder: Path, seed: int = 1) -> None:
     grid = {"truth.path.speed": [0.1, 0.2], "odometry": [0.5, 1.0, 2.0]}
     sweep = {"summary": "s", "base": "world.toml", "filters": ["ekf-xyz"], "rule": {"max_runs": 96}, "grid": grid}
     (folder / "sweep" / "sweep.toml").write_text(tomli_w.dumps(sweep), encoding="utf-8")
-    _quietly(["simulate", str(folder / "scenario" / "world.toml"), "--runs", "2", "--out", str(folder / "log")])
-    _quietly(["baseline", str(folder / "results"), "--out", str(folder / "baseline" / "base.json")])
+    quietly(["simulate", str(folder / "scenario" / "world.toml"), "--runs", "2", "--out", str(folder / "log")])
+    quietly(["baseline", str(folder / "results"), "--out", str(folder / "baseline" / "base.json")])
     entry = dict.fromkeys(("id", "source", "claim", "statistic", "published", "measured", "accept"), "x")
     entry |= {"verdict": "reproduced", "runs": 5, "seed": 0, "scenario": "s"}
     (folder / "findings" / "findings.json").write_text(json.dumps([entry]), encoding="utf-8")
     _write_cameras(folder)
 
 
-def _quietly(arguments: list[str]) -> None:
-    import contextlib
-    import io
-
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
-        main(arguments)
+def quietly(arguments: list[str]) -> int:
+    """Exit status of a command whose output nobody reads."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        try:
+            main(arguments)
+        except SystemExit as stop:
+            return int(stop.code or 0)
+    return 0
 
 
 def _write_cameras(folder: Path) -> None:

@@ -192,5 +192,6 @@ KINDS: dict[str, tuple[Callable[..., Any], str]] = {
         answers(innovation=np.ones(2), S=np.eye(3)),
         "ValueError: update() gave an array of shape (3, 3), not (2, 2)",
     ),
+    "pose of 1e61 m": (answers(mean=np.full(3, 1e61), covariance=1e120 * np.eye(3)), "the pose is beyond 1e+60"),
     "error of 1e160 sigma": (answers(mean=np.full(3, 1e160)), "the NEES is not finite"),
 }  # fmt: skip

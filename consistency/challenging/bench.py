@@ -13,15 +13,17 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.filters.compiled import one_blas_thread
-from consistency.filters.stepping import name_of, run_filter
-from consistency.protocols import Filter, WholeTrial
-from consistency.runs.montecarlo import compile_for, worker_count
+from consistency.protocols import Filter
+from consistency.runs.backends.local import worker_count
+from consistency.runs.isolating import Isolation
+from consistency.runs.work import compile_for
 from consistency.scenario import Scenario
 from consistency.simulation import require_landmarks_in_view
 from consistency.simulation.world import World
 from consistency.store.results import POSE, outcome_of
 
 WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not
+PATIENCE = 60.0  # s beyond the end of the search, after which a trial of a filter that is not compiled is killed
 Job = tuple[Scenario, Sequence[int]]  # a world, and the trials in it
 
 
@@ -47,12 +49,8 @@ class Bench:
 
     def __enter__(self) -> Bench:
         self._stack.enter_context(one_blas_thread())
-        if self.workers > 1:  # kernels release the GIL; Python needs processes
-            threads = isinstance(self.filter, WholeTrial)
-            options = {} if threads else {"inner_max_num_threads": 1}
-            self._stack.enter_context(
-                joblib.parallel_config("threading" if threads else "loky", n_jobs=self.workers, **options)
-            )
+        if self.workers > 1:  # kernels release the GIL; other filters run in processes, for which threads wait
+            self._stack.enter_context(joblib.parallel_config("threading", n_jobs=self.workers))
             self._parallel = self._stack.enter_context(joblib.Parallel())
         return self
 
@@ -90,22 +88,24 @@ def _score(filter_: Filter, scenario: Scenario, runs: Sequence[int], seed: int, 
     except InputError:
         return None
     scores, fastest = [], np.inf
-    for run in runs:
-        began = time.monotonic()
-        if began >= until:
-            break
-        scores.append(score_of_run(filter_, scenario, world, run, seed))
-        fastest = min(fastest, time.monotonic() - began)
+    timeout = until - time.monotonic() + PATIENCE if np.isfinite(until) else None
+    with Isolation([filter_], scenario.belief, timeout) as isolation:
+        for run in runs:
+            began = time.monotonic()
+            if began >= until:
+                break
+            scores.append(score_of_run(isolation, world, run, seed))
+            fastest = min(fastest, time.monotonic() - began)
     return Done(tuple(scores), fastest if scores else 0.0)
 
 
-def score_of_run(filter_: Filter, scenario: Scenario, world: World, run: int, seed: int) -> float:
-    """log(mean NEES / 3) of a run in the filter's own error; :data:`WORST` where it failed."""
+def score_of_run(isolation: Isolation, world: World, run: int, seed: int) -> float:
+    """log(mean NEES / 3) of a run of the one filter, in its own error; :data:`WORST` where it failed."""
     trial = world.trial(run, seed)
-    estimates = run_filter(filter_, trial, scenario.belief)
-    if estimates.failure is not None:
+    outcome = outcome_of(trial, isolation.run(trial))
+    if outcome.failures:
         return WORST
-    columns = outcome_of(trial, [estimates]).estimates[name_of(filter_)]
+    [columns] = outcome.estimates.values()
     nees = np.asarray(columns.get("own_nees", columns["nees"]), float)
     nees = nees[np.isfinite(nees)]
     if not len(nees):

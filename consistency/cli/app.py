@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
@@ -30,7 +31,24 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder written by 'run'.")]
 Power = Annotated[float, typer.Option("--power", help="Chance to find that ratio.")]
 FalseAlarm = Annotated[float, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none.")]
+BackendName = Annotated[
+    str, typer.Option("--backend", help="Where runs are done: local; dask or slurm (docs/cluster.md).")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", help="For dask: tcp://HOST:PORT, tls://HOST:PORT or a scheduler file [this machine]."),
+]
+SchedulerWait = Annotated[
+    float | None, typer.Option("--scheduler-wait", help="For dask: seconds to wait for the scheduler [60].")
+]
+SlurmOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--slurm", metavar="KEY=VALUE", help="For slurm: partition=short, time=60 (minutes); may be repeated."
+    ),
+]
 DETECT_HELP = "ratio of true to stated covariance that must be found"
+FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC)}  # a disk, a quota, a limit
 SCENARIO = "Built-in name (see 'list') or path of a .toml file."
 
 
@@ -168,14 +186,18 @@ def run(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run in --out.")] = False,
     overwrite: Overwrite = False,
+    backend: BackendName = "local",
+    scheduler: Scheduler = None,
+    scheduler_wait: SchedulerWait = None,
+    slurm: SlurmOptions = None,
 ) -> None:
     """Put simulated trials, or a recorded log, through filters."""
+    from consistency.runs.backends.choosing import backend_for, require_scheduler
     from consistency.runs.montecarlo import Interrupted, resolve_filters, run_log, run_trials
     from consistency.runs.sequential import run_until_decided
     from consistency.scenario import load_scenario
     from consistency.store.log import read_log
-    from consistency.store.results import Results, StoredResults, open_results
-    from consistency.store.storage import require_free
+    from consistency.store.results import Results, StoredResults
     from consistency.terminal.progress import say
     from consistency.terminal.table import print_verdicts
     from consistency.verdicts.judge import analyse
@@ -191,45 +213,39 @@ def run(
     verdicts = None
     if resume and overwrite:
         raise InputError("--resume goes on with what --overwrite would replace; give one of them")
+    place = backend_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out)
+    if until_decided:
+        require_scheduler(backend, scheduler, "--until-decided")
     try:
         if log is not None:
-            if runs is not None or seed is not None or resume or until_decided:
-                raise InputError(
-                    "--runs, --seed, --resume and --until-decided do not go with --log: a log has the runs it has"
-                )
+            if runs is not None or seed is not None or until_decided:
+                raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
             recorded = read_log(log)
             resolve_filters(filters, recorded.belief)
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")
-            require_free(out, overwrite)
-            results = run_log(recorded, filters, jobs, timeout, memory)
+            results = run_log(
+                recorded, filters, jobs, timeout, memory, place, out=out, resume=resume, overwrite=overwrite
+            )  # fmt: skip
         else:
             world = load_scenario(str(scenario))
             runs, seed = 50 if runs is None else runs, 0 if seed is None else seed
             resolve_filters(filters, world.belief)
             if until_decided:
-                require_free(out, overwrite or resume)
-                previous = open_results(out) if resume else None
                 results, verdicts = run_until_decided(
-                    world, filters, seed=seed, jobs=jobs, timeout=timeout, previous=previous, memory=memory, **planned
-                )
+                    world, filters, seed=seed, jobs=jobs, timeout=timeout, memory=memory, backend=place,
+                    out=out, resume=resume, overwrite=overwrite, **planned,
+                )  # fmt: skip
             else:
                 results = run_trials(
                     world, filters, runs, seed, jobs, timeout,
-                    out=out, overwrite=overwrite, resume=resume, memory=memory,
+                    out=out, overwrite=overwrite, resume=resume, memory=memory, backend=place,
                 )  # fmt: skip
     except Interrupted as stop:
         done = stop.results.manifest["finished_runs"]
-        if not done:
-            say("stopped before a run was finished; nothing written")
-        else:
-            if isinstance(stop.results, Results):
-                stop.results.write(out, overwrite or resume, keep_others=resume)
-            how = "add --resume to the same command to go on" if log is None else "run it again for the rest"
-            say(f"stopped: {done} finished runs are in {out}; {how}")
+        kept = f"{done} finished runs are in {out}; add --resume to the same command to go on"
+        say(f"stopped: {kept}" if done else "stopped before a run was finished; nothing written")
         raise typer.Exit(stop.status) from None
-    if isinstance(results, Results):
-        results.write(out, overwrite or resume, keep_others=resume)
     print_verdicts(verdicts or analyse(results))
     print(f"results in {out}; next: consistency report {out}")
 
@@ -238,7 +254,9 @@ def run(
 def analyse(
     path: Annotated[
         Path,
-        typer.Argument(metavar="PATH", help="Folder written by 'run', or estimates: .csv, .parquet, .npz, TUM."),
+        typer.Argument(
+            metavar="PATH", help="Folder written by 'run', or estimates: .csv, .parquet, .npz, TUM, ROS bags."
+        ),
     ],
     truth: Annotated[Path | None, typer.Option("--truth", help="Truth of the estimates, in the same form.")] = None,
     covariance: Annotated[
@@ -257,6 +275,20 @@ def analyse(
     ] = None,
     max_dt: Annotated[
         float | None, typer.Option("--max-dt", help="Seconds between an estimate and its truth at most [0.01].")
+    ] = None,
+    time_offset: Annotated[
+        str | None,
+        typer.Option("--time-offset", metavar="S|estimate", help="Seconds to add to the estimates' timestamps."),
+    ] = None,
+    axes: Annotated[
+        str | None,
+        typer.Option("--axes", metavar="A,B,C", help="Components of a trajectory to judge, as x,y,yaw in the plane."),
+    ] = None,
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Of a ROS bag: Odometry or PoseWithCovarianceStamped.")
+    ] = None,
+    truth_topic: Annotated[
+        str | None, typer.Option("--truth-topic", help="Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
     ] = None,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
     false_alarm: Annotated[
@@ -277,12 +309,18 @@ def analyse(
     confidence: Annotated[
         float | None, typer.Option("--confidence", help="The same as --false-alarm, which is 1 less it.")
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Folder for an HTML and a PDF page on files of another estimator.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
 ) -> None:
     """Judge results, or files of another estimator: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.recording import is_recording, read_recordings
+    from consistency.reporting import write_file_reports
     from consistency.store.results import open_results
+    from consistency.store.storage import require_free
     from consistency.terminal.table import print_verdicts, verdicts_json
     from consistency.verdicts.judge import analyse as judge_results
     from consistency.verdicts.judge import analyse_recordings, settings_of
@@ -295,16 +333,26 @@ def analyse(
     settings = settings_of(**changes) if changes else None
     options: dict[str, Any] = {
         "truth": truth, "covariance": covariance, "convention": error,
-        "state": None if state is None else [name.strip() for name in state.split(",")],
-        "covariance_order": covariance_order, "max_dt": max_dt,
+        "state": _names(state), "axes": _names(axes), "topic": topic, "truth_topic": truth_topic,
+        "covariance_order": covariance_order, "max_dt": max_dt, "time_offset": _seconds(time_offset),
     }  # fmt: skip
+    written: list[Path] = []
+    if overwrite and report is None:
+        raise InputError("--overwrite goes with --report: nothing else is written")
     if is_recording(path, **options):
+        if report is not None:
+            require_free(report, overwrite, "verdict", "--report")
         recordings = read_recordings(path, **options)
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         for note in dict.fromkeys(note for recording in recordings for note in recording.notes):
             print(f"consistency: {note}", file=sys.stderr)
+        if report is not None:
+            data = verdicts_json(verdicts)
+            written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
     else:
         results = open_results(path)
+        if report is not None:
+            raise InputError(f"--report: is for files of another estimator; for {path} use 'consistency report {path}'")
         if innovations is not None:
             raise InputError(
                 "--innovations is for files of another estimator; filters of the bench declare it themselves"
@@ -320,8 +368,22 @@ def analyse(
         print(verdicts_json(verdicts))
     else:
         print_verdicts(verdicts, reasons=True)
+        for file in written:
+            print(file)
     if fail_on and not all(verdict.consistent for verdict in verdicts.values()):
         raise typer.Exit(1)
+
+
+def _names(text: str | None) -> list[str] | None:
+    return None if text is None else [name.strip() for name in text.split(",")]
+
+
+def _seconds(text: str | None) -> float | str | None:
+    """A number where the text is one."""
+    try:
+        return text if text is None else float(text)
+    except ValueError:
+        return text
 
 
 @app.command()
@@ -413,10 +475,10 @@ def baseline(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Keep what a later 'compare' needs of results, one row a run."""
-    from consistency.store.results import read_results
+    from consistency.store.results import open_results
     from consistency.verdicts.comparison import write_baseline
 
-    write_baseline(read_results(folder), out, overwrite)
+    write_baseline(open_results(folder), out, overwrite)
     print(f"baseline in {out}; next: consistency compare NEW {out}")
 
 
@@ -546,12 +608,13 @@ def main(arguments: list[str] | None = None) -> Any:
         except (BrokenPipeError, SystemExit) as error:  # libraries end with status 1, which is a verdict's here
             if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
                 raise
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else its last words are said at the exit
+            _drop_output()
             sys.exit(141)
         except OSError as error:
-            if error.filename is None:
+            if error.filename is None and error.errno not in FULL:
                 raise
-            _end(f"{error.filename}: cannot be used ({error.strerror})", 2)
+            fault = "output cannot be written" if error.filename is None else f"{error.filename}: cannot be used"
+            _end(f"{fault} ({error.strerror})", 2)
         except (KeyboardInterrupt, Abort):
             _end("stopped", stop.status)
 
@@ -561,7 +624,16 @@ def _end(sentence: str, status: int) -> NoReturn:
     from consistency.terminal.progress import say
 
     say(f"consistency: {one_line(sentence, 4000)}")
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _drop_output()
     sys.exit(status)
+
+
+def _drop_output() -> None:
+    """What standard output could not take goes nowhere; else it would be tried again at the exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _open_closed_streams() -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from consistency.cli.app import SCENARIO, Jobs, Seed, app
+from consistency.cli.app import SCENARIO, BackendName, Jobs, Scheduler, SchedulerWait, Seed, SlurmOptions, app
 from consistency.errors import InputError
 
 
@@ -32,14 +31,22 @@ def sweep(
         typer.Option("--share", metavar="I/N", help="Only this share of the cells, I from 1 to N; for job arrays."),
     ] = None,
     jobs: Jobs = -1,
+    backend: BackendName = "local",
+    scheduler: Scheduler = None,
+    scheduler_wait: SchedulerWait = None,
+    slurm: SlurmOptions = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Run cells again that were made with other settings or code.")
     ] = False,
 ) -> None:
     """A grid of scenarios, each filter in each until decided; then a map of where which filter is consistent."""
-    from consistency.sweeps.folder import open_sweep, run_sweep
+    from consistency.runs.backends.choosing import backend_for, require_scheduler
+    from consistency.store.stopping import stoppable
+    from consistency.sweeps.folder import open_sweep
     from consistency.sweeps.plan import load_sweep
     from consistency.sweeps.regime import regime_of, write_regime
+    from consistency.sweeps.running import run_sweep
+    from consistency.terminal.progress import say
 
     if out is None and Path(source).is_dir():
         if filters or share or overwrite:
@@ -49,11 +56,14 @@ def sweep(
         if out is None:
             raise InputError(f"--out: missing; give a folder for the cells of {source}")
         plan = load_sweep(source, filters)
-        try:
-            folder, missing = run_sweep(plan, out, *_share(share), jobs=jobs, overwrite=overwrite)
-        except KeyboardInterrupt:
-            print(f"stopped: what is finished is in {out}; the same command goes on", file=sys.stderr)
-            raise typer.Exit(130) from None
+        place = backend_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out)
+        require_scheduler(backend, scheduler, "a sweep")
+        with stoppable() as stop:
+            try:
+                folder, missing = run_sweep(plan, out, *_share(share), jobs, overwrite, place)
+            except KeyboardInterrupt:
+                say(f"stopped: what is finished is in {out}; the same command goes on")
+                raise typer.Exit(stop.status) from None
         if missing:
             print(f"this share is done; {missing} of the whole sweep are missing in {out}")
             return

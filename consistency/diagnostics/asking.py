@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from consistency.diagnostics.band import Band, simultaneous_band
-from consistency.diagnostics.bias import hotelling, t_squared
+from consistency.diagnostics.bias import Moments, hotelling, moments, t_squared
 from consistency.diagnostics.direction import Largest, largest_direction
 from consistency.diagnostics.distribution import Pit, pit
 from consistency.diagnostics.outliers import Outlier, outliers
@@ -53,20 +53,21 @@ def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: fl
     largest = outlier = matrix = bias_step = shape_step = None
     if sample.errors is not None:
         w, n = sample.errors.whitened, sample.dof
+        in_steps = moments(w)
         axes = {
             key: scale_test(sample.group_means(index), len(index), sample.longest)
             for key, index in sample.errors.groups.items()
         }
         worst = np.array([t.above if settings.one_sided else t.p_value for t in axes.values()])
         p[AXIS] = _least(worst)[0] if n > 1 else float("nan")
-        bias_step = _bias(w, p)
-        outlier = outliers(w)
+        bias_step = _bias(w, in_steps, p)
+        outlier = outliers(w, in_steps)
         p["outliers"] = outlier.p_value
         if settings.one_sided:
             largest = largest_direction(w)
             p[DIRECTION] = largest.p_value
         else:
-            matrix, shape_step = _shape(w, p)
+            matrix, shape_step = _shape(w, in_steps, p)
     distribution = pit(sample.nees, sample.dof)
     if not settings.one_sided:
         p["distribution"] = _distribution(sample, settings, distribution)
@@ -83,19 +84,19 @@ def _band(sample: Sample, settings: Settings, p_values: Mapping[str, float]) -> 
     return simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
 
 
-def _bias(whitened: Array, p: dict[str, float]) -> int | None:
+def _bias(whitened: Array, in_steps: Moments, p: dict[str, float]) -> int | None:
     of_runs = mean_of_runs(whitened)
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     p["bias"] = hotelling(of_runs).p_value if len(of_runs) > whitened.shape[-1] else float("nan")
     if whitened.shape[1] == 1:
         return None
-    _, steps = t_squared(whitened)
+    _, steps = t_squared(whitened, in_steps)
     p["bias in some step"], step = _least(steps)
     return step
 
 
-def _shape(whitened: Array, p: dict[str, float]) -> tuple[Array, int | None]:
-    _, steps = sphericity(whitened)
+def _shape(whitened: Array, in_steps: Moments, p: dict[str, float]) -> tuple[Array, int | None]:
+    _, steps = sphericity(whitened, in_steps)
     matrix, over_runs = mean_shape(whitened)
     in_step, step = _least(steps)
     if whitened.shape[1] > 1:

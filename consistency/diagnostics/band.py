@@ -10,7 +10,7 @@ from scipy import optimize, special, stats
 from consistency.diagnostics.blocks import blocks
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.scale import FEW
-from consistency.types import Array
+from consistency.types import Array, Indices
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def simultaneous_band(
     if not len(judged):
         return Band(low, high, float("nan"), none, none)
     sides = 1 if allow == "conservative" else 2
-    slopes = _slopes(nees[:, judged]) if method == "max" and len(nees) >= FEW else None
+    slopes = _slopes(nees, judged) if method == "max" and len(nees) >= FEW else None
 
     def exceedance(c: float) -> float:
         if slopes is None:
@@ -79,9 +79,9 @@ def simultaneous_band(
         return Band(low, high, p_value, curve > high, curve < low)
 
 
-def _slopes(nees: Array) -> Array:
-    """sqrt((1 - rho) / (1 + rho)) of neighbouring steps, (runs, steps) -> (steps - 1,); rho from 0 to 1."""
-    parts = [_slopes_of(nees[:, here.start : here.stop + 1]) for here in blocks(nees.shape[1] - 1, len(nees))]
+def _slopes(nees: Array, judged: Indices) -> Array:
+    """sqrt((1 - rho) / (1 + rho)) of neighbours among the ``judged`` steps of (runs, steps); rho from 0 to 1."""
+    parts = [_slopes_of(nees[:, judged[here.start : here.stop + 1]]) for here in blocks(len(judged) - 1, len(nees))]
     return np.concatenate(parts)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
 from consistency.diagnostics.blocks import blocks
-from consistency.types import Array
+from consistency.diagnostics.whitening import all_finite
+from consistency.types import Array, Indices
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,13 @@ def hotelling(sample: Array, confidence: float = 0.95) -> Hotelling:
     return Hotelling(mean, np.stack([mean - half, mean + half], axis=-1), float(statistic), float(p_value))
 
 
-def t_squared(whitened: Array) -> tuple[Array, Array]:
+def t_squared(whitened: Array, known: Moments | None = None) -> tuple[Array, Array]:
     """T-squared and p value of every step by itself, (runs, steps, n) -> (steps,), (steps,).
 
     T^2 (N - n) / (n (N - 1)) is F(n, N - n) distributed (Anderson 2003, Theorem 5.2.2). NaN where fewer
-    than n + 1 runs are left.
+    than n + 1 runs are left. ``known`` are the moments, where they are.
     """
-    N, mean, S = moments(whitened)
+    N, mean, S = moments(whitened) if known is None else known
     n = whitened.shape[-1]
     statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
     good = n + 1 <= N
@@ -59,15 +61,23 @@ def t_squared(whitened: Array) -> tuple[Array, Array]:
     return statistic, p_value
 
 
-def moments(whitened: Array) -> tuple[Array, Array, Array]:
-    """Runs, mean and sample covariance of every step: (runs, steps, n) -> (steps,), (steps, n), (steps, n, n)."""
+class Moments(NamedTuple):
+    """Runs, mean and sample covariance of every step."""
+
+    runs: Indices  # (steps,)
+    mean: Array  # (steps, n)
+    covariance: Array  # (steps, n, n)
+
+
+def moments(whitened: Array) -> Moments:
+    """Those of whitened errors (runs, steps, n)."""
     runs, steps = whitened.shape[:2]
     N, mean, S = zip(*(_moments(whitened[:, here]) for here in blocks(steps, runs)), strict=True)
-    return np.concatenate(N), np.concatenate(mean), np.concatenate(S)
+    return Moments(np.concatenate(N), np.concatenate(mean), np.concatenate(S))
 
 
 def _moments(whitened: Array) -> tuple[Array, Array, Array]:
-    present = np.asarray(np.isfinite(whitened).all(axis=-1))
+    present = all_finite(whitened)
     N = present.sum(axis=0)
     w = np.where(present[..., None], whitened, 0.0)
     mean = w.sum(axis=0) / np.maximum(N, 1)[:, None]

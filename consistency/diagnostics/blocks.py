@@ -2,31 +2,46 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from consistency.diagnostics.symmetric import Symmetric
 from consistency.types import Array
 
 ROWS = 2**18  # pairs of run and step in a block
+FEWER = 2**16  # in a block of whole runs, which lies together in memory: what is worked out of it stays in the cache
 
 
-def blocks(count: int, each: int) -> Iterator[slice]:
+def blocks(count: int, each: int, rows: int | None = None) -> Iterator[slice]:
     """Slices of an axis of ``count`` places with ``each`` rows at a place; one slice, if of nothing, at least."""
-    size = max(ROWS // max(each, 1), 1)
+    size = max((ROWS if rows is None else rows) // max(each, 1), 1)
     return (slice(k, k + size) for k in range(0, max(count, 1), size))
 
 
-def by_runs(function: Callable[..., Array], *arrays: Array) -> Array:
+def of_runs(array: Array) -> Iterator[slice]:
+    """Slices of the runs of an array (runs, steps, ...), or of the rows of one (rows, n)."""
+    return blocks(len(array), math.prod(array.shape[1:2]), FEWER)
+
+
+def by_runs(function: Callable[..., Array], first: Array, *others: Array | Symmetric) -> Array:
     """``function`` of arrays (runs, ...), which works on each run by itself, block by block."""
-    runs = len(arrays[0])
+    runs = len(first)
+    parts = list(of_runs(first))
+    if len(parts) == 1:
+        return function(first, *others)
     out: Array | None = None
-    for here in blocks(runs, int(np.prod(arrays[0].shape[1:2]))):
-        part = function(*(array[here] for array in arrays))
+    for here in parts:
+        part = function(first[here], *(array[here] for array in others))
         if out is None:
-            if len(part) == runs:
-                return part
             out = np.empty((runs, *part.shape[1:]), part.dtype)
         out[here] = part
     assert out is not None
     return out
+
+
+def by_steps(function: Callable[..., Array], *arrays: Array) -> Array:
+    """``function`` of arrays (runs, steps, ...), which works on each step by itself, block by block: (steps, ...)."""
+    runs, steps = arrays[0].shape[:2]
+    return np.concatenate([function(*(array[:, here] for array in arrays)) for here in blocks(steps, runs)])

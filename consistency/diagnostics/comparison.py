@@ -8,8 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
+from consistency.diagnostics.blocks import by_runs
 from consistency.diagnostics.contrast import Contrast, contrast, margin
 from consistency.diagnostics.scale import run_means
+from consistency.diagnostics.symmetric import Symmetric
+from consistency.diagnostics.whitening import entries
 from consistency.types import Array, Indices
 
 FEWEST = 8  # runs; below, a standard error is worth nothing
@@ -80,22 +83,33 @@ class Comparison:
 
 
 def summary(
-    nees: Array, dof: int, error: Array | None = None, covariance: Array | None = None, runs: Indices | None = None
+    nees: Array,
+    dof: int,
+    error: Array | None = None,
+    covariance: Array | Symmetric | None = None,
+    runs: Indices | None = None,
 ) -> RunSummary:
     """One row for each run, from NEES (runs, steps) and, where known, error and covariance."""
     means, _ = run_means(nees)
-    counted = np.isfinite(nees)
     squared = covered = np.empty((len(nees), 0))
     if error is not None and covariance is not None:
-        with np.errstate(invalid="ignore"):  # a variance below zero covers nothing
-            sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-        inside = np.abs(np.where(counted[..., None], error, 0.0)) <= 2.0 * np.where(counted[..., None], sigma, 0.0)
-        count = counted.sum(axis=1)[:, None]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            squared = np.where(counted[..., None], np.square(error), 0.0).sum(axis=1) / count
-            covered = np.where(counted[..., None], inside, False).sum(axis=1) / count
+        both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), entries(covariance))
+        squared, covered = both[:, 0], both[:, 1]
     numbers = np.arange(len(nees)) if runs is None else runs
     return RunSummary(numbers, dof, means / dof, squared, covered)
+
+
+def _squared_and_covered(nees: Array, error: Array, covariance: Symmetric) -> Array:
+    """Mean squared error and share of steps within 2 sigma of each axis, (runs, 2, n)."""
+    counted = np.isfinite(nees)
+    with np.errstate(invalid="ignore"):  # a variance below zero covers nothing
+        sigma = np.sqrt(covariance.variances)
+    inside = np.abs(np.where(counted[..., None], error, 0.0)) <= 2.0 * np.where(counted[..., None], sigma, 0.0)
+    count = counted.sum(axis=1)[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squared = np.where(counted[..., None], np.square(error), 0.0).sum(axis=1) / count
+        covered = np.where(counted[..., None], inside, False).sum(axis=1) / count
+    return np.stack([squared, covered], axis=1)
 
 
 def compare(

@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
+import functools
+import operator
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import special
 
-from consistency.diagnostics.blocks import blocks, by_runs
-from consistency.diagnostics.whitening import spread_steps, squared_length
+from consistency.diagnostics.blocks import by_runs, of_runs
+from consistency.diagnostics.symmetric import Symmetric
+from consistency.diagnostics.whitening import entries, spread_steps, squared_length
 from consistency.types import Array
 
 TWO_SIGMA = 0.9544997361036416  # P(|N(0, 1)| <= 2)
 
 
-def coverage(error: Array, covariance: Array, bound: float = 2.0) -> Array:
+def coverage(error: Array, covariance: Array | Symmetric, bound: float = 2.0, counted: Array | None = None) -> Array:
     """Share of errors within ``bound`` standard deviations, for each axis.
 
-    Shapes (..., n) and (..., n, n) -> (n,); rows with NaN do not count.
+    Shapes (..., n) and (..., n, n) -> (n,); rows with NaN, or not ``counted`` (...), do not count.
     """
-    error = np.asarray(error, float)
+    error, P = np.asarray(error, float), entries(covariance)
     n = error.shape[-1]
     inside, count = np.zeros(n, np.int64), np.zeros(n, np.int64)
-    rows, variance = error.reshape(-1, n), np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, n)
-    for here in blocks(len(rows), 1):
-        sigma = _sigma(variance[here])
-        valid = np.isfinite(rows[here]) & np.isfinite(sigma)
-        within = np.abs(np.where(valid, rows[here], 0.0)) <= bound * np.where(valid, sigma, 0.0)
-        inside += (valid & within).sum(axis=0)
-        count += valid.sum(axis=0)
+    if error.ndim == 1:
+        error, P = error[None], P[None]
+    for here in of_runs(error):
+        for i in range(n):
+            e, sigma = error[here][..., i], _sigma(P.entry(i, i)[here])
+            valid = np.isfinite(e) & np.isfinite(sigma)
+            if counted is not None:
+                valid &= counted[here]
+            within = np.abs(np.where(valid, e, 0.0)) <= bound * np.where(valid, sigma, 0.0)
+            inside[i] += (valid & within).sum()
+            count[i] += valid.sum()
     return np.where(count > 0, inside / np.maximum(count, 1), np.nan)
 
 
@@ -34,27 +43,46 @@ def _sigma(variance: Array) -> Array:
     return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
-def rmse(error: Array) -> float:
-    """Root of the mean squared length of errors (..., n) over all runs and steps; NaN rows do not count."""
-    squared = squared_length(np.asarray(error, float))
-    squared = squared[np.isfinite(squared)]
-    return float(np.sqrt(squared.mean())) if squared.size else float("nan")
+def rmse(error: Array, axes: Sequence[int] | None = None, counted: Array | None = None) -> float:
+    """Root of the mean squared length of errors (..., n) over all runs and steps.
+
+    NaN rows do not count.
+
+    Parameters
+    ----------
+    axes : components of the length; all of them where None
+    counted : (...) of bool, rows that count
+    """
+    e = np.asarray(error, float)
+    some = list(range(e.shape[-1])) if axes is None else list(axes)
+    squared, count = np.empty(e[..., 0].size), 0
+    for here in of_runs(e):
+        part = squared_length(e[here][..., some])
+        part = part[np.isfinite(part) if counted is None else np.isfinite(part) & counted[here]]
+        squared[count : count + len(part)] = part
+        count += len(part)
+    return float(np.sqrt(squared[:count].mean())) if count else float("nan")
 
 
 def coverage_interval(
-    error: Array, covariance: Array, bound: float = 2.0, confidence: float = 0.95
+    error: Array,
+    covariance: Array | Symmetric,
+    bound: float = 2.0,
+    confidence: float = 0.95,
+    counted: Array | None = None,
 ) -> tuple[Array, Array]:
     """Coverage of one step of each run and its exact binomial interval (Clopper & Pearson 1934), for each axis.
 
     One step a run, spread over the trajectory (:func:`spread_steps`): independent draws, which pooled steps
-    are not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2).
+    are not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2); rows with NaN, or not ``counted``
+    (runs, steps), are not drawn.
     """
-    error = np.asarray(error, float)
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    there = by_runs(lambda e, v: (np.isfinite(e) & np.isfinite(v) & (v >= 0)).all(axis=-1), error, variance)
-    steps = spread_steps(there)
+    error, P = np.asarray(error, float), entries(covariance)
+    there = by_runs(_usable, error, P)
+    steps = spread_steps(there if counted is None else there & counted)
     rows = np.flatnonzero(steps >= 0)
-    inside = (np.abs(error[rows, steps[rows]]) <= bound * _sigma(variance[rows, steps[rows]])).sum(axis=0)
+    variance = P[rows, steps[rows]].variances
+    inside = (np.abs(error[rows, steps[rows]]) <= bound * _sigma(variance)).sum(axis=0)
     if not len(rows):
         n = error.shape[-1]
         return np.full(n, np.nan), np.tile([0.0, 1.0], (n, 1))
@@ -62,3 +90,9 @@ def coverage_interval(
     low = np.where(inside > 0, special.betaincinv(np.maximum(inside, 1), N - inside + 1, tail), 0.0)
     high = np.where(inside < N, special.betaincinv(inside + 1, np.maximum(N - inside, 1), 1.0 - tail), 1.0)
     return inside / N, np.stack([low, high], axis=-1)
+
+
+def _usable(error: Array, P: Symmetric) -> Array:
+    variances = (P.entry(i, i) for i in range(P.n))
+    known = (np.isfinite(error[..., i]) & np.isfinite(v) & (v >= 0) for i, v in enumerate(variances))
+    return functools.reduce(operator.and_, known)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.diagnostics.blocks import blocks
-from consistency.diagnostics.whitening import whiten
+from consistency.diagnostics.whitening import all_finite, squared_length, whiten
 from consistency.types import Array
 
 
@@ -33,7 +33,7 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
 
 def _of_steps(error: Array, nees: Array) -> tuple[Array, Array]:
     n = error.shape[-1]
-    present = np.isfinite(nees) & np.isfinite(error).all(axis=-1) & (nees > 0)
+    present = np.isfinite(nees) & all_finite(error) & (nees > 0)
     index, inclination = np.full(nees.shape[1], np.nan), np.full(nees.shape[1], np.nan)
     count = present.sum(axis=0)
     e = np.where(present[..., None], error, 0.0)
@@ -46,7 +46,7 @@ def _of_steps(error: Array, nees: Array) -> tuple[Array, Array]:
     good &= np.linalg.cond(np.where(good[:, None, None], correlation, np.eye(n))) < 1e12
     if not good.any():
         return index, inclination
-    actual = np.square(whiten(e[:, good] / unit[good], correlation[good])).sum(axis=-1)
+    actual = squared_length(whiten(e[:, good] / unit[good], correlation[good]))
     here = present[:, good]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(here, 10.0 * np.log10(np.where(here, nees[:, good], 1.0) / np.where(here, actual, 1.0)), 0.0)

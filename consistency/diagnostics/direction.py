@@ -10,6 +10,7 @@ from consistency.diagnostics.blocks import by_runs
 from consistency.diagnostics.records import Interval
 from consistency.diagnostics.scale import UNKNOWN, ratio_interval, scale_test
 from consistency.diagnostics.shape import second_moments
+from consistency.diagnostics.whitening import all_finite
 from consistency.types import Array
 
 
@@ -35,13 +36,13 @@ def largest_direction(whitened: Array) -> Largest:
     ----------
     whitened : (runs, steps, n), NaN where a run has no value. p is NaN with fewer than 2 runs or n = 1.
     """
-    present = np.asarray(np.isfinite(whitened).all(axis=-1))
+    present = all_finite(whitened)
     n, some = whitened.shape[-1], present.any(axis=1)
     if some.sum() < 2 or n == 1:
         return Largest(UNKNOWN, np.full(n, np.nan), float("nan"))
-    w, present = whitened[some], present[some]
-    moments = by_runs(second_moments, w, present) / present.sum(axis=1)[:, None, None]
-    steps = int(present.sum(axis=1).max())
+    count = present.sum(axis=1)
+    moments = by_runs(second_moments, whitened, present)[some] / count[some, None, None]
+    steps = int(count.max())
     halves = [np.arange(len(moments)) % 2 == k for k in (0, 1)]
     along, p_values = np.empty(len(moments)), []
     for chosen, judged in (halves, halves[::-1]):

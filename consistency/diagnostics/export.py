@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -230,8 +231,13 @@ def text(v: Verdict) -> str:
 
 def html(v: Verdict) -> str:
     """Summary of a verdict as an HTML table, for a notebook."""
-    rows = "".join(
+    return f"<div><p><strong>{escape(v.filter)}</strong> is {escape(v.reasons[0])}</p>{html_table(figures(v))}</div>"
+
+
+def html_table(rows: Sequence[tuple[str, str]]) -> str:
+    """Names and values as an HTML table, for a notebook."""
+    cells = "".join(
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
-        for name, value in figures(v)
+        for name, value in rows
     )
-    return f"<div><p><strong>{escape(v.filter)}</strong> is {escape(v.reasons[0])}</p><table>{rows}</table></div>"
+    return f"<table>{cells}</table>"

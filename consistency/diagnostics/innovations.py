@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics.whitening import whiten
+from consistency.diagnostics.blocks import by_runs
+from consistency.diagnostics.whitening import all_finite, whiten
 from consistency.types import Array
 
 LAGS = 10
@@ -83,17 +85,23 @@ def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
     """
     counted = np.isfinite(nis) & (dof > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = np.where(counted, nis / np.where(dof > 0, dof, 1), np.nan)
         overall = nis[counted].sum() / max(dof[counted].sum(), 1)
+    return _portmanteau(by_runs(functools.partial(_nearly_gaussian, overall), nis, dof)[..., None], lags)
+
+
+def _nearly_gaussian(overall: float, nis: Array, dof: Array) -> Array:
+    """Cube root of NIS (runs, steps), standardised; ``overall`` is what it is per degree of freedom."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = nis / np.where(dof > 0, dof, 1)
         spread = 2.0 / (9.0 * np.where(dof > 0, dof, 1))
         z = (np.cbrt(z / overall) - 1.0 + spread) / np.sqrt(spread) if overall > 0 else z * np.nan
-    return _portmanteau(np.where(counted, z, np.nan)[..., None], lags)
+    return np.where(np.isfinite(nis) & (dof > 0), z, np.nan)
 
 
 def _portmanteau(u: Array, lags: int) -> Whiteness:
     _, steps, m = u.shape
     lags = min(lags, max(steps // 4, 1), max(steps - 1, 0))
-    present = np.asarray(np.isfinite(u).all(axis=-1))
+    present = all_finite(u)
     if lags == 0 or present.sum() < FEWEST:
         return Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
     u = np.where(present[..., None], u, 0.0)

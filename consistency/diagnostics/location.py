@@ -10,7 +10,7 @@ from scipy import stats
 from consistency.diagnostics.asking import Tests
 from consistency.diagnostics.band import Band
 from consistency.diagnostics.bias import hotelling
-from consistency.diagnostics.blocks import blocks
+from consistency.diagnostics.blocks import blocks, by_runs
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
 from consistency.diagnostics.nees import anees
@@ -28,6 +28,7 @@ from consistency.diagnostics.records import (
 from consistency.diagnostics.sample import ATTITUDE, POSITION, Errors, Sample
 from consistency.diagnostics.scale import ratio_interval
 from consistency.diagnostics.scaling import INTERVAL, pointwise_band
+from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.whitening import mean_of_runs, standardise
 from consistency.types import Array, Indices
 
@@ -132,9 +133,7 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
 def bias_of(sample: Sample, tests: Tests, location: Location, answers: Answers) -> Bias:
     """Mean error of each axis, and what the scale is without it."""
     errors, late = _errors(sample), _late(location)
-    standard = standardise(errors.error[:, late], errors.covariance[:, late])
-    standard[~sample.counted[:, late]] = np.nan
-    of_runs = mean_of_runs(standard)
+    of_runs = by_runs(_standard_means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     by_axis = {}
     if len(of_runs) > sample.dof:
@@ -142,8 +141,13 @@ def bias_of(sample: Sample, tests: Tests, location: Location, answers: Answers) 
         by_axis = {a: Interval(test.mean[i], *test.interval[i]) for i, a in enumerate(errors.names)}
     if not _any(answers, BIAS):
         return Bias(by_axis, tests.bias_step, None, None)
-    without = ratio_interval(sample.centred().means(late), sample.dof, INTERVAL)
+    without = ratio_interval(sample.centred_means(late), sample.dof, INTERVAL)
     return Bias(by_axis, tests.bias_step, _axis_in_step(sample, tests.bias_step), without)
+
+
+def _standard_means(error: Array, covariance: Symmetric, counted: Array) -> Array:
+    """Mean of the standardised errors of each run, (runs, n)."""
+    return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
 
 
 def _axis_in_step(sample: Sample, step: int | None) -> str | None:
@@ -178,18 +182,18 @@ def accuracy_of(sample: Sample) -> Accuracy:
     """Coverage, RMSE and the noncredibility index."""
     errors = _errors(sample)
     index, inclination = noncredibility(errors.error, sample.nees)
-    error = np.where(sample.counted[..., None], errors.error, np.nan)
-    inside, interval = coverage_interval(error, errors.covariance)
+    counted = sample.counted
+    inside, interval = coverage_interval(errors.error, errors.covariance, counted=counted)
 
     def rmse_of(members: set[str]) -> float:
         columns = [i for i, axis in enumerate(errors.names) if axis in members]
-        return rmse(error[..., columns]) if columns else float("nan")
+        return rmse(errors.error, columns, counted) if columns else float("nan")
 
     return Accuracy(
-        coverage=coverage(error, errors.covariance),
+        coverage=coverage(errors.error, errors.covariance, counted=counted),
         coverage_one_step=inside,
         coverage_interval=interval,
-        rmse=np.array([rmse(error[..., [i]]) for i in range(sample.dof)]),
+        rmse=np.array([rmse(errors.error, [i], counted) for i in range(sample.dof)]),
         rmse_position=rmse_of(POSITION),
         rmse_heading=rmse_of(ATTITUDE),
         nci=float(np.nanmean(index)) if np.isfinite(index).any() else float("nan"),
@@ -210,12 +214,12 @@ def _any(answers: Answers, questions: tuple[str, ...]) -> bool:
     return any(q in answers and answers[q].found for q in questions)
 
 
-def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple[int, int] | None, float, float]:
+def _correlation(error: Array, covariance: Symmetric, counted: Array) -> tuple[tuple[int, int] | None, float, float]:
     """The two axes whose errors are correlated least as stated, with both correlations, averaged over steps."""
     if not counted.any():
         return None, float("nan"), float("nan")
     n, count = error.shape[-1], int(counted.sum())
-    parts = list(blocks(*counted.shape))
+    parts, half = list(blocks(*counted.shape)), np.argwhere(np.triu(np.ones((n, n))))
 
     def standard(here: slice) -> Array:
         return standardise(error[here], covariance[here])[counted[here]]
@@ -223,10 +227,14 @@ def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple
     mean = sum(e.sum(axis=0) for e in map(standard, parts)) / count
     stated, second = np.zeros((n, n)), np.zeros((n, n))
     for here in parts:
-        P, e = covariance[here][counted[here]], standard(here) - mean
-        sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
-        stated += (P / (sigma[:, :, None] * sigma[:, None, :])).sum(axis=0) / count
+        P, e = covariance[here], standard(here) - mean
+        sigma = [np.sqrt(P.entry(i, i)[counted[here]]) for i in range(n)]
+        part = np.empty((len(e), len(half)))
+        for k, (i, j) in enumerate(half):
+            part[:, k] = P.entry(i, j)[counted[here]] / (sigma[i] * sigma[j])
+        stated[*half.T] += part.sum(axis=0) / count
         second += e.T @ e / count
+    stated[*half.T[::-1]] = stated[*half.T]
     scale = np.sqrt(np.diag(second))
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.nan_to_num(second / np.outer(scale, scale) - stated)

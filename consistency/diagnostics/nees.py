@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.diagnostics.blocks import by_steps
 from consistency.diagnostics.whitening import whiten
 from consistency.types import Array
 
@@ -54,9 +55,13 @@ def anees(values: Array) -> Array:
     A NaN is a run that has no value in that step (rank-deficient covariance, or failed earlier); where
     no run has one the average is NaN.
     """
-    values = np.asarray(values, float)
-    count = np.isfinite(values).sum(axis=0)
-    total = np.where(np.isfinite(values), values, 0.0).sum(axis=0)
+    return by_steps(_mean_over_runs, np.asarray(values, float))
+
+
+def _mean_over_runs(values: Array) -> Array:
+    present = np.isfinite(values)
+    count = present.sum(axis=0)
+    total = np.where(present, values, 0.0).sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics.bias import moments
+from consistency.diagnostics.bias import Moments, moments
 from consistency.diagnostics.blocks import blocks
 from consistency.types import Array
 
@@ -22,7 +22,7 @@ class Outlier:
     distance: float  # from the mean of the other runs in that step, in their standard deviations
 
 
-def outliers(whitened: Array) -> Outlier:
+def outliers(whitened: Array, known: Moments | None = None) -> Outlier:
     """Largest distance of any run in any step from the other runs, Wilks (1963).
 
     The squared Mahalanobis distance D^2 from the sample mean with the sample covariance has D^2 N / (N - 1)^2
@@ -33,8 +33,9 @@ def outliers(whitened: Array) -> Outlier:
     Parameters
     ----------
     whitened : (runs, steps, n), NaN where a run has no value
+    known : its moments, where they are
     """
-    N, mean, S = moments(whitened)
+    N, mean, S = moments(whitened) if known is None else known
     n = whitened.shape[-1]
     usable = np.flatnonzero(n + 3 <= N)
     usable = usable[np.linalg.det(S[usable]) > 0]

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from consistency.diagnostics.symmetric import Symmetric
 from consistency.types import Array, Failure, Indices
 
 # status -> what it means; the order is that of reports
@@ -56,7 +57,7 @@ class Evidence:
 
     name: str
     error: Array | None = None  # (runs, steps, n), NaN where a run has no estimate
-    covariance: Array | None = None  # (runs, steps, n, n)
+    covariance: Array | Symmetric | None = None  # (runs, steps, n, n)
     nees: Array | None = None  # (runs, steps), NaN where it does not count; worked out from the errors if not given
     dof: int | None = None  # dimension of the error, where NEES stands alone
     nis: Array | None = None  # (runs, steps), NaN where there was no innovation

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
+from consistency.diagnostics.blocks import by_runs, by_steps, of_runs
 from consistency.diagnostics.innovations import nis_of
 from consistency.diagnostics.records import Evidence, Settings
-from consistency.diagnostics.scale import run_means
-from consistency.diagnostics.whitening import squared_length, subset, whiten
+from consistency.diagnostics.scale import means_and_counts, run_means
+from consistency.diagnostics.symmetric import Symmetric
+from consistency.diagnostics.whitening import all_finite, entries, squared_length, subset, whiten
 from consistency.types import Array
 
 POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
@@ -21,21 +25,40 @@ class Errors:
     """Errors and what they were called; N runs, T steps, n components."""
 
     error: Array  # (N, T, n)
-    covariance: Array  # (N, T, n, n)
+    covariance: Symmetric  # (N, T, n, n)
     whitened: Array  # (N, T, n), NaN where nothing counts
     names: tuple[str, ...]
     groups: Mapping[str, list[int]]  # components, named groups and subsets
+    centre: Centre | None = None  # where ``whitened`` is of the errors about it
+
+
+class Centre(NamedTuple):
+    """Mean of the errors of N runs in each step, and the factor that makes their variance what it was without it."""
+
+    mean: Array  # (T, n)
+    factor: Array  # (T, 1), NaN in a step of a single run
+
+    def about(self, error: Array, counted: Array) -> Array:
+        """Errors (runs, T, n) about the mean; NaN where they are not ``counted`` (runs, T)."""
+        return np.where(counted[..., None], (error - self.mean) * self.factor, np.nan)
+
+    def of_steps(self, steps: slice) -> Centre:
+        return Centre(self.mean[steps], self.factor[steps])
 
 
 @dataclass(frozen=True)
 class Sample:
-    """NEES of N runs in T steps; with errors where they are known."""
+    """NEES of N runs in T steps; with errors where they are known.
+
+    The arrays may be large: they are worked on by blocks of runs or steps, and nothing of their size is kept beside
+    them.
+    """
 
     nees: Array  # (N, T), NaN where nothing counts
     dof: int
     errors: Errors | None = None
 
-    @property
+    @cached_property
     def counted(self) -> Array:
         """(N, T) of bool."""
         return np.asarray(np.isfinite(self.nees))
@@ -48,26 +71,53 @@ class Sample:
     @property
     def longest(self) -> int:
         """Steps of the longest run."""
-        return int(np.isfinite(self.nees).sum(axis=1).max(initial=0))
+        return int(self.counted.sum(axis=1).max(initial=0))
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None)) -> Array:
         """Mean NEES of a group of components by itself, over its number of components."""
         assert self.errors is not None
-        w = subset(self.errors.error[:, steps], self.errors.covariance[:, steps], list(index))
-        nees = np.where(np.isfinite(self.nees[:, steps]), squared_length(w), np.nan)
-        means, counts = run_means(nees)
+        e, index = self.errors, list(index)
+        centre = None if e.centre is None else e.centre.of_steps(steps)
+
+        def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
+            error = error if centre is None else centre.about(error, counted)
+            return means_and_counts(np.where(counted, squared_length(subset(error, P, index)), np.nan))
+
+        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
         return np.asarray(means[counts > 0] / len(index))
 
-    def centred(self) -> Sample:
-        """Errors less their mean over runs in each step, with the variance that they would have without a bias."""
+    def centre(self) -> Centre:
+        """Mean error over runs in each step."""
         assert self.errors is not None
-        here = self.counted[..., None]
         N = self.counted.sum(axis=0)[:, None]
-        mean = np.where(here, self.errors.error, 0.0).sum(axis=0) / np.maximum(N, 1)
-        error = np.where(here & (N > 1), (self.errors.error - mean) * np.sqrt(N / np.maximum(N - 1, 1)), np.nan)
-        whitened = whiten(error, self.errors.covariance)
-        nees = np.where(np.isfinite(whitened).all(axis=-1), squared_length(whitened), np.nan)
-        return replace(self, nees=nees, errors=replace(self.errors, error=error, whitened=whitened))
+        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), self.errors.error, self.counted)
+        factor = np.sqrt(N / np.maximum(N - 1, 1))
+        return Centre(total / np.maximum(N, 1), np.where(N > 1, factor, np.nan))
+
+    def centred_means(self, steps: slice) -> Array:
+        """:meth:`means` of errors less their mean over runs in each step."""
+        assert self.errors is not None
+        centre = self.centre().of_steps(steps)
+
+        def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
+            return means_and_counts(squared_length(whiten(centre.about(error, counted), P)))
+
+        e = self.errors
+        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
+        return np.asarray(means[counts > 0] / self.dof)
+
+    def centred(self) -> Sample:
+        """Errors less their mean over runs in each step, with the variance that they would have without a bias.
+
+        In the place of this sample's NEES and whitened errors, so that it is of no more use.
+        """
+        assert self.errors is not None
+        e, centre = self.errors, self.centre()
+        counted = self.counted
+        for here in of_runs(counted):
+            w = whiten(centre.about(e.error[here], counted[here]), e.covariance[here])
+            e.whitened[here], self.nees[here] = w, squared_length(w)
+        return Sample(self.nees, self.dof, replace(e, centre=centre))
 
 
 def sample_of(evidence: Evidence, settings: Settings) -> Sample | None:
@@ -85,15 +135,19 @@ def sample_of(evidence: Evidence, settings: Settings) -> Sample | None:
         if e.dof is None:
             raise ValueError("nees needs dof, the dimension of the error")
         return Sample(e.nees, e.dof)
-    whitened = whiten(e.error, e.covariance)
-    counted = np.asarray(np.isfinite(e.nees) if e.nees is not None else np.isfinite(whitened).all(axis=-1))
-    nees = np.where(counted, squared_length(whitened), np.nan)
-    whitened[~np.isfinite(nees)] = np.nan
-    n = e.error.shape[-1]
+    n, P = e.error.shape[-1], entries(e.covariance)
     names = tuple(e.axes) if e.axes is not None else tuple(f"axis {i}" for i in range(n))
     if len(names) != n:
         raise ValueError(f"{len(names)} names of axes for {n} components")
-    return Sample(nees, n, Errors(e.error, e.covariance, whitened, names, groups_of(names, settings.subsets)))
+    groups = groups_of(names, settings.subsets)
+    whitened, nees = np.empty(e.error.shape), np.empty(e.error.shape[:2])
+    for here in of_runs(nees):
+        w = whiten(e.error[here], P[here])
+        counted = all_finite(w) if e.nees is None else np.isfinite(e.nees[here])
+        nees[here] = np.where(counted, squared_length(w), np.nan)
+        w[~np.isfinite(nees[here])] = np.nan
+        whitened[here] = w
+    return Sample(nees, n, Errors(e.error, P, whitened, names, groups))
 
 
 def groups_of(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
@@ -149,8 +203,13 @@ def impossible(e: Evidence, counted: Array) -> Array:
     """(runs, steps) of bool: what no filter may say, an infinite error or a covariance with a negative variance."""
     assert e.error is not None
     assert e.covariance is not None
-    odd = np.asarray(np.isinf(e.error).any(axis=-1) | np.isinf(e.covariance).any(axis=(-2, -1)))
-    suspect = ~counted & ~odd & np.isfinite(e.covariance).all(axis=(-2, -1))
-    P = e.covariance[suspect]
-    odd[suspect] = np.linalg.eigvalsh(P)[:, 0] < -1e-9 * np.abs(P).max(axis=(-2, -1)) if len(P) else False
-    return odd
+
+    def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
+        odd = np.isinf(error).any(axis=-1) | ~P.where_all(lambda entry: ~np.isinf(entry))
+        suspect = ~counted & ~odd & P.where_all(np.isfinite)
+        some = np.asarray(P[suspect])
+        if len(some):
+            odd[suspect] = np.linalg.eigvalsh(some)[:, 0] < -1e-9 * np.abs(some).max(axis=(-2, -1))
+        return odd
+
+    return by_runs(of_block, e.error, entries(e.covariance), counted)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special, stats
 
+from consistency.diagnostics.blocks import by_runs, by_steps
 from consistency.diagnostics.records import Interval
 from consistency.types import Array
 
@@ -104,19 +105,25 @@ def spreads_more_in_steps(nees: Array, dof: int) -> bool:
     The mean of log nu over the steps is compared, with the standard error of one step. Steps need not be independent.
     Those in which a run has no value, or none of the runs an error, do not count.
     """
-    whole = np.isfinite(nees).all(axis=0) & (nees > 0).all(axis=0)
+    whole = by_steps(lambda part: (np.isfinite(part) & (part > 0)).all(axis=0), nees)
     if len(nees) < FEW or not whole.any():
         return False
-    log_nu, error = _log_nu_of_gamma(nees[:, whole])
-    return bool((log_nu + error).mean() < np.log(dof))
+    nees = nees if whole.all() else nees[:, whole]
+    return bool(by_steps(lambda part: np.add(*_log_nu_of_gamma(part)), nees).mean() < np.log(dof))
 
 
 def run_means(nees: Array) -> tuple[Array, Array]:
     """Mean NEES of each run over the steps it has, and how many those are: (runs, steps) -> (runs,), (runs,)."""
+    means, count = by_runs(means_and_counts, nees).T
+    return np.ascontiguousarray(means), count.astype(np.int64)
+
+
+def means_and_counts(nees: Array) -> Array:
+    """What :func:`run_means` says, (runs, steps) -> (runs, 2)."""
     present = np.isfinite(nees)
     count = present.sum(axis=1)
     total = np.where(present, nees, 0.0).sum(axis=1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
+    return np.stack([np.where(count > 0, total / np.maximum(count, 1), np.nan), count], axis=-1)
 
 
 def acceptance(test: MeanTest, dof: int, false_alarm: float, allow: str | None = None) -> tuple[float, float]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics.bias import hotelling, moments
+from consistency.diagnostics.bias import Moments, hotelling, moments
 from consistency.diagnostics.blocks import by_runs
+from consistency.diagnostics.whitening import all_finite
 from consistency.types import Array
 
 
@@ -28,14 +29,14 @@ def identity_statistic(whitened: Array) -> tuple[float, float]:
     return statistic, float(stats.chi2.sf(statistic, n * (n + 1) / 2))
 
 
-def sphericity(whitened: Array) -> tuple[Array, Array]:
+def sphericity(whitened: Array, known: Moments | None = None) -> tuple[Array, Array]:
     """Mauchly's (1940) test of every step: covariance of the whitened errors proportional to I.
 
     (runs, steps, n) -> statistic and p value, (steps,) each; the mean and the scale may be anything. Box's
     second-order expansion of the null distribution (Anderson 2003, sec. 10.7.4). NaN where fewer than
-    4 n runs are left, or n is 1.
+    4 n runs are left, or n is 1. ``known`` are the moments, where they are.
     """
-    N, _, S = moments(whitened)
+    N, _, S = moments(whitened) if known is None else known
     n = whitened.shape[-1]
     statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
     good = (4 * n <= N) & (np.trace(S, axis1=-2, axis2=-1) > 0)
@@ -63,7 +64,7 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
     that differ are seen by the test of each axis.) p is NaN where there are fewer than three runs for each
     number.
     """
-    present = np.asarray(np.isfinite(whitened).all(axis=-1))
+    present = all_finite(whitened)
     n = whitened.shape[-1]
     count = present.sum(axis=1)
     M = by_runs(second_moments, whitened, present)[count > 0] / count[count > 0, None, None]

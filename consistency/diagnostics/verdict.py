@@ -33,6 +33,7 @@ from consistency.diagnostics.sample import Sample, impossible, innovations_of, s
 from consistency.diagnostics.sample import shape_of as shape_of_arrays
 from consistency.diagnostics.scale import scale_test, spreads_more, spreads_more_in_steps
 from consistency.diagnostics.scaling import INTERVAL, scale_of
+from consistency.diagnostics.whitening import entries
 from consistency.types import Array
 
 DEFAULT = Settings()
@@ -144,7 +145,7 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
         return replace(verdict, scale=scale, location=location, tails=tails_of(tests, None))
     odd = impossible(evidence, sample.counted)
-    there = np.isfinite(evidence.covariance).all(axis=(-2, -1))
+    there = entries(evidence.covariance).where_all(np.isfinite)
     return replace(
         verdict,
         scale=scale,
@@ -243,7 +244,7 @@ def _by_innovations(verdict: Verdict, faults: set[str]) -> str:
 def _without_bias(verdict: Verdict, sample: Sample) -> tuple[Sample, Tests, set[str]]:
     """Errors less their mean over runs, what they are asked, and the faults that remain."""
     others = {a.question: a.p_value for a in verdict.answers if a.question in INNOVATIONS}
-    centred = sample.centred()
+    centred = sample.centred()  # nobody asks the sample again
     again = ask(centred, verdict.settings, others)
     p_values = {q: p for q, p in again.p_values.items() if q not in BIAS} | others
     faults = {q for q, a in answers(p_values, verdict.settings.false_alarm).items() if a.found}

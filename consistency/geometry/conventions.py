@@ -75,16 +75,33 @@ def planar_map_error(
     gap, error = np.asarray(true_points - points, float), planar_error(true_pose, pose, convention)
     if convention in ("so2", "vector"):
         return np.append(error, gap), np.array(covariance, float)
-    turn, T = error[2], np.eye(len(covariance))
+    turn = error[2]
     shift = _shift(gap[:, :2], points[:, :2], convention, turn, pose[2])
     moved = se2_log(np.column_stack([shift, np.full(len(points), turn)]))[:, :2]
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    for at, (x, y) in zip(range(0, len(T), 3), (pose[:2], *points[:, :2]), strict=True):
-        if convention == "left":
-            T[at : at + 2, at : at + 2] = [[c, s], [-s, c]]
-        else:
-            T[at : at + 2, 2] = y, -x
-    return np.append(error, np.column_stack([moved, gap[:, 2]])), T @ covariance @ T.T
+    if convention == "left":
+        P = _turned(_turned(covariance, pose[2]).T, pose[2]).T
+    else:
+        P = _sheared(_sheared(covariance, pose, points).T, pose, points).T
+    return np.append(error, np.column_stack([moved, gap[:, 2]])), P
+
+
+def _turned(matrix: Array, angle: float) -> Array:
+    """x and y of pose and points, in the rows of (3 + 3 K, n), about axes turned by ``angle``."""
+    c, s = np.cos(angle), np.sin(angle)
+    out = np.array(matrix, float, order="C").reshape(-1, 3, matrix.shape[1])
+    out[:, :2] = np.array([[c, s], [-s, c]]) @ out[:, :2]
+    return out.reshape(matrix.shape)
+
+
+def _sheared(matrix: Array, pose: Array, points: Array) -> Array:
+    """Rows (3 + 3 K, n) of errors in x and y with what the error of the heading, row 2, adds to each."""
+    T = np.eye(3)
+    T[:2, 2] = pose[1], -pose[0]
+    out = np.array(matrix, float, order="C")
+    out[3::3] += points[:, 1:2] * out[2]
+    out[4::3] -= points[:, :1] * out[2]
+    out[:3] = T @ out[:3]
+    return out
 
 
 def spatial_error(truth: Array, estimate: Array, convention: str) -> Array:

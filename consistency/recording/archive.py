@@ -11,7 +11,7 @@ from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, planar_error
 from consistency.reading import is_file, reading, require_room
 from consistency.recording.record import Recording, Track, assemble, symmetric
-from consistency.recording.sheet import bounded
+from consistency.recording.sheet import are_dof, bounded
 from consistency.types import Array, Failure
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
@@ -143,13 +143,10 @@ def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[
         raise InputError(f"{path}: key 'nis' has shape {nis.shape}, needs {shape}")
     dof = whole_numbers(path, arrays, "nis_dof", shape)
     known = np.isfinite(nis)
-    if (
-        (nis < 0).any()
-        or np.isinf(nis).any()
-        or not (dof[known] == np.round(np.abs(dof[known]))).all()
-        or np.isinf(dof).any()
-    ):
-        raise InputError(f"{path}: keys 'nis', 'nis_dof': nis must be 0 or more, nis_dof whole numbers of 0 or more")
+    if (nis < 0).any() or np.isinf(nis).any() or not are_dof(dof[known]).all():
+        raise InputError(
+            f"{path}: keys 'nis', 'nis_dof': nis must be 0 or more, nis_dof whole numbers from 0 to below 2^31"
+        )
     return nis, np.where(known, dof, 0.0)
 
 
@@ -176,7 +173,7 @@ def _of_nees(path: Path, arrays: dict[str, Array]) -> Recording:
     """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
     nees = _array(path, arrays, "nees", 2).copy()
     dof = arrays["dof"]
-    if dof.ndim or dof.dtype.kind not in "fiu" or not 1 <= dof < 2**31 or dof != round(float(dof)):
+    if dof.ndim or dof.dtype.kind not in "fiu" or not 1 <= float(dof) < 2**31 or dof % 1:
         raise InputError(f"{path}: key 'dof' must be one whole number of 1 or more, the dimension of the error")
     if (nees < 0).any():
         run, step = np.argwhere(nees < 0)[0]

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.reading import MOST_DOF, one_line
 from consistency.recording.archive import load_arrays, run_lengths, step_times, whole_numbers
 from consistency.recording.record import listed
-from consistency.recording.sheet import Sheet, bounded, read_sheet
+from consistency.recording.sheet import Sheet, are_dof, bounded, read_sheet
 from consistency.recording.table import row_order
 from consistency.types import Array
 
@@ -84,12 +85,12 @@ def checked_dof(nis: Array, dof: Array, place: Callable[[int], str]) -> Array:
         A NIS is negative or infinite, or its degrees of freedom are not a whole number of 0 or more.
     """
     dof = np.where(np.isnan(nis) & np.isnan(dof), 0.0, dof)
-    bad = (nis < 0) | np.isinf(nis) | ~((dof >= 0) & np.isfinite(dof) & (dof == np.round(dof)))
+    bad = (nis < 0) | np.isinf(nis) | ~are_dof(dof)
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise InputError(
             f"{place(row)}: nis {nis[row]:g} with nis_dof {dof[row]:g}; "
-            "nis must be 0 or more and finite, nis_dof a whole number of 0 or more"
+            "nis must be 0 or more and finite, nis_dof a whole number from 0 to below 2^31"
         )
     return dof
 
@@ -170,6 +171,8 @@ def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, fl
             raise InputError(f"{place}: has {len(fields)} columns, the header has {len(columns)}")
         row = dict(zip(columns, fields, strict=True))
         nis, dof = (_number(place, key, row[key].strip()) for key in NEEDED)
+        if dof >= MOST_DOF:
+            raise InputError(f"{place}: nis_dof must be a whole number from 0 to below 2^31, got {dof:g}")
         yield place, nis, 0.0 if nis != nis and dof != dof else dof
     if not columns:
         raise InputError(f"{name}: is empty; its first line must name the columns, nis and nis_dof among them")
@@ -177,6 +180,6 @@ def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, fl
 
 def _number(place: str, column: str, text: str) -> float:
     try:
-        return float(text) if text else float("nan")
+        return float(bounded(np.array(float(text) if text else np.nan)))
     except ValueError:
-        raise InputError(f"{place}: column '{column}': not a number ({text})") from None
+        raise InputError(f"{place}: column '{column}': not a number ({one_line(text, 60)})") from None

@@ -247,10 +247,15 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"
     of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})" * bool(none.any())
-    return (
-        f"{file}: the covariance is singular in every step{of}; "
-        "write only the states that the filter estimates, as CSV with --state"
+    return f"{file}: the covariance is singular in every step{of}; " + (
+        _without(axes, none) if none.any() else "write only the states that the filter estimates by themselves"
     )
+
+
+def _without(axes: tuple[str, ...], none: Array) -> str:
+    """How to leave out the components whose variance is zero."""
+    left = ",".join(axis for axis, zero in zip(axes, none, strict=True) if not zero)
+    return f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
 
 
 def count(number: int, what: str) -> str:

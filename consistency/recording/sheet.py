@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
-from consistency.reading import HUGE, is_file, one_line, reading
+from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading
 from consistency.reading import read_text as read_whole
 from consistency.store.parquet import read_frame
 from consistency.types import Array, Indices
@@ -78,9 +79,37 @@ class Lines:
         return f"{self.path}, line {self.line[row]}"
 
 
+class Places(Sequence[str]):
+    """Where some rows of a file stand, put into words when asked for."""
+
+    def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
+        self._of, self._rows = of, rows
+
+    @overload
+    def __getitem__(self, which: int) -> str: ...
+    @overload
+    def __getitem__(self, which: slice) -> Places: ...
+    def __getitem__(self, which: int | slice) -> str | Places:
+        if isinstance(which, slice):
+            return Places(self._of, self._rows[which])
+        return self._of(int(self._rows[which]))
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def at(self, rows: Indices) -> Places:
+        """Those of some of the rows."""
+        return Places(self._of, self._rows[rows])
+
+
 def bounded(values: Array) -> Array:
     """Numbers, where those that no sensor measures are infinite: what a filter that broke down writes."""
     return np.where(np.abs(values) > HUGE, np.copysign(np.inf, values), values)
+
+
+def are_dof(values: Array) -> Array:
+    """Whether numbers are degrees of freedom: whole, from 0 to below 2^31."""
+    return np.asarray((values >= 0) & (values < MOST_DOF) & (values == np.round(values)))
 
 
 def read_sheet(path: Path) -> Sheet:

@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
+from consistency.recording.hints import hints
+from consistency.recording.interpolation import Manifold, truth_at
+from consistency.recording.offset import clock_shift
+from consistency.recording.poses import Poses
 from consistency.recording.record import (
     DEFAULT_DT,
     Recording,
     Track,
     assemble,
-    associate,
     common_steps,
     common_times,
     count,
@@ -23,7 +27,7 @@ from consistency.recording.record import (
     smallest_correlation,
     symmetric,
 )
-from consistency.recording.sheet import Sheet, read_sheet
+from consistency.recording.sheet import Places, Sheet, are_dof, read_sheet
 from consistency.store.parquet import COVARIANCE, OWN_COVARIANCE
 from consistency.types import Array, Indices
 
@@ -32,7 +36,12 @@ OWN_NAMES = {(POSE[i], POSE[j]): name for name, (i, j) in COVARIANCE.items()}
 
 
 def read_tables(
-    estimates: Path, truth: Path | None, convention: str | None, state: Sequence[str] | None, max_dt: float | None
+    estimates: Path,
+    truth: Path | None,
+    convention: str | None,
+    state: Sequence[str] | None,
+    max_dt: float | None,
+    time_offset: float | str | None = None,
 ) -> list[Recording]:
     """Recordings of the estimators in a table, one for each value of its column ``filter``.
 
@@ -47,7 +56,7 @@ def read_tables(
     other = read_sheet(truth) if truth is not None else None
     if other is None and not {"nis", "nis_dof"} <= set(sheet.data.columns):
         raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
-    key = _key(sheet, other, max_dt)
+    key = _key(sheet, other, max_dt, time_offset)
     names = [estimates.stem]
     if "filter" in sheet:
         empty = np.flatnonzero(sheet.data["filter"].isna())
@@ -57,7 +66,7 @@ def read_tables(
     recordings = []
     for name in names:
         own = sheet.rows((sheet.data["filter"].astype(str) == name).to_numpy()) if "filter" in sheet else sheet
-        recordings.append(_recording(name, own, other, key, axes, convention, max_dt))
+        recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset))
     return recordings
 
 
@@ -73,8 +82,12 @@ def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | Non
     return "vector"
 
 
-def _key(sheet: Sheet, truth: Sheet | None, max_dt: float | None) -> str:
+def _key(sheet: Sheet, truth: Sheet | None, max_dt: float | None, time_offset: float | str | None) -> str:
     """The column that says which estimate belongs to which truth."""
+    if time_offset is not None:
+        if "t" in sheet and truth is not None and "t" in truth:
+            return "t"
+        raise InputError("--time-offset: needs a column t in the estimates and in the truth")
     for key in ("step", "t"):
         if key in sheet and (truth is None or key in truth):
             if max_dt is not None and not ("t" in sheet and truth is not None and "t" in truth):
@@ -94,6 +107,7 @@ def _recording(
     axes: tuple[str, ...],
     convention: str,
     max_dt: float | None,
+    time_offset: float | str | None,
 ) -> Recording:
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet.data), int)
     order = row_order(sheet, runs, key)
@@ -108,9 +122,16 @@ def _recording(
     else:
         own = convention != ADDITIVE and axes == POSE and _has_own(sheet)
         covariance = _covariance(sheet, axes, own)
-        keep, true, notes = _matched(name, sheet, truth, runs, keys, key, axes, max_dt)
         estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
+        samples = _samples(truth, axes, key)
+        shift, clocks = 0.0, list[str]()
+        if key == "t":
+            poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, _default_dt(max_dt))
+            shift, clocks = clock_shift(name, poses, time_offset)
+            clocks += hints(name, axes, poses, shift)
+        keep, true, notes = _matched(name, sheet, truth, samples, runs, keys + shift, key, axes, convention, max_dt)
+        notes += clocks
         error = planar_error(true, estimate, convention) if axes == POSE else true - estimate
         notes.append(f"error convention {convention}: {PLANAR[convention]}")
         if own:
@@ -135,7 +156,7 @@ def _recording(
         Track(
             run,
             column,
-            [sheet.place(int(row)) for row in rows],
+            Places(sheet.place, rows),
             *(None if values is None else values[rows] for values in (error, covariance, nis, dof)),
         )
         for run, rows, column in zip(numbers, members, columns, strict=True)
@@ -168,43 +189,96 @@ def row_order(sheet: Sheet, runs: Array, key: str) -> Indices:
     return order
 
 
+class Samples(NamedTuple):
+    """The truth of all runs, in order of the runs and of time."""
+
+    keys: Array  # (M,), step, or s
+    values: Array  # (M, n)
+    row: Indices  # (M,), of the file
+    runs: Indices | None  # (M,); None: it serves all
+
+    def of(self, run: int) -> Samples:
+        """Those of one run."""
+        if self.runs is None:
+            return self
+        here = self.runs == run
+        return Samples(self.keys[here], self.values[here], self.row[here], self.runs[here])
+
+
+def _samples(truth: Sheet, axes: tuple[str, ...], key: str) -> Samples:
+    _require(truth, axes)
+    values = np.column_stack([truth.numbers(axis, finite=True) for axis in axes])
+    runs = truth.numbers("run", whole=True).astype(int) if "run" in truth else None
+    order = row_order(truth, runs if runs is not None else np.zeros(len(values), int), key)
+    return Samples(truth.numbers(key)[order], values[order], order, None if runs is None else runs[order])
+
+
+def _manifold(convention: str) -> Manifold:
+    return "vector" if convention == "vector" else "planar"
+
+
+def _poses(
+    sheet: Sheet,
+    samples: Samples,
+    runs: Array,
+    t: Array,
+    estimate: Array,
+    covariance: Array,
+    convention: str,
+    max_dt: float,
+) -> list[Poses]:
+    """Each run that has a truth, with it."""
+    found = []
+    for run in np.unique(runs):
+        rows, true = np.flatnonzero(runs == run), samples.of(run)
+        if len(true.keys):
+            place = Places(sheet.place, rows)
+            found.append(
+                Poses(
+                    place, t[rows], estimate[rows], covariance[rows], np.ones(len(rows), bool), true.keys, true.values,
+                    _manifold(convention), convention, max_dt,
+                )
+            )  # fmt: skip
+    return found
+
+
 def _matched(
     name: str,
     sheet: Sheet,
     truth: Sheet,
+    samples: Samples,
     runs: Array,
     keys: Array,
     key: str,
     axes: tuple[str, ...],
+    convention: str,
     max_dt: float | None,
 ) -> tuple[Array, Array, list[str]]:
     """Which rows have a truth, (N,), that truth, (N, n), and what to say about it."""
-    _require(truth, axes)
-    values = np.column_stack([truth.numbers(axis, finite=True) for axis in axes])
-    true_runs = truth.numbers("run", whole=True).astype(int) if "run" in truth else None
-    order = row_order(truth, true_runs if true_runs is not None else np.zeros(len(values), int), key)
-    true_keys = truth.numbers(key)
+    true_runs = samples.runs
     tolerance = 0.0 if key == "step" else _default_dt(max_dt)
     keep, true = np.zeros(len(keys), bool), np.full((len(keys), len(axes)), np.nan)
     partner, furthest = np.full(len(keys), -1), 0.0
     for run in np.unique(runs):
         rows = np.flatnonzero(runs == run)
-        there = order if true_runs is None else order[true_runs[order] == run]
-        if not len(there):
+        there = samples.of(run)
+        if not len(there.keys):
             has = ", ".join(map(str, np.unique(true_runs)[:5])) if true_runs is not None else ""
             raise InputError(f"{truth.path}: holds no run {run} (it has {has}); without a column 'run' it serves all")
-        own, match = associate(keys[rows], true_keys[there], tolerance)
         if key == "step":
-            exact = keys[rows][own] == true_keys[there][match]
-            own, match = own[exact], match[exact]
+            own, match = _equal(keys[rows], there.keys)
+            found = there.values[match]
+        else:
+            manifold = _manifold(convention)
+            own, found, match, apart, _ = truth_at(keys[rows], there.keys, there.values, manifold, tolerance)
+            furthest = max(furthest, float(apart.max(initial=0.0)))
         if not len(own):
-            spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (keys[rows], true_keys[there])]
+            spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (keys[rows], there.keys)]
             within = f" within {tolerance:g} s (--max-dt)" if key == "t" else ""
             raise InputError(
                 f"{sheet.path}: no {key} of run {run} ({spans[0]}) is in {truth.path} ({spans[1]}){within}"
             )
-        keep[rows[own]], true[rows[own]], partner[rows[own]] = True, values[there[match]], there[match]
-        furthest = max(furthest, float(np.abs(keys[rows[own]] - true_keys[there[match]]).max()))
+        keep[rows[own]], true[rows[own]], partner[rows[own]] = True, found, there.row[match]
     if key == "step" and "t" in sheet and "t" in truth:
         _same_instants(sheet, truth, keep, partner, _default_dt(max_dt))
     notes = []
@@ -217,8 +291,14 @@ def _matched(
     if not keep.all():
         notes.append(f"{name}: {int((~keep).sum())} of {len(keep)} estimates have no truth and are left out")
     if furthest > 1e-6:
-        notes.append(f"{name}: estimates and truth are up to {furthest:.2g} s apart; the truth is not interpolated")
+        notes.append(f"{name}: the truth is interpolated, from samples up to {furthest:.2g} s away")
     return keep, true, notes
+
+
+def _equal(steps: Array, reference: Array) -> tuple[Indices, Indices]:
+    """Indices of equal numbers in two increasing lists."""
+    _, own, match = np.intersect1d(steps, reference, assume_unique=True, return_indices=True)
+    return own, match
 
 
 def _default_dt(max_dt: float | None) -> float:
@@ -292,11 +372,11 @@ def _nis(sheet: Sheet) -> tuple[Array | None, Array | None]:
     if "nis_dof" not in sheet:
         raise InputError(f"{sheet.path}: column 'nis_dof' is missing; it is the number of measurements in each nis")
     nis, dof = sheet.numbers("nis"), sheet.numbers("nis_dof")
-    bad = (nis < 0) | np.isinf(nis) | (np.isfinite(nis) & ~((dof >= 0) & np.isfinite(dof) & (dof == np.round(dof))))
+    bad = (nis < 0) | np.isinf(nis) | (np.isfinite(nis) & ~are_dof(dof))
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise InputError(
             f"{sheet.place(row)}: nis {nis[row]:g} with nis_dof {dof[row]:g}; "
-            "nis must be 0 or more, nis_dof a whole number of 0 or more"
+            "nis must be 0 or more, nis_dof a whole number from 0 to below 2^31"
         )
     return nis, np.where(np.isfinite(nis), dof, 0.0)

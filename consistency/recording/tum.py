@@ -3,38 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.geometry.conventions import SPATIAL, spatial_error
-from consistency.recording.record import DEFAULT_DT, Recording, Track, assemble, associate, common_times, symmetric
-from consistency.recording.sheet import Lines, read_numbers
+from consistency.geometry.conventions import SPATIAL
+from consistency.recording.poses import Poses
+from consistency.recording.record import DEFAULT_DT, Recording, associate, symmetric
+from consistency.recording.sheet import Lines, Places, read_numbers
+from consistency.recording.spatial import Source, apart, recordings_of, require_axes
 from consistency.types import Array, Indices
 
-AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
 ORDERS = ("translation-rotation", "rotation-translation")
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
 FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
 UNIT = 1e-3  # quaternions of four decimals pass
 SUFFIXES = (".txt", ".tum")
-MOVED = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
-FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
-
-
-@dataclass(frozen=True)
-class Match:
-    """The estimates of one run that have truth and covariance."""
-
-    place: list[str]  # (k,)
-    t: Array  # (k,)
-    error: Array  # (k, 6)
-    P: Array  # (k, 6, 6)
-    left_out: int
-    angle: float  # rad, median of the rotation error
-    moved: float  # sigma, median of the motion between estimate and nearest truth
 
 
 def read_tum(
@@ -44,8 +29,12 @@ def read_tum(
     convention: str | None,
     order: str | None,
     max_dt: float | None,
+    time_offset: float | str | None = None,
+    axes: Sequence[str] | None = None,
 ) -> list[Recording]:
     """Recording of one estimator: a file, or a folder with a file for each run.
+
+    With ``axes`` only these components of the error are judged, by their part of the covariance.
 
     With the 20 columns that the tools of OpenVINS write, position and rotation are two recordings: their
     cross-covariance is not in the file, so a joint NEES would be wrong.
@@ -54,6 +43,7 @@ def read_tum(
         raise InputError(f"--error {convention}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     if order not in (None, *ORDERS):
         raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}")
+    require_axes(axes)
     if truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
     runs = _runs(estimates, truth, covariance)
@@ -62,37 +52,25 @@ def read_tum(
     if split and order == ORDERS[0]:
         raise InputError(f"--covariance-order: {trajectories[0].path} has {SPLIT} columns, rotation before translation")
     error_kind = convention or ("so3-body" if split else "so3")
-    matches = []
+    poses = []
     for (_, true_path, P_path), own in zip(runs, trajectories, strict=True):
         if (own.values.shape[1] == SPLIT) != split:
             raise InputError(f"{own.path}: has {own.values.shape[1]} columns, {trajectories[0].path} another layout")
-        matches.append(_run(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt))
-    columns, t = common_times([run.t for run in matches])
-    tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, matches, strict=True))]
-    notes = _notes(estimates, matches, max_dt)
+        poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt))
     why = "" if convention else f"; the default of this layout, {_origin(split)}"
-    notes.append(f"error convention {error_kind}: {SPATIAL[error_kind]}{why}")
-    name, file = estimates.stem, str(covariance or estimates)
-    if not split:
-        return [assemble(name, tracks, t, AXES, file, error_kind, notes)]
-    halves = []
-    for title, part in (("position", slice(0, 3)), ("rotation", slice(3, 6))):
-        half = [_half(track, part) for track in tracks]
-        halves.append(assemble(f"{name} {title}", half, t, AXES[part], file, error_kind, notes))
-        notes = []
-    return halves
+    source = Source(
+        estimates,
+        [(own.path, true) for own, (_, true, _) in zip(trajectories, runs, strict=True)],
+        covariance or estimates,
+        why,
+    )
+    return recordings_of(source, poses, split, time_offset, axes)
 
 
 def _origin(split: bool) -> str:
     if split:
         return "written by OpenVINS; --error so3 where it comes from another ROS topic"
     return "as in ROS messages with a covariance; declare yours with --error"
-
-
-def _half(track: Track, part: slice) -> Track:
-    assert track.error is not None
-    assert track.covariance is not None
-    return replace(track, error=track.error[:, part], covariance=track.covariance[:, part, part])
 
 
 def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
@@ -127,86 +105,36 @@ def _same_stem(folder: Path, path: Path, option: str) -> Path:
     return matches[0]
 
 
-def _run(
+def _poses(
     own: Lines, truth_path: Path, covariance_path: Path | None, convention: str, order: str, max_dt: float | None
-) -> Match:
-    """The estimates of a run that have truth and covariance."""
+) -> Poses:
+    """A run with its truth; the covariance is NaN where none is near."""
     tolerance = DEFAULT_DT if max_dt is None else max_dt
     truth = read_trajectory(truth_path, true=True)
-    rows, match = _pairs(own, truth, tolerance, "truth")
     covariance, source = _inline(own, order), own
-    picked = rows
+    rows = picked = np.arange(len(own.t))
     if covariance_path is not None:
         if covariance is not None:
             raise InputError(f"--covariance {covariance_path}: {own.path} holds covariances already; give one of them")
         source = read_covariances(covariance_path)
         covariance = _matrices(source.values[:, 1:], order)
-        with_P, P_rows = _pairs(own, source, tolerance, "covariance")
-        both, in_truth, in_P = np.intersect1d(rows, with_P, return_indices=True)
-        rows, match, picked = both, match[in_truth], P_rows[in_P]
-        if not len(rows):
-            raise InputError(f"{own.path}: no estimate has both a truth and a covariance within {tolerance:g} s")
+        rows, picked = _pairs(own, source, tolerance, "covariance")
     if covariance is None:
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, lines of t and {FULL} numbers")
-    P = symmetric(covariance[picked], lambda row: source.place(int(picked[row])))
-    estimate = own.values[rows, 1:8]
-    finite = np.isfinite(estimate).all(axis=1)
-    error = np.full((len(rows), 6), np.nan)
-    error[finite] = spatial_error(truth.values[match][finite, 1:8], estimate[finite], convention)
-    return Match(
-        [own.place(int(row)) for row in rows], own.t[rows], error, P, len(own.t) - len(rows),
-        *_doubts(truth, match, own.t[rows], error, P),
-    )  # fmt: skip
+    P = np.full((len(own.t), 6, 6), np.nan)
+    P[rows] = symmetric(covariance[picked], lambda row: source.place(int(picked[row])))
+    with_P = np.zeros(len(own.t), bool)
+    with_P[rows] = True
+    place = Places(own.place, np.arange(len(own.t)))
+    estimate = own.values[:, 1:8]
+    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:8], "spatial", convention, tolerance)
 
 
 def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indices, Indices]:
     rows, match = associate(own.t, other.t, tolerance)
     if not len(rows):
-        raise InputError(
-            f"{own.path}: no estimate has a {what} within {tolerance:g} s (--max-dt): t is {_span(own)}, "
-            f"but {_span(other)} in {other.path}"
-        )
+        raise apart(own.path, own.t, other.path, other.t, tolerance, what)
     return rows, match
-
-
-def _span(lines: Lines) -> str:
-    return f"{lines.t[0]:.10g} to {lines.t[-1]:.10g}"
-
-
-def _doubts(truth: Lines, match: Indices, t: Array, error: Array, P: Array) -> tuple[float, float]:
-    """Medians over a run: angle of the rotation error, rad; motion between estimate and truth, sigma."""
-    angles = np.linalg.norm(error[:, 3:], axis=1)
-    angle = float(np.nanmedian(angles)) if np.isfinite(angles).any() else 0.0
-    if len(truth.t) < 2:
-        return angle, 0.0
-    speed = np.linalg.norm(np.gradient(truth.values[:, 1:4], truth.t, axis=0), axis=1)[match]
-    sigma = np.sqrt(np.abs(np.diagonal(P[:, :3, :3], axis1=1, axis2=2)).mean(axis=1))
-    moved = speed * np.abs(t - truth.t[match])
-    ratio = np.where((sigma > 0) & (moved > 1e-9), moved / np.where(sigma > 0, sigma, 1.0), 0.0)
-    return angle, float(np.median(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else 0.0
-
-
-def _notes(estimates: Path, matches: Sequence[Match], max_dt: float | None) -> list[str]:
-    """What was left out, and what looks like a matter of clocks or of conventions."""
-    notes = []
-    total = sum(run.left_out + len(run.t) for run in matches)
-    if left_out := sum(run.left_out for run in matches):
-        notes.append(
-            f"{estimates}: {left_out} of {total} estimates have no truth or no covariance "
-            f"within {DEFAULT_DT if max_dt is None else max_dt:g} s (--max-dt) and are left out"
-        )
-    angle, moved = max(run.angle for run in matches), max(run.moved for run in matches)
-    if angle > FAR:
-        notes.append(
-            f"{estimates}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run: "
-            "are the quaternions of both files x y z w, body to world, of the same body frame?"
-        )
-    if moved > MOVED:
-        notes.append(
-            f"{estimates}: between estimate and nearest truth the body moves {moved:.1f} sigma in the median of a run, "
-            "which counts as error; interpolate the truth to the timestamps of the estimates"
-        )
-    return notes
 
 
 # --- files ---------------------------------------------------------------------------------------

@@ -16,12 +16,23 @@ from consistency.errors import InputError
 from consistency.store.atomic import write_whole
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from consistency.characterising.characterise import Characterisation
+    from consistency.diagnostics import Verdict
+    from consistency.recording import Recording
     from consistency.reporting.blocks import Document
     from consistency.sweeps.regime import Regime
     from consistency.verdicts.monitoring import Watched
 
-__all__ = ["require_plot", "write_monitor_plot", "write_regime_reports", "write_reports", "write_sensor_reports"]
+__all__ = [
+    "require_plot",
+    "write_file_reports",
+    "write_monitor_plot",
+    "write_regime_reports",
+    "write_reports",
+    "write_sensor_reports",
+]
 
 KINDS = (".png", ".pdf", ".svg")  # of a plot
 
@@ -99,6 +110,40 @@ def write_sensor_reports(of: Characterisation, folder: Path, data: str, overwrit
 
     write_folder(folder, {}, manifest, contents, overwrite)
     return [folder / name for name in ("report.html", "report.pdf", "characterisation.json")]
+
+
+def write_file_reports(
+    records: Sequence[Recording],
+    judged: Mapping[str, Verdict],
+    folder: Path,
+    title: str,
+    data: str,
+    overwrite: bool = False,
+) -> list[Path]:
+    """``report.html``, ``report.pdf`` and ``verdict.json`` in a folder that appears whole or not at all.
+
+    Parameters
+    ----------
+    judged : verdicts by name of the records that are shown
+    data : text of the JSON file
+
+    Raises
+    ------
+    InputError
+        The folder exists or cannot be written.
+    """
+    from consistency.reporting.files import compose_files
+    from consistency.store.storage import manifest_of, write_folder
+
+    manifest = manifest_of(kind="verdict", source=title)
+    document = compose_files(records, judged, title, manifest)
+
+    def contents(at: Path) -> None:
+        _write_document(document, at / "report.html", at / "report.pdf")
+        _write(at / "verdict.json", data.encode("utf-8"))
+
+    write_folder(folder, {}, manifest, contents, overwrite)
+    return [folder / name for name in ("report.html", "report.pdf", "verdict.json")]
 
 
 def _write_document(document: Document, html: Path | None, pdf: Path | None) -> None:

@@ -19,7 +19,7 @@ from consistency.runs.findings import read_findings
 from consistency.store.results import open_results
 from consistency.store.storage import read_manifest
 from consistency.verdicts.curves import curves, nis_ratio, steps_of
-from consistency.verdicts.judge import design_of, verdict_by
+from consistency.verdicts.judge import design_of, verdict_by, with_map
 
 
 def build_report(folder: Path) -> Report:
@@ -53,12 +53,12 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
     shown_run = int(runs[0]) if len(runs) else 0
 
     def track(name: str) -> Track:
-        c, number = curves(results, name, steps), styles.setdefault(name, len(styles))
-        verdict = verdict_by(c, Settings(), design)
-        return Track(
-            name, number, f"{index}:{number}", verdict, c.of_run(shown_run), nis_ratio(c, verdict.runs), c.failures,
-            results,
-        )  # fmt: skip
+        c, number = curves(results, name, steps, maps=False), styles.setdefault(name, len(styles))
+        verdict, ends, shown = verdict_by(c, Settings(), design), c.ends, c.of_run(shown_run)
+        ratio = nis_ratio(c, verdict.runs)
+        del c  # its arrays are free before the maps are read
+        verdict = with_map(verdict, results, ends, Settings(), design)
+        return Track(name, number, f"{index}:{number}", verdict, ends.failures, shown, ratio, results)
 
     return Study(
         name=scenario.name if scenario else Path(str(results.manifest.get("log", folder.name))).name,

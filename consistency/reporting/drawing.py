@@ -106,6 +106,20 @@ class Bars:
 
 
 @dataclass(frozen=True)
+class Tiles:
+    """Coloured squares around N points of whole numbers, with two lines of text in each."""
+
+    x: Array  # (N,)
+    y: Array  # (N,)
+    text: tuple[str, ...]  # (N,)
+    below: tuple[str, ...]  # (N,), smaller
+    faces: tuple[str, ...]  # (N,), colours
+    inks: tuple[str, ...]  # (N,), of the text
+    tips: Tips = ()
+    columns: Columns = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Rule:
     """Line across the whole panel at one value of an axis."""
 
@@ -124,7 +138,7 @@ class Span:
     look: Look
 
 
-Mark: TypeAlias = Line | Points | Stems | Intervals | Band | Bars | Rule | Span
+Mark: TypeAlias = Line | Points | Stems | Intervals | Band | Bars | Tiles | Rule | Span
 
 
 @dataclass(frozen=True)
@@ -141,6 +155,7 @@ class Axis:
     follows: bool = False  # on a screen the range is that of the filters that are shown
     share: str = ""  # axes of one name move together
     rows: tuple[str, ...] = ()  # names at 0, 1, ... from the top
+    names: tuple[str, ...] = ()  # names at 0, 1, ... from the left
     ticks: tuple[float, ...] = ()
     whole: bool = False  # ticks at whole numbers only
     digits: tuple[int, ...] = ()  # of a log axis on a screen: leading digits of its ticks, written out
@@ -162,7 +177,7 @@ class Panel:
 
     @property
     def has_values(self) -> bool:
-        return any(np.isfinite(mark.y).any() for mark in self.marks if isinstance(mark, Line | Points | Stems))
+        return any(np.isfinite(mark.y).any() for mark in self.marks if isinstance(mark, Line | Points | Stems | Tiles))
 
 
 @dataclass(frozen=True)
@@ -234,6 +249,8 @@ def numbers(mark: Mark) -> tuple[int, int]:
             return 0, 0
         case Bars():
             return len(mark.height), 3
+        case Tiles():
+            return len(mark.x), 6 + len(mark.columns)
         case Band():
             return len(mark.x), 3
         case Intervals():

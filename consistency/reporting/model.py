@@ -20,17 +20,14 @@ DECADE = 10.0  # values that span more are drawn on a log axis
 
 
 @dataclass(frozen=True)
-class Track:
-    """One filter in one study; R runs of T steps."""
+class Estimator:
+    """One filter or estimator in one study, with the verdict on it."""
 
     name: str
     style: int  # the same number for the same filter in the whole report
     tag: str  # of the filter in this study, for what belongs to it on a page
     verdict: Verdict
-    shown: Curves  # of the shown run alone; NaN where the filter had no estimate
-    nis_ratio: Array  # (T,), NIS of the runs of the verdict over their degrees of freedom
     failures: tuple[Failure, ...]  # of all runs, also of those after the look that decided
-    results: Tables
 
     @property
     def look(self) -> Look:
@@ -41,32 +38,36 @@ class Track:
         return Owner(self.name, self.tag)
 
     @property
-    def curves(self) -> Curves:
-        """All R runs, read anew each time: a report holds those of one filter at a time, if any."""
-        return curves(self.results, self.name)
-
-    @property
     def innovations_judged(self) -> bool:
         """Whether the filter declares an optimal gain; innovations of any other are reported only."""
         return self.verdict.innovations is not None and self.verdict.innovations.judged
 
 
 @dataclass(frozen=True)
-class Study:
-    """Filters on one scenario or one log."""
+class Track(Estimator):
+    """One filter of the bench in one study; R runs of T steps."""
+
+    shown: Curves  # of the shown run alone; NaN where the filter had no estimate
+    nis_ratio: Array  # (T,), NIS of the runs of the verdict over their degrees of freedom
+    results: Tables
+
+    @property
+    def curves(self) -> Curves:
+        """All R runs, read anew each time: a report holds those of one filter at a time, if any."""
+        return curves(self.results, self.name)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Estimators that were judged on the same runs."""
 
     name: str
     summary: str
     runs: int
     shown_run: int  # the one that is drawn where only one can be
     steps: Indices  # (T,), 1..T
-    tracks: tuple[Track, ...]
-    results: Tables
+    tracks: tuple[Estimator, ...]
     until_decided: bool  # each verdict is that of the look that decided it
-
-    @property
-    def is_log(self) -> bool:
-        return self.results.scenario is None
 
     @property
     def has_truth(self) -> bool:
@@ -103,6 +104,18 @@ class Study:
     def keys(self, marked: bool = False) -> tuple[Key, ...]:
         """Entries of a legend, one a filter; ``marked``: with the filter's marker."""
         return tuple(Key(track.name, track.look, marked=marked, owner=track.owner) for track in self.tracks)
+
+
+@dataclass(frozen=True)
+class Study(Judged):
+    """Filters on one scenario or one log."""
+
+    tracks: tuple[Track, ...]
+    results: Tables
+
+    @property
+    def is_log(self) -> bool:
+        return self.results.scenario is None
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from io import BytesIO
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis as TickAxis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from consistency.reporting.drawing import (
@@ -28,11 +29,13 @@ from consistency.reporting.drawing import (
     Sheet,
     Span,
     Stems,
+    Tiles,
     kept,
 )
 from consistency.reporting.frames import dots, frame, legend, plain_numbers, stroke, title, wrapped
 from consistency.reporting.thin import LIMIT
 
+Drawn: TypeAlias = Figure  # for rooms that do not draw themselves
 WIDTH = 6.7  # inches, the text width of the page
 NARROWEST = 0.15  # span of one axis of a map over that of the other, at least: room for the tick labels
 BOUND = 0.9  # points, width of the lines at plus and minus a bound
@@ -56,6 +59,12 @@ def render(sheet: Sheet, kind: str = "svg", resolution: int = 200) -> bytes:
             engine.execute(figure)
             figure.set_layout_engine(None)
         return picture(figure, kind, resolution)
+
+
+def drawn(sheet: Sheet) -> Drawn:
+    """One sheet as a figure of Matplotlib, in the looks of the reports."""
+    with mpl.rc_context(RC):
+        return draw(sheet)
 
 
 def picture(figure: Figure, kind: str, resolution: int = 200) -> bytes:
@@ -122,7 +131,7 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
         title(axes, panel.title)
     frame(axes)
     if panel.y.rows:
-        axes.grid(visible=False, axis="y")
+        axes.grid(visible=False, axis="both" if panel.x.names else "y")
     if panel.empty and not panel.has_values:
         axes.text(0.5, 0.5, panel.empty, transform=axes.transAxes, ha="center")
         if not panel.marks:
@@ -137,6 +146,9 @@ def _axis(axes: Axes, side: str, axis: Axis) -> None:
         plain_numbers(ticks, *(axis.window or getattr(axes, f"get_{side}lim")()))
     if axis.rows:
         _rows(axes, axis.rows)
+    if axis.names:
+        axes.set(xlim=(-0.5, len(axis.names) - 0.5), xticks=range(len(axis.names)))
+        axes.set_xticklabels([wrapped(name, 12) for name in axis.names], parse_math=False)
     if axis.window is not None:
         axes.set(**{f"{side}lim": axis.window})
     if axis.start is not None:
@@ -225,6 +237,14 @@ def _bars(axes: Axes, mark: Bars, order: float, _: Panel) -> None:
     axes.stairs(mark.height, mark.edges, fill=True, color=mark.look.colour, zorder=order)
 
 
+def _tiles(axes: Axes, mark: Tiles, order: float, _: Panel) -> None:
+    for x, y, text, below, face, ink in zip(mark.x, mark.y, mark.text, mark.below, mark.faces, mark.inks, strict=True):
+        axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", zorder=order))
+        place: dict[str, Any] = {"color": ink, "ha": "center", "zorder": order, "parse_math": False}
+        axes.text(x, y, text, weight="bold", va="bottom", **place)
+        axes.text(x, y + 0.08, below, fontsize=5.5, va="top", **place)
+
+
 def _rule(axes: Axes, mark: Rule, order: float, _: Panel) -> None:
     (axes.axhline if mark.side == "y" else axes.axvline)(mark.at, zorder=order, **stroke(mark.look))
 
@@ -235,6 +255,6 @@ def _span(axes: Axes, mark: Span, _: float, __: Panel) -> None:
 
 
 PAINT: dict[type[Mark], Callable[[Axes, Any, float, Panel], None]] = {
-    Line: draw_line, Points: _points, Stems: _stems, Intervals: _intervals, Band: _band, Bars: _bars, Rule: _rule,
-    Span: _span,
+    Line: draw_line, Points: _points, Stems: _stems, Intervals: _intervals, Band: _band, Bars: _bars, Tiles: _tiles,
+    Rule: _rule, Span: _span,
 }  # fmt: skip

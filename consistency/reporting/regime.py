@@ -11,6 +11,7 @@ import numpy as np
 from consistency.diagnostics.records import STATUSES
 from consistency.reporting.blocks import Block, Cell, Chapter, Column, Document, Facts, Small, Stack, Table, Text, table
 from consistency.reporting.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, Tips
+from consistency.reporting.heat import PAPER_TITLE, heat_figure, on_paper
 from consistency.reporting.looks import COLOURS, Look, style
 from consistency.reporting.sections.provenance import facts
 from consistency.reporting.wording import listed, number
@@ -52,7 +53,9 @@ def compose_regime(regime: Regime) -> Document:
     chapters = [Chapter("filters", "Filters", "Filters", (_summary(regime), about), sweep.summary)]
     if regions:
         chapters.append(Chapter("regions", "Where each filter is consistent", "Regions", regions))
+    heat = tuple(heat_figure(regime, name) for name in sweep.filters)
     chapters += [
+        Chapter("ratios", "How wrong the covariance is", "Covariance ratios", heat),
         Chapter("rigs", "Rig, and the filters to trust", "Rigs", (_rigs(regime),)),
         Chapter("provenance", "Provenance", "Provenance", _provenance(regime)),
     ]
@@ -187,7 +190,8 @@ def _figures(regime: Regime, name: str) -> tuple[Figure, ...]:
         for i in range(len(axis.values))
     ]
     columns = 4 if len(panels) > 2 else 2
-    paper = [replace(panel, title=panel.title if i % 2 == 0 else "RMSE") for i, panel in enumerate(panels)]
+    width = PAPER_TITLE * 2 // columns
+    paper = [replace(p, title=on_paper(p.title, width) if i % 2 == 0 else "RMSE") for i, p in enumerate(panels)]
     sheets = tuple(
         Sheet(tuple(part), 1.75 * -(-len(part) // columns) + 0.3, columns=columns, keys=tuple(keys))
         for part in (paper[i : i + columns * ROWS] for i in range(0, len(paper), columns * ROWS))

@@ -25,6 +25,7 @@ from consistency.reporting.drawing import (
     Rule,
     Span,
     Stems,
+    Tiles,
     kept,
 )
 from consistency.reporting.looks import Look, solid
@@ -78,6 +79,8 @@ class Screen:
             return self.shared[axis.share]
         if axis.rows:
             return Range1d(start=len(axis.rows) - 0.5, end=-0.5)
+        if axis.names:
+            return Range1d(start=-0.5, end=len(axis.names) - 0.5)
         if axis.follows:
             return DataRange1d(only_visible=True, min_interval=axis.least or None)
         if axis.window is not None:
@@ -115,6 +118,10 @@ def _dress(chart: Any, panel: Panel) -> None:
         if axis.whole and axis.window:
             low, high = axis.window
             ticks.ticker = FixedTicker(ticks=list(range(int(np.ceil(low)), int(high) + 1)))
+    if panel.x.names:
+        chart.xaxis.ticker = FixedTicker(ticks=list(range(len(panel.x.names))))
+        chart.xaxis.major_label_overrides = dict(enumerate(panel.x.names))
+        chart.grid.visible = False
     if panel.y.rows:
         _rows(chart, panel.y.rows)
 
@@ -237,6 +244,24 @@ def _bars(chart: Any, mark: Bars, _: Panel, __: int) -> Any:
     return chart.add_glyph(source, glyphs.Quad(**bars, fill_color=mark.look.colour, line_color=None))
 
 
+def _tiles(chart: Any, mark: Tiles, _: Panel, __: int) -> Any:
+    texts = {"text": mark.text, "below": mark.below, "face": mark.faces, "ink": mark.inks}
+    source = _source(x=mark.x, y=mark.y, **texts, **mark.columns)
+    edge: dict[str, Any] = {"line_color": "#ffffff", "line_width": 2}
+    tiles = chart.add_glyph(source, glyphs.Rect(x="x", y="y", width=1, height=1, fill_color="face", **edge))
+    middle: dict[str, Any] = {"x": "x", "y": "y", "text_align": "center", "text_color": "ink"}
+    number: dict[str, Any] = {
+        "text_font_size": "13px",
+        "text_font_style": "bold",
+        "text_baseline": "bottom",
+        "y_offset": 2,
+    }
+    word: dict[str, Any] = {"text_font_size": "10px", "text_baseline": "top", "y_offset": 4}
+    chart.add_glyph(source, glyphs.Text(text="text", **middle, **number))
+    chart.add_glyph(source, glyphs.Text(text="below", **middle, **word))
+    return tiles
+
+
 def _rule(chart: Any, mark: Rule, _: Panel, __: int) -> None:
     dimension = "width" if mark.side == "y" else "height"
     chart.add_layout(Across(location=mark.at, **({"dimension": dimension} | _stroke(mark.look))))
@@ -252,6 +277,6 @@ def _span(chart: Any, mark: Span, _: Panel, __: int) -> None:
 
 
 PAINT: dict[type[Mark], Callable[[Any, Any, Panel, int], Any]] = {
-    Line: _line, Points: _points, Stems: _stems, Intervals: _intervals, Band: _band, Bars: _bars, Rule: _rule,
-    Span: _span,
+    Line: _line, Points: _points, Stems: _stems, Intervals: _intervals, Band: _band, Bars: _bars, Tiles: _tiles,
+    Rule: _rule, Span: _span,
 }  # fmt: skip

@@ -18,7 +18,8 @@ from joblib.externals.loky import Future, ProcessPoolExecutor
 from consistency.diagnostics import Verdict
 from consistency.errors import InputError
 from consistency.reading import read_json, reading
-from consistency.runs.montecarlo import run_trials, worker_count
+from consistency.runs.backends.local import worker_count
+from consistency.runs.montecarlo import run_trials
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.store.results import Results, joined
 from consistency.store.storage import manifest_of, require_free, write_folder

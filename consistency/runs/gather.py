@@ -6,8 +6,8 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import astuple
-from itertools import pairwise
+from dataclasses import astuple, dataclass
+from itertools import pairwise, takewhile
 from operator import itemgetter
 from typing import Any, Protocol
 
@@ -16,6 +16,7 @@ import pandas as pd
 
 from consistency.errors import InputError
 from consistency.store.journal import Journal
+from consistency.store.machine import this_machine
 from consistency.store.parquet import COLUMNS, Columns, Writer, write_table
 from consistency.store.results import (
     MAP_NUMBERS,
@@ -100,7 +101,8 @@ class Gathered:
         parts = {f"estimates {name}": columns for name, columns in outcome.estimates.items()}
         parts |= {f"map {name}": columns for name, columns in outcome.maps.items()}
         parts |= {} if outcome.truth is None else {"truth": outcome.truth}
-        notes = {"failures": [astuple(failure) for failure in outcome.failures], "rejections": outcome.rejections}
+        notes: dict[str, Any] = {"failures": [astuple(failure) for failure in outcome.failures]}
+        notes |= {"rejections": outcome.rejections, "machine": outcome.machine}
         with nullcontext() if self.new is None else self.new.writing():
             self._now.append(outcome.run, parts, {key: rows for key, rows in notes.items() if rows})
 
@@ -108,6 +110,25 @@ class Gathered:
     def finished(self) -> set[int]:
         """Runs that are there, those of before too."""
         return self._now.runs | self.kept
+
+    def machines(self, before: Sequence[dict[str, str]]) -> list[dict[str, str]]:
+        """Those that computed the runs: the ones ``before``, and the ones of now."""
+        now = self._now.runs - self.kept
+        noted = [self._now.notes.get(run, {}).get("machine", this_machine()) for run in sorted(now)]
+        machines = [*before, *(noted or [this_machine()])]
+        return [machine for i, machine in enumerate(machines) if machine not in machines[:i]]
+
+    def so_far(self, runs: int, manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> SoFar:
+        """Runs 0 to ``runs`` - 1 of what is there, to be read while more come."""
+        failures, rejections = self._all_failures(), self._all_rejections()
+        return SoFar(
+            self, runs, manifest, failures[failures["run"] < runs], landmarks,
+            None if rejections is None else rejections[rejections["run"] < runs],
+        )  # fmt: skip
+
+    def pieces(self, table: str, filter_name: str) -> Iterator[Columns]:
+        """Rows of ``estimates`` or ``map`` of a filter, or of ``truth``, run by run in order of the runs."""
+        return self._true() if table == "truth" else (self._of if table == "estimates" else self._map_of)(filter_name)
 
     def results(self, manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results | StoredResults:
         """The results; a folder is written and put in its place, unless no run is finished."""
@@ -219,3 +240,31 @@ class Gathered:
         rows = [row for row in rows if row.run in self.kept and row.filter in rank]
         rows += [Rejected(*row) for row in self._noted("rejections")]
         return rejections_table(sorted(rows, key=lambda row: (rank[row.filter], row.run)))
+
+
+@dataclass(frozen=True)
+class SoFar(Tables):
+    """The first runs of what is gathered; the tables are read each time they are asked for, a run at a time."""
+
+    gathered: Gathered
+    runs: int
+    manifest: dict[str, Any]
+    failures: pd.DataFrame
+    landmarks: pd.DataFrame | None
+    rejections: pd.DataFrame | None = None
+
+    @property
+    def has_truth(self) -> bool:
+        return next(self.batches("truth", ["run"]), None) is not None
+
+    @property
+    def has_joint(self) -> bool:
+        return True  # NaN in runs of older results, which lack it
+
+    def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
+        """See :meth:`Tables.batches`."""
+        names = self.filters if filter_name is None and table != "truth" else [filter_name or ""]
+        for name in names:
+            for piece in takewhile(lambda piece: piece["run"][0] < self.runs, self.gathered.pieces(table, name)):
+                nothing = np.full(len(piece["run"]), np.nan)
+                yield {column: piece.get(column, nothing) for column in columns}

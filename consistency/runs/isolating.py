@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from multiprocessing import current_process
+from typing import Any
 
 from joblib.externals.loky.backend import get_context
 from joblib.externals.loky.backend.reduction import dumps
@@ -66,6 +67,9 @@ class Isolation:
         self._free: list[_Supervisor] = []
         self._busy: set[_Supervisor] = set()
         self._is_open = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Isolation, (self.filters, self.belief, self._study.timeout, self._study.memory)
 
     def __enter__(self) -> Isolation:
         self._is_open = True
@@ -207,7 +211,8 @@ def _folder() -> str:
 
 
 @atexit.register  # before multiprocessing waits for its children
-def _dismiss() -> None:
+def dismiss() -> None:
+    """End the supervisors that are idle."""
     while _idle:
         _idle.pop().link.close()
 

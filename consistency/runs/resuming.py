@@ -10,12 +10,16 @@ from typing import Any
 
 from consistency.errors import InputError
 from consistency.store.journal import Journal, Unfinished
-from consistency.store.machine import this_machine
+from consistency.store.machine import in_words, this_machine
 from consistency.store.results import StoredResults, Tables, open_results
 from consistency.store.storage import NewFolder
 from consistency.terminal.progress import say
 
-KEYS = {"scenario_hash": "scenario", "filters": "filter", "error": "error of a filter", "seed": "seed"}
+PLAN = "until_decided"
+KEYS = {
+    "scenario_hash": "scenario", "log_sha256": "log", "filters": "filter", "error": "error of a filter", "seed": "seed",
+    PLAN: "plan of looks",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,12 @@ class Place:
     previous: Tables | None
     kept: frozenset[int]
     machines: list[dict[str, str]]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether what is there are complete results and nothing else."""
+        more = self.journal is not None and self.journal.runs
+        return self.previous is not None and bool(self.previous.manifest["complete"]) and not more
 
     @property
     def finished(self) -> set[int]:
@@ -74,6 +84,11 @@ def place_for(
                 unfinished.is_over = new.is_placed
 
 
+def place_with(journal: Journal) -> Place:
+    """Results stay in memory, and the finished runs in ``journal``."""
+    return Place(None, journal, None, frozenset(), [this_machine()])
+
+
 def _place(study: Mapping[str, Any], new: NewFolder | None, journal: Journal | None, previous: Tables | None) -> Place:
     sources = [{}] if previous is None else [previous.manifest]
     sources += [] if journal is None or not journal.runs else [journal.study]
@@ -84,15 +99,11 @@ def _place(study: Mapping[str, Any], new: NewFolder | None, journal: Journal | N
     here = this_machine()
     if others := [machine for machine in machines if machine != here]:
         say(
-            f"consistency: {' and '.join(map(_text, others))} computed the runs that are there, this is {_text(here)}: "
+            f"consistency: {in_words(others)} computed the runs that are there, this is {in_words([here])}: "
             "the last digits of the others may differ from those of one machine"
         )
     kept = frozenset() if previous is None else frozenset(previous.finished_runs(study["filters"]))
     return Place(new, journal, previous, kept, [*others, here])
-
-
-def _text(machine: Mapping[str, str]) -> str:
-    return f"{machine.get('cpu')} (BLAS: {machine.get('blas')})"
 
 
 def _with_rest(error: InputError, place: Place) -> InputError:
@@ -106,7 +117,8 @@ def _with_rest(error: InputError, place: Place) -> InputError:
 
 
 def _require_same(study: Mapping[str, Any], before: Mapping[str, Any]) -> None:
-    """Refuse to go on from runs of something else."""
+    """Refuse to go on from runs of something else; a study of a fixed number of runs has no plan that could differ."""
     for key, text in KEYS.items() if before else ():
-        if study[key] != before.get(key, {} if key == "error" else None):
+        now, then = study.get(key), before.get(key, {} if key == "error" else None)
+        if now != then and not (key == PLAN and None in (now, then)):
             raise InputError(f"the results to resume have another {text}; use the same command as before")

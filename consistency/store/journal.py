@@ -8,7 +8,7 @@ import shutil
 import struct
 import threading
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from consistency.errors import InputError
 from consistency.store.atomic import make_durable
 from consistency.store.parquet import Columns
 from consistency.store.storage import require_free, writing
+from consistency.types import Array
 
 MARK = b"run:"
 HEAD = struct.Struct("<4sIQ")  # mark, CRC-32 and length of what follows
@@ -53,6 +54,7 @@ class Journal:
         self.notes: dict[int, dict[str, Any]] = {}
         self._offsets: dict[int, int] = {}
         self._end = 0  # of the last record
+        self._buffer = bytearray()  # one for all records: a new one each time costs more than filling it
         path.touch()
         self._file = path.open("r+b", buffering=0)
         self.dropped = self._read_all()
@@ -68,20 +70,26 @@ class Journal:
 
     def begin(self, study: Mapping[str, Any]) -> None:
         """Write down what the runs are of."""
-        self._write({"study": dict(study)}, [])
+        self._write({"study": dict(study)}, ())
         self.study = dict(study)
+
+    def clear(self) -> None:
+        """Drop all that is there."""
+        self._file.truncate(0)
+        self._end, self.study, self._unsynced = 0, {}, True
+        self.notes.clear()
+        self._offsets.clear()
 
     def append(self, run: int, parts: Mapping[str, Columns], notes: Mapping[str, Any] | None = None) -> None:
         """Keep a finished run: its columns by the names of the parts, and ``notes``, which JSON can hold."""
         if self._fault is not None:
             raise self._fault
         about: dict[str, Any] = {"run": run, "parts": []} | ({"notes": dict(notes)} if notes else {})
-        pieces = []
         for name, columns in parts.items():
-            kinds, piece = _encoded(columns)
-            about["parts"].append((name, len(next(iter(columns.values()))), kinds, len(piece)))
-            pieces.append(piece)
-        offset = self._write(about, pieces)
+            kinds = " ".join([f"{column} {values.dtype.str}" for column, values in columns.items()])
+            size = sum(values.nbytes for values in columns.values())
+            about["parts"].append((name, len(next(iter(columns.values()))), kinds, size))
+        offset = self._write(about, [values for columns in parts.values() for values in columns.values()])
         if notes:
             self.notes[run] = dict(notes)
         self._offsets[run] = offset
@@ -108,21 +116,29 @@ class Journal:
         self._sync()
         self._file.close()
 
-    def _write(self, about: dict[str, Any], pieces: list[bytes]) -> int:
+    def _write(self, about: dict[str, Any], numbers: Sequence[Array]) -> int:
         """Write a record and give its offset; one that cannot be written whole leaves nothing."""
         text = json.dumps(about).encode()
-        body = b"".join([COUNT.pack(len(text)), text, *pieces])
-        record, offset = HEAD.pack(MARK, zlib.crc32(body), len(body)) + body, self._end
+        start = HEAD.size + COUNT.size + len(text)
+        size, offset = start + sum(values.nbytes for values in numbers), self._end
+        if size > len(self._buffer):
+            self._buffer = bytearray(size)
+        record, at = memoryview(self._buffer)[:size], start
+        for values in numbers:
+            np.frombuffer(record, values.dtype, len(values), at)[:] = values
+            at += values.nbytes
+        COUNT.pack_into(record, HEAD.size, len(text))
+        record[start - len(text) : start] = text
+        HEAD.pack_into(record, 0, MARK, zlib.crc32(record[HEAD.size :]), size - HEAD.size)
         try:
             self._file.seek(offset)
-            rest = memoryview(record)
-            while rest:
-                rest = rest[self._file.write(rest) :]
+            while record:
+                record = record[self._file.write(record) :]
         except BaseException:
             with suppress(OSError):
                 self._file.truncate(offset)
             raise
-        self._end, self._unsynced = offset + len(record), True
+        self._end, self._unsynced = offset + size, True
         return offset
 
     def _read(self, size: int, at: int) -> bytes:
@@ -172,21 +188,19 @@ class Journal:
                 self._fault = error
 
 
-def _encoded(columns: Columns) -> tuple[list[tuple[str, str]], bytes]:
-    """Names and types of columns, and their numbers one column after the other."""
-    kinds = [(name, values.dtype.str) for name, values in columns.items()]
-    return kinds, b"".join([values.tobytes() for values in columns.values()])
-
-
-def _decoded(piece: bytes, kinds: list[list[str]], rows: int) -> Columns:
-    columns, at = {}, 0
-    for name, kind in kinds:
+def _decoded(piece: bytes, kinds: str, rows: int) -> Columns:
+    columns, at, words = {}, 0, kinds.split(" ")
+    for name, kind in zip(words[::2], words[1::2], strict=True):
         columns[name] = np.frombuffer(piece, kind, rows, at)
         at += columns[name].nbytes
     return columns
 
 
 # --- beside an output folder -----------------------------------------------------------------------
+
+
+class Busy(InputError):
+    """Another process is at work there."""
 
 
 class Unfinished:
@@ -199,20 +213,23 @@ class Unfinished:
     ----------
     resume : go on with what is there
     overwrite : drop what is there
+    kind : of the output folder
 
     Raises
     ------
+    Busy
+        Another process works on ``out``.
     InputError
-        Another process works on ``out``; unfinished work is there, and neither ``resume`` nor ``overwrite`` is asked
+        Unfinished work is there, and neither ``resume`` nor ``overwrite`` is asked
         for; the place cannot be written.
     """
 
-    def __init__(self, out: Path, resume: bool = False, overwrite: bool = False) -> None:
+    def __init__(self, out: Path, resume: bool = False, overwrite: bool = False, kind: str = "results") -> None:
         self.out, self.path, self.is_over = out, unfinished_of(out), False
         self._made = [folder for folder in out.absolute().parents if not folder.exists()]
         with writing(out):
             if not self.path.exists():
-                require_free(out, overwrite or resume)
+                require_free(out, overwrite or resume, kind)
             self._lock = self._locked()
             try:
                 self._recover()
@@ -258,7 +275,7 @@ class Unfinished:
             except FileNotFoundError:  # the other process has just ended
                 continue
             except Timeout:
-                raise InputError(
+                raise Busy(
                     f"--out {self.out}: another process is at work on it; wait for it, or choose another folder"
                 ) from None
             if self.path.exists():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -97,8 +97,10 @@ def read_log(folder: str | Path) -> Log:
     names = _names(folder, observations, tables["landmarks"])
     _require_landmarks_only(folder, names, belief)
     positions = _positions(folder, tables["landmarks"], names.landmarks, belief)
+    of_controls, of_observations, truth = _by_run(controls), _by_run(observations), tables["truth"]
+    of_truth = None if truth is None else _by_run(truth)
     trials = [
-        _trial(folder, run, controls[controls["run"] == run], observations, names, tables["truth"], start, positions)
+        _trial(folder, run, of_controls(run), of_observations(run), names, of_truth and of_truth(run), start, positions)
         for run in sorted({int(run) for run in controls["run"]})
     ]
     files = [path, *sorted(folder.glob("*.parquet"))]
@@ -257,25 +259,28 @@ def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, beli
     return table.loc[list(labels)].to_numpy(float)
 
 
+def _by_run(table: pd.DataFrame) -> Callable[[int], pd.DataFrame]:
+    """The rows of each run, in order of the steps; those of a step as they stand."""
+    places = table.groupby("run").indices
+    return lambda run: table.iloc[places.get(run, [])].sort_values("step", kind="stable")
+
+
 def _trial(
     folder: Path,
     run: int,
     controls: pd.DataFrame,
-    observations: pd.DataFrame,
+    rows: pd.DataFrame,
     names: _Names,
     truth: pd.DataFrame | None,
     start: Array | None,
     positions: Array | None,
 ) -> Trial:
-    controls = controls.sort_values("step")
-    steps = len(controls)
-    rows = observations[observations["run"] == run].sort_values("step", kind="stable")
-    path = None
+    """A trial of its rows of the tables, in order of the steps."""
+    steps, path = len(controls), None
     if truth is not None:
-        own = truth[truth["run"] == run].sort_values("step")
-        if not np.array_equal(own["step"], np.arange(steps + 1)):
+        if not np.array_equal(truth["step"], np.arange(steps + 1)):
             raise InputError(f"{folder / 'truth.parquet'}: run {run} must have the steps 0 to {steps}, each once")
-        path = own[POSE].to_numpy(float)
+        path = truth[POSE].to_numpy(float)
     if start is None:
         start = path[0] if path is not None else np.zeros(3)
     return Trial(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import platform
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from threadpoolctl import threadpool_info
@@ -18,6 +19,11 @@ def _found() -> tuple[tuple[str, str], ...]:
 def this_machine() -> dict[str, str]:
     """``cpu``: model of the processor; ``blas``: for which architecture the loaded BLAS has chosen its code."""
     return dict(_found())
+
+
+def in_words(machines: Iterable[Mapping[str, str]]) -> str:
+    """Machines as :func:`this_machine` has them, for a sentence."""
+    return " and ".join(f"{machine.get('cpu')} (BLAS: {machine.get('blas')})" for machine in machines)
 
 
 def _cpu() -> str:

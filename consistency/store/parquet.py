@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from consistency.errors import InputError
-from consistency.reading import HUGE, is_file, one_line, reading, require_room
+from consistency.reading import HUGE, LARGEST_NUMBER, MOST_DOF, is_file, one_line, reading, require_room
 from consistency.types import Array
 
 COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
@@ -172,13 +173,11 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
     path, dtypes = folder / f"{name}.parquet", COLUMNS[name] | OPTIONAL.get(name, {})
     file = require_table(folder, name, columns)
     needed = [*columns, "filter"] if filter_name is not None else list(columns)
+    held = None if filter_name is None else _filters_of(path)
     first = 0
     for group in range(file.num_row_groups):
-        about = file.metadata.row_group(group)
-        with reading(path):
-            passed_over = filter_name is not None and not _may_hold(about, filter_name)
-        if passed_over:
-            first += about.num_rows
+        if held is not None and filter_name not in held[group]:
+            first += file.metadata.row_group(group).num_rows
             continue
         with reading(path):
             for batch in map(_plain, file.iter_batches(ROWS, [group], needed)):
@@ -192,6 +191,7 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
                     mask = pc.equal(batch.column("filter"), filter_name).to_numpy(zero_copy_only=False)
                 first += batch.num_rows
                 yield {column: values.to_numpy(dtypes[column])[mask] for column, values in table.items()}
+    pa.default_memory_pool().release_unused()
 
 
 def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
@@ -215,6 +215,8 @@ def open_parquet(path: Path, refusal: str = "cannot be read, damaged or cut shor
         about = file.metadata
         pages = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
         require_room(path, max(pages, about.num_rows * about.num_columns * 8))
+        if about.num_rows != sum(about.row_group(k).num_rows for k in range(about.num_row_groups)):
+            raise ValueError("its numbers of rows do not agree")  # no checksum is over them
     return file
 
 
@@ -236,11 +238,27 @@ def columns_of(folder: Path, name: str) -> list[str]:
     return list(require_table(folder, name).schema_arrow.names)
 
 
-def _may_hold(group: Any, filter_name: str) -> bool:
-    """Whether rows of the filter are in a row group, by its statistics; True where there are none."""
-    columns = (group.column(k) for k in range(group.num_columns))
-    known = next(column.statistics for column in columns if column.path_in_schema == "filter")
-    return known is None or not known.has_min_max or bool(known.min <= filter_name <= known.max)
+def _filters_of(path: Path) -> tuple[frozenset[str], ...]:
+    """Names of the filters in each row group of a table, which is passed over where a filter is not in it.
+
+    They are read and not taken from the statistics of the file: those that are damaged end the process, as pyarrow lets
+    no exception out of what it says of a column.
+    """
+    with reading(path):
+        about = path.stat()
+    return _filters_read(path, about.st_mtime_ns, about.st_size)
+
+
+@functools.lru_cache(maxsize=16)
+def _filters_read(path: Path, mtime_ns: int, size: int) -> tuple[frozenset[str], ...]:
+    file, first, found = open_parquet(path), 0, []
+    for group in range(file.num_row_groups):
+        with reading(path):
+            names = file.read_row_group(group, ["filter"]).column("filter")
+        _require_text(path, names, first)
+        found.append(frozenset(pc.unique(names).to_pylist()))
+        first += len(names)
+    return tuple(found)
 
 
 def _require_text(path: Path, names: Any, first: int = 0) -> None:
@@ -260,12 +278,12 @@ def _check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0)
         values = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
     if column.name in NULLABLE:
         values = np.where(column.isna() | (values == np.inf) & (column.name in UNBOUNDED), 0.0, values)
-    largest = HUGE if path.stem in GIVEN and kind == "float64" else np.inf
-    right = np.isfinite(values) & (np.abs(values) <= largest)
+    largest = MOST_DOF - 1 if column.name == "nis_dof" else HUGE if path.stem in GIVEN else LARGEST_NUMBER
+    right = np.abs(values) <= largest  # false of NaN
     if not right.all():
         row = int(np.argmin(right))
-        value = one_line(column.iloc[row], 60)
-        raise InputError(f"{path}: column '{column.name}', row {first + row}: not a finite number ({value})")
+        value, what = one_line(column.iloc[row], 60), "too large a" if np.isfinite(values[row]) else "not a finite"
+        raise InputError(f"{path}: column '{column.name}', row {first + row}: {what} number ({value})")
     if kind == "int64" and ((values != np.round(values)) | (np.abs(values) > WHOLE)).any():
         row = int(np.flatnonzero((values != np.round(values)) | (np.abs(values) > WHOLE))[0])
         raise InputError(f"{path}: column '{column.name}', row {first + row}: not a whole number ({values[row]})")

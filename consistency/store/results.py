@@ -20,6 +20,7 @@ from consistency.filters.compiled import one_blas_thread
 from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry import pose_error
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error, planar_map_error
+from consistency.reading import LARGEST_NUMBER
 from consistency.scenario import Scenario, explain
 from consistency.store.parquet import (
     COLUMNS,
@@ -57,7 +58,7 @@ class Rejected(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run leaves: rows of the tables, by filter, and failures."""
+    """What one run leaves: rows of the tables, by filter, and failures; ``machine`` did it, None for this one."""
 
     run: int
     estimates: dict[str, Columns]
@@ -65,6 +66,7 @@ class Outcome:
     failures: tuple[Failure, ...]
     maps: dict[str, Columns] = field(default_factory=dict)
     rejections: tuple[Rejected, ...] = ()
+    machine: dict[str, str] | None = None
 
 
 class Tables(ABC):
@@ -247,7 +249,7 @@ def joined(parts: Sequence[Results]) -> Results:
 def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:
     """Rows of the tables for one trial; a failed run has none from the failed step on.
 
-    A run whose NEES or NIS is too large for a number has failed in that step.
+    A run whose pose, covariance, NEES or NIS is beyond :data:`LARGEST_NUMBER` has failed in that step.
     """
     rows = [_rows(trial, e) for e in estimates]
     estimates = [e for e, _ in rows]
@@ -270,19 +272,40 @@ def _rejected(trial: Trial, estimates: Estimates, rejected: Array) -> Rejected:
 
 
 def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
-    """Rows of ``estimates``, with what they are of: a run fails in the first step whose NEES or NIS is not finite."""
+    """Rows of ``estimates``, with what they are of: a run fails in the first step with a number that is too large."""
     last, own = _last(trial, estimates), estimates.own
     first = _full_rank((estimates.covariance if own is None else own)[:last])
     columns = _columns(trial, estimates, last, first)
-    bad = {"NIS": (columns["nis_dof"] > 0) & ~np.isfinite(columns["nis"])}
-    if trial.truth is not None:
-        values = columns["nees"] + columns.get("own_nees", 0.0)
-        bad["NEES"] = (columns["step"] > first) & ~np.isfinite(values)
-    step, name = min(((int(rows.argmax()) + 1, name) for name, rows in bad.items() if rows.any()), default=(0, ""))
+    step, reason = _first_failure(columns, first, trial.truth is not None)
+    if not step and estimates.map is not None and not _is_bounded(estimates.map):
+        step, reason = last, f"a number in the map is beyond {LARGEST_NUMBER:g}"
     if not step:
         return estimates, columns
-    failure = Failure(estimates.filter, estimates.run, step, f"the {name} is not finite")
+    failure = Failure(estimates.filter, estimates.run, step, reason)
     return replace(estimates, failure=failure, map=None), {key: values[: step - 1] for key, values in columns.items()}
+
+
+def _first_failure(columns: Columns, first: int, has_truth: bool) -> tuple[int, str]:
+    """First step with a number that is too large, and which; 0 without one. A NEES counts after step ``first``."""
+    judged = columns["step"] > first if has_truth else np.zeros(len(columns["step"]), bool)
+    everywhere = np.ones(len(judged), bool)
+    numbers = {
+        "NEES": (("nees", "own_nees"), judged), "NIS": (("nis",), columns["nis_dof"] > 0),
+        "pose": (POSE, everywhere), "covariance": ((*COVARIANCE, *OWN_COVARIANCE), everywhere),
+    }  # fmt: skip
+    faults = []
+    for kind, (names, counted) in numbers.items():
+        size = np.max([np.abs(columns[name]) for name in names if name in columns], axis=0)  # NaN of any NaN
+        bad = counted & ~(size <= LARGEST_NUMBER)
+        if bad.any():
+            at = int(bad.argmax())
+            beyond = f"is beyond {LARGEST_NUMBER:g}" if np.isfinite(size[at]) else "is not finite"
+            faults.append((at + 1, f"the {kind} {beyond}"))
+    return min(faults, key=lambda fault: fault[0], default=(0, ""))
+
+
+def _is_bounded(map_: Map) -> bool:
+    return all(bool((np.abs(values) <= LARGEST_NUMBER).all()) for values in (map_.mean, map_.covariance))
 
 
 def _last(trial: Trial, estimates: Estimates) -> int:
@@ -344,7 +367,8 @@ def _map_columns(trial: Trial, estimates: Estimates, map_: Map) -> Columns:
         n = 2 if is_flat(map_.covariance) else 3
         error = trial.landmarks[ids[judged]] - map_.mean[judged]
         w = whiten(error[:, :n], map_.covariance[judged, :n, :n])
-        nees[judged] = np.einsum("ki,ki->k", w, w)
+        with np.errstate(over="ignore"):
+            nees[judged] = _capped(np.einsum("ki,ki->k", w, w))
         joint[judged] = _joint_nees(trial, estimates, map_, judged)
     return {
         "run": np.full(count, trial.run),
@@ -352,8 +376,13 @@ def _map_columns(trial: Trial, estimates: Estimates, map_: Map) -> Columns:
         **dict(zip("xyz", map_.mean.T, strict=True)),
         **{name: map_.covariance[:, i, j] for name, (i, j) in POINT_COVARIANCE.items()},
         "nees": nees,
-        JOINT: joint,
+        JOINT: np.where(np.isinf(joint), joint, _capped(joint)),
     }
+
+
+def _capped(nees: Array) -> Array:
+    """NEES of landmarks, no more than a table may hold."""
+    return np.minimum(nees, LARGEST_NUMBER)
 
 
 def _joint_nees(trial: Trial, estimates: Estimates, map_: Map, judged: Array) -> Array:
@@ -364,12 +393,14 @@ def _joint_nees(trial: Trial, estimates: Estimates, map_: Map, judged: Array) ->
     """
     if map_.joint is None or trial.truth is None or trial.landmarks is None:
         return np.full(int(judged.sum()), np.nan)
-    ids, kept = map_.landmarks[judged], np.repeat(np.append(True, judged), 3)
+    ids, P = map_.landmarks[judged], map_.joint
+    if not judged.all():
+        kept = np.repeat(np.append(True, judged), 3)
+        P = P[np.ix_(kept, kept)]
     with one_blas_thread():
         error, P = planar_map_error(
-            trial.truth[-1], trial.landmarks[ids], estimates.pose[-1], map_.mean[judged],
-            map_.joint[np.ix_(kept, kept)], estimates.error,
-        )  # fmt: skip
+            trial.truth[-1], trial.landmarks[ids], estimates.pose[-1], map_.mean[judged], P, estimates.error
+        )
         if is_flat(map_.covariance):
             flat = np.flatnonzero(np.append([1, 1, 1], np.tile([1, 1, 0], len(ids))))
             return joint_nees(error[flat], P[np.ix_(flat, flat)], dof=2)[1:]

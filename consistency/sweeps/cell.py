@@ -13,12 +13,15 @@ import pandas as pd
 
 from consistency.diagnostics import Verdict
 from consistency.filters import get_filter
-from consistency.filters.compiled import one_blas_thread
+from consistency.filters.compiled import Compiled, one_blas_thread
 from consistency.filters.stepping import run_filter
 from consistency.protocols import Filter, WholeTrial
+from consistency.runs.isolating import Isolation
 from consistency.runs.sequential import run_until_decided
+from consistency.runs.work import Backend
 from consistency.scenario import Scenario
 from consistency.simulation import simulate
+from consistency.store.journal import Journal
 from consistency.sweeps.plan import Cell, Sweep
 from consistency.terminal.progress import quiet
 from consistency.types import Trial
@@ -26,6 +29,7 @@ from consistency.verdicts.curves import Curves, curves, run_means
 
 TIMED = 3  # times that a trial is timed, of which the least counts, and trials that are tried
 SLOW = 1.0  # s, a trial that takes longer is timed once
+PATIENCE = 60.0  # s, a trial of a filter that is not compiled is not timed if it takes longer
 RUN_COLUMNS = ("run", "nees", "rmse_position", "rmse_heading", "failed_at", "reason")
 
 
@@ -59,20 +63,39 @@ class Outcome(NamedTuple):
     runs: pd.DataFrame  # RUN_COLUMNS
 
 
-def run_cell(sweep: Sweep, cell: Cell, filter_name: str, jobs: int = -1) -> Outcome:
+def run_cell(
+    sweep: Sweep,
+    cell: Cell,
+    filter_name: str,
+    jobs: int = -1,
+    backend: Backend | None = None,
+    journal: Journal | None = None,
+) -> Outcome:
     """Run one filter in one cell until it is decided.
 
     The trials depend on the sweep's seed and the cell's scenario alone. An exception is a result, too: the filter has
-    failed there.
+    failed there; but not what the system refuses.
+
+    Parameters
+    ----------
+    journal : where finished runs are kept; what is in it is of the same cell
+
+    Raises
+    ------
+    OSError, InputError with an OSError as its cause
+        No space left, no process can be started, a connection is lost.
     """
     nothing = CellResult("failed", "", 0, 0, *[np.nan] * len(NUMBERS))
     try:
         with quiet():
             results, verdicts = run_until_decided(
-                cell.scenario, [filter_name], **sweep.rule.model_dump(), seed=sweep.seed_of(cell), jobs=jobs
-            )
+                cell.scenario, [filter_name], **sweep.rule.model_dump(), seed=sweep.seed_of(cell), jobs=jobs,
+                backend=backend, journal=journal,
+            )  # fmt: skip
         verdict, found = verdicts[filter_name], curves(results, filter_name)
     except Exception as error:  # what breaks one cell must not end a night of others
+        if isinstance(error, OSError) or isinstance(error.__cause__, OSError):  # it would break all of them
+            raise
         text = f"failed: {type(error).__name__}: {error}"
         return Outcome(CellResult(**asdict(nothing) | {"diagnosis": text}), pd.DataFrame(columns=list(RUN_COLUMNS)))
     try:
@@ -129,7 +152,11 @@ def cost_of(filter_name: str, reference: str, scenario: Scenario, seed: int) -> 
 
 
 def _fastest(filters: list[Filter], trial: Trial, scenario: Scenario) -> list[float]:
-    """Seconds that each filter takes at best; infinite where it fails."""
+    """Seconds that each filter takes at best; infinite where it fails, which is tried where it can do no harm."""
+    if apart := [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]:
+        with Isolation(apart, scenario.belief, PATIENCE) as isolation:
+            if any(estimates.failure for estimates in isolation.run(trial)):
+                return [np.inf] * len(filters)
     for filter_ in filters:
         if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, scenario.belief):
             filter_.compile(trial, scenario.belief)
@@ -151,14 +178,17 @@ def _cpu_time(filter_: Filter, trial: Trial, scenario: Scenario) -> float:
 
 
 def plain_numbers(result: CellResult) -> dict[str, Any]:
-    """Fields by name, for JSON: five digits of every number."""
+    """Fields by name, for JSON: five digits of every number, text for an infinite one and null for NaN."""
     data = asdict(result)
     for name in NUMBERS:
-        data[name] = float(f"{data[name]:.5g}") if np.isfinite(data[name]) else None
+        value = data[name]
+        data[name] = None if np.isnan(value) else float(f"{value:.5g}") if np.isfinite(value) else str(float(value))
     return data
 
 
 def result_from(numbers: Mapping[str, Any]) -> CellResult:
     """The result that :func:`plain_numbers` gave; raises TypeError where a field is missing or unknown."""
-    given: dict[str, Any] = {name: np.nan if value is None else value for name, value in numbers.items()}
+    given: dict[str, Any] = {
+        name: np.nan if value is None else float(value) if name in NUMBERS else value for name, value in numbers.items()
+    }
     return CellResult(**given)

@@ -6,23 +6,22 @@ import functools
 import hashlib
 import itertools
 import json
-import time
+import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from consistency.errors import InputError
 from consistency.reading import reading
-from consistency.runs.montecarlo import worker_count
 from consistency.scenario import Scenario
 from consistency.store.atomic import write_whole
-from consistency.store.stopping import stoppable
+from consistency.store.journal import Journal, Unfinished
 from consistency.store.storage import manifest_of, read_manifest, write_folder
 from consistency.sweeps.axes import Axis
-from consistency.sweeps.cell import CellResult, Outcome, plain_numbers, result_from, run_cell
-from consistency.sweeps.plan import Cell, Rule, Sweep
-from consistency.terminal.progress import say
+from consistency.sweeps.cell import CellResult, Outcome, plain_numbers, result_from
+from consistency.sweeps.plan import MOST_CELLS, Cell, Rule, Sweep
 
 KIND, CELL_KIND = "sweep", "cell"
 CELLS = "cells"  # folder of the cells in that of the sweep
@@ -101,6 +100,13 @@ class SweepFolder:
         with reading(path / "manifest.json", "key 'result' is damaged; remove that folder"):
             return result_from(manifest["result"])
 
+    def is_missing(self, work: Work) -> bool:
+        """Whether there is no result, or one with other inputs."""
+        try:
+            return self.done(work) is None
+        except StaleCell:
+            return True
+
     def require_usable(self, overwrite: bool) -> None:
         """Refuse, before any work, a folder of something else, and cells that were made with other inputs.
 
@@ -155,6 +161,24 @@ class SweepFolder:
         text = json.dumps(manifest | {"sweep": describe(self.sweep), "tables": []}, indent=2)
         write_whole(self.path / "manifest.json", f"{text}\n".encode(), 0o644)
 
+    @contextmanager
+    def at_work(self, work: Work) -> Iterator[Journal]:
+        """The journal of what is finished of a cell; nobody else has it meanwhile, and it is gone with the cell's end.
+
+        Raises
+        ------
+        Busy
+            Another process is at work on the cell.
+        """
+        inputs = self.inputs(work)
+        with Unfinished(self.place(work), resume=True, kind=CELL_KIND) as unfinished:
+            journal = unfinished.journal
+            if journal.study.get("inputs") != inputs:
+                journal.clear()
+                journal.begin({"inputs": inputs})
+            yield journal
+            unfinished.is_over = True
+
     def write(self, work: Work, outcome: Outcome, wall: float) -> None:
         """Put a result in its place as a whole; one that another process has put there meanwhile is replaced."""
         manifest = manifest_of(
@@ -207,11 +231,20 @@ def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
     """
     with reading(path, "key 'sweep' is damaged; write it again"):
         data = manifest["sweep"]
-        return Sweep(
+        lists = [data["filters"], *data["grid"].values()]
+        if not all(isinstance(values, list) and values for values in lists):
+            raise TypeError("filters and values must be lists")
+        if not all(isinstance(name, str) for name in data["filters"]):
+            raise TypeError("filters must be names")
+        if math.prod(map(len, lists[1:])) > MOST_CELLS:
+            raise ValueError(f"more than {MOST_CELLS} cells")
+        sweep = Sweep(
             str(data["name"]), str(data["summary"]), Scenario.model_validate(data["base"]),
             tuple(Axis(key, tuple(values)) for key, values in data["grid"].items()),
             tuple(data["filters"]), int(data["seed"]), Rule.model_validate(data["rule"]),
         )  # fmt: skip
+        _ = sweep.cells  # each is checked when it is made
+        return sweep
 
 
 def open_sweep(path: Path) -> SweepFolder:
@@ -220,66 +253,3 @@ def open_sweep(path: Path) -> SweepFolder:
     if manifest.get("kind") != KIND:
         raise InputError(f"{path}: holds {manifest.get('kind')}, not a sweep; give a folder of 'consistency sweep'")
     return SweepFolder(sweep_from(manifest, path / "manifest.json"), path)
-
-
-def run_sweep(
-    sweep: Sweep, out: Path, part: int = 1, parts: int = 1, jobs: int = -1, overwrite: bool = False
-) -> tuple[SweepFolder, int]:
-    """Do what is not done yet of a share, each filter in each cell by itself.
-
-    Parameters
-    ----------
-    out : folder, which may hold a part of the same sweep; several processes may write into it
-    part, parts : this share, 1 to ``parts``
-    overwrite : run cells again that were made with other inputs
-
-    Returns
-    -------
-    The folder, and how much of the whole sweep is missing
-
-    Raises
-    ------
-    InputError
-        The folder is something else's, or holds cells that were made with other inputs; a number out of range.
-    KeyboardInterrupt
-        Ctrl-C; what is finished is kept.
-    """
-    if not 1 <= part <= parts:
-        raise InputError(f"--share {part}/{parts}: must be I/N with I from 1 to N")
-    worker_count(jobs)
-    folder = SweepFolder(sweep, Path(out))
-    folder.require_usable(overwrite)
-    share = folder.all_work(part, parts)
-    folder.begin()
-    todo = [work for work in share if _is_missing(folder, work)]
-    if len(todo) < len(share):
-        say(f"{len(share) - len(todo)} of {len(share)} are there already")
-    started = time.monotonic()
-    with stoppable() as stop:
-        for count, work in enumerate(todo, 1):
-            begun = time.monotonic()
-            outcome = run_cell(folder.sweep, work.cell, work.filter, jobs)
-            if stop.number is not None:  # and the cell took it for an error of its own
-                raise KeyboardInterrupt
-            folder.write(work, outcome, time.monotonic() - begun)
-            left = _left((time.monotonic() - started) / count * (len(todo) - count))
-            say(f"{count} of {len(todo)}: {work.text}: {_said(outcome.result)}{left}")
-    missing = sum(_is_missing(folder, work) for work in folder.all_work())
-    return folder, missing
-
-
-def _is_missing(folder: SweepFolder, work: Work) -> bool:
-    try:
-        return folder.done(work) is None
-    except StaleCell:
-        return True
-
-
-def _said(result: CellResult) -> str:
-    return f"{result.status} after {result.runs} runs" if result.runs else result.diagnosis
-
-
-def _left(seconds: float) -> str:
-    return (
-        f"; {seconds / 60.0:.0f} min left" if seconds >= 90.0 else f"; {seconds:.0f} s left" if seconds >= 1.0 else ""
-    )

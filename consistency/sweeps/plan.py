@@ -19,6 +19,7 @@ from pydantic import Field, ValidationError, field_validator
 from consistency.diagnostics import Settings
 from consistency.errors import InputError
 from consistency.filters import get_filter
+from consistency.reading import HUGE
 from consistency.runs.montecarlo import resolve_filters
 from consistency.runs.sequential import plan_of
 from consistency.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
@@ -205,6 +206,8 @@ def _axis(key: str, values: Any) -> Axis:
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
                 raise InputError(f"key 'grid.{key}': values must be positive numbers, got {value!r}")
     numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+    if numbers and not all(-HUGE <= value <= HUGE for value in values):
+        raise InputError(f"key 'grid.{key}': numbers must be finite, and {HUGE:g} at most")
     values = sorted(map(float, values)) if numbers and any(isinstance(value, float) for value in values) else values
     return Axis(key, tuple(sorted(values) if numbers else values))
 

@@ -12,10 +12,12 @@ from rich.table import Table as RichTable
 from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import plural, short
 from consistency.store.storage import plain
-from consistency.sweeps.cell import plain_numbers
+from consistency.sweeps.cell import CellResult, plain_numbers
 from consistency.sweeps.recommend import OPEN, Advice, Candidate
 from consistency.sweeps.regime import Regime
 from consistency.terminal.table import COLOURS, open_console
+
+MOST_CELLS = 48  # for a table of all cells on a terminal; map.csv has any number
 
 
 def print_regime(regime: Regime) -> None:
@@ -34,6 +36,10 @@ def print_regime(regime: Regime) -> None:
     out = open_console()
     out.print(table)
     cells = regime.sweep.cells
+    if len(cells) <= MOST_CELLS:
+        out.print()
+        out.print(_cells_table(regime))
+        out.print("verdict, and ratio of true to stated covariance", markup=False, soft_wrap=not out.is_terminal)
     lines = [f"{len(cells)} cells; cost: CPU time of a step against {regime.sweep.reference}, median over the cells"]
     if alone := sum(bool(regime.trusted(cell)) for cell in cells):
         lines.append(f"in {alone} of {len(cells)} cells some filter is consistent")
@@ -41,6 +47,29 @@ def print_regime(regime: Regime) -> None:
         lines.append(f"{regime.missing} of {len(cells) * len(regime.sweep.filters)} are not there yet")
     for line in lines:
         out.print(line, markup=False, soft_wrap=not out.is_terminal)
+
+
+def _cells_table(regime: Regime) -> RichTable:
+    """One row a cell: its values, and of each filter the verdict and the covariance ratio."""
+    table = RichTable(box=None, pad_edge=False)
+    axes = [axis for axis in regime.sweep.axes if len(axis.values) > 1] or list(regime.sweep.axes)
+    for axis in axes:
+        table.add_column(escape(axis.key.rpartition(".")[2]), justify="right" if axis.numeric else "left", max_width=36)
+    for name in regime.sweep.filters:
+        table.add_column(escape(name))
+    for cell in regime.sweep.cells:
+        values = [escape(axis.say(cell.indices[regime.sweep.axes.index(axis)])) for axis in axes]
+        found = regime.at(cell)
+        table.add_row(*values, *(_verdict_text(found.get(name)) for name in regime.sweep.filters))
+    return table
+
+
+def _verdict_text(result: CellResult | None) -> str:
+    if result is None:
+        return "-"
+    colour = COLOURS[result.status]
+    ratio = "" if np.isnan(result.ratio) else f" {'∞' if np.isinf(result.ratio) else short(result.ratio)}"
+    return f"[{colour}]{result.status}[/{colour}]{ratio}"
 
 
 # --- advice -----------------------------------------------------------------------------------------

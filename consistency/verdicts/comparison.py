@@ -16,9 +16,9 @@ from consistency.diagnostics.comparison import FailedRuns
 from consistency.errors import InputError
 from consistency.reading import HUGE, read_json, reading
 from consistency.store.atomic import write_whole
-from consistency.store.results import POSE, Results, read_results
+from consistency.store.results import POSE, Tables, open_results
 from consistency.store.storage import SCHEMA_VERSION, manifest_of, plain
-from consistency.verdicts.curves import curves
+from consistency.verdicts.curves import Curves, curves, steps_of
 
 DETECT = 1.5  # ratio that a sentence speaks of
 HIGHEST_DOF = 1000  # of an error in a baseline
@@ -73,7 +73,7 @@ class Compared:
         return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
 
 
-def baseline_of(results: Results, name: str = "results") -> Baseline:
+def baseline_of(results: Tables, name: str = "results") -> Baseline:
     """Summaries of all filters.
 
     Raises
@@ -81,21 +81,24 @@ def baseline_of(results: Results, name: str = "results") -> Baseline:
     InputError
         The results have no truth.
     """
-    filters, failures = {}, {}
-    for each in results.filters:
-        c = curves(results, each)
-        nees = c.judged.nees
-        if nees is None or c.error is None:
-            raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
-        filters[each] = summary(nees, len(POSE), c.error, c.covariance, c.runs)
-        failures[each] = len(c.failures)
+    if not results.has_truth:
+        raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
+    steps = steps_of(results)
+    filters = {each: _summary_of(curves(results, each, steps, maps=False)) for each in results.filters}
+    failures = {each: int((results.failures["filter"] == each).sum()) for each in results.filters}
     scenario = results.scenario
     m = results.manifest
     origin = (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed"))
     return Baseline(name, scenario.name if scenario else None, origin, filters, failures, m)
 
 
-def write_baseline(results: Results, path: Path, overwrite: bool = False) -> None:
+def _summary_of(c: Curves) -> RunSummary:
+    nees = c.judged.nees
+    assert nees is not None
+    return summary(nees, len(POSE), c.error, c.covariance, c.runs)
+
+
+def write_baseline(results: Tables, path: Path, overwrite: bool = False) -> None:
     """Keep the summaries of results as a small JSON file, for version control.
 
     Raises
@@ -130,7 +133,7 @@ def read_baseline(path: Path) -> Baseline:
         Neither, or damaged.
     """
     if path.is_dir():
-        return baseline_of(read_results(path), str(path))
+        return baseline_of(open_results(path), str(path))
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")

@@ -9,8 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from consistency.diagnostics import scale
+from consistency.diagnostics.blocks import by_runs, by_steps
+from consistency.diagnostics.symmetric import Symmetric
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, planar_error
+from consistency.reading import LARGEST_NUMBER
 from consistency.store.parquet import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, Columns
 from consistency.store.results import JOINT, POSE, Tables
 from consistency.types import Array, Failure, Indices
@@ -20,7 +24,7 @@ class Errors(NamedTuple):
     """Errors in one convention, with their covariance and NEES; R runs, T steps, NaN where a run has no value."""
 
     error: Array | None  # (R, T, 3), truth minus estimate; None without truth
-    covariance: Array  # (R, T, 3, 3)
+    covariance: Symmetric  # (R, T, 3, 3)
     nees: Array | None  # (R, T)
 
 
@@ -31,18 +35,22 @@ class Landmarks(NamedTuple):
     nees: Array  # (M,), NaN where the landmark is not judged
     label: Indices  # (M,)
     error: Array  # (M, 3), truth minus estimate, NaN where the truth is not known
-    covariance: Array  # (M, 3, 3)
+    covariance: Symmetric  # (M, 3, 3)
     joint: Array  # (M,), NEES given the pose and the landmarks above it in its run; NaN where it was not kept
 
     @property
     def dof(self) -> int:
         """Degrees of freedom of a landmark: 3, or 2 in the plane."""
-        return 3 if self.covariance[:, 2].any() else 2
+        return 3 if any(self.covariance.entry(2, j).any() for j in range(3)) else 2
 
     def of_runs(self, runs: int | None) -> Landmarks:
         """Those of runs 0 to ``runs`` - 1, or of all."""
-        some = self.run < (np.inf if runs is None else runs)
-        return Landmarks(*(column[some] for column in self))
+        return self.where(self.run < (np.inf if runs is None else runs))
+
+    def where(self, some: Array) -> Landmarks:
+        """Those for which ``some`` (M,) is true."""
+        columns: tuple[Any, ...] = self
+        return Landmarks(*(column[some] for column in columns))
 
 
 class Rejections(NamedTuple):
@@ -60,6 +68,15 @@ class Rejections(NamedTuple):
         return Rejections(*(column[some] for column in self))
 
 
+class Ends(NamedTuple):
+    """One filter's R runs, each by its last step."""
+
+    filter: str
+    runs: Indices  # (R,), run numbers
+    nees: Array | None  # (R,), of the pose in the filter's own error, in the last step that has one
+    failures: tuple[Failure, ...]
+
+
 @dataclass(frozen=True)
 class Curves:
     """One filter's results as arrays over (runs, steps); NaN where a run has no value."""
@@ -67,7 +84,7 @@ class Curves:
     filter: str
     runs: Indices  # (R,), run numbers
     t: Array  # (T,)
-    covariance: Array  # (R, T, 3, 3)
+    covariance: Symmetric  # (R, T, 3, 3)
     error: Array | None  # (R, T, 3), truth minus estimate, heading wrapped
     nees: Array | None  # (R, T)
     nis: Array  # (R, T)
@@ -76,14 +93,14 @@ class Curves:
     optimal_gain: bool = False  # declared by the filter
     convention: str = ADDITIVE  # of the filter's own error
     own: Errors | None = None  # in that convention, where it is not the additive one
-    landmarks: Landmarks | None = None  # None where no run has a map
+    landmarks: Landmarks | None = None  # None where no run has a map, or where they were not asked for
     rejections: Rejections | None = None  # None of a filter without a guard
 
     def of_run(self, run: int) -> Curves:
         """One run alone, R = 1, or none where there is no such run; maps and rejections are left out."""
         at = np.flatnonzero(self.runs == run)
 
-        def some(values: Array | None) -> Any:
+        def some(values: Array | Symmetric | None) -> Any:
             return None if values is None else values[at]
 
         own = None if self.own is None else Errors(*map(some, self.own))
@@ -92,6 +109,12 @@ class Curves:
             nis=self.nis[at], nis_dof=self.nis_dof[at], own=own, landmarks=None, rejections=None,
             failures=tuple(failure for failure in self.failures if failure.run == run),
         )  # fmt: skip
+
+    @property
+    def ends(self) -> Ends:
+        """What a verdict on the maps needs of the poses."""
+        nees = self.judged.nees
+        return Ends(self.filter, self.runs, None if nees is None else by_runs(_last_value, nees), self.failures)
 
     @property
     def additive(self) -> Errors:
@@ -104,8 +127,20 @@ class Curves:
         return self.additive if self.own is None else self.own
 
 
-def curves(results: Tables, filter_name: str, steps: int | None = None) -> Curves:
+def _last_value(nees: Array) -> Array:
+    """The last value of each run that is a number, (runs, steps) -> (runs,); NaN where none is."""
+    if not nees.size:
+        return np.full(len(nees), np.nan)
+    last = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
+    return np.asarray(nees[np.arange(len(nees)), last])
+
+
+def curves(results: Tables, filter_name: str, steps: int | None = None, maps: bool = True) -> Curves:
     """Arrays of one filter; of results in a folder nothing else is read but, unless ``steps`` is known, the steps.
+
+    Parameters
+    ----------
+    maps : False leaves the landmarks out, for :func:`landmarks_of` when the other arrays are needed no more
 
     Raises
     ------
@@ -117,43 +152,53 @@ def curves(results: Tables, filter_name: str, steps: int | None = None) -> Curve
     broken = results.failures[results.failures["filter"] == filter_name]
     convention, runs = results.error_of(filter_name), results.runs_of(filter_name)
     steps = steps_of(results) if steps is None else steps
-    pose, covariance = np.full((len(runs), steps, 3), np.nan), np.full((len(runs), steps, 3, 3), np.nan)
-    own = None if convention == ADDITIVE else covariance.copy()
-    nis, nis_dof = np.full(pose.shape[:2], np.nan), np.zeros(pose.shape[:2], np.int64)
-    nees = np.full(pose.shape[:2], np.nan) if results.has_truth else None
+    shape = len(runs), steps
+    pose, covariance = np.full((*shape, 3), np.nan), Symmetric.filled(shape, 3)
+    own = None if convention == ADDITIVE else Symmetric.filled(shape, 3)
+    nis, nis_dof = np.full(shape, np.nan), np.zeros(shape, np.int64)
+    nees = np.full(shape, np.nan) if results.has_truth else None
     own_nees = None if own is None or nees is None else nees.copy()
     t = np.full(steps, np.nan)
     for batch in results.batches("estimates", results.numbers_of(filter_name), filter_name):
         if (batch["step"] < 1).any():
             raise InputError(f"estimates of '{filter_name}': column 'step' must be at least 1")
-        at = np.searchsorted(runs, batch["run"]), batch["step"] - 1
+        at = _places_of(runs, steps, batch)
         for i, axis in enumerate(POSE):
-            pose[*at, i] = batch[axis]
+            pose.reshape(-1, 3)[at, i] = batch[axis]
         _fill(covariance, at, batch, COVARIANCE)
-        nis[at], nis_dof[at], t[at[1]] = batch["nis"], batch["nis_dof"], batch["t"]
+        nis.reshape(-1)[at], nis_dof.reshape(-1)[at], t[batch["step"] - 1] = batch["nis"], batch["nis_dof"], batch["t"]
         if nees is not None:
-            nees[at] = batch["nees"]
+            nees.reshape(-1)[at] = batch["nees"]
         if own is not None:
             _require_own(batch, filter_name)
             _fill(own, at, batch, OWN_COVARIANCE)
         if own_nees is not None:
-            own_nees[at] = batch["own_nees"]
+            own_nees.reshape(-1)[at] = batch["own_nees"]
     failures = tuple(Failure(filter_name, int(r), int(s), str(why)) for _, r, s, why in broken.itertuples(index=False))
     own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
     error = _errors(results, runs, pose, t) if results.has_truth else None
+    _require_agreement(filter_name, runs, Errors(error, covariance, nees))
+    if own is not None:
+        _require_agreement(filter_name, runs, Errors(own_error, own, own_nees))
     return Curves(
         filter_name, runs, t, covariance, error, nees, nis, nis_dof, failures,
         optimal_gain=filter_name in results.manifest.get("optimal_gain", []),
         convention=convention,
         own=None if own is None else Errors(own_error, own, own_nees),
-        landmarks=_landmarks(results, filter_name),
+        landmarks=landmarks_of(results, filter_name) if maps else None,
         rejections=_rejections(results, filter_name),
     )  # fmt: skip
 
 
-def _fill(covariance: Array, at: tuple[Any, ...], batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
+def _places_of(runs: Indices, steps: int, batch: Columns) -> Any:
+    """Where rows stand among the values of ``runs`` with ``steps`` each: a slice if one comes after the other."""
+    at = np.searchsorted(runs, batch["run"]) * steps + batch["step"] - 1
+    return slice(int(at[0]), int(at[-1]) + 1) if len(at) and (np.diff(at) == 1).all() else at
+
+
+def _fill(covariance: Symmetric, at: Any, batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
     for name, (i, j) in columns.items():
-        covariance[*at, i, j] = covariance[*at, j, i] = batch[name]
+        covariance.entry(i, j).reshape(-1)[at] = batch[name]
 
 
 def _require_own(batch: Columns, filter_name: str) -> None:
@@ -163,6 +208,25 @@ def _require_own(batch: Columns, filter_name: str) -> None:
                 f"estimates of '{filter_name}': column '{column}' is null, but manifest.json says that it has an "
                 "error of its own; run it again"
             )
+
+
+def _require_agreement(filter_name: str, runs: Indices, errors: Errors) -> None:
+    """Refuse an error of so many standard deviations that no NEES can go with it: its square would overflow."""
+    if errors.error is None or errors.nees is None:
+        return
+
+    def beyond(error: Array, covariance: Array, nees: Array) -> Array:
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        too_large = np.abs(error) > np.sqrt(LARGEST_NUMBER * np.maximum(variance, 0.0))
+        return np.asarray(np.isfinite(nees) & (too_large & (variance > 0)).any(axis=-1))
+
+    bad = by_runs(beyond, errors.error, errors.covariance, errors.nees)
+    if bad.any():
+        row, step = np.argwhere(bad)[0]
+        raise InputError(
+            f"estimates of '{filter_name}', run {runs[row]}, step {step + 1}: the NEES is not that of the error and "
+            "its covariance; the tables were changed or damaged; write them again"
+        )
 
 
 def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: str = ADDITIVE) -> Array:
@@ -179,14 +243,23 @@ def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: s
     return pose
 
 
-def _landmarks(results: Tables, filter_name: str) -> Landmarks | None:
+def landmarks_of(results: Tables, filter_name: str) -> Landmarks | None:
+    """Landmarks in the maps of one filter; None where no run has a map.
+
+    Raises
+    ------
+    InputError
+        The file is damaged.
+    """
     batches = list(results.batches("map", results.map_numbers, filter_name))
     if not sum(len(batch["run"]) for batch in batches):
         return None
-    rows = {column: np.concatenate([batch[column] for batch in batches]) for column in results.map_numbers}
-    covariance = np.empty((len(rows["run"]), 3, 3))
-    _fill(covariance, (slice(None),), rows, POINT_COVARIANCE)
-    error = _places(results, rows["landmark"]) - np.stack([rows[axis] for axis in "xyz"], axis=-1)
+    rows = {column: np.concatenate([batch.pop(column) for batch in batches]) for column in results.map_numbers}
+    entries = {place: rows[name] for name, place in POINT_COVARIANCE.items()}
+    covariance = Symmetric([[entries[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
+    error = _places(results, rows["landmark"])
+    for i, axis in enumerate("xyz"):
+        error[:, i] -= rows.pop(axis)
     joint = rows.get(JOINT, np.full(len(error), np.nan))
     return Landmarks(rows["run"], rows["nees"], rows["landmark"], error, covariance, joint)
 
@@ -222,16 +295,18 @@ def run_means(c: Curves) -> Array:
     """Mean NEES of each run over its judged steps, in the filter's own error, shape (R,); infinite for a failed run."""
     nees = c.judged.nees
     assert nees is not None
-    counted = np.isfinite(nees)
-    total = np.where(counted, nees, 0.0).sum(axis=1)
-    means = np.where(counted.any(axis=1), total / np.maximum(counted.sum(axis=1), 1), np.inf)
+    means, count = scale.run_means(nees)
+    means[count == 0] = np.inf
     means[np.isin(c.runs, [failure.run for failure in c.failures])] = np.inf
     return np.asarray(means)
 
 
 def nis_ratio(c: Curves, runs: int) -> Array:
     """NIS of the first ``runs`` runs over their degrees of freedom in each step, (T,)."""
-    nis, nis_dof = c.nis[:runs], c.nis_dof[:runs]
+    return by_steps(_ratio, c.nis[:runs], c.nis_dof[:runs])
+
+
+def _ratio(nis: Array, nis_dof: Array) -> Array:
     known = np.isfinite(nis) & (nis_dof > 0)
     dof = np.where(known, nis_dof, 0).sum(axis=0)
     total = np.where(known, nis, 0.0).sum(axis=0)

@@ -25,11 +25,12 @@ from consistency.diagnostics import (
     sequential_design,
 )
 from consistency.diagnostics.scale import FEW
+from consistency.diagnostics.symmetric import Symmetric
 from consistency.errors import InputError
 from consistency.recording import Recording
 from consistency.store.results import POSE, Tables
 from consistency.types import Array, Indices
-from consistency.verdicts.curves import Curves, Landmarks, curves, run_means, steps_of
+from consistency.verdicts.curves import Curves, Ends, Landmarks, curves, landmarks_of, run_means, steps_of
 
 POINT = ("x", "y", "z")
 OPTION = {
@@ -83,8 +84,14 @@ def analyse(
     settings = settings_of(confidence) if settings is None else settings
     verdicts, steps = {}, steps_of(results)
     for name in filters or results.filters:
-        verdicts[name] = verdict_by(curves(results, name, steps), settings, design)
+        verdict, ends = _of_poses(curves(results, name, steps, maps=False), settings, design)
+        verdicts[name] = with_map(verdict, results, ends, settings, design)
     return verdicts
+
+
+def _of_poses(c: Curves, settings: Settings, design: Design | None) -> tuple[Verdict, Ends]:
+    """A verdict without the maps; the arrays are free before those are read."""
+    return verdict_by(c, settings, design), c.ends
 
 
 def verdict_by(c: Curves, settings: Settings, design: Design | None) -> Verdict:
@@ -96,8 +103,21 @@ def verdict_of(c: Curves, settings: Settings) -> Verdict:
     """The verdict of one filter in its own error, with that in the additive error and the map beside it."""
     world = None if c.own is None else judge(evidence_of(c, additive=True), settings)
     verdict = replace(judge(evidence_of(c), settings), world=world, convention=own_convention(c))
-    map_ = map_evidence(c)
-    return with_scores(verdict, c, map_verdict=None if map_ is None else judge(map_, settings))
+    return _with_map(with_rejections(verdict, c), c.landmarks, c.ends, settings)
+
+
+def with_map(verdict: Verdict, results: Tables, ends: Ends, settings: Settings, design: Design | None) -> Verdict:
+    """The verdict with that on the maps, which are read for it, or with their scores where there is a ``design``."""
+    landmarks = landmarks_of(results, ends.filter)
+    if design is not None:
+        looked_at = ends.runs[: verdict.runs]
+        return with_map_score(verdict, landmarks, 1 + int(looked_at.max(initial=-1)))
+    return _with_map(verdict, landmarks, ends, settings)
+
+
+def _with_map(verdict: Verdict, landmarks: Landmarks | None, ends: Ends, settings: Settings) -> Verdict:
+    evidence = map_evidence(ends, landmarks)
+    return with_map_score(verdict, landmarks, map_verdict=None if evidence is None else judge(evidence, settings))
 
 
 def own_convention(c: Curves) -> str | None:
@@ -105,58 +125,68 @@ def own_convention(c: Curves) -> str | None:
     return None if c.own is None else c.convention
 
 
-def with_scores(verdict: Verdict, c: Curves, runs: int | None = None, map_verdict: Verdict | None = None) -> Verdict:
-    """The verdict with the scores of maps and guards of runs 0 to ``runs`` - 1, or of all, and with what was judged."""
-    if c.rejections is not None:
-        verdict = replace(verdict, rejection=rejection_score(*c.rejections.of_runs(runs)[1:]))
-    if c.landmarks is None:
+def with_rejections(verdict: Verdict, c: Curves, runs: int | None = None) -> Verdict:
+    """The verdict with the scores of a guard in runs 0 to ``runs`` - 1, or in all."""
+    if c.rejections is None:
         return verdict
-    some = c.landmarks.of_runs(runs)
-    return replace(verdict, map=replace(map_score(some.run, some.nees, c.landmarks.dof), verdict=map_verdict))
+    return replace(verdict, rejection=rejection_score(*c.rejections.of_runs(runs)[1:]))
 
 
-def map_evidence(c: Curves) -> Evidence | None:
+def with_map_score(
+    verdict: Verdict, landmarks: Landmarks | None, runs: int | None = None, map_verdict: Verdict | None = None
+) -> Verdict:
+    """The verdict with the score of the maps of runs 0 to ``runs`` - 1, or of all, and with the verdict on them."""
+    if landmarks is None:
+        return verdict
+    some = landmarks if runs is None else landmarks.of_runs(runs)
+    return replace(verdict, map=replace(map_score(some.run, some.nees, landmarks.dof), verdict=map_verdict))
+
+
+def map_evidence(ends: Ends, landmarks: Landmarks | None) -> Evidence | None:
     """The maps of one filter as the referee takes them, landmarks in the place of steps; None where none is judged.
 
     Landmarks that every map holds stand with their errors. Which runs saw the others depends on where the robot was,
     and so on the error: those count in the joint NEES only, unless there are no others.
     """
-    if c.landmarks is None or not np.isfinite(c.landmarks.nees).any():
+    if landmarks is None or not np.isfinite(landmarks.nees).any():
         return None
-    some = Landmarks(*(column[np.isfinite(c.landmarks.nees)] for column in c.landmarks))
+    judged, dof = np.isfinite(landmarks.nees), landmarks.dof
+    some = landmarks if judged.all() else landmarks.where(judged)
     runs, row = np.unique(some.run, return_inverse=True)
     labels, column = np.unique(some.label, return_inverse=True)
     nees = np.full((len(runs), len(labels)), np.nan)
     nees[row, column] = some.nees
-    dof = c.landmarks.dof
-    error, covariance = np.full((*nees.shape, dof), np.nan), np.full((*nees.shape, dof, dof), np.nan)
-    error[row, column], covariance[row, column] = some.error[:, :dof], some.covariance[:, :dof, :dof]
+    error, covariance = np.full((*nees.shape, dof), np.nan), Symmetric.filled(nees.shape, dof)
+    error[row, column] = some.error[:, :dof]
+    for i, j in itertools.combinations_with_replacement(range(dof), 2):
+        covariance.entry(i, j)[row, column] = some.covariance.entry(i, j)
     common = np.isfinite(nees).all(axis=0)
     kept = common if common.any() else np.full(len(labels), True)
-    known = common.any() and bool(np.isfinite(error[:, kept]).all())
+    at: Any = slice(None) if kept.all() else kept  # a slice is no copy
+    known = common.any() and bool(np.isfinite(error[:, at]).all())
     return Evidence(
-        c.filter,
-        error[:, kept] if known else None,
-        covariance[:, kept] if known else None,
-        nees[:, kept],
+        ends.filter,
+        error[:, at] if known else None,
+        covariance[:, at] if known else None,
+        nees[:, at],
         dof=dof,
-        failures=c.failures,
+        failures=ends.failures,
         axes=POINT[:dof],
         run_numbers=runs,
         landmarks=labels[kept],
-        joint=_joint(c, some, runs, row, column, kept),
+        joint=_joint(ends, some, dof, runs, row, column, kept),
     )
 
 
-def _joint(c: Curves, some: Landmarks, runs: Indices, row: Indices, column: Indices, kept: Array) -> JointNees | None:
+def _joint(
+    ends: Ends, some: Landmarks, width: int, runs: Indices, row: Indices, column: Indices, kept: Array
+) -> JointNees | None:
     """NEES of pose and map together of ``runs``, in whose rows and columns the landmarks stand; None where not kept."""
-    nees, width = c.judged.nees, some.dof
-    if nees is None or np.isnan(some.joint).all():
+    if ends.nees is None or np.isnan(some.joint).all():
         return None
-    of_runs, parts = nees[np.searchsorted(c.runs, runs)], np.full((len(runs), len(kept)), np.nan)
+    parts = np.full((len(runs), len(kept)), np.nan)
     parts[row, column] = some.joint
-    last = of_runs.shape[1] - 1 - np.argmax(np.isfinite(of_runs[:, ::-1]), axis=1)
-    pose = of_runs[np.arange(len(runs)), last]
+    pose = ends.nees[np.searchsorted(ends.runs, runs)]
     return JointNees(pose, np.bincount(row, some.joint), width * np.bincount(row), parts[:, kept], width)
 
 
@@ -200,7 +230,8 @@ def until_decided(c: Curves, design: Design) -> Verdict:
 def beside(verdict: Verdict, c: Curves, design: Design, runs: int) -> Verdict:
     """The verdict of a look with what the same ``runs`` say in the additive error, looked at likewise, and the map."""
     world = None if c.own is None else follow(design, lambda n: evidence_of(c, n, additive=True), runs)[0]
-    return with_scores(replace(verdict, world=world, convention=own_convention(c)), c, runs)
+    verdict = with_rejections(replace(verdict, world=world, convention=own_convention(c)), c, runs)
+    return with_map_score(verdict, c.landmarks, runs)
 
 
 def analyse_recordings(

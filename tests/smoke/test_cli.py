@@ -217,17 +217,17 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, name: str) -> None:
     """Interrupted after the first runs, then resumed: the bytes of an uninterrupted run."""
     code = f"""
 import signal, sys
-import consistency.runs.montecarlo as mc
 from consistency.cli import main
-one, count = mc._one, []
+from consistency.runs.work import Work
+one, count = Work.__call__, []
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell runs in the background
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup
-def interrupt(trial, *rest):
-    count.append(trial.run)
+def interrupt(work, run):
+    count.append(run)
     if len(count) == 4:
         signal.raise_signal(signal.{name})
-    return one(trial, *rest)
-mc._one = interrupt
+    return one(work, run)
+Work.__call__ = interrupt
 main({["run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--jobs", "1", "--out", "out"]!r})
 """
     stopped = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)

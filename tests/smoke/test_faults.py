@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command import begun, size_of
 
 from consistency.scenario import data_folder
 from consistency.store.journal import Journal
@@ -46,14 +47,8 @@ def steps_of(text: str) -> str:
 
 
 def begin(at: Path, *options: str, out: str = "out", runs: int = RUNS, **popen: Any) -> subprocess.Popen[str]:
-    """The command, in a session of its own, with signals as in a terminal."""
-    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    code += "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"  # ignored under nohup
-    code += "from consistency.cli import main; main()"
-    command = [sys.executable, "-c", code, "run", "world.toml", "--filter", FILTER, "--out", out]
-    command += ["--runs", str(runs), "--jobs", "2", *options]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | popen
-    return subprocess.Popen(command, cwd=at, text=True, start_new_session=True, **pipes)
+    command = ("run", "world.toml", "--filter", FILTER, "--out", out, "--runs", str(runs), "--jobs", "2", *options)
+    return begun(*command, cwd=at, **popen)
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:
@@ -70,12 +65,19 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> N
 
 def working(at: Path, size: int = 200_000) -> Callable[[], bool]:
     """Whether the journal has grown so large."""
-    journal = at / UNFINISHED / "journal"
-    return lambda: journal.exists() and journal.stat().st_size > size
+    return lambda: size_of(at / UNFINISHED / "journal") > size
 
 
 def kept(at: Path) -> int:
     journal = Journal(at / UNFINISHED / "journal")
+    journal.close()
+    return len(journal.runs)
+
+
+def kept_beside(at: Path) -> int:
+    """As :func:`kept`, of a journal that another process writes."""
+    shutil.copytree(at / UNFINISHED, at / ".out-copied")
+    journal = Journal(at / ".out-copied" / "journal")
     journal.close()
     return len(journal.runs)
 
@@ -141,7 +143,7 @@ def test_twenty_kills_at_random_moments(fresh: Path) -> None:
         late = kill >= 10
         process = begin(fresh, *["--resume"] * (kill > 0))
         tables, journal = fresh / UNFINISHED / "tables", fresh / UNFINISHED / "journal"
-        size = journal.stat().st_size if journal.exists() else 0
+        size = size_of(journal)
         wait_for(tables.exists if late else working(fresh, size + 3_000), process)
         time.sleep(moments.uniform(0.0, 0.15))
         process.kill()
@@ -267,3 +269,71 @@ def test_results_that_are_removed_meanwhile(fresh: Path) -> None:
     assert process.returncode == 2
     assert kept(fresh) == RUNS - 50
     resume(fresh)
+
+
+@pytest.mark.slow
+def test_a_full_disk_that_is_freed(fresh: Path, tmp_path: Path) -> None:
+    """A file system of 16 MiB, of which something else takes 11; nobody but root may mount it."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16m", "none", str(disk)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        (disk / "ballast").write_bytes(bytes(11 * 2**20))
+        shutil.copy(fresh / "world.toml", disk)
+        process = begin(disk)
+        _, error = process.communicate(timeout=300)
+        assert process.returncode == 2
+        done = kept(disk)
+        said = f"--out out: cannot be written (No space left on device); {done} finished runs are kept, and the same"
+        assert said in one_sentence(error)
+        assert 0 < done < RUNS
+        (disk / "ballast").unlink()
+        status, error = end(begin(disk, "--resume"))
+        assert status == 0, error
+        for path in (fresh / "whole").glob("*.parquet"):
+            assert (disk / "out" / path.name).read_bytes() == path.read_bytes(), path.name
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.slow
+def test_memory_that_is_taken_away(fresh: Path) -> None:
+    """A limit on the address space at what is taken: a sentence, or the C library ends the process; no run is lost."""
+    process = begin(fresh)
+    wait_for(working(fresh), process)
+    taken = int(Path(f"/proc/{process.pid}/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.prlimit(process.pid, resource.RLIMIT_AS, (taken, resource.RLIM_INFINITY))
+    done = kept_beside(fresh)
+    _, error = process.communicate(timeout=300)
+    assert "Traceback" not in error
+    if process.returncode > 0:  # below 0 a library aborted, by a signal
+        assert "memory" in error.lower()
+    if (fresh / UNFINISHED).exists():  # else the results are there, and a verdict may be missing
+        assert kept(fresh) >= done > 0
+        resume(fresh)
+    require_same(fresh)
+
+
+@pytest.mark.slow
+def test_a_journal_that_is_cut_short_anywhere(fresh: Path) -> None:
+    process = begin(fresh)
+    wait_for(working(fresh), process)
+    process.kill()
+    process.communicate()
+    journal, done = fresh / UNFINISHED / "journal", kept(fresh)
+    cut = random.Random().randrange(journal.stat().st_size)
+    os.truncate(journal, cut)
+    assert kept(fresh) < done
+    resume(fresh)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
+@pytest.mark.parametrize("arguments", [["list"], ["--help"]])
+def test_standard_output_on_a_full_disk(arguments: list[str]) -> None:
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "consistency", *arguments]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=300)
+    assert done.returncode == 2
+    assert done.stderr == "consistency: output cannot be written (No space left on device)\n"

@@ -61,6 +61,7 @@ def test_blocks_do_not_change_the_verdict(
     whole = verdicts(arrays, failures=failures)
     before = {name: array.copy() for name, array in arrays.items()}
     monkeypatch.setattr(blocks, "ROWS", size)
+    monkeypatch.setattr(blocks, "FEWER", size)
     for a, b in zip(whole, verdicts(arrays, failures=failures), strict=True):
         assert (a.status, a.reasons) == (b.status, b.reasons)
         equal(a.statistics, b.statistics)
@@ -84,10 +85,10 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(
 ) -> None:
     """Error, covariance, NIS and its degrees of freedom are 112 bytes a run and step."""
     arrays = sample(rng, 400, 100)
-    monkeypatch.setattr(blocks, "ROWS", 1000)
     peaks = []
-    for rows in (blocks.ROWS, 10**9):  # the second is the negative control
+    for rows in (1000, 10**9):  # the second is the negative control
         monkeypatch.setattr(blocks, "ROWS", rows)
+        monkeypatch.setattr(blocks, "FEWER", rows)
         tracemalloc.start()
         try:
             assert judge("f", **arrays).status == "overconfident"

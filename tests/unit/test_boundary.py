@@ -220,3 +220,80 @@ def test_one_bad_step_sizes_nothing(files: Path) -> None:
     table.to_parquet(path, index=False)
     with pytest.raises(cs.InputError, match=r"estimates\.parquet: step 1000000000000 of run 0"):
         cs.analyse(cs.read_results(path.parent))
+
+
+# --- results ----------------------------------------------------------------------------------------
+
+
+def edited(files: Path, column: str, new: float) -> Path:
+    """Results in which one number of a step was changed."""
+    path = files / "results" / "estimates.parquet"
+    table = pd.read_parquet(path).astype({column: float})
+    table.loc[40, column] = new
+    table.to_parquet(path, index=False)
+    return path.parent
+
+
+@pytest.mark.parametrize(
+    ("column", "new", "said"),
+    [
+        ("x", 1e61, "column 'x', row 40: too large a number"),
+        ("P_xx", -1e300, "column 'P_xx', row 40: too large a number"),
+        ("nees", 1e61, "column 'nees', row 40: too large a number"),
+        ("nis", np.inf, "column 'nis', row 40: not a finite number"),
+        ("nis_dof", 2.0**31, "column 'nis_dof', row 40: too large a number"),
+        ("x", 1e40, "estimates of 'one', run 3, step 5: the NEES is not that of the error"),
+        ("P_yy", 1e-200, "estimates of 'one', run 3, step 5: the NEES is not that of the error"),
+    ],
+)
+def test_numbers_whose_squares_would_overflow_are_refused(files: Path, column: str, new: float, said: str) -> None:
+    folder = edited(files, column, new)
+    with pytest.raises(cs.InputError, match=said):
+        cs.analyse(cs.read_results(folder))
+
+
+def test_large_numbers_that_go_together_are_judged(files: Path) -> None:
+    """Without a warning, as the whole suite treats them as errors; the verdict is on what is there."""
+    with np.errstate(all="raise", under="ignore"):
+        verdict = cs.analyse(cs.read_results(edited(files, "nees", 1e60)))["one"]
+    assert verdict.status in ("overconfident", "heavy-tailed", "inconsistent", "undecided")
+
+
+@pytest.mark.parametrize("name", ["est.npz", "nees.npz"])
+def test_degrees_of_freedom_beyond_whole_numbers_are_refused(files: Path, name: str) -> None:
+    path = files / "archive" / name
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    key = "nis_dof" if name == "est.npz" else "dof"
+    for value in (2.0**31, np.float16(np.inf), 1e300, np.float32(2.5)):
+        np.savez(path, **arrays | {key: np.array(value)})
+        with pytest.raises(cs.InputError, match="whole number"):
+            read(path)
+
+
+def test_counts_of_rows_that_disagree_are_refused(files: Path) -> None:
+    """The number of rows of a group, which no checksum is over, is one less: a row would be passed over."""
+    path = files / "results" / "truth.parquet"
+    content = path.read_bytes()
+    rows = pq.read_metadata(path).num_rows
+    group = b"\x16" + varint(rows)
+    at = content.rindex(group)
+    path.write_bytes(content[:at] + b"\x16" + varint(rows - 1) + content[at + len(group) :])
+    with pytest.raises(cs.InputError, match=r"truth\.parquet: .*numbers of rows do not agree"):
+        read_parquet(path.parent, "truth")
+
+
+def varint(value: int) -> bytes:
+    """A whole number as the compact protocol of Thrift has it."""
+    coded, out = 2 * value, b""
+    while coded > 127:
+        coded, out = coded >> 7, out + bytes([coded & 127 | 128])
+    return out + bytes([coded])
+
+
+def test_a_number_of_a_grid_that_no_float_holds_is_refused(files: Path) -> None:
+    path = files / "sweep" / "sweep.toml"
+    text = path.read_text(encoding="utf-8").replace("odometry = [", f"odometry = [\n    {10**400},")
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(cs.InputError, match=r"key 'grid\.odometry'"):
+        load_sweep(path)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import os
+import sys
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +16,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
+from consistency.challenging import bench as scoring
 from consistency.challenging.bench import WORST, Bench, Done, score_of_run
 from consistency.challenging.challenge import BASES, Campaign, Plan, base_of, challenge, is_overconfident
 from consistency.challenging.search import BATCH, RUNGS, Budget, Candidate, ranked, search, standard_error
@@ -21,6 +25,7 @@ from consistency.challenging.wording import as_data, lines, write_scenario
 from consistency.challenging.worlds import Choice, Point, Scale, Space, space_of
 from consistency.cli import main
 from consistency.errors import InputError
+from consistency.runs.isolating import Isolation
 from consistency.simulation import require_landmarks_in_view
 from consistency.simulation.path import lap_length, planned_path
 
@@ -502,7 +507,30 @@ def test_the_score_is_in_the_error_of_the_filter() -> None:
     filter_: Any = Invariant()
     filter_.update = lambda state, observation: (state, None)
     world = require_landmarks_in_view(STEREO)
-    assert score_of_run(filter_, STEREO, world, 0, 0) < -5.0  # in the additive error it is above 0
+    with Isolation([filter_], STEREO.belief) as isolation:
+        assert score_of_run(isolation, world, 0, 0) < -5.0  # in the additive error it is above 0
+
+
+class Ends(Invariant):
+    """Ends its process, or never ends a step."""
+
+    def __init__(self, hangs: bool) -> None:
+        self.hangs = hangs
+
+    def predict(self, state: Any, control: Any) -> Any:
+        while self.hangs:
+            pass
+        os._exit(3)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="signals")
+@pytest.mark.parametrize("hangs", [False, True])
+def test_a_filter_that_crashes_or_hangs_fails_its_trials_alone(hangs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scoring, "PATIENCE", 0.3)
+    filter_: Any = Ends(hangs)
+    with Bench(filter_, jobs=2) as bench:
+        done = bench([(STEREO, [0]), (STEREO, [1])], 0, until=time.monotonic() + 0.5)
+    assert [each.scores for each in done if each is not None] == [(WORST,), (WORST,)]
 
 
 def test_worlds_that_show_nothing_are_left_out() -> None:

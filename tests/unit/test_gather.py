@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import tracemalloc
 import weakref
 from collections.abc import Callable
@@ -19,8 +20,10 @@ import pytest
 from edited import accept_changes
 
 import consistency as cs
-from consistency.runs import gather, montecarlo
+from consistency.runs import gather, work
+from consistency.runs.backends import local
 from consistency.runs.montecarlo import Interrupted
+from consistency.runs.work import Work
 from consistency.simulation import World
 from consistency.store import parquet
 from consistency.store.results import Outcome, StoredResults, open_results, outcome_of
@@ -169,8 +172,8 @@ def test_few_outcomes_wait_for_their_turn(uvd: cs.Scenario, tmp_path: Path, monk
         most.append(len(alive))
         return outcome
 
-    monkeypatch.setattr(montecarlo, "outcome_of", counted)
-    monkeypatch.setattr(montecarlo, "AHEAD", 2)
+    monkeypatch.setattr(work, "outcome_of", counted)
+    monkeypatch.setattr(local, "AHEAD", 2)
     cs.run_trials(uvd, ["ekf-uvd"], 60, jobs=2, out=tmp_path / "out")
     assert len(most) == 60
     assert max(most) <= 2 * 2 + 2, "those ahead, the one that is written, and the next"
@@ -277,9 +280,10 @@ def test_stopped_and_resumed_gives_the_same_bytes(
         cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, out=out)
     monkeypatch.undo()
     part = open_results(out)
-    assert part.finished_runs(FILTERS) == {0, 1, 2, 3}
+    finished = part.finished_runs(FILTERS)
+    assert finished == {0, 1, 2, 3} or (jobs > 1 and 4 not in finished)  # another worker may be before or behind
     assert part.manifest == stop.value.results.manifest
-    assert (part.manifest["complete"], part.manifest["finished_runs"]) == (False, 4)
+    assert (part.manifest["complete"], part.manifest["finished_runs"]) == (False, len(finished))
     (out / "notes.txt").write_text("mine")
     cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=jobs, previous=part, out=out)
     assert content(out) == content(written)
@@ -324,6 +328,45 @@ def test_a_filter_without_any_row_is_resumed(uvd: cs.Scenario, tmp_path: Path) -
         cs.run_trials(uvd, filters, runs=4, jobs=1, previous=previous, out=tmp_path / "out", overwrite=True)
         cs.run_trials(uvd, filters, runs=4, jobs=1, out=tmp_path / "whole", overwrite=True)
         assert content(tmp_path / "out") == content(tmp_path / "whole")
+
+
+def test_a_run_that_takes_long_keeps_no_other_from_the_journal(
+    uvd: cs.Scenario, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trial, kept = World.trial, threading.Event()
+    add = gather.Gathered.add
+
+    def last(self: World, run: int, seed: int) -> Trial:
+        assert run or kept.wait(60.0), "the others wait for the first"
+        return trial(self, run, seed)
+
+    def counted(self: gather.Gathered, outcome: Outcome) -> None:
+        add(self, outcome)
+        if self.finished == set(range(1, 9)):
+            kept.set()
+
+    monkeypatch.setattr(World, "trial", last)
+    monkeypatch.setattr(Work, "compile", lambda self, run: None)
+    monkeypatch.setattr(gather.Gathered, "add", counted)
+    cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=2, out=tmp_path / "out")
+    assert content(tmp_path / "out") == content(written)
+
+
+def test_what_ends_together_with_an_error_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Fails:
+        isolation = nullcontext()
+
+        def __call__(self, run: int) -> int:
+            if run in (0, 2):
+                raise RuntimeError("out of ideas")
+            return run
+
+    wait = local.wait
+    monkeypatch.setattr(local, "wait", lambda futures, return_when: wait(futures))
+    outcomes = local.Local(2).outcomes(Fails(), range(4))  # type: ignore[arg-type]
+    assert {next(outcomes), next(outcomes)} == {1, 3}
+    with pytest.raises(RuntimeError, match="out of ideas"):
+        next(outcomes)
 
 
 def test_rows_out_of_order_are_not_resumed(uvd: cs.Scenario, written: Path) -> None:
@@ -382,7 +425,8 @@ def test_an_error_in_the_middle_leaves_the_finished_runs(
     trial = World.trial
     monkeypatch.setattr(World, "trial", lambda self, run, seed: (done.append(run), trial(self, run, seed))[1])
     cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=out, resume=True)
-    assert set(done) == {5, 6, 7, 8}
+    assert 5 in done
+    assert set(done) == {5, 6, 7, 8} or (jobs > 1 and set(done) <= {3, 4, 5, 6, 7, 8})
     assert content(out) == content(written)
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 

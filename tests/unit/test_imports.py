@@ -29,15 +29,16 @@ RANK = {
     "store.log": 7,
     "imaging": 6,
     "recording": 7,
-    "runs.supervising": 6, "runs.gather": 7, "runs.isolating": 7, "runs.resuming": 7, "runs.montecarlo": 8,
+    "runs.supervising": 6, "runs.gather": 7, "runs.isolating": 7, "runs.resuming": 7, "runs.work": 8,
+    "runs.backends": 9, "runs.campaign": 9, "runs.montecarlo": 10,
     "frontend": 8,
-    "verdicts.curves": 7, "verdicts.judge": 8, "verdicts.monitoring": 8, "verdicts.comparison": 9,
-    "runs.sequential": 9,
-    "terminal.table": 10,
-    "runs.findings": 11, "sweeps": 11, "challenging": 11, "characterising": 11,
-    "reporting": 12, "gating": 12,
-    "cli": 13, "testing": 13, "pytest_plugin": 13,
-    "__main__": 14,
+    "verdicts.curves": 7, "verdicts.judge": 10, "verdicts.monitoring": 10, "verdicts.comparison": 11,
+    "runs.sequential": 11,
+    "terminal.table": 12,
+    "runs.findings": 13, "sweeps": 13, "challenging": 13, "characterising": 13,
+    "reporting": 14, "gating": 14,
+    "cli": 15, "notebook": 15, "testing": 15, "pytest_plugin": 15,
+    "__main__": 16,
 }  # fmt: skip
 DIAGNOSTICS = {"types", "geometry", "errors", "diagnostics"}
 DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}  # only reporting draws
@@ -217,6 +218,15 @@ def test_the_package_itself_loads_nothing_heavy() -> None:
     heavy = {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh", "typer"}
     assert not loaded("import consistency") & heavy
     assert "numba" in loaded("import consistency; consistency.get_filter('ekf-uvd')")  # negative control
+
+
+def test_engines_of_clusters_are_loaded_when_they_are_chosen() -> None:
+    engines = {"dask", "distributed", "submitit"}
+    choose = "import consistency.runs.montecarlo\nfrom consistency.runs.backends import choosing\n"
+    choose += "choosing.backend_for({!r})"
+    assert not loaded(choose.format("local")) & engines
+    assert loaded(choose.format("dask")) & engines == {"dask", "distributed"}
+    assert loaded(choose.format("slurm")) & engines == {"submitit"}
 
 
 @pytest.mark.parametrize("package", ["consistency", "consistency.vision"])

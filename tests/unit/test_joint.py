@@ -197,6 +197,13 @@ def results() -> cs.Results:
     return cs.run_trials(scenario, ["ekf-uvd", "ri-ekf-uvd"], runs=6, seed=3, jobs=1)
 
 
+def _evidence(results: cs.Results, name: str) -> Evidence:
+    c = curves(results, name)
+    evidence = map_evidence(c.ends, c.landmarks)
+    assert evidence is not None
+    return evidence
+
+
 @pytest.mark.parametrize("name", ["ekf-uvd", "ri-ekf-uvd"])
 def test_the_table_has_the_nees_of_the_joint_error(results: cs.Results, name: str) -> None:
     scenario = results.scenario
@@ -210,9 +217,9 @@ def test_the_table_has_the_nees_of_the_joint_error(results: cs.Results, name: st
     at = results.estimates[(results.estimates["filter"] == name) & (results.estimates["run"] == 2)].iloc[-1]
     pose = at["nees"] if name == "ekf-uvd" else at["own_nees"]
     assert rows["joint_nees"].sum() + pose == pytest.approx(error @ np.linalg.solve(own, error), rel=1e-8)
-    joint = map_evidence(curves(results, name)).joint
+    joint = _evidence(results, name).joint
     assert joint.pose[2] + joint.map[2] == pytest.approx(rows["joint_nees"].sum() + pose)
-    evidence = map_evidence(curves(results, name))
+    evidence = _evidence(results, name)
     for j, label in enumerate(evidence.landmarks):
         mean = rows[rows["landmark"] == label][["x", "y", "z"]].to_numpy()[0]
         np.testing.assert_allclose(evidence.error[2, j], trial.landmarks[label] - mean)
@@ -243,7 +250,7 @@ def test_a_map_that_is_not_definite_survives_a_file(results: cs.Results, tmp_pat
 def test_landmarks_that_only_some_runs_saw_count_in_the_joint_nees_alone(results: cs.Results) -> None:
     label = results.map["landmark"].iloc[0]
     rare = replace(results, map=results.map[(results.map["landmark"] != label) | (results.map["run"] == 0)])
-    whole, part = (map_evidence(curves(r, "ekf-uvd")) for r in (results, rare))
+    whole, part = (_evidence(r, "ekf-uvd") for r in (results, rare))
     assert label in whole.landmarks
     assert label not in part.landmarks
     assert part.joint.dof[0] == part.joint.dof[1] + 3

@@ -425,7 +425,8 @@ def test_two_ctrl_c_lose_nothing(uvd: cs.Scenario, whole: Path, tmp_path: Path, 
     assert there or jobs == 2, "of two workers one may be in run 4 before an outcome is taken"
     if there:
         done = open_results(tmp_path / "out").finished_runs(FILTER)
-        assert done == set(range(len(done)))
+        assert 4 not in done
+        assert jobs == 2 or done == {0, 1, 2, 3}, "of two workers one may be behind"
     at_run(4, int)
     cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=there)
     assert content(tmp_path / "out") == content(whole)
@@ -563,3 +564,11 @@ def test_another_processor_is_named(uvd: cs.Scenario, whole: Path, tmp_path: Pat
     cs.run_trials(uvd, FILTER, RUNS + 2, seed=3, jobs=1, out=out, resume=True)
     assert "Z80 (BLAS: Prescott) computed the runs that are there" in capsys.readouterr().err
     assert open_results(out).manifest["machines"] == [old, here]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_no_signal_disturbs_what_must_be_whole() -> None:
+    """Each of those that are taken for Ctrl-C, SIGTERM and SIGHUP among them."""
+    with stopping.undisturbed():
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            assert signal.getsignal(number) is signal.SIG_IGN, number

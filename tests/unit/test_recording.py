@@ -177,7 +177,7 @@ def write_trajectories(at: Path, convention: str, order: str = "translation-rota
                 swap = [3, 4, 5, 0, 1, 2]
                 P = P[np.ix_(swap, swap)]
             estimates.append([t, *estimate])
-            truths.append([t + 0.001, *position, *Rotation.from_matrix(turn).as_quat()])
+            truths.append([t, *position, *Rotation.from_matrix(turn).as_quat()])
             matrices.append([t, *(P[np.triu_indices(6)] if triangle else P.ravel())])
         for folder, rows in (("est", estimates), ("truth", truths), ("P", matrices)):
             np.savetxt(at / folder / f"run{run}.txt", rows, fmt="%.17g", header="made")
@@ -273,8 +273,9 @@ def test_a_failing_trajectory_and_warnings(tmp_path: Path) -> None:
     rows = np.loadtxt(path)
     rows[20:, 1:] = np.nan
     np.savetxt(path, rows, fmt="%.17g")
-    for path in (tmp_path / "truth").iterdir():  # w first, and a truth that moves
+    for path in (tmp_path / "truth").iterdir():  # w first, and a truth that jumps about between its samples
         rows = np.loadtxt(path)
+        rows[:, 0] -= 0.02
         np.savetxt(path, rows[:, [0, 1, 2, 3, 7, 4, 5, 6]], fmt="%.17g")
     [r] = read_recordings(tmp_path / "est", tmp_path / "truth", tmp_path / "P")
     assert [(f.run, f.step) for f in r.failures] == [(3, 21)]
@@ -283,7 +284,40 @@ def test_a_failing_trajectory_and_warnings(tmp_path: Path) -> None:
     assert r.error is not None
     assert np.isnan(r.error[3, 20:]).all()
     assert any("degrees in the median" in note for note in r.notes)
-    assert any("interpolate the truth" in note for note in r.notes)
+    assert any("give a truth of a higher rate" in note for note in r.notes)
+
+
+@pytest.mark.parametrize(
+    ("spatial_kind", "planar_kind"), [("so3", "so2"), ("so3-body", "so2"), ("left", "left"), ("right", "right")]
+)
+def test_a_planar_robot_in_messages_of_six(spatial_kind: str, planar_kind: str, tmp_path: Path) -> None:
+    """Zeros for z, roll and pitch: with three axes the errors are those of the planar poses."""
+    rng = np.random.default_rng()
+    t, n = 0.1 * np.arange(40), 40
+    true = np.column_stack([rng.uniform(-9, 9, (n, 2)), rng.uniform(-3, 3, n)])
+    own = true + rng.normal(0, [0.3, 0.2, 0.1], (n, 3))
+    A = rng.normal(size=(n, 3, 3))
+    P3 = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    P = np.zeros((n, 6, 6))
+    P[np.ix_(range(n), [0, 1, 5], [0, 1, 5])] = P3
+    for name, pose in (("est", own), ("truth", true)):
+        half = 0.5 * pose[:, 2]
+        zero = np.zeros((n, 1))
+        rows = np.column_stack([t, pose[:, :2], zero, zero, zero, np.sin(half), np.cos(half)])
+        np.savetxt(tmp_path / f"{name}.txt", rows, fmt="%.17g")
+    np.savetxt(tmp_path / "P.txt", np.column_stack([t, P.reshape(n, 36)]), fmt="%.17g")
+    files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
+    [r] = read_recordings(*files, spatial_kind, axes=["x", "y", "yaw"])
+    assert r.axes == ("x", "y", "yaw")
+    assert r.error is not None
+    assert r.covariance is not None
+    np.testing.assert_allclose(r.error[0], planar_error(true, own, planar_kind), atol=1e-12)
+    np.testing.assert_allclose(r.covariance[0], P3, rtol=1e-12)
+    hint = r"variance zero: z, roll, pitch\); judge only what the filter estimates: --axes x,y,yaw for a trajectory"
+    with pytest.raises(InputError, match=hint):
+        read_recordings(*files)
+    with pytest.raises(InputError, match=r"--axes x,heading: 'heading' is not one of x, y, z, roll, pitch, yaw"):
+        read_recordings(*files, axes=["x", "heading"])
 
 
 # --- association ---------------------------------------------------------------------------------
@@ -567,8 +601,11 @@ def consistency(*arguments: str, capsys: pytest.CaptureFixture[str]) -> tuple[in
     return int(end.value.code or 0), out, err
 
 
-def examples() -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / "docs/files.md").read_text(), re.DOTALL)
+def example(word: str) -> str:
+    """The block of the manual that holds a word."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/files.md").read_text(), re.DOTALL)
+    (found,) = (block for block in blocks if word in block)
+    return str(found)
 
 
 @pytest.mark.parametrize(
@@ -585,7 +622,7 @@ def test_the_filterpy_filter_of_the_manual(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     """The manual's seed, so no false alarm of its own; the three wrong filters are the negative control."""
-    text = examples()[0]
+    text = example("KalmanFilter(")
     if change:
         assert change[0] in text
         text = text.replace(*change)
@@ -601,10 +638,19 @@ def test_the_filterpy_filter_of_the_manual(
     assert "error convention vector" in err
 
 
+def test_the_notebook_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "make.py").write_text(example("KalmanFilter("))
+    (tmp_path / "notebook.py").write_text(example("cs.read("))
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path("make.py")
+    assert runpy.run_path("notebook.py")["verdict"].status == "consistent"
+    assert (tmp_path / "mine.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_the_archive_of_the_manual(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "make.py").write_text(examples()[1])
+    (tmp_path / "make.py").write_text(example("np.savez"))
     monkeypatch.chdir(tmp_path)
     runpy.run_path("make.py")
     code, out, _ = consistency("analyse", "errors.npz", "--json", capsys=capsys)

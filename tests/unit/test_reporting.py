@@ -329,14 +329,16 @@ def test_the_captions_state_the_rates_in_force(folder):
     v = report.studies[0].tracks[0].verdict
     (share,) = (a.share for a in v.answers if a.question == STEP)
     assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in anees.caption(anees.read(report.studies[0]))
-    assert "probability 5 % at most" in verdicts.method(report)
+    assert "probability 5 % at most" in verdicts.method(report.studies)
     assert "two one-sided tests, each at 5 %, put the ratio of true to stated covariance between 0.67 and 1.50" in (
-        verdicts.method(report)
+        verdicts.method(report.studies)
     )
     track = judged(report.studies[0].tracks[0], *drawn(1), Settings(1e-3, 2.0, 0.9))
     other = with_tracks(report, track)
-    assert "probability 0.1 % at most" in verdicts.method(other)
-    assert "each at 10 %, put the ratio of true to stated covariance between 0.50 and 2.00" in verdicts.method(other)
+    assert "probability 0.1 % at most" in verdicts.method(other.studies)
+    assert "each at 10 %, put the ratio of true to stated covariance between 0.50 and 2.00" in verdicts.method(
+        other.studies
+    )
     assert "Shown inside [0.50,\u00a02.00]" in verdicts.caption(other.studies[0])
 
 
@@ -417,7 +419,7 @@ def test_where_only_too_small_is_a_fault_the_worst_direction_is_shown(folder):
     assert DIRECTION in {question.name for question in questions.read(study).asked if question.answers[0].found}
     assert verdicts.columns(study)[4].head == "Shown inside (0,\u00a01.50]"
     assert "Worst direction: chosen by one half of the runs" in axis_caption(study)
-    assert "a one-sided test at 5 %, put" in verdicts.method(replace(report, studies=(study,)))
+    assert "a one-sided test at 5 %, put" in verdicts.method((study,))
     assert "orst direction" not in axis_caption(report.studies[0])
 
 
@@ -491,7 +493,7 @@ def test_without_truth_only_a_declared_optimal_gain_is_put_to_the_test(folder):
     study = replace(report.studies[0], tracks=(unknown,))
     assert "reported and not judged" in no_truth.note(study)
     assert "all that can be judged" in no_truth.note(replace(study, tracks=(good, unknown)))
-    assert "Without truth the ratio is that of the NIS" in verdicts.method(replace(report, studies=(study,)))
+    assert "Without truth the ratio is that of the NIS" in verdicts.method((study,))
 
 
 # --- until decided ----------------------------------------------------------------------------
@@ -524,7 +526,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     )
     assert "kf after 24 runs and small after 12 runs" in verdicts.caption(study)
     assert "Average NEES over 24 runs" in anees.caption(anees.read(study))
-    assert "judged by an e-process" in verdicts.method(report)
+    assert "judged by an e-process" in verdicts.method(report.studies)
     assert "they are listed below and counted in the verdicts that looked at them" in compose(report).answer
     assert "asks scale alone" in question_caption(study)
     shown(report)
@@ -545,7 +547,7 @@ def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
 def test_runs_of_a_fixed_number_say_nothing_of_looks(folder):
     report = build_report(folder)
     assert not report.studies[0].until_decided
-    for text in (verdicts.caption(report.studies[0]), verdicts.method(report), compose(report).answer):
+    for text in (verdicts.caption(report.studies[0]), verdicts.method(report.studies), compose(report).answer):
         assert "look" not in text
 
 

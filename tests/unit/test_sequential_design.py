@@ -287,16 +287,14 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPa
         status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
         return Verdict(evidence.name, status, (f"{status}: at {runs}",), runs, 1, design.settings)
 
-    def more(scenario: Any, filters: list[str], runs: int, *rest: Any) -> Any:
-        return SimpleNamespace(filters=filters, manifest={}, runs=runs)
-
     monkeypatch.setattr(sequential, "look", verdict_at)
     monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)
-    monkeypatch.setattr(sequential, "_more", more)
     bare = {"own": None, "landmarks": None, "rejections": None}
-    monkeypatch.setattr(sequential, "curves", lambda results, name: SimpleNamespace(name=name, **bare))
     monkeypatch.setattr(sequential, "evidence_of", lambda c, runs: Evidence(c.name, run_numbers=[runs]))
-    _, verdicts = sequential.run_until_decided(None, ["early", "late"])  # type: ignore[arg-type]
+    verdicts: dict[str, Verdict] = {}
+    read = lambda runs, name: SimpleNamespace(name=name, **bare)  # noqa: E731
+    counts = list(sequential.looks(sequential_design(3), ["early", "late"], read, verdicts))  # type: ignore[arg-type]
+    assert counts == [12, 15, 18, 21, 24]
     assert {name: v.status for name, v in verdicts.items()} == {"early": "overconfident", "late": "conservative"}
     assert [call for call in calls if call[0] == "early"] == [("early", 12)]
     assert [runs for name, runs in calls if name == "late"] == [12, 24]

@@ -19,10 +19,12 @@ from consistency.runs.sequential import run_until_decided
 from consistency.scenario import data_folder
 from consistency.sweeps import cell as cells
 from consistency.sweeps import folder as folders
+from consistency.sweeps import running
 from consistency.sweeps.cell import CellResult, cost_of, run_cell
-from consistency.sweeps.folder import SweepFolder, Work, open_sweep, run_sweep
+from consistency.sweeps.folder import SweepFolder, Work, open_sweep
 from consistency.sweeps.plan import Sweep, load_sweep, sweep_names
 from consistency.sweeps.regime import Regime, ranked, read_regime, regime_of, write_regime
+from consistency.sweeps.running import run_sweep
 
 LINEAR = """
 summary = "Two noises of the odometry in a linear world"
@@ -210,14 +212,15 @@ def test_a_stopped_sweep_goes_on(at: Path, monkeypatch: pytest.MonkeyPatch, insi
 
     write = SweepFolder.write
     with monkeypatch.context() as patch:
-        patch.setattr(*((SweepFolder, "write", stops_while_writing) if inside else (folders, "run_cell", stops)))
+        patch.setattr(*((SweepFolder, "write", stops_while_writing) if inside else (running, "run_cell", stops)))
         with pytest.raises(KeyboardInterrupt):
             run_sweep(sweep, at / "out", jobs=1)
     assert len(list((at / "out").rglob("runs.csv"))) == 2
-    assert not [path for path in (at / "out").rglob(".*") if path.is_dir()]  # nothing half written
+    hidden = [path.name for path in (at / "out").rglob(".*") if path.is_dir()]
+    assert hidden == [".kf.unfinished"] * inside  # the runs of the cell; nothing else is half written
     kept = {path: path.read_bytes() for path in (at / "out").rglob("runs.csv")}
     done: list[Any] = []
-    monkeypatch.setattr(folders, "run_cell", lambda *a, **o: (done.append(a), run_cell(*a, **o))[1])
+    monkeypatch.setattr(running, "run_cell", lambda *a, **o: (done.append(a), run_cell(*a, **o))[1])
     folder, missing = run_sweep(sweep, at / "out", jobs=1)
     assert (missing, len(done)) == (0, 2)
     assert {path: path.read_bytes() for path in kept} == kept
@@ -259,7 +262,7 @@ def test_shares_fill_one_folder(at: Path) -> None:
 def test_more_values_and_filters_go_into_the_same_folder(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
     done: list[str] = []
-    monkeypatch.setattr(folders, "run_cell", lambda *a, **o: (done.append(a[2]), run_cell(*a, **o))[1])
+    monkeypatch.setattr(running, "run_cell", lambda *a, **o: (done.append(a[2]), run_cell(*a, **o))[1])
     more = load_sweep(edited(at, "odometry = [1.0, 2.0]", "odometry = [1.0, 1.5, 2.0]"))
     folder, _ = run_sweep(more, at / "out", jobs=1)
     assert (len(done), len(folder.results())) == (2, 6)
@@ -395,7 +398,7 @@ def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
     }  # fmt: skip
     document = compose_regime(Regime(sweep, results, {"kind": "map"}))
     assert "Of 4 cells, consistent are ekf-uvd in 1 and parked-ekf-uvd in 0" in document.answer
-    assert [figure.title for figure in document.figures] == list(sweep.filters)
+    assert [figure.title for figure in document.figures] == [*sweep.filters, *sweep.filters]  # verdicts, then ratios
     assert {key.text for figure in document.figures for key in figure.keys} >= set(statuses)
     page = render_html(document)
     assert "ekf-uvd: 0.100 m, ×1" in page
@@ -407,12 +410,12 @@ def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
     assert "not finished: 5 of 8" in unfinished.answer
 
 
-def test_a_map_without_numbers_on_its_axes_has_tables_alone(at: Path) -> None:
+def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at: Path) -> None:
     from consistency.reporting.html import render_html
     from consistency.reporting.regime import compose_regime
 
     path = edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "truth.sensor.range = [[0.5, 3.0], [0.5, 4.0]]")
     sweep: Sweep = load_sweep(path)
     document = compose_regime(Regime(sweep, {(0, "kf"): result(), (1, "kf"): result()}, {}))
-    assert document.figures == ()
+    assert [figure.title for figure in document.figures] == ["kf"]
     assert "range [0.5, 3.0]" in render_html(document)

@@ -11,7 +11,7 @@ from consistency.diagnostics import Verdict
 from consistency.diagnostics.coverage import TWO_SIGMA
 from consistency.reporting.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, dodge
 from consistency.reporting.looks import EXPECTED, solid
-from consistency.reporting.model import Study, Track
+from consistency.reporting.model import Estimator, Judged
 from consistency.reporting.section import STUDY, Section
 from consistency.types import Array
 
@@ -44,7 +44,7 @@ class Forest:
 class ByAxis:
     """Quantities that a filter of the study has; at least one."""
 
-    study: Study
+    study: Judged
     forests: tuple[Forest, ...]
 
     @property
@@ -54,13 +54,13 @@ class ByAxis:
         return tuple(sorted(names, key=lambda name: name == WHOLE))
 
 
-def read(study: Study) -> ByAxis | None:
+def read(study: Judged) -> ByAxis | None:
     """The intervals of the verdicts; None where no filter has any."""
     all_forests = forests(study)
     return ByAxis(study, all_forests) if all_forests else None
 
 
-def forests(study: Study) -> tuple[Forest, ...]:
+def forests(study: Judged) -> tuple[Forest, ...]:
     """Covariance ratio, bias and coverage by axis; those that no filter has are left out."""
     kinds = (
         ("ratio", "covariance ratio (truth / stated)", ".3g", 1.0, _ratio_window, True, _ratios),
@@ -76,7 +76,7 @@ def forests(study: Study) -> tuple[Forest, ...]:
     return tuple(result)
 
 
-def _rows(study: Study, intervals_of: Callable[[Verdict], dict[str, Interval]]) -> tuple[Row, ...]:
+def _rows(study: Judged, intervals_of: Callable[[Verdict], dict[str, Interval]]) -> tuple[Row, ...]:
     by_filter = [{k: i for k, i in intervals_of(t.verdict).items() if np.isfinite(i[0])} for t in study.tracks]
     names = dict.fromkeys(name for intervals in by_filter for name in intervals)
     return tuple((name, tuple(intervals.get(name) for intervals in by_filter)) for name in names)
@@ -132,7 +132,7 @@ def figures(by_axis: ByAxis) -> tuple[Figure, ...]:
     return (Figure("By axis", caption(by_axis), panels, (sheet,), keys, layout="three", level=4),)
 
 
-def _panel(study: Study, forest: Forest, labels: tuple[str, ...], share: str = "") -> Panel:
+def _panel(study: Judged, forest: Forest, labels: tuple[str, ...], share: str = "") -> Panel:
     marks = [
         mark
         for slot, track in enumerate(study.tracks)
@@ -147,7 +147,7 @@ def _panel(study: Study, forest: Forest, labels: tuple[str, ...], share: str = "
     )
 
 
-def _intervals(forest: Forest, labels: tuple[str, ...], track: Track, slot: int, slots: int) -> Intervals | None:
+def _intervals(forest: Forest, labels: tuple[str, ...], track: Estimator, slot: int, slots: int) -> Intervals | None:
     """Intervals of the filter in one slot of each row."""
     named_intervals = [(label, interval) for label, row in forest.rows if (interval := row[slot]) is not None]
     if not named_intervals:

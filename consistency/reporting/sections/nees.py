@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.reporting.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Sheet
 from consistency.reporting.looks import EXPECTED, SHADE, solid
-from consistency.reporting.model import Study, Track
+from consistency.reporting.model import Estimator, Judged
 from consistency.reporting.section import STUDY, Section
 from consistency.types import Array
 
@@ -20,7 +20,7 @@ WINDOW = (-0.02, 1.02)
 class Steps:
     """Empirical distribution function of chi-square's distribution function at N values of the NEES."""
 
-    track: Track
+    track: Estimator
     x: Array  # (N + 2,), with 0 and 1
     y: Array  # (N + 2,)
     half_width: float  # of the simultaneous band
@@ -30,17 +30,17 @@ class Steps:
 class Distribution:
     """Filters that have a NEES; at least one."""
 
-    study: Study
+    study: Judged
     filters: tuple[Steps, ...]
 
 
-def read(study: Study) -> Distribution | None:
+def read(study: Judged) -> Distribution | None:
     """The values that the verdicts hold; None where there is no NEES."""
     distributions = tuple(of for track in study.tracks if (of := steps(track)) is not None)
     return Distribution(study, distributions) if distributions else None
 
 
-def steps(track: Track) -> Steps | None:
+def steps(track: Estimator) -> Steps | None:
     """Distribution of one filter; None without NEES."""
     tails = track.verdict.tails
     if tails is None or not len(tails.pit) or not np.isfinite(tails.half_width):
@@ -59,7 +59,7 @@ def figures(distribution: Distribution) -> tuple[Figure, ...]:
     return (Figure("Distribution of the NEES", caption(), (_panel(study, filters),), (sheet,), keys, level=4),)
 
 
-def _panel(study: Study, filters: tuple[Steps, ...], alone: bool = False) -> Panel:
+def _panel(study: Judged, filters: tuple[Steps, ...], alone: bool = False) -> Panel:
     same = len({of.half_width for of in filters}) == 1
     bands = [_band(of, same) for of in (filters[:1] if same else filters)]
     diagonal = Line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), EXPECTED)
@@ -80,7 +80,7 @@ def _band(of: Steps, shaded: bool) -> Mark:
     return Band(corners, low, high, replace(of.track.look, dash=(1.0, 2.0), width=0.7), of.track.owner, outline=True)
 
 
-def _small(study: Study, of: Steps, number: int) -> Panel:
+def _small(study: Judged, of: Steps, number: int) -> Panel:
     panel, ticks = _panel(study, (of,), alone=True), (0.0, 0.5, 1.0)
     label = "share of runs" if number % PANELS == 0 else ""
     return replace(

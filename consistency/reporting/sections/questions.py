@@ -8,7 +8,7 @@ from consistency.diagnostics import Answer
 from consistency.diagnostics.questions import ABOUT, MAIN
 from consistency.reporting import blocks
 from consistency.reporting.blocks import Block, Column, Heading, Small, Stack, Text, table
-from consistency.reporting.model import Study
+from consistency.reporting.model import Judged
 from consistency.reporting.section import STUDY, Section
 from consistency.reporting.wording import p_cell
 
@@ -30,11 +30,11 @@ class Question:
 class Questions:
     """All questions, in the referee's order."""
 
-    study: Study
+    study: Judged
     asked: tuple[Question, ...]
 
 
-def read(study: Study) -> Questions:
+def read(study: Judged) -> Questions:
     """The answers that the verdicts hold."""
     by_filter = [{a.question: a for a in track.verdict.answers} for track in study.tracks]
     known = list(ABOUT) + [q for answers in by_filter for q in answers if q not in ABOUT]

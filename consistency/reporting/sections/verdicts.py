@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from consistency.diagnostics.wording import UNCERTAIN, plural, short
 from consistency.reporting.blocks import Block, Cell, Column, Heading, Name, Reason, Reasons, Status, Table, Text, table
-from consistency.reporting.model import Report, Study, Track
+from consistency.reporting.model import Estimator, Judged, Report
 from consistency.reporting.section import Part, Section
 from consistency.reporting.wording import brief, listed, number, p_cell
 
@@ -28,11 +30,12 @@ def show(report: Report) -> tuple[Block, ...]:
     """Tables and sentences of each study, then the method."""
     if not report.studies:
         return (Text("No study was run for these findings."),)
-    blocks = [block for study in report.studies for block in _study(study)]
-    return (*blocks, Text(method(report), "How a verdict comes about.", "note"))
+    blocks = [block for study in report.studies for block in judgement(study)]
+    return (*blocks, Text(method(report.studies), "How a verdict comes about.", "note"))
 
 
-def _study(study: Study) -> list[Block]:
+def judgement(study: Judged) -> list[Block]:
+    """Table and sentences of one study, and its failed runs."""
     blocks: list[Block] = [Heading(study.name), _table(study), Reasons(tuple(_reason(t) for t in study.tracks))]
     if study.failures:
         rows: list[tuple[Cell, ...]] = [(name, str(run), str(step), why) for name, run, step, why in study.failures]
@@ -41,7 +44,7 @@ def _study(study: Study) -> list[Block]:
     return blocks
 
 
-def _table(study: Study) -> Table:
+def _table(study: Judged) -> Table:
     rows = [_cells(track) for track in study.tracks]
     text = caption(study)
     return table(
@@ -49,17 +52,17 @@ def _table(study: Study) -> Table:
     )
 
 
-def _cells(track: Track) -> tuple[Cell, ...]:
+def _cells(track: Estimator) -> tuple[Cell, ...]:
     name, status, *others = row(track)
     return Name(name, track.look), Status(status), *others
 
 
-def _reason(track: Track) -> Reason:
+def _reason(track: Estimator) -> Reason:
     sentence, *others = track.verdict.reasons
     return Reason(track.name, track.look, sentence, tuple(others))
 
 
-def columns(study: Study) -> tuple[Column, ...]:
+def columns(study: Judged) -> tuple[Column, ...]:
     """Heads of the verdict table."""
     inside = equivalence_interval(study)
     return (
@@ -77,7 +80,7 @@ def columns(study: Study) -> tuple[Column, ...]:
     )
 
 
-def row(track: Track) -> tuple[str, ...]:
+def row(track: Estimator) -> tuple[str, ...]:
     """Cells of the verdict table, as :func:`columns`."""
     v, location, accuracy = track.verdict, track.verdict.location, track.verdict.in_world.accuracy
     since = None if location is None else location.since
@@ -96,7 +99,7 @@ def row(track: Track) -> tuple[str, ...]:
     )
 
 
-def equivalence_interval(study: Study) -> str:
+def equivalence_interval(study: Judged) -> str:
     """Where consistent filters are shown to have their ratio of true to stated covariance; the same for all."""
     if not study.tracks:
         return ""
@@ -106,7 +109,7 @@ def equivalence_interval(study: Study) -> str:
     return f"{low},\u00a0{short(factor)}]"
 
 
-def inflation(track: Track) -> str:
+def inflation(track: Estimator) -> str:
     """Factor that makes the stated covariance that of the errors, with its interval."""
     scale = track.verdict.scale
     if scale is None or not np.isfinite(scale.inflation.value):
@@ -116,7 +119,7 @@ def inflation(track: Track) -> str:
     return f"×{brief(ratio)} [{f'{brief(low)}, {brief(high)}' if known else 'unknown'}]"
 
 
-def shown_inside(track: Track) -> str:
+def shown_inside(track: Estimator) -> str:
     """Whether the ratio of true to stated covariance was shown to lie where it should, and the p value."""
     shown = track.verdict.equivalence
     if shown is None or not np.isfinite(shown.p_value):
@@ -124,14 +127,14 @@ def shown_inside(track: Track) -> str:
     return f"{'yes' if shown.shown else 'no'}, p {p_cell(shown.p_value)}"
 
 
-def nis(track: Track) -> str:
+def nis(track: Estimator) -> str:
     """NIS per degree of freedom, in parentheses where it is not judged."""
     found = track.verdict.innovations
     ratio = number(None if found is None else found.ratio, ".3f")
     return ratio if track.innovations_judged or ratio == "–" else f"({ratio})"
 
 
-def caption(study: Study) -> str:
+def caption(study: Judged) -> str:
     """How large the study is, and how to read the table of verdicts."""
     text = f"{plural(study.runs, 'run')} of {plural(len(study.steps), 'step')}"
     if study.single and study.has_truth:
@@ -148,9 +151,9 @@ def caption(study: Study) -> str:
     return f"{text}."
 
 
-def method(report: Report) -> str:
+def method(studies: Sequence[Judged]) -> str:
     """How a verdict comes about, in one paragraph."""
-    tracks = [track for study in report.studies for track in study.tracks]
+    tracks = [track for study in studies for track in study.tracks]
     rates = [track.verdict.settings.false_alarm for track in tracks]
     rate = f"{100 * rates[0]:.2g} %" if rates else "the false-alarm rate"
     text = (
@@ -160,26 +163,26 @@ def method(report: Report) -> str:
     )
     if tracks:
         text += _consistent(tracks[0])
-    return text + "".join(sentence for applies, sentence in _conditions(report) if applies)
+    return text + "".join(sentence for applies, sentence in _conditions(studies) if applies)
 
 
-def _conditions(report: Report) -> tuple[tuple[bool, str], ...]:
+def _conditions(studies: Sequence[Judged]) -> tuple[tuple[bool, str], ...]:
     """Sentences of the method, and whether the report needs them."""
     return (
         (
-            any(study.has_truth for study in report.studies),
+            any(study.has_truth for study in studies),
             " Half of the false-alarm rate belongs to the mean NEES of whole runs, for which the number of runs is "
             "planned; the other questions share the rest. Where a fault was absent before some step, the factor and "
             "the axes are those since that step.",
         ),
         (
-            any(not study.has_truth for study in report.studies),
+            any(not study.has_truth for study in studies),
             " Without truth the ratio is that of the NIS to its degrees of freedom, and only the innovations of a "
             "filter that declares an optimal gain are judged: those of any other need be neither white nor of the "
             "stated size.",
         ),
         (
-            any(study.until_decided for study in report.studies),
+            any(study.until_decided for study in studies),
             " In a run until decided the scale is judged by an e-process, a bet against the filter that may be looked "
             "at at any time (Ville 1939); the other questions are asked after 12, 24, 48, ... runs, each time at a "
             "part of their share.",
@@ -187,7 +190,7 @@ def _conditions(report: Report) -> tuple[tuple[bool, str], ...]:
     )
 
 
-def _consistent(track: Track) -> str:
+def _consistent(track: Estimator) -> str:
     """What consistent and undecided mean."""
     settings = track.verdict.settings
     upper = short(settings.factor)

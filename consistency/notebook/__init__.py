@@ -1,0 +1,1 @@
+"""Files of another estimator in three lines of Python: read, judge, look."""

@@ -1,0 +1,183 @@
+"""Records of files and verdicts on them, which draw themselves."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from consistency.diagnostics import Verdict
+from consistency.diagnostics.export import html_table
+from consistency.diagnostics.wording import plural
+from consistency.errors import InputError
+from consistency.recording import Recording, read_recordings
+from consistency.store.atomic import write_whole
+from consistency.verdicts.judge import analyse_recordings, settings_of
+
+if TYPE_CHECKING:
+    from consistency.reporting.drawing import Sheet
+    from consistency.reporting.paper import Drawn
+
+
+@dataclass(frozen=True, repr=False)
+class Record(Recording):
+    """What one estimator said in files, beside the truth; made by :func:`read`."""
+
+    def plot(self, path: str | Path | None = None) -> Drawn:
+        """Error of each component in one run with the stated 2-sigma bounds, and the coverage.
+
+        Parameters
+        ----------
+        path : .png, .pdf or .svg to write as well; one that is there is replaced
+
+        Returns
+        -------
+        A figure of Matplotlib, which notebooks show
+
+        Raises
+        ------
+        InputError
+            There is no error to draw, or the file cannot be written.
+        """
+        from consistency.reporting.files import record_sheet
+
+        return _drawn(record_sheet(self), path)
+
+    def __repr__(self) -> str:
+        size = f"{plural(len(self.runs), 'run')} x {plural(len(self.t), 'step')}"
+        return f"<Record {self.name}: {size}, error {self.convention or '-'} of {', '.join(self.axes)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("runs", str(len(self.runs))), ("steps", str(len(self.t))), ("error", self.convention or "-"),
+            ("components", ", ".join(self.axes)), ("failed runs", str(len(self.failures))),
+        ]  # fmt: skip
+        notes = "".join(f"<li>{escape(note)}</li>" for note in self.notes)
+        return f"<div><strong>{escape(self.name)}</strong>{html_table(rows)}<ul>{notes}</ul></div>"
+
+
+@dataclass(frozen=True, repr=False)
+class Judgement(Verdict):
+    """A verdict on a :class:`Record`; made by :func:`judge`."""
+
+    record: Record | None = None
+
+    def plot(self, path: str | Path | None = None) -> Drawn:
+        """Errors with their bounds, NEES with its band, and coverage; as :meth:`Record.plot`."""
+        from consistency.reporting.files import record_sheet
+
+        assert self.record is not None
+        return _drawn(record_sheet(self.record, self), path)
+
+    def _repr_html_(self) -> str:
+        text, figure = super()._repr_html_(), _picture(self)
+        return text if figure is None else f'{text}<img alt="errors, NEES, coverage" src="{figure}">'
+
+
+def read(
+    estimates: str | Path,
+    truth: str | Path | None = None,
+    covariance: str | Path | None = None,
+    error: str | None = None,
+    *,
+    state: Sequence[str] | None = None,
+    covariance_order: str | None = None,
+    max_dt: float | None = None,
+    time_offset: float | str | None = None,
+    axes: Sequence[str] | None = None,
+    topic: str | None = None,
+    truth_topic: str | None = None,
+    filter: str | None = None,
+) -> Record:
+    """Files of another estimator, as ``consistency analyse FILES`` reads them; docs/files.md has the forms.
+
+    Parameters
+    ----------
+    estimates : .csv, .parquet, .npz, a TUM trajectory, or a folder of these with one for each run
+    truth : of the same kind; not with .npz
+    covariance : of a TUM trajectory: t and 36 or 21 numbers
+    error : what the covariance is of: so2, vector, left, right, so3 or so3-body; None is the default of the kind
+    state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
+    covariance_order : translation-rotation or rotation-translation, of a trajectory
+    max_dt : s, between an estimate and its truth; None is 0.01
+    time_offset : s to add to the timestamps of the estimates, or "estimate"
+    axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw
+    topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
+    filter : which estimator, where the files hold several
+
+    Raises
+    ------
+    InputError
+        Something cannot be used: names file, line, column or option, and what is allowed.
+    """
+    found = read_recordings(
+        Path(estimates),
+        None if truth is None else Path(truth),
+        None if covariance is None else Path(covariance),
+        error,
+        state=state,
+        covariance_order=covariance_order,
+        max_dt=max_dt,
+        time_offset=time_offset,
+        axes=axes,
+        topic=topic,
+        truth_topic=truth_topic,
+    )
+    named = {recording.name: recording for recording in found}
+    if filter is None and len(named) > 1:
+        raise InputError(f"{estimates}: holds several estimators ({', '.join(named)}); choose one with filter=")
+    name = next(iter(named)) if filter is None else filter
+    if name not in named:
+        raise InputError(f"filter '{name}' is not in {estimates}; there are: {', '.join(named)}")
+    return Record(**_parts(named[name]))
+
+
+def judge(record: Record, *, optimal_gain: bool = False, **settings: Any) -> Judgement:
+    """The verdict on a record: consistent, overconfident, conservative, undecided ..., and why.
+
+    Parameters
+    ----------
+    optimal_gain : the filter declares one and gates nothing away, so that its innovations are judged
+    settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow`` of
+        :class:`consistency.diagnostics.Settings`
+
+    Raises
+    ------
+    InputError
+        A setting out of its range.
+    """
+    verdict = analyse_recordings([record], None, settings_of(**settings), optimal_gain)[record.name]
+    return Judgement(**_parts(verdict), record=record)
+
+
+def _parts(of: Any) -> dict[str, Any]:
+    return {field.name: getattr(of, field.name) for field in fields(of)}
+
+
+def _drawn(sheet: Sheet, path: str | Path | None) -> Drawn:
+    from consistency.reporting.paper import drawn, picture
+
+    figure = drawn(sheet)
+    if path is not None:
+        from consistency.reporting import require_plot
+
+        path = Path(path)
+        require_plot(path, overwrite=True)
+        write_whole(path, picture(figure, path.suffix.lower().removeprefix(".")), 0o644)
+    return figure
+
+
+def _picture(verdict: Judgement) -> str | None:
+    """The plot as the source of an image in HTML; None where there is nothing to draw."""
+    from consistency.reporting.files import record_sheet
+    from consistency.reporting.paper import render
+
+    assert verdict.record is not None
+    try:
+        sheet = record_sheet(verdict.record, verdict)
+    except InputError:
+        return None
+    return f"data:image/png;base64,{b64encode(render(sheet, 'png', 110)).decode()}"

@@ -1,0 +1,273 @@
+"""Errors that no estimator makes: a unit, order, side or frame with which they are as large as the covariance says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from consistency.diagnostics.whitening import whiten
+from consistency.geometry import wrap
+from consistency.geometry.conventions import PLANAR, SPATIAL
+from consistency.recording.poses import Poses
+from consistency.types import Array
+
+MOST = 4000  # estimates that are looked at, of all runs together
+WRONG = 1.0  # decades that the NEES is off, from which a mix-up is looked for
+APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
+RIGHT = 0.4  # decades that it may be off with the mix-up undone
+ALIKE = 0.01  # decades between guesses of which the likelier is named
+DEGREE = np.pi / 180.0
+MILLI = 1e-3
+TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
+
+Change = Callable[[Poses], Poses]
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What the files may be, in words, and how they read then."""
+
+    text: str
+    change: Change
+
+
+def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 0.0) -> list[str]:
+    """What the error may really be, where the NEES is off by a decade or more and one guess brings it right; or none.
+
+    The NEES of a median estimate is compared with that of a right one. The best guess is named.
+    """
+    some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
+    off = decades(some)
+    limit = np.append(WRONG, np.full(len(off) - 1, APART))
+    worst = int(np.argmax(np.abs(off) / limit))
+    if not abs(off[worst]) > limit[worst]:
+        return []
+    guesses = _guesses(some)
+    left = np.array([np.abs(decades([guess.change(poses) for poses in some])).max() for guess in guesses])
+    if not np.nanmin(left) < RIGHT:
+        return []
+    best = int(np.flatnonzero(left <= np.nanmin(left) + ALIKE)[0])
+    of = "" if worst == 0 else f" of {axes[worst - 1]} by itself"
+    size = f"{10.0 ** abs(off[worst]):.2g} times too {'large' if off[worst] > 0 else 'small'}"
+    return [f"{name}: the NEES{of} is {size}, but about right if {guesses[best].text}"]
+
+
+def decades(runs: Sequence[Poses]) -> Array:
+    """log10 of the median NEES over that of chi-square, of all n components and of each by itself, (1 + n,).
+
+    NaN without any.
+    """
+    n = runs[0].covariance.shape[-1]
+    found = []
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for poses in runs:
+            error, P = poses.errors(), poses.covariance
+            own = np.square(error) / np.diagonal(P, axis1=1, axis2=2)
+            found.append(np.column_stack([np.square(whiten(error, P)).sum(axis=1), own]))
+    nees = np.concatenate(found)
+    nees = nees[np.isfinite(nees).all(axis=1)]
+    if not len(nees):
+        return np.full(1 + n, np.nan)
+    right = stats.chi2.median(np.append(n, np.ones(n)))
+    return np.asarray(np.log10(np.maximum(np.median(nees, axis=0), 1e-300) / right))
+
+
+# --- guesses ----------------------------------------------------------------------------------------
+
+
+def _guesses(runs: Sequence[Poses]) -> list[Guess]:
+    """What may be, the likelier first."""
+    kind = runs[0].manifold
+    guesses = [*_covariances()]
+    if kind == "spatial":
+        guesses = [*_orders(runs[0].convention), *_quaternions(), *guesses, *_units(3, slice(3, 6)), *_frames(runs)]
+    elif kind == "planar":
+        guesses = [*_sides(runs[0].convention), *_headings(), *guesses, *_units(2, slice(2, 3)), *_frames(runs)]
+    return guesses
+
+
+def _orders(convention: str) -> Iterator[Guess]:
+    swap = [3, 4, 5, 0, 1, 2]
+    for other in SPATIAL:
+        for turned in (False, True):
+            if (other, turned) != (convention, False):
+                words = [] if other == convention else [f"the error is '{other}' (--error {other})"]
+                words += ["the covariance has its two blocks in the other order (--covariance-order)"] if turned else []
+                yield Guess(" and ".join(words), _read_as(other, swap if turned else [0, 1, 2, 3, 4, 5]))
+
+
+def _read_as(convention: str, order: list[int]) -> Change:
+    return lambda p: replace(p, convention=convention, covariance=p.covariance[:, order][:, :, order])
+
+
+def _sides(convention: str) -> Iterator[Guess]:
+    for other in PLANAR:
+        if other not in (convention, "vector"):
+            yield Guess(f"the error is '{other}' (--error {other})", _read_as(other, [0, 1, 2]))
+
+
+def _quaternions() -> Iterator[Guess]:
+    first = [0, 1, 2, 4, 5, 6, 3]
+    yield Guess(
+        "the quaternions of both files are w x y z; write them x y z w",
+        lambda p: replace(p, estimate=p.estimate[:, first], truth=p.truth[:, first]),
+    )
+    yield Guess(
+        "the quaternions of the estimates are w x y z; write them x y z w",
+        lambda p: replace(p, estimate=p.estimate[:, first]),
+    )
+    yield Guess(
+        "the quaternions of the truth are w x y z; write them x y z w", lambda p: replace(p, truth=p.truth[:, first])
+    )
+    back = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
+    yield Guess(
+        "the quaternions of the estimates turn world into body; invert them",
+        lambda p: replace(p, estimate=p.estimate * back),
+    )
+
+
+def _headings() -> Iterator[Guess]:
+    degrees = np.array([1.0, 1.0, DEGREE])
+    yield Guess("the headings of both files are in degrees", lambda p: _scaled(p, degrees, degrees))
+    yield Guess("the headings of the estimates are in degrees", lambda p: _scaled(p, degrees, None))
+    yield Guess("the headings of the truth are in degrees", lambda p: _scaled(p, None, degrees))
+    both = "the headings of both files and their variances are in degrees"
+    yield Guess(both, lambda p: _weighed(_scaled(p, degrees, degrees), slice(2, 3), DEGREE))
+
+
+def _scaled(p: Poses, estimate: Array | None, truth: Array | None) -> Poses:
+    ones = np.ones(p.estimate.shape[1])
+    p = replace(p, estimate=p.estimate * (ones if estimate is None else estimate))
+    p = replace(p, truth=p.truth * (ones if truth is None else truth))
+    for values in (p.estimate, p.truth):
+        values[:, 2] = wrap(values[:, 2])
+    return p
+
+
+def _units(width: int, angles: slice) -> Iterator[Guess]:
+    """Millimetres and degrees; the first ``width`` components are metres."""
+    part = slice(0, width)
+
+    def shrunk(values: Array) -> Array:
+        out = values.copy()
+        out[:, part] *= MILLI
+        return out
+
+    yield Guess("its angles are in degrees (deg^2 for rad^2)", lambda p: _weighed(p, angles, DEGREE))
+    yield Guess("its positions are in millimetres (mm^2 for m^2)", lambda p: _weighed(p, part, MILLI))
+    yield Guess(
+        "the positions of the estimates and their covariance are in millimetres",
+        lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
+    )
+    yield Guess("the positions of the truth are in millimetres", lambda p: replace(p, truth=shrunk(p.truth)))
+    yield Guess("the positions of the estimates are in millimetres", lambda p: replace(p, estimate=shrunk(p.estimate)))
+
+
+def _weighed(p: Poses, part: slice, factor: float) -> Poses:
+    scale = np.ones(p.covariance.shape[-1])
+    scale[part] = factor
+    return replace(p, covariance=p.covariance * scale[:, None] * scale)
+
+
+def _covariances() -> Iterator[Guess]:
+    yield Guess("its diagonal holds standard deviations; square them", _squared)
+    yield Guess("it is an information matrix; invert it", _inverted)
+
+
+def _squared(p: Poses) -> Poses:
+    n = p.covariance.shape[-1]
+    return replace(p, covariance=np.square(np.diagonal(p.covariance, axis1=1, axis2=2))[:, :, None] * np.eye(n))
+
+
+def _inverted(p: Poses) -> Poses:
+    P = np.full_like(p.covariance, np.nan)
+    regular = np.abs(np.linalg.det(p.covariance)) > 0
+    P[regular] = np.linalg.inv(p.covariance[regular])
+    return replace(p, covariance=P)
+
+
+# --- frames -----------------------------------------------------------------------------------------
+
+
+def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
+    """The worlds of the files differ by a turn about z and a shift, the same in all runs."""
+    frame = fitted_frame(runs)
+    if frame is None:
+        return
+    angle, shift = frame
+    turn = f"turned by {np.rad2deg(angle):.1f} degrees about z and " if abs(np.rad2deg(angle)) > TURN else ""
+    where = ", ".join(f"{value:.3g}" for value in shift)
+    words = (
+        f"the world of the estimates is {turn}shifted by ({where}) m to meet that of the truth; write both in one world"
+    )
+    yield Guess(words, lambda p: moved(p, angle, shift))
+
+
+def fitted_frame(runs: Sequence[Poses]) -> tuple[float, Array] | None:
+    """Turn about z, rad, and shift (d,), m, with which the estimates of all runs are nearest to the truth.
+
+    Umeyama (1991), in the plane. None where frames hardly differ, or where positions do not spread.
+    """
+    d = 3 if runs[0].manifold == "spatial" else 2
+    pairs = [
+        (poses.estimate[known.rows, :d], known.truth[:, :d]) for poses in runs if len((known := poses.known()).rows)
+    ]
+    if not pairs:
+        return None
+    own, true = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    finite = np.isfinite(own).all(axis=1)
+    own, true = own[finite], true[finite]
+    if len(own) < 3:
+        return None
+    a, b = own - own.mean(axis=0), true - true.mean(axis=0)
+    angle = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
+    turned = own.copy()
+    turned[:, :2] = _turned(own[:, :2], angle)
+    shift = true.mean(axis=0) - turned.mean(axis=0)
+    size = float(np.sqrt(np.square(b).sum(axis=1).mean()))
+    if not size > 0 or (abs(np.rad2deg(angle)) < TURN and np.linalg.norm(shift) < SHIFT * size):
+        return None
+    return angle, shift
+
+
+def _turned(points: Array, angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.asarray(points @ np.array([[c, s], [-s, c]]))
+
+
+def moved(p: Poses, angle: float, shift: Array) -> Poses:
+    """The estimates in a world that is turned about z and shifted, with their covariance."""
+    d = len(shift)
+    estimate, n = p.estimate.copy(), p.covariance.shape[-1]
+    estimate[:, :2] = _turned(p.estimate[:, :2], angle)
+    estimate[:, :d] += shift
+    if p.manifold == "planar":
+        estimate[:, 2] = wrap(estimate[:, 2] + angle)
+    else:
+        sound = np.isfinite(estimate).all(axis=1)
+        estimate[sound, 3:] = (Rotation.from_euler("z", angle) * Rotation.from_quat(estimate[sound, 3:])).as_quat()
+    T = carried(p.convention, angle, shift, n)
+    return replace(p, estimate=estimate, covariance=T @ p.covariance @ T.T)
+
+
+def carried(convention: str, angle: float, shift: Array, n: int) -> Array:
+    """Matrix (n, n) that carries an error over to a world that is turned about z and shifted by (d,).
+
+    An error in the frame of the body stays; that of ``right`` goes by the adjoint (Sola et al. 2018, eq. 159 and 175).
+    """
+    T, d = np.eye(n), len(shift)
+    if convention == "left":
+        return T
+    turn = Rotation.from_euler("z", angle).as_matrix()
+    T[:d, :d] = turn[:d, :d]
+    if n == 6 and convention in ("so3", "right"):
+        T[3:, 3:] = turn
+    if convention == "right":
+        x, y, z = np.append(shift, np.zeros(3 - d))
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        T[:d, d:] = cross @ turn if n == 6 else cross[:2, 2:]
+    return T

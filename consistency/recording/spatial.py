@@ -1,0 +1,148 @@
+"""Trajectories in space, whatever file they are from: errors of poses with their 6 x 6 covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from consistency.errors import InputError
+from consistency.geometry.conventions import SPATIAL
+from consistency.recording.hints import hints
+from consistency.recording.offset import clock_shift
+from consistency.recording.poses import Poses
+from consistency.recording.record import Recording, Track, assemble, common_times
+from consistency.recording.sheet import Places
+from consistency.types import Array
+
+AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
+BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
+FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where trajectories are from, for names and messages."""
+
+    path: Path
+    files: Sequence[tuple[Path | str, Path | str]]  # of each run: its estimates, its truth
+    covariance: Path
+    why: str = ""  # the convention is what it is
+
+
+@dataclass(frozen=True)
+class Match:
+    """The estimates of one run that have truth and covariance."""
+
+    place: Places  # (k,)
+    t: Array  # (k,)
+    error: Array  # (k, 6)
+    P: Array  # (k, 6, 6)
+    left_out: int
+    angle: float  # rad, median of the rotation error
+    bent: float  # sigma, median of what the interpolated truth may be off by
+
+
+def require_axes(axes: Sequence[str] | None) -> None:
+    """Refuse components that a pose in space does not have."""
+    if unknown := [axis for axis in axes or () if axis not in AXES]:
+        raise InputError(f"--axes {','.join(axes or ())}: '{unknown[0]}' is not one of {', '.join(AXES)}")
+
+
+def recordings_of(
+    source: Source, poses: Sequence[Poses], split: bool, time_offset: float | str | None, axes: Sequence[str] | None
+) -> list[Recording]:
+    """The recording of one estimator, each of whose runs is one of ``poses``; clocks and mix-ups are looked for.
+
+    Parameters
+    ----------
+    split : position and rotation are two recordings, as their cross-covariance is not known
+    time_offset, axes : as :func:`consistency.recording.read_recordings` has them
+
+    Raises
+    ------
+    InputError
+        A run has no estimate with truth and covariance, or the covariance is singular throughout.
+    """
+    shift, clocks = clock_shift(source.path.name, poses, time_offset)
+    matches = [_match(one, *files, shift) for one, files in zip(poses, source.files, strict=True)]
+    columns, t = common_times([run.t for run in matches])
+    tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, matches, strict=True))]
+    kind = poses[0].convention
+    notes = [*_notes(source.path, matches, poses[0].max_dt), *clocks, *hints(source.path.name, AXES, poses, shift)]
+    notes.append(f"error convention {kind}: {SPATIAL[kind]}{source.why}")
+    judged = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
+    name = source.path.stem
+    parts = {name: judged}
+    if split:
+        parts = {f"{name} position": [i for i in judged if i < 3], f"{name} rotation": [i for i in judged if i >= 3]}
+    recordings = []
+    for title, part in parts.items():
+        if part:
+            some = [_part(track, part) for track in tracks]
+            names = tuple(AXES[i] for i in part)
+            recordings.append(assemble(title, some, t, names, str(source.covariance), kind, notes))
+            notes = []
+    return recordings
+
+
+def _part(track: Track, part: list[int]) -> Track:
+    assert track.error is not None
+    assert track.covariance is not None
+    return replace(track, error=track.error[:, part], covariance=track.covariance[:, part][:, :, part])
+
+
+def _match(poses: Poses, path: Path | str, truth: Path | str, shift: float) -> Match:
+    """The estimates of a run that have truth and covariance."""
+    known = poses.known(shift)
+    if not len(known.rows):
+        raise apart(path, poses.t + shift, truth, poses.true_t, poses.max_dt, "truth")
+    kept = poses.stated[known.rows]
+    if not kept.any():
+        raise InputError(f"{path}: no estimate has both a truth and a covariance within {poses.max_dt:g} s")
+    rows = known.rows[kept]
+    error, P = poses.error_of(rows, known.truth[kept]), poses.covariance[rows]
+    doubts = _doubts(error, P, known.bend[kept])
+    return Match(poses.place.at(rows), poses.t[rows], error, P, len(poses.t) - len(rows), *doubts)
+
+
+def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, tolerance: float, what: str) -> InputError:
+    """That no timestamp of one is near one of the other."""
+    own_span, span = (f"{each[0]:.10g} to {each[-1]:.10g}" for each in (t, other_t))
+    return InputError(
+        f"{path}: no estimate has a {what} within {tolerance:g} s (--max-dt): t is {own_span}, but {span} in {other}"
+    )
+
+
+def _doubts(error: Array, P: Array, bend: Array) -> tuple[float, float]:
+    """Medians over a run: angle of the rotation error, rad; what the interpolated truth may be off by, sigma."""
+    angles = np.linalg.norm(error[:, 3:], axis=1)
+    angle = float(np.nanmedian(angles)) if np.isfinite(angles).any() else 0.0
+    sigma = np.sqrt(np.abs(np.diagonal(P[:, :3, :3], axis1=1, axis2=2)).mean(axis=1))
+    ratio = np.where((sigma > 0) & (bend > 1e-9), bend / np.where(sigma > 0, sigma, 1.0), 0.0)
+    return angle, float(np.median(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else 0.0
+
+
+def _notes(estimates: Path, matches: Sequence[Match], max_dt: float) -> list[str]:
+    """What was left out, and what looks like a matter of clocks or of conventions."""
+    notes = []
+    total = sum(run.left_out + len(run.t) for run in matches)
+    if left_out := sum(run.left_out for run in matches):
+        notes.append(
+            f"{estimates}: {left_out} of {total} estimates have no truth or no covariance "
+            f"within {max_dt:g} s (--max-dt) and are left out"
+        )
+    angle, bent = max(run.angle for run in matches), max(run.bent for run in matches)
+    if angle > FAR:
+        notes.append(
+            f"{estimates}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run: "
+            "are the quaternions of both files x y z w, body to world, of the same body frame?"
+        )
+    if bent > BENT:
+        notes.append(
+            f"{estimates}: the truth turns so fast that between its samples it may be off by {bent:.1f} sigma in the "
+            "median of a run, which counts as error; give a truth of a higher rate"
+        )
+    return notes

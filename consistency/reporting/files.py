@@ -1,0 +1,290 @@
+"""The report of another estimator: the verdict, then errors with bounds, NEES with band, coverage, innovations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import special, stats
+
+from consistency.diagnostics import Verdict
+from consistency.diagnostics.wording import plural
+from consistency.errors import InputError
+from consistency.recording import Recording
+from consistency.reporting.blocks import Block, Chapter, Document, Facts, Text
+from consistency.reporting.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
+from consistency.reporting.looks import EXPECTED, LIMIT, SHADE, Look, style
+from consistency.reporting.model import Estimator, Judged, wide
+from consistency.reporting.sections import axes, questions, verdicts
+from consistency.reporting.sections.pose_errors import SIGMAS, ZERO
+from consistency.reporting.sections.provenance import facts
+from consistency.types import Array
+
+MOST_PANELS = 12  # components of an error that are drawn
+MOST_RUNS = 20  # runs that are drawn beside the shown one
+ANGLES = {"heading", "yaw", "pitch", "roll"}
+METRES = {"x", "y", "z"}
+SHOWN, OTHERS = replace(style(0), width=1.0), Look("#c0c0c0", width=0.5)
+JOINT = Look("#333333", width=1.4)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What stands on the axis along the runs; T steps."""
+
+    values: Array  # (T,)
+    label: str
+    word: str  # "s" or "step"
+    note: str = ""  # where the clock begins, if not at zero
+
+    @property
+    def axis(self) -> Axis:
+        return Axis(self.label, share="clock")
+
+
+def clock_of(record: Recording) -> Clock:
+    """Seconds from the first estimate on where all steps have a time, else steps."""
+    t = record.t
+    if not len(t) or not np.isfinite(t).all():
+        return Clock(np.arange(1.0, len(t) + 1), "step", "step")
+    if abs(t[0]) < 1e6:
+        return Clock(t, "time (s)", "s")
+    return Clock(t - t[0], "time (s)", "s", f" Time 0 is {t[0]:.2f} s.")
+
+
+def compose_files(
+    records: Sequence[Recording], judged: Mapping[str, Verdict], title: str, manifest: Mapping[str, Any]
+) -> Document:
+    """The document that HTML and PDF show; a chapter for each of the records that has a verdict."""
+    named = {record.name: record for record in records}
+    study = _study(tuple(judged.values()), title)
+    several = len(judged) > 1
+    chapters = [
+        Chapter(f"estimator-{i}", name, name, _of_one(named[name], verdict, several), _counts(named[name], verdict))
+        for i, (name, verdict) in enumerate(judged.items())
+    ]
+    by_axis = axes.read(study)
+    blocks: list[Block] = [*verdicts.judgement(study), *questions.show(questions.read(study))]
+    blocks += [] if by_axis is None else axes.figures(by_axis)
+    blocks.append(Text(verdicts.method((study,)), "How a verdict comes about.", "note"))
+    notes = list(dict.fromkeys(note for name in judged for note in named[name].notes))
+    read = tuple(Text(note[:1].upper() + note[1:] + "." * (note[-1] not in ".?")) for note in notes)
+    chapters += [
+        Chapter("verdicts", "Verdict in figures", "Figures", tuple(blocks)),
+        Chapter("provenance", "What was read", "Files", (*read, Facts(facts(dict(manifest))))),
+    ]
+    return Document(f"Estimator consistency: {title}", answer(judged), tuple(chapters))
+
+
+def answer(judged: Mapping[str, Verdict]) -> str:
+    """The sentence of each verdict."""
+    return " ".join(f"{name} is {_ended(verdict.reasons[0])}" for name, verdict in judged.items())
+
+
+def _ended(sentence: str) -> str:
+    return sentence if sentence.endswith(".") else f"{sentence}."
+
+
+def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
+    tracks = tuple(Estimator(v.filter, i, f"0:{i}", v, v.failures) for i, v in enumerate(judged))
+    runs, steps = max(v.runs for v in judged), max(v.steps for v in judged)
+    return Judged(title, "", runs, 0, np.arange(1, steps + 1), tracks, False)
+
+
+def _counts(record: Recording, verdict: Verdict) -> str:
+    clock = clock_of(record)
+    size = f"{plural(verdict.runs, 'run')} of {plural(verdict.steps, 'step')}"
+    return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and verdict.steps > 1 else size
+
+
+def _of_one(record: Recording, verdict: Verdict, said: bool) -> tuple[Block, ...]:
+    sentence = (Text(f"{record.name} is {_ended(verdict.reasons[0])}"),) if said else ()
+    return (*sentence, *record_figures(record, verdict))
+
+
+def record_figures(record: Recording, verdict: Verdict) -> tuple[Figure, ...]:
+    """Errors with their bounds, NEES with its band, coverage, and innovations; those that the record has."""
+    found = (_errors(record), _nees(record, verdict), _coverage(record), _innovations(record, verdict))
+    return tuple(figure for figure in found if figure is not None)
+
+
+def record_sheet(record: Recording, verdict: Verdict | None = None) -> Sheet:
+    """Errors with their bounds, coverage, and with a ``verdict`` the NEES with its band, on one sheet.
+
+    Raises
+    ------
+    InputError
+        The record has neither errors nor NEES.
+    """
+    nees = None if verdict is None else _nees(record, verdict)
+    found = [figure for figure in (_errors(record), nees, _coverage(record)) if figure is not None]
+    if not found:
+        raise InputError(f"{record.name}: has neither errors nor NEES to draw; give --truth, or truth= in Python")
+    panels = tuple(panel for figure in found for panel in figure.panels)
+    keys = dict.fromkeys(key for figure in found[:1] for key in figure.keys)
+    columns = _columns(len(panels))
+    return Sheet(panels, 0.3 + 1.6 * -(-len(panels) // columns), columns=columns, keys=tuple(keys), title=record.name)
+
+
+# --- errors -----------------------------------------------------------------------------------------
+
+
+def unit_of(axis: str) -> tuple[str, float]:
+    """Unit that a component is shown in, and the factor to it; none where it is not known."""
+    if axis in ANGLES:
+        return "deg", 180.0 / np.pi
+    return ("m", 1.0) if axis in METRES else ("", 1.0)
+
+
+def shown_run(record: Recording) -> int:
+    """Row of the run that is drawn: the first that reaches furthest."""
+    assert record.error is not None
+    return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
+
+
+def _errors(record: Recording) -> Figure | None:
+    """Error of each component of one run with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
+    if record.error is None or record.covariance is None:
+        return None
+    clock, row = clock_of(record), shown_run(record)
+    others = [i for i in np.linspace(0, len(record.runs) - 1, MOST_RUNS + 1).astype(int) if i != row]
+    names = record.axes[:MOST_PANELS]
+    panels = tuple(_error_panel(record, clock, row, list(dict.fromkeys(others)), i) for i in range(len(names)))
+    keys = [Key(f"run {record.runs[row]}", SHOWN), Key("2-sigma bounds", replace(SHOWN, dash=(4.0, 3.0), width=0.8))]
+    keys += [Key("other runs", OTHERS)] if others else []
+    left_out = len(record.axes) - len(names)
+    caption = (
+        f"Error (truth minus estimate) of run {record.runs[row]} with the 2-sigma bounds that the estimator states "
+        "(dashed). Honest errors stay inside about 95 % of the time."
+        + (f" {plural(left_out, 'further component')} not drawn." if left_out else "")
+        + clock.note
+    )
+    columns = _columns(len(panels))
+    sheet = Sheet(panels, 0.3 + 1.4 * -(-len(panels) // columns), columns=columns, keys=tuple(keys))
+    return Figure("Errors and stated bounds", caption, panels, (sheet,), tuple(keys))
+
+
+def _columns(panels: int) -> int:
+    return 2 if panels in (2, 4) else min(3, panels)
+
+
+def _error_panel(record: Recording, clock: Clock, row: int, others: list[int], i: int) -> Panel:
+    assert record.error is not None
+    assert record.covariance is not None
+    name = record.axes[i]
+    unit, factor = unit_of(name)
+    error = factor * record.error[..., i]
+    bound = SIGMAS * factor * np.sqrt(np.maximum(record.covariance[row, :, i, i], 0.0))
+    tips = ((clock.word, "@x"), ("error", f"@y{{0.0000}} {unit}"), ("2 sigma", f"@bound{{0.0000}} {unit}"))
+    marks: list[Mark] = [Line(clock.values, error[k], OTHERS) for k in others]
+    marks += [Rule("y", 0.0, ZERO), Line(clock.values, error[row], SHOWN, tips=tips, bound=bound)]
+    label = f"{name} ({unit})" if unit else name
+    alt = f"Error of {name} of {record.name} with 2-sigma bounds"
+    return Panel(clock.axis, Axis(label), tuple(marks), alt, height=220)
+
+
+# --- NEES -------------------------------------------------------------------------------------------
+
+
+def _nees(record: Recording, verdict: Verdict) -> Figure | None:
+    """NEES of one run, or its average over runs, with the bands of a right estimator."""
+    scale, location = verdict.scale, verdict.location
+    if scale is None or len(scale.anees) != len(record.t):
+        return None
+    clock, single = clock_of(record), verdict.runs == 1
+    name = "NEES" if single else f"NEES, average of {verdict.runs} runs"
+    marks: list[Mark] = [Band(clock.values, *xy(scale.band), SHADE)]
+    keys = [Key("95 % band of one step", SHADE, "band")]
+    curves = [scale.anees, scale.band]
+    if location is not None and np.isfinite(location.simultaneous).any():
+        marks.append(Band(clock.values, *xy(location.simultaneous), LIMIT, outline=True))
+        keys.append(Key("band of all steps at once", LIMIT))
+        curves.append(location.simultaneous)
+    tips = ((clock.word, "@x"), (name, "@y{0.000}"))
+    marks += [Rule("y", float(scale.dof), EXPECTED), Line(clock.values, scale.anees, SHOWN, tips=tips)]
+    keys += [Key("expected", EXPECTED), Key(record.name, SHOWN)]
+    caption = (
+        f"{name}; {scale.dof} is expected (line). Above is overconfident, below conservative. Shaded: where one step "
+        f"of a right estimator lies with 95 %, which is not judged.{clock.note}"
+    )
+    panel = Panel(clock.axis, Axis("NEES", log=wide(curves)), tuple(marks), f"{name} of {record.name}", height=300)
+    return Figure("NEES", caption, (panel,), (Sheet((panel,), 2.2, keys=tuple(keys)),), tuple(keys))
+
+
+# --- coverage ---------------------------------------------------------------------------------------
+
+
+def observed_coverage(record: Recording, p: Array) -> dict[str, Array]:
+    """Share of errors inside the interval that should hold them with probability ``p`` (N,), by component and jointly.
+
+    Of all steps of all runs; -> (N,) each.
+    """
+    found: dict[str, Array] = {}
+    if record.error is not None and record.covariance is not None:
+        sigma = np.sqrt(np.diagonal(record.covariance, axis1=-2, axis2=-1))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            z = np.abs(record.error) / sigma
+        for i, name in enumerate(record.axes[:MOST_PANELS]):
+            found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
+    if record.nees is not None and record.dof:
+        found["all together"] = _shares(record.nees, stats.chi2.ppf(p, record.dof))
+    return {name: shares for name, shares in found.items() if np.isfinite(shares).any()}
+
+
+def _shares(values: Array, limits: Array) -> Array:
+    known = np.sort(values[np.isfinite(values)])
+    return np.searchsorted(known, limits, side="right") / len(known) if len(known) else np.full(len(limits), np.nan)
+
+
+def _coverage(record: Recording) -> Figure | None:
+    """Share of errors within an interval against the probability that it should hold them with."""
+    p = np.linspace(0.0, 0.999, 200)
+    found = observed_coverage(record, p)
+    if not found:
+        return None
+    looks = [replace(style(i), width=1.1) for i in range(len(found))]
+    looks[-1] = JOINT if "all together" in found else looks[-1]
+    tips = (("stated", "@x{0.000}"), ("observed", "@y{0.000}"))
+    lines = [Line(p, shares, look, tips=tips) for shares, look in zip(found.values(), looks, strict=True)]
+    diagonal = Line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), EXPECTED)
+    window = (-0.02, 1.02)
+    panel = Panel(
+        Axis("stated probability", window=window), Axis("share of errors inside", window=window), (diagonal, *lines),
+        f"Coverage of {record.name}", height=340, shape="square",
+    )  # fmt: skip
+    keys = (Key("expected", EXPECTED), *(Key(name, look) for name, look in zip(found, looks, strict=True)))
+    caption = (
+        "Coverage: share of errors inside the interval that should hold them with the stated probability, over all "
+        "steps of all runs. On the diagonal the covariance is right; below it is overconfident, above conservative."
+    )
+    return Figure("Coverage", caption, (panel,), (Sheet((panel,), 2.6, keys=keys, beside=True),), keys)
+
+
+# --- innovations ------------------------------------------------------------------------------------
+
+
+def _innovations(record: Recording, verdict: Verdict) -> Figure | None:
+    """NIS over its degrees of freedom, averaged over runs."""
+    if record.nis is None or record.nis_dof is None:
+        return None
+    clock = clock_of(record)
+    known = np.isfinite(record.nis) & (record.nis_dof > 0)
+    dof = np.where(known, record.nis_dof, 0.0).sum(axis=0)
+    ratio = np.where(dof > 0, np.where(known, record.nis, 0.0).sum(axis=0) / np.maximum(dof, 1.0), np.nan)
+    low, high = (stats.chi2.ppf(q, np.maximum(dof, 1.0)) / np.maximum(dof, 1.0) for q in (0.025, 0.975))
+    marks = (
+        Band(clock.values, np.where(dof > 0, low, np.nan), np.where(dof > 0, high, np.nan), SHADE),
+        Rule("y", 1.0, EXPECTED),
+        Points(clock.values, ratio, replace(style(0), size=2.0, alpha=0.7)),
+    )
+    judged = verdict.innovations is not None and verdict.innovations.judged
+    caption = (
+        "NIS over its degrees of freedom; 1 is expected (line). Shaded: where one step of white innovations lies with "
+        f"95 %.{'' if judged else ' Reported, not judged: no optimal gain is declared.'}{clock.note}"
+    )
+    y = Axis("NIS / dof", log=wide([ratio]))
+    panel = Panel(clock.axis, y, marks, f"NIS over degrees of freedom of {record.name}", height=240)
+    keys = (Key("95 % band of one step", SHADE, "band"), Key("expected", EXPECTED))
+    return Figure("Innovations", caption, (panel,), (Sheet((panel,), 1.8, keys=keys),), keys)

@@ -1,0 +1,103 @@
+"""What is done for each run, as a value that can be sent to where it is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+from consistency.filters.stepping import name_of
+from consistency.protocols import Filter, WholeTrial
+from consistency.runs.isolating import Isolation
+from consistency.scenario import Belief, Scenario
+from consistency.simulation import require_landmarks_in_view
+from consistency.simulation.world import World
+from consistency.store.results import Outcome, outcome_of
+from consistency.terminal.progress import KERNELS, progress
+from consistency.types import Trial
+
+Outcomes = Generator[Outcome, None, None]
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Trials of a scenario.
+
+    Raises
+    ------
+    InputError
+        No landmark can ever be seen.
+    """
+
+    scenario: Scenario
+    seed: int
+
+    def __post_init__(self) -> None:
+        _ = self._world
+
+    def __call__(self, run: int) -> Trial:
+        return self._world.trial(run, self.seed)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Simulated, (self.scenario, self.seed)
+
+    @cached_property
+    def _world(self) -> World:
+        return require_landmarks_in_view(self.scenario)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Trials that are there, by number of their runs."""
+
+    trials: Mapping[int, Trial]
+
+    def __call__(self, run: int) -> Trial:
+        return self.trials[run]
+
+
+@dataclass(frozen=True)
+class Work:
+    """Trials, and the filters through which each is put; it can be pickled.
+
+    Runs are done in a ``with`` on ``isolation``.
+    """
+
+    trials: Callable[[int], Trial]
+    isolation: Isolation
+
+    def __call__(self, run: int) -> Outcome:
+        trial = self.trials(run)
+        return outcome_of(trial, self.isolation.run(trial))
+
+    @property
+    def filters(self) -> list[Filter]:
+        return self.isolation.filters
+
+    def compile(self, run: int) -> None:
+        """Compile what a run needs and is not yet compiled, and say so."""
+        if self.isolation.compiled:
+            compile_for(self.isolation.compiled, self.trials(run), self.isolation.belief)
+
+
+class Backend(Protocol):
+    """Where runs are done."""
+
+    def prepare(self, work: Work, run: int, /) -> None:
+        """Compile what ``run`` needs, where that is done on this machine."""
+
+    def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
+        """What each run left, in the order in which they end; to be closed, which stops what is not done.
+
+        The bits do not depend on who does a run: BLAS has one thread.
+        """
+
+
+def compile_for(filters: Sequence[Filter], trial: Trial, belief: Belief) -> None:
+    """Compile what the filters need for ``trial`` and is not yet compiled, and say so."""
+    for filter_ in filters:
+        if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, belief):
+            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, KERNELS) as advance:
+                filter_.compile(trial, belief)
+                advance(1)

@@ -1,0 +1,90 @@
+"""The command on workers of dask: Ctrl-C, a scheduler that dies and comes back, or does not."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cluster import Cluster
+from test_faults import at as at
+from test_faults import begin, end, fresh, kept, require_same, resume, wait_for, working
+
+__all__ = ["fresh"]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="signals")]
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    with Cluster(tmp_path) as cluster:
+        yield cluster
+
+
+def remaining(session: int) -> bool:
+    """Whether a process of the session is still there after some seconds."""
+    for _ in range(100):
+        try:
+            os.killpg(session, 0)
+        except ProcessLookupError:
+            return False
+        time.sleep(0.1)
+    return True
+
+
+@pytest.mark.parametrize("to_all", [False, True])
+def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(fresh: Path, to_all: bool) -> None:
+    process = begin(fresh, "--backend", "dask")
+    wait_for(working(fresh), process)
+    (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)  # in a terminal all processes get it
+    status, error = end(process)
+    assert status == 130, error
+    assert "Traceback" not in error
+    assert not remaining(process.pid)
+    assert "finished runs are in out; add --resume" in error
+    resume(fresh)
+
+
+def test_a_killed_client_leaves_no_process(fresh: Path) -> None:
+    process = begin(fresh, "--backend", "dask")
+    wait_for(working(fresh), process)
+    process.kill()
+    process.communicate()
+    assert kept(fresh) > 0
+    assert not remaining(process.pid)
+    resume(fresh)
+
+
+def test_a_scheduler_is_killed_and_started_again(fresh: Path, cluster: Cluster) -> None:
+    process = begin(fresh, "--backend", "dask", "--jobs", "-1", "--scheduler", cluster.address)
+    wait_for(working(fresh), process)
+    cluster.kill()
+    time.sleep(1.0)
+    cluster.start()
+    status, error = end(process)
+    assert status == 0, error
+    assert all(line.startswith("runs: ") for line in error.splitlines()), error
+    require_same(fresh)
+
+
+def test_a_scheduler_that_stays_away(fresh: Path, cluster: Cluster) -> None:
+    process = begin(fresh, "--backend", "dask", "--jobs", "-1", "--scheduler", cluster.address, "--scheduler-wait", "3")
+    wait_for(working(fresh), process)
+    cluster.kill()
+    status, error = end(process)
+    assert status == 2, error
+    assert "Traceback" not in error
+    assert f"the scheduler {cluster.address} cannot be reached for 3 s; {kept(fresh)} finished runs are kept" in error
+    resume(fresh)
+
+
+def test_workers_that_stay_away(fresh: Path, cluster: Cluster) -> None:
+    process = begin(fresh, "--backend", "dask", "--jobs", "-1", "--scheduler", cluster.address, "--scheduler-wait", "3")
+    wait_for(working(fresh), process)
+    cluster.kill_workers()
+    status, error = end(process)
+    assert status == 2, error
+    assert f"the scheduler {cluster.address} has had no worker for 3 s" in error
+    resume(fresh)

@@ -1,0 +1,230 @@
+"""Files that are mixed up in one way are told so in words, and right ones are not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from consistency.geometry import wrap
+from consistency.geometry.conventions import planar_error, spatial_error
+from consistency.recording import read_recordings
+from consistency.recording.hints import carried, decades, fitted_frame, hints, moved
+from consistency.recording.poses import Poses
+from consistency.recording.sheet import Places
+from consistency.types import Array
+
+RUNS, STEPS = 3, 60
+SIX = ("x", "y", "z", "roll", "pitch", "yaw")
+THREE = ("x", "y", "heading")
+DEGREES = 180.0 / np.pi
+ANGLES = np.array([1.0, 1.0, DEGREES])
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(22)
+
+
+def covariance(rng: np.random.Generator, sigma: Sequence[float], plain: bool) -> Array:
+    root = np.eye(len(sigma)) + (0.0 if plain else 0.3) * rng.normal(size=(len(sigma),) * 2)
+    P = root @ root.T
+    scale = np.array(sigma) * np.exp(0.2 * rng.normal()) / np.sqrt(np.diag(P))
+    return np.asarray(P * np.outer(scale, scale))
+
+
+def hat(xi: Array) -> Array:
+    x, y, z, a, b, c = xi
+    return np.array([[0, -c, b, x], [c, 0, -a, y], [-b, a, 0, z], [0, 0, 0, 0]])
+
+
+def spatial(rng: np.random.Generator, convention: str = "so3", plain: bool = False) -> list[Poses]:
+    """Drives whose errors have the stated covariance in ``convention``: so3 or left."""
+    runs = []
+    for _ in range(RUNS):
+        t, heading = 0.1 * np.arange(STEPS), rng.uniform(-3, 3) + np.cumsum(rng.normal(0, 0.1, STEPS))
+        steps = 0.5 * np.column_stack([np.cos(heading), np.sin(heading), 0.1 * np.sin(t)])
+        at = rng.uniform(-5, 5, 3) + np.cumsum(steps, axis=0)
+        turn = Rotation.from_euler("ZYX", np.column_stack([heading, 0.1 * np.sin(t), 0.1 * np.cos(2 * t)]))
+        P = covariance(rng, (0.05, 0.08, 0.12, 0.004, 0.006, 0.01), plain)
+        xi = rng.normal(size=(STEPS, 6)) @ np.linalg.cholesky(P).T
+        true = np.hstack([at + xi[:, :3], (Rotation.from_rotvec(xi[:, 3:]) * turn).as_quat()])
+        if convention == "left":
+            T = np.tile(np.eye(4), (STEPS, 1, 1))
+            T[:, :3, :3], T[:, :3, 3] = turn.as_matrix(), at
+            T = T @ np.array([expm(hat(each)) for each in xi])
+            true = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
+        runs.append(poses(t, np.hstack([at, turn.as_quat()]), P, true, "spatial", convention))
+    return runs
+
+
+def planar(rng: np.random.Generator, plain: bool = False) -> list[Poses]:
+    runs = []
+    for _ in range(RUNS):
+        t, heading = 0.1 * np.arange(STEPS), rng.uniform(-3, 3) + np.cumsum(rng.normal(0, 0.1, STEPS))
+        at = rng.uniform(-5, 5, 2) + np.cumsum(0.5 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+        P = covariance(rng, (0.05, 0.08, 0.01), plain)
+        own = np.column_stack([at, wrap(heading)])
+        true = own + rng.normal(size=(STEPS, 3)) @ np.linalg.cholesky(P).T
+        true[:, 2] = wrap(true[:, 2])
+        runs.append(poses(t, own, P, true, "planar", "so2"))
+    return runs
+
+
+def poses(t: Array, own: Array, P: Array, true: Array, manifold: str, convention: str) -> Poses:
+    place, stated = Places("line {}".format, np.arange(len(t))), np.ones(len(t), bool)
+    return Poses(place, t, own, np.tile(P, (len(t), 1, 1)), stated, t, true, manifold, convention, 0.01)  # type: ignore[arg-type]
+
+
+def weighed(p: Poses, part: slice, factor: float) -> Poses:
+    scale = np.ones(p.covariance.shape[-1])
+    scale[part] = factor
+    return replace(p, covariance=p.covariance * np.outer(scale, scale))
+
+
+def deviations(p: Poses) -> Poses:
+    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
+    return replace(p, covariance=sigma[:, :, None] * np.eye(sigma.shape[1]))
+
+
+SWAP = [3, 4, 5, 0, 1, 2]
+W_FIRST = [0, 1, 2, 6, 3, 4, 5]
+FAR = np.array([10.0, -3.0, 1.0])
+Make = Callable[[np.random.Generator], list[Poses]]
+Mess = Callable[[Poses], Poses]
+MIXED: dict[str, tuple[Make, Mess, str]] = {
+    "blocks": (
+        spatial, lambda p: replace(p, covariance=p.covariance[:, SWAP][:, :, SWAP]),
+        "the covariance has its two blocks in the other order (--covariance-order)",
+    ),
+    "gtsam": (
+        lambda rng: spatial(rng, "left"),
+        lambda p: replace(p, convention="so3", covariance=p.covariance[:, SWAP][:, :, SWAP]),
+        "the error is 'left' (--error left) and the covariance has its two blocks in the other order",
+    ),
+    "quaternions": (
+        spatial, lambda p: replace(p, estimate=p.estimate[:, W_FIRST]),
+        "the quaternions of the estimates are w x y z",
+    ),
+    "true quaternions": (
+        spatial, lambda p: replace(p, truth=p.truth[:, W_FIRST]), "the quaternions of the truth are w x y z",
+    ),
+    "world to body": (
+        spatial, lambda p: replace(p, estimate=p.estimate * [1, 1, 1, -1, -1, -1, 1]), "turn world into body",
+    ),
+    "variances in degrees": (spatial, lambda p: weighed(p, slice(3, 6), DEGREES), "its angles are in degrees"),
+    "variances in mm": (spatial, lambda p: weighed(p, slice(0, 3), 1e3), "its positions are in millimetres"),
+    "estimates in mm": (
+        spatial, lambda p: weighed(replace(p, estimate=p.estimate * ([1e3] * 3 + [1] * 4)), slice(0, 3), 1e3),
+        "the positions of the estimates and their covariance are in millimetres",
+    ),
+    "truth in mm": (
+        spatial, lambda p: replace(p, truth=p.truth * ([1e3] * 3 + [1] * 4)), "positions of the truth are in millim",
+    ),
+    "deviations": (lambda rng: spatial(rng, plain=True), deviations, "its diagonal holds standard deviations"),
+    "information": (spatial, lambda p: replace(p, covariance=np.linalg.inv(p.covariance)), "information matrix"),
+    "turned world": (spatial, lambda p: moved(p, -np.pi / 4.5, FAR), "turned by 40."),
+    "headings in degrees": (
+        planar, lambda p: replace(p, estimate=p.estimate * ANGLES), "the headings of the estimates are in degrees",
+    ),
+    "true headings in degrees": (
+        planar, lambda p: replace(p, truth=p.truth * ANGLES), "the headings of the truth are in degrees",
+    ),
+    "planar deviations": (lambda rng: planar(rng, plain=True), deviations, "its diagonal holds standard deviations"),
+    "shifted world": (planar, lambda p: moved(p, 0.0, FAR[:2]), "the world of the estimates is shifted by (-"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MIXED)
+def test_a_mix_up_is_named(name: str, rng: np.random.Generator) -> None:
+    make, mess, words = MIXED[name]
+    runs = make(rng)
+    axes = SIX if runs[0].manifold == "spatial" else THREE
+    assert hints("est", axes, runs) == []
+    (said,) = hints("est", axes, [mess(p) for p in runs])
+    assert said.startswith("est: the NEES")
+    assert words in said
+
+
+@pytest.mark.parametrize("ratio", [0.2, 5.0])
+def test_a_filter_that_is_wrong_by_itself_gets_no_hint(ratio: float, rng: np.random.Generator) -> None:
+    for make, axes in ((spatial, SIX), (planar, THREE)):
+        runs = [replace(p, covariance=p.covariance / ratio) for p in make(rng)]
+        assert decades(runs)[0] == pytest.approx(np.log10(ratio), abs=0.15)
+        assert hints("est", axes, runs) == []
+
+
+def test_no_guess_that_fits_is_no_hint(rng: np.random.Generator) -> None:
+    runs = [replace(p, covariance=p.covariance / 1000.0) for p in planar(rng)]
+    assert decades(runs)[0] > 2.5
+    assert hints("est", THREE, runs) == []
+
+
+# --- frames -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", [-2.0, 0.3])
+def test_the_frame_is_found(angle: float, rng: np.random.Generator) -> None:
+    for make, shift in ((spatial, FAR), (planar, FAR[:2])):
+        runs = make(rng)
+        for p in runs:
+            p.truth[:, : len(shift)] = p.estimate[:, : len(shift)]
+        found = fitted_frame([moved(p, angle, shift) for p in runs])
+        assert found is not None
+        assert found[0] == pytest.approx(-angle, abs=1e-9)
+        back = moved(moved(runs[0], angle, shift), *found)
+        np.testing.assert_allclose(back.estimate[:, : len(shift)], runs[0].estimate[:, : len(shift)], atol=1e-9)
+        assert fitted_frame(runs) is None
+
+
+@pytest.mark.parametrize("convention", ["so3", "so3-body", "left", "right"])
+def test_errors_in_space_are_carried_over(convention: str) -> None:
+    """To first order: the change of the error by small errors of each kind, in the moved world, is the matrix."""
+    own = np.array([[3.0, -1.0, 2.0, *Rotation.from_euler("ZYX", [0.7, 0.2, -0.3]).as_quat()]])
+    step = 1e-6
+    found = np.zeros((6, 6))
+    for i, xi in enumerate(step * np.eye(6)):
+        true = np.zeros((1, 7))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_quat(own[0, 3:]).as_matrix(), own[0, :3]
+        E = expm(hat(xi))
+        G = {"left": T @ E, "right": E @ T}.get(convention, T.copy())
+        if convention.startswith("so3"):
+            G[:3, 3] += xi[:3]
+            G[:3, :3] = E[:3, :3] @ T[:3, :3] if convention == "so3" else T[:3, :3] @ E[:3, :3]
+        true[0] = [*G[:3, 3], *Rotation.from_matrix(G[:3, :3]).as_quat()]
+        both = [
+            moved(poses(np.zeros(1), each, np.eye(6), each, "spatial", convention), 0.9, FAR) for each in (own, true)
+        ]
+        found[:, i] = spatial_error(both[1].estimate, both[0].estimate, convention)[0] / step
+    np.testing.assert_allclose(found, carried(convention, 0.9, FAR, 6), atol=1e-4)
+
+
+@pytest.mark.parametrize("convention", ["so2", "left", "right"])
+def test_errors_in_the_plane_are_carried_over(convention: str) -> None:
+    own, step = np.array([[3.0, -1.0, 0.4]]), 1e-6
+    change, found = np.zeros((3, 3)), np.zeros((3, 3))
+    for i, xi in enumerate(step * np.eye(3)):
+        pair = [poses(np.zeros(1), each, np.eye(3), each, "planar", convention) for each in (own, own + xi)]
+        change[:, i] = planar_error(own + xi, own, convention)[0] / step
+        both = [moved(p, 0.9, FAR[:2]).estimate for p in pair]
+        found[:, i] = planar_error(both[1], both[0], convention)[0] / step
+    np.testing.assert_allclose(found, carried(convention, 0.9, FAR[:2], 3) @ change, atol=1e-4)
+
+
+# --- files ------------------------------------------------------------------------------------------
+
+
+def test_the_hint_is_a_note_of_what_was_read(tmp_path: Path, rng: np.random.Generator) -> None:
+    p = spatial(rng)[0]
+    for name, values in (("est", p.estimate), ("truth", p.truth), ("P", p.covariance.reshape(STEPS, 36))):
+        np.savetxt(tmp_path / f"{name}.txt", np.column_stack([p.t, values]), fmt="%.17g")
+    files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
+    wrong = read_recordings(*files, covariance_order="rotation-translation")[0].notes
+    assert any("in the other order (--covariance-order)" in note for note in wrong)
+    assert not any("about right if" in note for note in read_recordings(*files)[0].notes)

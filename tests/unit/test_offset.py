@@ -1,0 +1,172 @@
+"""Clocks that differ, on runs whose offset is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import consistency as cs
+from consistency.geometry import wrap
+from consistency.recording import read_recordings
+from consistency.recording.offset import clock_shift, offset_of, steps_of
+from consistency.recording.poses import Poses
+from consistency.recording.sheet import Places
+from consistency.types import Array
+
+SIGMA = np.array([0.3, 0.3, 0.02])
+TRUE_T = np.arange(-2.0, 12.0, 0.02)
+
+
+def path(rng: np.random.Generator, speed: float) -> Array:
+    """A winding drive at every 0.02 s, (700, 3)."""
+    heading = rng.uniform(-3, 3) + 0.4 * np.sin(rng.uniform(-1, 1) * TRUE_T) + 0.2 * TRUE_T
+    steps = 0.02 * speed * np.column_stack([np.cos(heading), np.sin(heading)])
+    return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])
+
+
+def run_of(rng: np.random.Generator, offset: float, noise: float = 1.0, speed: float = 5.0) -> Poses:
+    """100 estimates in 10 s, whose clock is ``offset`` early."""
+    t, truth = 0.1 * np.arange(100), path(rng, speed)
+    poses = Poses(
+        Places("line {}".format, np.arange(100)), t, np.zeros((100, 3)), np.tile(np.diag(SIGMA**2), (100, 1, 1)),
+        np.ones(100, bool), TRUE_T, truth, "planar", "so2", 0.01,
+    )  # fmt: skip
+    estimate = poses.known(offset).truth - noise * SIGMA * rng.normal(size=(100, 3))
+    return replace(poses, estimate=estimate)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng()
+
+
+@pytest.mark.parametrize("offset", [-0.35, -0.012, 0.0, 0.04, 0.7])
+def test_without_noise_it_is_found_to_the_millisecond(rng: np.random.Generator, offset: float) -> None:
+    found = offset_of([run_of(rng, offset, noise=1e-3) for _ in range(5)])
+    assert found is not None
+    assert found.value == pytest.approx(offset, abs=5e-4)
+    assert found.low <= found.value <= found.high
+
+
+def test_a_step_goes_to_the_offset(rng: np.random.Generator) -> None:
+    steps = steps_of(run_of(rng, 0.02, noise=1e-3), 0.0, 3)
+    np.testing.assert_allclose(steps, 0.02, atol=2e-3)
+
+
+def test_with_noise_it_is_named(rng: np.random.Generator) -> None:
+    """40 ms at 5 m/s are 0.2 m beside a sigma of 0.3 m. The estimate spreads by 1.2 ms: 10 times that is never seen."""
+    runs = [run_of(rng, 0.04) for _ in range(20)]
+    found = offset_of(runs)
+    assert found is not None
+    assert found.found
+    assert found.value == pytest.approx(0.04, abs=0.012)
+    shift, notes = clock_shift("est", runs, None)
+    assert shift == 0.0
+    assert "seem to differ by 0.0" in notes[0]
+    assert "--time-offset 0.0" in notes[0]
+    shift, notes = clock_shift("est", runs, "estimate")
+    assert shift == found.value
+    assert "is added to the timestamps" in notes[0]
+
+
+def test_a_right_clock_is_left_alone(rng: np.random.Generator) -> None:
+    """Each is named with probability 1e-4: more than 2 of 60 with 4e-8."""
+    assert sum(bool(clock_shift("est", [run_of(rng, 0.0) for _ in range(8)], None)[1]) for _ in range(60)) <= 2
+
+
+def test_the_error_of_a_single_run_is_not_laid_on_the_clock(rng: np.random.Generator) -> None:
+    """An error along the path looks the same; only one far too large for the covariance is named."""
+    for noise in (1.0, 0.01):  # the second is sure of the offset
+        assert clock_shift("est", [run_of(rng, 0.04, noise)], None)[1] == []
+    assert "of estimates and truth seem to differ by" in clock_shift("est", [run_of(rng, 0.3)], None)[1][0]
+
+
+def test_where_nothing_moves_there_is_none(rng: np.random.Generator) -> None:
+    runs = [run_of(rng, 0.0) for _ in range(4)]
+    still = [replace(run, truth=np.zeros_like(run.truth), estimate=0.1 * SIGMA * run.estimate) for run in runs]
+    assert offset_of(still) is None
+    with pytest.raises(cs.InputError, match="--time-offset estimate: nothing moves in est"):
+        clock_shift("est", still, "estimate")
+
+
+# --- files ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tables(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Estimates of 12 runs that are 0.1 s early, with their truths."""
+    estimates, truths = [], []
+    for number in range(12):
+        run = run_of(rng, 0.1)
+        P = {name: SIGMA[i] ** 2 for i, name in enumerate(("P_xx", "P_yy", "P_hh"))}
+        columns = dict(zip(("x", "y", "heading"), run.estimate.T, strict=True))
+        estimates.append(pd.DataFrame({"run": number, "t": run.t} | columns | P | {"P_xy": 0, "P_xh": 0, "P_yh": 0}))
+        true = dict(zip(("x", "y", "heading"), run.truth.T, strict=True))
+        truths.append(pd.DataFrame({"run": number, "t": run.true_t} | true))
+    pd.concat(estimates).to_csv(tmp_path / "est.csv", index=False)
+    pd.concat(truths).to_csv(tmp_path / "truth.csv", index=False)
+    return tmp_path
+
+
+def test_tables_are_read_with_an_offset(tables: Path) -> None:
+    """NEES 3 expected, of 1,200: 2.5 and 3.5 are 7 sigma away."""
+    files = tables / "est.csv", tables / "truth.csv"
+    for option, right in ((None, False), (0.1, True), ("estimate", True), (-0.1, False)):
+        [record] = read_recordings(*files, time_offset=option)
+        assert record.nees is not None
+        assert (2.5 < np.nanmean(record.nees) < 3.5) == right, option
+    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
+    assert cs.judge(cs.read(*files, time_offset=0.1)).status != "overconfident"
+
+
+def test_trajectories_are_read_with_an_offset(tmp_path: Path, rng: np.random.Generator) -> None:
+    for folder in ("est", "truth", "P"):
+        (tmp_path / folder).mkdir()
+    for number in range(6):
+        run = run_of(rng, 0.1)
+        for folder, t, pose in (("est", run.t, run.estimate), ("truth", run.true_t, run.truth)):
+            half = 0.5 * pose[:, 2]
+            zero = np.zeros(len(t))
+            up = rng.normal(size=(len(t), 3)) * 0.01 if folder == "est" else np.zeros((len(t), 3))
+            turn = np.column_stack([0.5 * up[:, 1:], np.sin(half), np.cos(half)])
+            turn /= np.linalg.norm(turn, axis=1)[:, None]
+            np.savetxt(tmp_path / folder / f"{number}.txt", np.column_stack([t, pose[:, :2], zero + up[:, 0], turn]))
+        P = np.diag([*SIGMA[:2] ** 2, 1e-4, 1e-4, 1e-4, SIGMA[2] ** 2]).ravel()
+        np.savetxt(tmp_path / "P" / f"{number}.txt", np.column_stack([run.t, np.tile(P, (len(run.t), 1))]))
+    files = tmp_path / "est", tmp_path / "truth", tmp_path / "P"
+    early, right = (np.nanmean(read_recordings(*files, time_offset=o)[0].nees) for o in (None, "estimate"))  # type: ignore[arg-type]
+    assert early > 6.8
+    assert 5.0 < right < 6.8
+    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("soon", "--time-offset soon: must be a number of seconds, or 'estimate'"),
+        ("nan", "--time-offset nan: must be a number of seconds, or 'estimate'"),
+        ("1000", "no t of run 0"),
+    ],
+)
+def test_bad_offsets(tables: Path, option: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from consistency.cli import main
+
+    with pytest.raises(SystemExit) as end:
+        main(["analyse", str(tables / "est.csv"), "--truth", str(tables / "truth.csv"), "--time-offset", option])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_offsets_need_clocks(tables: Path) -> None:
+    with pytest.raises(cs.InputError, match="--time-offset needs --truth"):
+        read_recordings(tables / "est.csv", time_offset=1)
+    for name in ("est.csv", "truth.csv"):
+        table = pd.read_csv(tables / name)
+        table["t"] = table.groupby("run").cumcount()
+        table.rename(columns={"t": "step"}).to_csv(tables / name, index=False)
+    with pytest.raises(cs.InputError, match="--time-offset: needs a column t"):
+        read_recordings(tables / "est.csv", tables / "truth.csv", time_offset=1.0)

@@ -120,14 +120,15 @@ def frontend(
     calibration: Annotated[
         Path | None,
         typer.Option(
-            "--calibration", help="KITTI calib.txt, OpenCV .yaml, or folder of EuRoC's; not needed if in IMAGES."
+            "--calibration",
+            help="KITTI's text, .yaml of OpenCV or BoofCV, or folder of EuRoC's; not needed if in IMAGES.",
         ),
     ] = None,
     truth: Annotated[
         Path | None, typer.Option("--truth", help="True poses: KITTI, EuRoC .csv or TUM; found if in IMAGES.")
     ] = None,
     format: Annotated[
-        str | None, typer.Option("--format", help="kitti, euroc or opencv (plain) [by the folders].")
+        str | None, typer.Option("--format", help="kitti, kitti-raw, euroc or opencv (plain) [by the folders].")
     ] = None,
     left: Annotated[str | None, typer.Option("--left", help="Pattern of plain left images, as 'left/*.png'.")] = None,
     right: Annotated[str | None, typer.Option("--right", help="Pattern of plain right images.")] = None,

@@ -12,6 +12,7 @@ from consistency.diagnostics import Settings
 from consistency.errors import InputError
 from consistency.reporting.answer import answer
 from consistency.reporting.blocks import Chapter, Document
+from consistency.reporting.clock import clock_of
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.section import STUDY, Section
 from consistency.reporting.sections import SECTIONS
@@ -60,13 +61,15 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
         verdict = with_map(verdict, results, ends, Settings(), design)
         return Track(name, number, f"{index}:{number}", verdict, ends.failures, shown, ratio, results)
 
+    tracks = tuple(track(name) for name in results.filters)
     return Study(
         name=scenario.name if scenario else Path(str(results.manifest.get("log", folder.name))).name,
         summary=scenario.summary if scenario else "Recorded log",
         runs=len(runs),
         shown_run=shown_run,
+        clock=clock_of(tracks[0].shown.t if tracks else np.full(steps, np.nan)),
         steps=np.arange(1, steps + 1),
-        tracks=tuple(track(name) for name in results.filters),
+        tracks=tracks,
         results=results,
         until_decided=design is not None,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from consistency.diagnostics.wording import plural
 from consistency.errors import InputError
 from consistency.recording import Recording
 from consistency.reporting.blocks import Block, Chapter, Document, Facts, Text
+from consistency.reporting.clock import Clock, clock_of
 from consistency.reporting.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
 from consistency.reporting.looks import EXPECTED, LIMIT, SHADE, Look, style
 from consistency.reporting.model import Estimator, Judged, wide
@@ -28,30 +29,6 @@ ANGLES = {"heading", "yaw", "pitch", "roll"}
 METRES = {"x", "y", "z"}
 SHOWN, OTHERS = replace(style(0), width=1.0), Look("#c0c0c0", width=0.5)
 JOINT = Look("#333333", width=1.4)
-
-
-@dataclass(frozen=True)
-class Clock:
-    """What stands on the axis along the runs; T steps."""
-
-    values: Array  # (T,)
-    label: str
-    word: str  # "s" or "step"
-    note: str = ""  # where the clock begins, if not at zero
-
-    @property
-    def axis(self) -> Axis:
-        return Axis(self.label, share="clock")
-
-
-def clock_of(record: Recording) -> Clock:
-    """Seconds from the first estimate on where all steps have a time, else steps."""
-    t = record.t
-    if not len(t) or not np.isfinite(t).all():
-        return Clock(np.arange(1.0, len(t) + 1), "step", "step")
-    if abs(t[0]) < 1e6:
-        return Clock(t, "time (s)", "s")
-    return Clock(t - t[0], "time (s)", "s", f" Time 0 is {t[0]:.2f} s.")
 
 
 def compose_files(
@@ -90,11 +67,11 @@ def _ended(sentence: str) -> str:
 def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
     tracks = tuple(Estimator(v.filter, i, f"0:{i}", v, v.failures) for i, v in enumerate(judged))
     runs, steps = max(v.runs for v in judged), max(v.steps for v in judged)
-    return Judged(title, "", runs, 0, np.arange(1, steps + 1), tracks, False)
+    return Judged(title, "", runs, 0, clock_of(np.full(steps, np.nan)), np.arange(1, steps + 1), tracks, False)
 
 
 def _counts(record: Recording, verdict: Verdict) -> str:
-    clock = clock_of(record)
+    clock = clock_of(record.t)
     size = f"{plural(verdict.runs, 'run')} of {plural(verdict.steps, 'step')}"
     return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and verdict.steps > 1 else size
 
@@ -148,7 +125,7 @@ def _errors(record: Recording) -> Figure | None:
     """Error of each component of one run with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
     if record.error is None or record.covariance is None:
         return None
-    clock, row = clock_of(record), shown_run(record)
+    clock, row = clock_of(record.t), shown_run(record)
     others = [i for i in np.linspace(0, len(record.runs) - 1, MOST_RUNS + 1).astype(int) if i != row]
     names = record.axes[:MOST_PANELS]
     panels = tuple(_error_panel(record, clock, row, list(dict.fromkeys(others)), i) for i in range(len(names)))
@@ -193,7 +170,7 @@ def _nees(record: Recording, verdict: Verdict) -> Figure | None:
     scale, location = verdict.scale, verdict.location
     if scale is None or len(scale.anees) != len(record.t):
         return None
-    clock, single = clock_of(record), verdict.runs == 1
+    clock, single = clock_of(record.t), verdict.runs == 1
     name = "NEES" if single else f"NEES, average of {verdict.runs} runs"
     marks: list[Mark] = [Band(clock.values, *xy(scale.band), SHADE)]
     keys = [Key("95 % band of one step", SHADE, "band")]
@@ -269,7 +246,7 @@ def _innovations(record: Recording, verdict: Verdict) -> Figure | None:
     """NIS over its degrees of freedom, averaged over runs."""
     if record.nis is None or record.nis_dof is None:
         return None
-    clock = clock_of(record)
+    clock = clock_of(record.t)
     known = np.isfinite(record.nis) & (record.nis_dof > 0)
     dof = np.where(known, record.nis_dof, 0.0).sum(axis=0)
     ratio = np.where(dof > 0, np.where(known, record.nis, 0.0).sum(axis=0) / np.maximum(dof, 1.0), np.nan)

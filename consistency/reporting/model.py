@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from consistency.diagnostics import Verdict
+from consistency.reporting.clock import Clock
 from consistency.reporting.drawing import Key, Owner
 from consistency.reporting.looks import Look, style
 from consistency.store.results import Tables
@@ -65,6 +66,7 @@ class Judged:
     summary: str
     runs: int
     shown_run: int  # the one that is drawn where only one can be
+    clock: Clock
     steps: Indices  # (T,), 1..T
     tracks: tuple[Estimator, ...]
     until_decided: bool  # each verdict is that of the look that decided it

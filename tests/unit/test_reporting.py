@@ -24,6 +24,7 @@ from consistency.reporting import html, pdf, write_reports
 from consistency.reporting.answer import answer
 from consistency.reporting.blocks import Document
 from consistency.reporting.build import build_report, compose
+from consistency.reporting.clock import clock_of
 from consistency.reporting.drawing import Figure, Intervals, Line, Points, Span
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.sections import (
@@ -589,15 +590,27 @@ def template(name: str) -> str:
     return (Path(html.__file__).parent / "templates" / name).read_text(encoding="utf-8")
 
 
-def test_every_status_reads_well_in_html_and_differs_by_more_than_colour():
+@pytest.mark.parametrize("dark", [False, True])
+def test_every_status_reads_well_in_html_and_differs_by_more_than_colour(dark):
     css, looks = template("report.css"), set()
+    light, night = (dict(re.findall(r"--(\w+): (#[0-9a-f]{3,6})", part)) for part in css.split("@media")[:2])
+    shades = {name: full(colour) for name, colour in (light | (night if dark else {})).items()}
+    assert set(night) == set(light)
+
+    def shade(value: str) -> str:
+        name = value.removeprefix("var(--").removesuffix(")")
+        return shades[name] if name in shades else full(value)
+
+    def reads_well(look):
+        return contrast(shade(look["color"]), shade(look.get("background", "var(--paper)"))) > 4.5
+
     for status in STATUSES:
         look = rule(css, f".{status}")
-        assert contrast(full(look["color"]), full(look.get("background", "#fff"))) > 4.5, status
+        assert reads_well(look), status
         looks.add((look["color"], look.get("border-style", "solid")))
     assert len(looks) == len(STATUSES)
-    for name in (".marks .found", ".marks .tolerated"):
-        assert contrast(rule(css, name)["color"], rule(css, name).get("background", "#ffffff")) > 4.5
+    for name in (".marks .found", ".marks .tolerated", "body", "a", ".small", ".caption"):
+        assert reads_well(rule(css, name)), name
 
 
 def test_every_status_reads_well_in_print():
@@ -807,7 +820,10 @@ def test_many_long_studies_stay_below_six_megabytes(results, tmp_path):
         return replace(track, shown=shown, nis_ratio=peak, verdict=verdict)
 
     study = replace(
-        report.studies[0], steps=np.arange(1, steps + 1), tracks=tuple(long(t) for t in report.studies[0].tracks * 4)
+        report.studies[0],
+        steps=np.arange(1, steps + 1),
+        clock=clock_of(0.1 * np.arange(1, steps + 1)),
+        tracks=tuple(long(t) for t in report.studies[0].tracks * 4),
     )
     document = compose(replace(report, studies=(study,) * 6))
     limit = html.points_a_line(document)

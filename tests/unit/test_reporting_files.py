@@ -81,7 +81,7 @@ def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive: Path
 
 def test_without_times_steps_are_on_the_axis(tmp_path: Path, rng: np.random.Generator) -> None:
     np.savez(tmp_path / "e.npz", **errors_of(rng))
-    clock = clock_of(read_recordings(tmp_path / "e.npz")[0])
+    clock = clock_of(read_recordings(tmp_path / "e.npz")[0].t)
     assert (clock.word, clock.values[0], clock.values[-1]) == ("step", 1, STEPS)
     assert unit_of("e1") == ("", 1.0)
 

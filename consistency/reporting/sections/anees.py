@@ -13,7 +13,7 @@ from consistency.reporting.looks import EXPECTED, LIMIT, SHADE
 from consistency.reporting.model import Study, Track, wide
 from consistency.reporting.section import STUDY, Section
 from consistency.reporting.wording import listed
-from consistency.types import Array, Indices
+from consistency.types import Array
 
 DIMENSION = "3"  # of a pose: what is expected where no filter has a band
 
@@ -85,11 +85,9 @@ def figures(anees: Anees) -> tuple[Figure, ...]:
     """One panel with all filters."""
     study = anees.study
     name = f"{study.statistic} of the pose"
-    steps = Axis("step", window=(0.0, float(len(study.steps))), share="step")
     marks = [*_bands(anees), *(_line(curve, study) for curve in anees.curves)]
-    panel = Panel(
-        steps, Axis(name, log=anees.log), tuple(marks), f"{study.statistic} of {study.name} over steps", height=360
-    )
+    alt = f"{study.statistic} of {study.name} over time"
+    panel = Panel(study.clock.whole, Axis(name, log=anees.log), tuple(marks), alt, height=360)
     keys = (
         Key("95 % band of one step", SHADE, "band"), Key("band of all steps at once", LIMIT), Key("expected", EXPECTED),
         *study.keys(),
@@ -100,7 +98,7 @@ def figures(anees: Anees) -> tuple[Figure, ...]:
 def _bands(anees: Anees) -> list[Mark]:
     """The bands of the study shaded and dashed, those that differ as thin lines in the filter's colour."""
     marks: list[Mark] = []
-    steps, shared = anees.study.steps, anees.common
+    steps, shared = anees.study.clock.values, anees.common
     if shared is not None:
         marks.append(Band(steps, *xy(shared.band), SHADE))
         if shared.simultaneous is not None:
@@ -112,7 +110,7 @@ def _bands(anees: Anees) -> list[Mark]:
     return marks
 
 
-def _own_bands(curve: Curve, steps: Indices) -> list[Mark]:
+def _own_bands(curve: Curve, steps: Array) -> list[Mark]:
     marks: list[Mark] = []
     look, owner = curve.track.look, curve.track.owner
     if curve.simultaneous is not None:
@@ -124,15 +122,15 @@ def _own_bands(curve: Curve, steps: Indices) -> list[Mark]:
 
 def _line(curve: Curve, study: Study) -> Line:
     tips = [
-        ("step", "@x"),
+        *study.clock.tips,
         (study.statistic, "@y{0.000}"),
         ("95 % band, one step", "@low{0.00} to @high{0.00}"),
     ]
-    columns = {"low": curve.band[:, 0], "high": curve.band[:, 1]}
+    columns = {"step": study.steps, "low": curve.band[:, 0], "high": curve.band[:, 1]}
     if curve.simultaneous is not None:
         tips.append(("band of all steps", "@least{0.00} to @most{0.00}"))
         columns |= {"least": curve.simultaneous[:, 0], "most": curve.simultaneous[:, 1]}
-    return Line(study.steps, curve.values, curve.track.look, curve.track.owner, tuple(tips), columns)
+    return Line(study.clock.values, curve.values, curve.track.look, curve.track.owner, tuple(tips), columns)
 
 
 def caption(anees: Anees) -> str:

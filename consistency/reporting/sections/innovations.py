@@ -92,14 +92,21 @@ def _sheet(innovations: Innovations, of: Innovation) -> Sheet:
 
 
 def _sizes(study: Study, filters: Sequence[Innovation]) -> Panel:
-    x = Axis("step", window=(0.0, float(len(study.steps))), share="step")
     y = Axis("NIS / dof", log=wide([of.ratio for of in filters]), follows=True)
-    tips = (("step", "@x"), ("NIS / dof", "@y{0.000}"))
+    tips = (*study.clock.tips, ("NIS / dof", "@y{0.000}"))
     points = (
-        Points(study.steps, of.ratio, replace(of.track.look, size=2.0, alpha=0.7), of.track.owner, tips)
+        Points(
+            study.clock.values,
+            of.ratio,
+            replace(of.track.look, size=2.0, alpha=0.7),
+            of.track.owner,
+            tips,
+            {"step": study.steps},
+        )
         for of in filters
     )
-    return Panel(x, y, (*points, Rule("y", 1.0, ONE)), f"NIS over degrees of freedom of {study.name} over steps")
+    alt = f"NIS over degrees of freedom of {study.name} over time"
+    return Panel(study.clock.whole, y, (*points, Rule("y", 1.0, ONE)), alt)
 
 
 def _correlation(study: Study, filters: Sequence[Innovation]) -> Panel:

@@ -66,18 +66,20 @@ def figures(errors: PoseErrors) -> tuple[Figure, ...]:
 
 def _panel(study: Study, filters: tuple[PoseError, ...], component: int, alone: bool = False) -> Panel:
     name, unit = COMPONENTS[component]
-    x = Axis("step", window=(0.0, float(len(study.steps))), share="step")
     y = Axis(f"{name} error ({unit})", f"{name} error\n({unit})")
     marks = (_line(study, of, component, alone) for of in filters)
-    alt = f"{name} error of {study.name} over steps with 2-sigma bounds"
-    return Panel(x, y, (*marks, Rule("y", 0.0, ZERO)), alt, height=240)
+    alt = f"{name} error of {study.name} over time with 2-sigma bounds"
+    return Panel(study.clock.whole, y, (*marks, Rule("y", 0.0, ZERO)), alt, height=240)
 
 
 def _line(study: Study, of: PoseError, component: int, alone: bool) -> Line:
     unit = COMPONENTS[component][1]
-    tips = (("step", "@x"), ("error", f"@y{{0.0000}} {unit}"), ("2 sigma", f"@bound{{0.0000}} {unit}"))
+    tips = (*study.clock.tips, ("error", f"@y{{0.0000}} {unit}"), ("2 sigma", f"@bound{{0.0000}} {unit}"))
     look = replace(solid(of.track.look) if alone else of.track.look, width=1.0)
-    return Line(study.steps, of.error[:, component], look, of.track.owner, tips, bound=SIGMAS * of.sigma[:, component])
+    bound = SIGMAS * of.sigma[:, component]
+    return Line(
+        study.clock.values, of.error[:, component], look, of.track.owner, tips, {"step": study.steps}, bound=bound
+    )
 
 
 def _sheet(study: Study, of: PoseError) -> Sheet:

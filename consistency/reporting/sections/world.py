@@ -123,7 +123,7 @@ def caption(world: World) -> str:
     """What the map shows."""
     parts = []
     if world.truth is not None:
-        parts.append("true path solid black with its start as a circle")
+        parts.append("true path solid with its start as a circle")
     if world.odometry is not None:
         parts.append("path by odometry alone dashed grey")
     if world.landmarks is not None:

@@ -89,6 +89,8 @@ def recordings_of(
 
 
 def _part(track: Track, part: list[int]) -> Track:
+    if len(part) == len(AXES):
+        return track
     assert track.error is not None
     assert track.covariance is not None
     return replace(track, error=track.error[:, part], covariance=track.covariance[:, part][:, :, part])
@@ -103,7 +105,8 @@ def _match(poses: Poses, path: Path | str, truth: Path | str, shift: float) -> M
     if not kept.any():
         raise InputError(f"{path}: no estimate has both a truth and a covariance within {poses.max_dt:g} s")
     rows = known.rows[kept]
-    error, P = poses.error_of(rows, known.truth[kept]), poses.covariance[rows]
+    error = poses.error_of(rows, known.truth[kept])
+    P = poses.covariance if len(rows) == len(poses.t) else poses.covariance[rows]
     doubts = _doubts(error, P, known.bend[kept])
     return Match(poses.place.at(rows), poses.t[rows], error, P, len(poses.t) - len(rows), *doubts)
 

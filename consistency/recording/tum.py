@@ -47,20 +47,21 @@ def read_tum(
     if truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
     runs = _runs(estimates, truth, covariance)
-    trajectories = [read_trajectory(path) for path, _, _ in runs]
-    split = trajectories[0].values.shape[1] == SPLIT
-    if split and order == ORDERS[0]:
-        raise InputError(f"--covariance-order: {trajectories[0].path} has {SPLIT} columns, rotation before translation")
-    error_kind = convention or ("so3-body" if split else "so3")
-    poses = []
-    for (_, true_path, P_path), own in zip(runs, trajectories, strict=True):
+    split, poses = False, list[Poses]()
+    for path, true_path, P_path in runs:
+        own = read_trajectory(path)
+        if not poses:
+            split = own.values.shape[1] == SPLIT
+            error_kind = convention or ("so3-body" if split else "so3")
+        if split and order == ORDERS[0]:
+            raise InputError(f"--covariance-order: {path} has {SPLIT} columns, rotation before translation")
         if (own.values.shape[1] == SPLIT) != split:
-            raise InputError(f"{own.path}: has {own.values.shape[1]} columns, {trajectories[0].path} another layout")
+            raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
         poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt))
     why = "" if convention else f"; the default of this layout, {_origin(split)}"
     source = Source(
         estimates,
-        [(own.path, true) for own, (_, true, _) in zip(trajectories, runs, strict=True)],
+        [(path, true) for path, true, _ in runs],
         covariance or estimates,
         why,
     )
@@ -122,12 +123,12 @@ def _poses(
     if covariance is None:
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, lines of t and {FULL} numbers")
     P = np.full((len(own.t), 6, 6), np.nan)
-    P[rows] = symmetric(covariance[picked], lambda row: source.place(int(picked[row])))
+    P[rows] = symmetric(covariance if source is own else covariance[picked], lambda row: source.place(int(picked[row])))
     with_P = np.zeros(len(own.t), bool)
     with_P[rows] = True
-    place = Places(own.place, np.arange(len(own.t)))
-    estimate = own.values[:, 1:8]
-    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:8], "spatial", convention, tolerance)
+    own = own.of(slice(0, POSE))
+    place, estimate = Places(own.place, np.arange(len(own.t))), own.values[:, 1:]
+    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance)
 
 
 def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indices, Indices]:

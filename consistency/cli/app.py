@@ -534,7 +534,8 @@ def monitor(
     path: Annotated[
         str,
         typer.Argument(
-            metavar="FILE", help="Innovations of one run: .csv, .parquet, .npz, a folder of 'run', or - for CSV lines."
+            metavar="FILE",
+            help="Innovations of one run: .csv, .parquet, .npz, .ulg of PX4, a folder of 'run', or - for CSV lines.",
         ),
     ],
     innovations: Annotated[
@@ -553,8 +554,12 @@ def monitor(
     mission: Annotated[
         int | None, typer.Option("--mission", help="Innovations of the whole mission, if known.")
     ] = None,
-    filter_name: Annotated[str | None, typer.Option("--filter", help="Which, if FILE holds several.")] = None,
-    run: Annotated[int | None, typer.Option("--run", help="Which, if FILE holds several.")] = None,
+    filter_name: Annotated[
+        str | None, typer.Option("--filter", help="Which, if FILE holds several; of a .ulg the sensor.")
+    ] = None,
+    run: Annotated[
+        int | None, typer.Option("--run", help="Which, if FILE holds several; of a .ulg the EKF2's instance.")
+    ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
@@ -575,6 +580,8 @@ def monitor(
         watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
     else:
         log = read_innovations(Path(path), filter_name, run)
+        for note in log.notes:
+            print(f"consistency: {note}", file=sys.stderr)
         if plot is not None:
             require_plot(plot, overwrite)
         watched = watch(log, watcher)

@@ -30,6 +30,7 @@ class NisLog:
     t: Array  # (N,), s; NaN where not given
     nis: Array  # (N,), NaN where there is none
     dof: Array  # (N,), whole numbers of 0 or more
+    notes: tuple[str, ...] = ()  # what a reader must know: what was left out
 
 
 def read_nis(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
@@ -48,7 +49,7 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if suffix not in SUFFIXES:
-        raise InputError(f"{path}: unknown kind of file; known are {', '.join(SUFFIXES)}")
+        raise InputError(f"{path}: unknown kind of file; known are {', '.join(SUFFIXES)}, .ulg")
     if suffix == ".npz":
         if filter_name is not None:
             raise InputError(f"--filter {filter_name}: does not go with {path}")

@@ -258,7 +258,10 @@ def analyse(
             metavar="PATH", help="Folder written by 'run', or estimates: .csv, .parquet, .npz, TUM, ROS bags."
         ),
     ],
-    truth: Annotated[Path | None, typer.Option("--truth", help="Truth of the estimates, in the same form.")] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", help="Truth of the estimates, in the same form, or a KITTI drive's folder."),
+    ] = None,
     covariance: Annotated[
         Path | None, typer.Option("--covariance", help="Covariances of a TUM trajectory: t and 36 or 21 numbers.")
     ] = None,
@@ -289,6 +292,9 @@ def analyse(
     ] = None,
     truth_topic: Annotated[
         str | None, typer.Option("--truth-topic", help="Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
+    ] = None,
+    body: Annotated[
+        str | None, typer.Option("--body", help="Of a KITTI drive as truth: imu [default], velodyne or camera.")
     ] = None,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
     false_alarm: Annotated[
@@ -334,7 +340,7 @@ def analyse(
     options: dict[str, Any] = {
         "truth": truth, "covariance": covariance, "convention": error,
         "state": _names(state), "axes": _names(axes), "topic": topic, "truth_topic": truth_topic,
-        "covariance_order": covariance_order, "max_dt": max_dt, "time_offset": _seconds(time_offset),
+        "covariance_order": covariance_order, "max_dt": max_dt, "time_offset": _seconds(time_offset), "body": body,
     }  # fmt: skip
     written: list[Path] = []
     if overwrite and report is None:

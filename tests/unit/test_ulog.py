@@ -135,9 +135,7 @@ def test_sensors_and_instances_are_chosen(tmp_path: Path) -> None:
     np.testing.assert_allclose(second.nis, 4.0 * first.nis, rtol=1e-5)
     with pytest.raises(InputError, match=r"--filter gps_hpos: is never fused in .*; there are: baro_vpos$"):
         read_innovations(path, "gps_hpos", 1)
-    with pytest.raises(
-        InputError, match=r"--filter sonar: is not in .*; there are: gps_hpos, baro_vpos$"
-    ):
+    with pytest.raises(InputError, match=r"--filter sonar: is not in .*; there are: gps_hpos, baro_vpos$"):
         read_innovations(path, "sonar", 0)
     with pytest.raises(InputError, match="--run 3: is not in"):
         read_innovations(path, "baro_vpos", 3)

@@ -100,13 +100,14 @@ def simulate(
     out: Out,
     runs: Runs = 1,
     seed: Seed = 0,
+    form: Annotated[str, typer.Option("--format", help="Of the tables: parquet or csv; both are read.")] = "parquet",
     overwrite: Overwrite = False,
 ) -> None:
     """Write truth, controls and observations of a scenario: a log for any filter, ours or not."""
     from consistency.runs.montecarlo import simulate_log
     from consistency.scenario import load_scenario
 
-    simulate_log(load_scenario(scenario), runs, seed, out, overwrite)
+    simulate_log(load_scenario(scenario), runs, seed, out, overwrite, form)
     count = f"{runs} run{'s' * (runs != 1)}"
     print(f"{count} of {scenario} in {out}; filter them with: consistency run --log {out} --filter F")
 

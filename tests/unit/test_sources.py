@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drives import write_drive, write_states
 from scipy.spatial.transform import Rotation
 from test_conventions import FAULTS, RATE, run_example
-from test_drives import estimates, write_drive, write_states
+from test_drives import estimates
 
 from consistency.cli import main
 from consistency.types import Array

@@ -48,7 +48,7 @@ def is_recording(path: Path, **options: Any) -> bool:
     if path.is_dir() and not (path / "manifest.json").exists():
         recording = bool(trajectory_files(path)) or is_bag(path) or any(value is not None for value in options.values())
     else:
-        recording = path.is_file() or (path.suffix != "" and not path.exists())
+        recording = not path.is_dir() and (path.exists() or path.suffix != "")
     if not recording and path.exists():
         keys = [name for name, value in options.items() if value is not None]
         if keys:

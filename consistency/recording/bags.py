@@ -150,7 +150,7 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]
     parent, child = (frame.strip().lstrip("/") for frame in frames.split(":", 1))
     connections = [connection for connection in reader.connections if connection.msgtype in TREE]
     seen = set()
-    for connection, _, raw in reader.messages(connections=connections):
+    for connection, _, raw in reader.messages(connections=connections) if connections else ():  # of none it gives all
         for each in reader.deserialize(raw, connection.msgtype).transforms:
             pair = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
             seen.add(":".join(pair))

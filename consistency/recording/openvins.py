@@ -33,9 +33,7 @@ def as_states(lines: Lines) -> States | None:
     the body as a JPL quaternion, whose four numbers are those of the rotation from the body into the world as a
     Hamilton quaternion.
     """
-    cameras = lines.values[:, CAMERAS]
-    width = CAMERAS + 1 + CALIBRATION * cameras
-    if not ((cameras >= 1) & (cameras == np.round(cameras)) & (width <= lines.values.shape[1])).all():
+    if not _has_cameras(lines.values, CAMERAS, CALIBRATION):
         return None
     return States(lines.path, lines.values[:, AS_TUM], lines.line)
 
@@ -46,6 +44,8 @@ def read_deviations(path: Path) -> tuple[Lines, Array]:
     The rotation is the error about the axes of the body, in rad.
     """
     lines = read_numbers(path, DEVIATED, LAYOUT)
+    if not _has_cameras(lines.values, CAMERAS - 1, CALIBRATION - 1):
+        raise InputError(f"{lines.place(0)}: has {lines.values.shape[1]} columns; should be {LAYOUT}")
     sigma = lines.values[:, SIGMA]
     negative = np.flatnonzero((sigma < 0).any(axis=1))
     if len(negative):
@@ -53,3 +53,10 @@ def read_deviations(path: Path) -> tuple[Lines, Array]:
     P = np.zeros((len(sigma), 6, 6))
     P[:, range(6), range(6)] = np.square(np.roll(sigma, 3, axis=1))
     return lines, P
+
+
+def _has_cameras(values: Array, column: int, each: int) -> bool:
+    """Whether a column holds a number of cameras, of which there are so many numbers each in the columns behind it."""
+    cameras = values[:, column]
+    width = column + 1 + each * cameras
+    return bool(((cameras >= 1) & (cameras == np.round(cameras)) & (width <= values.shape[1])).all())

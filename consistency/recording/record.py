@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -84,9 +85,10 @@ def assemble(
     Raises
     ------
     InputError
-        No covariance of any run has full rank.
+        No covariance of any run has full rank, or two runs are the same.
     """
     tracks = sorted(tracks, key=lambda track: track.run)
+    _require_different(file, tracks)
     notes = list(notes)
     failures, parts, skipped = [], [], 0
     for track in tracks:
@@ -132,6 +134,20 @@ def assemble(
         convention=convention,
         notes=tuple(notes),
     )
+
+
+def _require_different(file: str, tracks: Sequence[Track]) -> None:
+    """Refuse a run that is there twice: the verdict counts runs that share no noise."""
+    seen: dict[bytes, Track] = {}
+    for track in tracks:
+        if track.error is None or len(track.error) < 2 or not np.nan_to_num(track.error).any():
+            continue
+        other = seen.setdefault(hashlib.sha256(np.ascontiguousarray(track.error).tobytes()).digest(), track)
+        if other is not track:
+            raise InputError(
+                f"{file}: the errors from {track.place[0]} on are those from {other.place[0]} on to the last digit: a "
+                "run that is there twice; leave one of them out"
+            )
 
 
 def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:

@@ -92,6 +92,9 @@ def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[P
     files = trajectory_files(estimates)
     if not files:
         raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json")
+    stems = [path.stem for path in files]
+    if twice := next((path for path in files if stems.count(path.stem) > 1), None):
+        raise InputError(f"{estimates}: holds the run '{twice.stem}' twice, as .txt and .tum; keep one of them")
     if covariance is not None and not covariance.is_dir():
         raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
     out = []

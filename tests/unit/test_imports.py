@@ -25,7 +25,7 @@ RANK = {
     "scenario": 3,
     "protocols": 4,
     "simulation": 5, "filters": 5, "vision": 5, "diagnostics": 5,
-    "store.parquet": 4, "store.storage": 5, "store.soundness": 5, "store.journal": 6, "store.results": 6,
+    "store.parquet": 4, "store.storage": 5, "store.soundness": 5, "store.tables": 5, "store.journal": 6, "store.results": 6,
     "store.log": 7,
     "imaging": 6,
     "recording": 7,

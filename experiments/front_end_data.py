@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -71,17 +70,22 @@ def by_vector(pose: RelativePose, S: Array) -> Array:
 
 def cases_of(folder: Path, seed: int) -> dict[str, Case]:
     """All three data sets with default settings."""
-    readers = {KITTI: partial(_sequence, truth="poses.txt"), EUROC: partial(_sequence, truth="groundtruth_first97.csv")}
-    cases = {name: read(folder / name, np.random.default_rng(seed)) for name, read in readers.items()}
+    truths = {KITTI: "poses.txt", EUROC: "groundtruth_first97.csv"}
+    cases = {name: sequence_case(folder / name, np.random.default_rng(seed), truth) for name, truth in truths.items()}
     return cases | {MINNIE: _minnie(folder / MINNIE, np.random.default_rng(seed))}
 
 
-def _sequence(folder: Path, rng: np.random.Generator, truth: str) -> Case:
+def sequence_case(folder: Path, rng: np.random.Generator, truth: str = "poses.txt", step: int = 1) -> Case:
+    """Every ``step``-th stereo pair of a sequence: a drive that is as many times faster."""
     sequence = read_sequence(folder)
-    turns, shifts = relative(*read_truth(folder / truth, sequence))
+    R, t = read_truth(folder / truth, sequence)
+    left, right, times = sequence.left[::step], sequence.right[::step], sequence.t[::step]
+    sequence = replace(sequence, left=left, right=right, t=times)
+    turns, shifts = relative(R[::step], t[::step])
     motions = visual_odometry(sequence, rng=rng)
     true = [RelativePose(R, t) for R, t in zip(turns, shifts, strict=True)]
-    return Case(folder.name, sequence.rectification.rig, motions, true, sequence.pair(0)[0])
+    name = folder.name if step == 1 else f"{folder.name}, every {step}."
+    return Case(name, sequence.rectification.rig, motions, true, sequence.pair(0)[0])
 
 
 def _minnie(folder: Path, rng: np.random.Generator) -> Case:

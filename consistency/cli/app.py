@@ -11,6 +11,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from consistency.cli.files import FileOptions, reads_files
 from consistency.errors import InputError
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
@@ -28,7 +29,8 @@ Runs = Annotated[int, typer.Option("--runs", help="Number of Monte Carlo runs.")
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the noise.")]
 Jobs = Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core. The result does not depend on it.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output folder of this bench.")]
-Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder written by 'run'.")]
+ESTIMATES = ".csv, .parquet, .npz, TUM, ROS bags"
+Judged = Annotated[Path, typer.Argument(metavar="PATH", help=f"Folder written by 'run', or estimates: {ESTIMATES}.")]
 Power = Annotated[float, typer.Option("--power", help="Chance to find that ratio.")]
 FalseAlarm = Annotated[float, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none.")]
 BackendName = Annotated[
@@ -119,14 +121,15 @@ def frontend(
     calibration: Annotated[
         Path | None,
         typer.Option(
-            "--calibration", help="KITTI calib.txt, OpenCV .yaml, or folder of EuRoC's; not needed if in IMAGES."
+            "--calibration",
+            help="KITTI's text, .yaml of OpenCV or BoofCV, or folder of EuRoC's; not needed if in IMAGES.",
         ),
     ] = None,
     truth: Annotated[
         Path | None, typer.Option("--truth", help="True poses: KITTI, EuRoC .csv or TUM; found if in IMAGES.")
     ] = None,
     format: Annotated[
-        str | None, typer.Option("--format", help="kitti, euroc or opencv (plain) [by the folders].")
+        str | None, typer.Option("--format", help="kitti, kitti-raw, euroc or opencv (plain) [by the folders].")
     ] = None,
     left: Annotated[str | None, typer.Option("--left", help="Pattern of plain left images, as 'left/*.png'.")] = None,
     right: Annotated[str | None, typer.Option("--right", help="Pattern of plain right images.")] = None,
@@ -441,10 +444,12 @@ def plan(
 
 
 @app.command()
+@reads_files
 def compare(
-    folder: Folder,
+    path: Judged,
+    files: FileOptions,
     other: Annotated[
-        Path | None, typer.Argument(metavar="[OTHER]", help="Earlier results, or a file of 'baseline'.")
+        Path | None, typer.Argument(metavar="[OTHER]", help="Earlier ones in the same form, or a file of 'baseline'.")
     ] = None,
     filters: Annotated[
         list[str] | None,
@@ -456,17 +461,34 @@ def compare(
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
     from consistency.terminal.table import comparisons_json, print_comparisons
-    from consistency.verdicts.comparison import compare_filters, compare_with, read_baseline
+    from consistency.verdicts.comparison import (
+        baseline_of_files,
+        compare_filters,
+        compare_with,
+        is_baseline,
+        read_baseline,
+    )
 
     if fail_on not in (None, "worse"):
         raise InputError(f"--fail-on must be 'worse', got '{fail_on}'")
     if not 0.0 < false_alarm < 1.0:
         raise InputError(f"--false-alarm must lie between 0 and 1, got {false_alarm}")
-    new = read_baseline(folder)
-    if other is None:
-        compared = compare_filters(new, filters or [], false_alarm)
+    sides = [each for each in (path, other) if each is not None]
+    estimates = [each for each in sides if not is_baseline(each) and files.are(each)]
+    if not estimates and (unread := files.given()):
+        raise InputError(f"{unread[0]}: is for files of another estimator, and none is named")
+    if len(estimates) == 2 and files.covariance is not None:
+        raise InputError(
+            f"--covariance: would be read with {path} and with {other}; keep one of them with 'consistency baseline'"
+        )
+    read = dict(zip(estimates, files.read(*estimates), strict=True))
+    new, *old = (
+        baseline_of_files(read[each], str(each), files.truth) if each in read else read_baseline(each) for each in sides
+    )
+    if old:
+        compared = compare_with(new, old[0], filters or [], false_alarm)
     else:
-        compared = compare_with(new, read_baseline(other), filters or [], false_alarm)
+        compared = compare_filters(new, filters or [], false_alarm)
     if as_json:
         print(comparisons_json(compared))
     else:
@@ -476,35 +498,56 @@ def compare(
 
 
 @app.command()
+@reads_files
 def baseline(
-    folder: Folder,
+    path: Judged,
     out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],
+    files: FileOptions,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Keep what a later 'compare' needs of results, one row a run."""
     from consistency.store.results import open_results
-    from consistency.verdicts.comparison import write_baseline
+    from consistency.verdicts.comparison import baseline_of_files, write_baseline
 
-    write_baseline(open_results(folder), out, overwrite)
+    if files.are(path):
+        (recordings,) = files.read(path)
+        write_baseline(baseline_of_files(recordings, str(path), files.truth), out, overwrite)
+    else:
+        write_baseline(open_results(path), out, overwrite)
     print(f"baseline in {out}; next: consistency compare NEW {out}")
 
 
 @app.command()
+@reads_files
 def report(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder written by 'run' or 'reproduce'.")],
-    html: Annotated[Path | None, typer.Option("--html", help="HTML file [default: DIR/report.html].")] = None,
-    pdf: Annotated[Path | None, typer.Option("--pdf", help="PDF file [default: DIR/report.pdf].")] = None,
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help=f"Folder written by 'run' or 'reproduce', or estimates: {ESTIMATES}.")
+    ],
+    files: FileOptions,
+    html: Annotated[
+        Path | None,
+        typer.Option("--html", help="HTML file [default: PATH/report.html; of estimates PATH-report.html]."),
+    ] = None,
+    pdf: Annotated[Path | None, typer.Option("--pdf", help="PDF file [beside the default HTML file].")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Write a report of results as one offline HTML file and a PDF."""
-    from consistency.reporting import write_reports
+    from consistency.reporting import require_pages, write_file_pages, write_reports
+    from consistency.verdicts.judge import analyse_recordings
 
+    estimates = files.are(path)
+    stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
     # one of the two named: only that one is written
-    targets = (
-        {"html": html, "pdf": pdf} if html or pdf else {"html": folder / "report.html", "pdf": folder / "report.pdf"}
-    )
-    for path in write_reports(folder, targets["html"], targets["pdf"], overwrite):
-        print(path)
+    targets = (html, pdf) if html or pdf else (stem.with_name(f"{stem.name}.html"), stem.with_name(f"{stem.name}.pdf"))
+    if estimates:
+        require_pages(*targets, overwrite)
+        (recordings,) = files.read(path)
+        write_file_pages(recordings, analyse_recordings(recordings), *targets, path.name)
+    else:
+        write_reports(path, *targets, overwrite)
+    for target in targets:
+        if target is not None:
+            print(target)
 
 
 @app.command()

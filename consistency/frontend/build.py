@@ -57,6 +57,8 @@ class Summary:
     timed: bool  # whether images had timestamps
     rate: float  # Hz
     truth: Path | None
+    faults: tuple[str, ...] = ()  # of motions that could not be measured
+    doubts: tuple[str, ...] = ()  # of motions whose estimator far points dominate
 
     def lines(self, out: Path) -> list[str]:
         """What a terminal shows, and what to do next."""
@@ -68,8 +70,11 @@ class Summary:
             if self.truth is None
             else f"truth from {self.truth}; next: {judge} --error so3"
         )
+        bridges = f"{len(self.faults)} of {self.frames - 1} motions could not be measured and are bridged"
         return [
             f"{self.frames} stereo pairs, {self.distance:.2f} m, {self.inliers:.0f} inliers in the median",
+            *([f"{len(self.doubts)} of {self.frames - 1} motions: {self.doubts[0]}"] if self.doubts else []),
+            *([f"{bridges}, with the covariance of that; the first: {self.faults[0]}"] if self.faults else []),
             f"residuals: chi2/dof {self.noise_ratio:.2f}; 1 where the stated noise of the features "
             "(--sigma-per-scale) is right",
             f"log: {self.landmarks} landmarks, {self.observations} observations; "
@@ -119,6 +124,7 @@ def write_frontend_log(images: Path, out: Path, options: Options, overwrite: boo
         kind="log", seed=options.seed, runs=1, complete=True, failures=0, wall=time.monotonic() - started,
         opencv=opencv().__version__, images=str(images), calibration=sequence.calibration.source,
         settings=asdict(options.settings), timestamps="read" if sequence.timed else "assumed",
+        bridged={str(k): m.fault for k, m in enumerate(motions) if m.fault},
     )  # fmt: skip
     view = (rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2])))
     write_log(out, [trial], belief, None, manifest, overwrite, view, trajectory_files(sequence, motions, truth))
@@ -128,6 +134,7 @@ def write_frontend_log(images: Path, out: Path, options: Options, overwrite: boo
         float(sum(np.linalg.norm(m.pose.t) for m in motions)), float(np.median([m.inliers.sum() for m in motions])),
         chi2 / dof, belief.sensor.sigma, belief.motion.sigma_v, belief.motion.sigma_omega, sequence.timed,
         (len(sequence) - 1) / float(sequence.t[-1] - sequence.t[0]), path,
+        tuple(m.fault for m in motions if m.fault), tuple(m.doubt for m in motions if m.doubt),
     )  # fmt: skip
 
 

@@ -121,7 +121,7 @@ def of_filters(
     of_b = than or of_a
     if of_b not in old.filters:
         raise ValueError(f"filter '{of_b}' is not in the reference; there are: {', '.join(old.filters)}")
-    paired = old is new or (None not in new.origin and new.origin == old.origin)
+    paired = new.of_the_trials_of(old)
     label = of_b if old is new else f"{of_b} in {old.name}"
     failures = FailedRuns(new.failures[of_a], old.failures[of_b])
     return Sides(candidate, new.filters[of_a], old.filters[of_b], label, tuple(POSE), paired, failures)

@@ -43,10 +43,13 @@ def is_recording(path: Path, **options: Any) -> bool:
     Raises
     ------
     InputError
-        It is such a folder, and one of the ``options`` of other files is given with it.
+        It is such a folder, and one of the ``options`` of other files is given with it; or it is a folder of neither.
     """
     if path.is_dir() and not (path / "manifest.json").exists():
         recording = bool(trajectory_files(path)) or is_bag(path) or any(value is not None for value in options.values())
+        if not recording:
+            known = f"trajectories ({', '.join(SUFFIXES)}) or ROS bags"
+            raise InputError(f"{path}: holds no results of 'consistency run', and no {known}")
     else:
         recording = not path.is_dir() and (path.exists() or path.suffix != "")
     if not recording and path.exists():

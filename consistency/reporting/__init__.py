@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from consistency.verdicts.monitoring import Watched
 
 __all__ = [
+    "require_pages",
     "require_plot",
+    "write_file_pages",
     "write_file_reports",
     "write_monitor_plot",
     "write_regime_reports",
@@ -55,18 +57,39 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     InputError
         The folder cannot be read, or a file exists or cannot be written.
     """
-    targets = [path for path in (html, pdf) if path is not None]
-    if html is not None and pdf is not None and html.absolute() == pdf.absolute():
-        raise InputError(f"{html}: is named for both HTML and PDF; name two files")
     from consistency.store.storage import read_manifest
 
     read_manifest(Path(folder))
-    for path in targets:
-        _require_writable(path, overwrite)
+    require_pages(html, pdf, overwrite)
     from consistency.reporting.build import build_report, compose
 
     _write_document(compose(build_report(Path(folder))), html, pdf)
-    return targets
+    return [path for path in (html, pdf) if path is not None]
+
+
+def require_pages(html: Path | None, pdf: Path | None, overwrite: bool) -> None:
+    """Refuse, before any work, files of a report that cannot be written; None leaves one out.
+
+    Raises
+    ------
+    InputError
+        Both are the same, or one exists or cannot be written.
+    """
+    if html is not None and pdf is not None and html.absolute() == pdf.absolute():
+        raise InputError(f"{html}: is named for both HTML and PDF; name two files")
+    for path in (html, pdf):
+        if path is not None:
+            _require_writable(path, overwrite)
+
+
+def write_file_pages(
+    records: Sequence[Recording], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
+) -> None:
+    """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
+    from consistency.reporting.files import compose_files
+    from consistency.store.storage import manifest_of
+
+    _write_document(compose_files(records, judged, title, manifest_of(kind="verdict", source=title)), html, pdf)
 
 
 def write_regime_reports(regime: Regime, folder: Path) -> list[Path]:

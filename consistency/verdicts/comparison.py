@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.diagnostics.comparison import FailedRuns
 from consistency.errors import InputError
 from consistency.reading import HUGE, read_json, reading
+from consistency.recording import Recording
 from consistency.store.atomic import write_whole
 from consistency.store.results import POSE, Tables, open_results
 from consistency.store.storage import SCHEMA_VERSION, manifest_of, plain
@@ -30,10 +32,15 @@ class Baseline:
 
     name: str
     scenario: str | None
-    origin: tuple[Any, Any]  # scenario hash and seed: the same trials have the same
+    origin: tuple[Any, Any]  # scenario hash and seed, or what a log or truth holds: the same trials have the same
     filters: dict[str, RunSummary]
     failures: dict[str, int]
     manifest: dict[str, Any]
+    axes: dict[str, tuple[str, ...]]  # names of the components of each filter's error
+
+    def of_the_trials_of(self, other: Baseline) -> bool:
+        """Whether both are of the same trials, so that runs of one number belong together."""
+        return self is other or (self.origin[0] is not None and self.origin == other.origin)
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,38 @@ def baseline_of(results: Tables, name: str = "results") -> Baseline:
     scenario = results.scenario
     m = results.manifest
     origin = (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed"))
-    return Baseline(name, scenario.name if scenario else None, origin, filters, failures, m)
+    axes = dict.fromkeys(filters, tuple(POSE))
+    return Baseline(name, scenario.name if scenario else None, origin, filters, failures, m, axes)
+
+
+def baseline_of_files(recordings: Sequence[Recording], name: str, truth: Path | None = None) -> Baseline:
+    """Summaries of estimators whose files were read.
+
+    Parameters
+    ----------
+    truth : file, or folder of them, beside which the estimates were read; the same trials have the same
+
+    Raises
+    ------
+    InputError
+        An estimator has no NEES.
+    """
+    filters = {}
+    for r in recordings:
+        if r.nees is None:
+            raise InputError(f"{name}: has no truth of {r.name}; give it with --truth, as only a NEES can be compared")
+        filters[r.name] = summary(r.nees, r.dof, r.error, r.covariance, r.runs)
+    failures = {r.name: len(r.failures) for r in recordings}
+    origin = (None if truth is None else _digest(truth), None)
+    return Baseline(name, None, origin, filters, failures, {}, {r.name: r.axes for r in recordings})
+
+
+def _digest(truth: Path) -> str:
+    digest = hashlib.sha256()
+    for path in [truth] if truth.is_file() else sorted(path for path in truth.rglob("*") if path.is_file()):
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
 
 
 def _summary_of(c: Curves) -> RunSummary:
@@ -98,7 +136,7 @@ def _summary_of(c: Curves) -> RunSummary:
     return summary(nees, len(POSE), c.error, c.covariance, c.runs)
 
 
-def write_baseline(results: Tables, path: Path, overwrite: bool = False) -> None:
+def write_baseline(of: Tables | Baseline, path: Path, overwrite: bool = False) -> None:
     """Keep the summaries of results as a small JSON file, for version control.
 
     Raises
@@ -108,13 +146,14 @@ def write_baseline(results: Tables, path: Path, overwrite: bool = False) -> None
     """
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
-    base = baseline_of(results, str(path))
+    base = of if isinstance(of, Baseline) else baseline_of(of, str(path))
     data = manifest_of(
         kind="baseline",
         scenario=base.scenario,
         origin=list(base.origin),
         filters={
-            name: {key: plain(value) for key, value in vars(s).items()} | {"failures": base.failures[name]}
+            name: {key: plain(value) for key, value in vars(s).items()}
+            | {"failures": base.failures[name], "axes": list(base.axes[name])}
             for name, s in base.filters.items()
         },
     )
@@ -122,6 +161,14 @@ def write_baseline(results: Tables, path: Path, overwrite: bool = False) -> None
         write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"))
     except OSError as error:
         raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
+
+
+def is_baseline(path: Path) -> bool:
+    """Whether a file looks like one of :func:`write_baseline`, whatever its name."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(64).lstrip().startswith(b"{")
 
 
 def read_baseline(path: Path) -> Baseline:
@@ -141,7 +188,8 @@ def read_baseline(path: Path) -> Baseline:
         rows = _Rows.model_validate(data)
         filters = {name: row.summary() for name, row in rows.filters.items()}
     failures = {name: row.failures for name, row in rows.filters.items()}
-    return Baseline(str(path), rows.scenario, (rows.origin[0], rows.origin[1]), filters, failures, data)
+    axes = {name: tuple(row.axes) for name, row in rows.filters.items()}
+    return Baseline(str(path), rows.scenario, (rows.origin[0], rows.origin[1]), filters, failures, data, axes)
 
 
 Number = Annotated[float, Field(ge=0.0, le=HUGE**4)] | None  # None where a run has no value
@@ -158,6 +206,7 @@ class _Summary(BaseModel):
     squared: list[Row]  # (R, n)
     covered: list[Row]  # (R, n)
     failures: Annotated[int, Field(ge=0)]
+    axes: Annotated[list[str], Field(max_length=HIGHEST_DOF)] = list(POSE)  # files written before lack them
 
     def summary(self) -> RunSummary:
         """As the referee takes it; raises ValueError where the parts do not fit together."""
@@ -190,21 +239,30 @@ def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float =
 
 def compare_with(new: Baseline, old: Baseline, filters: Sequence[str], false_alarm: float = 0.05) -> list[Compared]:
     """Each filter of ``new`` against the same in ``old``; run by run only where the trials are the same."""
-    names = list(filters) or [name for name in new.filters if name in old.filters]
-    if not names:
+    pairs = [(name, name) for name in filters or new.filters if filters or name in old.filters]
+    if not pairs and len(new.filters) == len(old.filters) == 1:  # estimators that are named after their files
+        pairs = [(next(iter(new.filters)), next(iter(old.filters)))]
+    if not pairs:
         raise InputError(f"{new.name} and {old.name} have no filter in common; name one with --filter")
-    same = None not in new.origin and new.origin == old.origin
-    note = "" if same else "Scenario or seed differ: the trials are not the same"
-    return [replace(_compared(new, name, old, name, same, false_alarm), note=note) for name in names]
+    same = new.of_the_trials_of(old)
+    which = "Log or truth" if new.scenario is None and old.scenario is None else "Scenario or seed"
+    note = "" if same else f"{which} differ: the trials are not the same"
+    return [replace(_compared(new, a, old, b, same, false_alarm), note=note) for a, b in pairs]
 
 
 def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, false_alarm: float) -> Compared:
     for base, name in ((a, of_a), (b, of_b)):
         if name not in base.filters:
             raise InputError(f"--filter {name}: is not in {base.name}; there are: {', '.join(base.filters)}")
+    axes = a.axes[of_a]
+    if axes != b.axes[of_b]:
+        raise InputError(
+            f"{of_a} against {of_b}: their errors have different components, {', '.join(axes)} and "
+            f"{', '.join(b.axes[of_b])}"
+        )
     paired = None if true_pairs else False
     try:
-        comparison = compare(a.filters[of_a], b.filters[of_b], false_alarm, tuple(POSE), paired)
+        comparison = compare(a.filters[of_a], b.filters[of_b], false_alarm, axes, paired)
     except ValueError as error:
         raise InputError(f"{of_a} against {of_b}: {error}") from None
     return Compared(of_a, of_b, comparison, FailedRuns(a.failures[of_a], b.failures[of_b]))

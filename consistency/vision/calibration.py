@@ -1,16 +1,18 @@
-"""Stereo calibrations from files: KITTI odometry, EuRoC / ASL, OpenCV. Whatever they hold becomes one record."""
+"""Stereo calibrations from files: KITTI odometry and raw, EuRoC / ASL, OpenCV, BoofCV, as one record."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.reading import HUGE, one_line, read_text, reading
+from consistency.reading import read_text, reading
 from consistency.types import Array
+from consistency.vision.boofcv import read_boofcv
+from consistency.vision.cameras import Calibration, checked, distortion, sized
+from consistency.vision.kitti import read_kitti, read_kitti_raw
 from consistency.vision.yaml_file import matrix, read_yaml
 
 # names that tools give to the same thing; the first one is used in messages
@@ -26,32 +28,18 @@ OPENCV_KEYS = {
 OTHERS = {"R1", "R2", "P1", "P2", "Q", "E", "F", "essential_matrix", "fundamental_matrix", "LEFT.R", "LEFT.P"}
 OTHERS |= {"RIGHT.R", "RIGHT.P", "projection_matrix_1", "projection_matrix_2", "rectification_matrix_1"}
 OTHERS |= {"rectification_matrix_2", "image_size", "imageSize"}
-WIDEST = 30.0  # m between two cameras on one rig; calibrations are often in millimetres by mistake
-COUNTS = (4, 5, 8, 12, 14)  # distortion coefficients that OpenCV knows
 EUROC_KEYS = ("T_BS", "intrinsics", "distortion_model", "distortion_coefficients", "resolution")
 NO_DISTORTION = ("none", "")
 RADIAL_TANGENTIAL = ("radial-tangential", "radtan", "plumb_bob", *NO_DISTORTION)
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Two cameras as calibrated, before any rectification."""
+def read_calibration(
+    path: Path, left: str = "", right: str = "", image_size: tuple[int, int] | None = None
+) -> Calibration:
+    """A calibration by the look of ``path``: a folder as EuRoC's, .yaml or .yml as OpenCV's or BoofCV's, else KITTI's.
 
-    source: str  # file or files, for messages
-    K_left: Array  # (3, 3), px
-    K_right: Array  # (3, 3), px
-    D_left: Array  # (k,), k1 k2 p1 p2 ... of OpenCV, all 0 for images without distortion
-    D_right: Array
-    R: Array  # (3, 3), x_right = R x_left + T (Bouguet's convention, OpenCV's)
-    T: Array  # (3,), m
-    image_size: tuple[int, int] | None  # width, height, px; None where the file does not say
-    body_from_left: Array | None = None  # (4, 4), pose of the left camera in the body that a truth is of
-
-
-def read_calibration(path: Path, left: str = "", right: str = "") -> Calibration:
-    """A calibration by the look of ``path``: a folder as EuRoC's, .yaml or .yml as OpenCV's, else KITTI's text.
-
-    ``left`` and ``right`` are the folders of the images: they choose P0 and P1 or P2 and P3 in a KITTI file.
+    ``left`` and ``right`` are the folders of the images: they choose the cameras in a KITTI file. ``image_size``,
+    (width, height), tells whether the images of KITTI raw are rectified.
 
     Raises
     ------
@@ -64,40 +52,10 @@ def read_calibration(path: Path, left: str = "", right: str = "") -> Calibration
         if not path.is_file():
             raise InputError(f"--calibration {path}: no such file")
         if path.suffix.lower() in (".yaml", ".yml"):
-            return read_opencv(path)
+            return read_boofcv(path) if "rightToLeft" in read_yaml(path) else read_opencv(path)
+        if "P_rect_00:" in read_text(path, "cannot be read"):
+            return read_kitti_raw(path, left, right, image_size)
         return read_kitti(path, left, right)
-
-
-def read_kitti(path: Path, left: str = "", right: str = "") -> Calibration:
-    """``calib.txt`` of KITTI odometry: lines ``P0:`` to ``P3:`` of 12 numbers, or two lines without names.
-
-    P = K [I | t] of each camera in the common rectified axes; colour images (image_2, image_3) go with P2 and P3.
-    """
-    rows: dict[str, Array] = {}
-    if not path.exists():
-        raise InputError(f"{path}: no such file")
-    lines = [line for line in read_text(path, "cannot be read").splitlines() if line.strip()]
-    for number, line in enumerate(lines):
-        key, _, values = line.rpartition(":")
-        name = key.strip() or f"P{number}"
-        if name in rows:
-            raise InputError(f"{path}: key '{one_line(name)}' is there twice")
-        try:
-            rows[name] = np.array(values.split(), float)
-        except ValueError:
-            raise InputError(f"{path}: line {number + 1}: must be 'P0:' and 12 numbers, or 12 numbers") from None
-    names = ("P2", "P3") if left.endswith("2") and right.endswith("3") else ("P0", "P1")
-    for name in names:
-        if name not in rows:
-            raise InputError(f"{path}: key '{name}' is missing; there: {one_line(', '.join(rows)) or 'nothing'}")
-        if rows[name].size != 12 or not (np.abs(rows[name]) < HUGE).all():
-            raise InputError(f"{path}: key '{name}': must be 12 finite numbers, P (3 x 4) row by row")
-        if np.linalg.matrix_rank(rows[name].reshape(3, 4)[:, :3]) < 3:
-            raise InputError(f"{path}: key '{name}': the matrix of its camera is singular; must be P = K [I | t]")
-    P_left, P_right = (rows[name].reshape(3, 4) for name in names)
-    T = np.linalg.solve(P_right[:, :3], P_right[:, 3]) - np.linalg.solve(P_left[:, :3], P_left[:, 3])
-    none = np.zeros(4)
-    return _checked(Calibration(str(path), P_left[:, :3], P_right[:, :3], none, none, np.eye(3), T, None))
 
 
 def read_opencv(path: Path) -> Calibration:
@@ -125,9 +83,9 @@ def read_opencv(path: Path) -> Calibration:
                 raise InputError(f"{path}: key '{key}': has {matrices[key].size} numbers, not {np.prod(shape)}")
             matrices[key] = matrices[key].reshape(shape)
     size = tuple(int(_number(path, data, key)) for key in ("image_width", "image_height") if key in data)
-    D_left, D_right = (_distortion(path, key, matrices.get(key, np.zeros(4))) for key in ("D1", "D2"))
+    D_left, D_right = (distortion(path, key, matrices.get(key, np.zeros(4))) for key in ("D1", "D2"))
     R, image_size = matrices.get("R", np.eye(3)), (size[0], size[1]) if len(size) == 2 else None
-    return _checked(
+    return checked(
         Calibration(str(path), matrices["K1"], matrices["K2"], D_left, D_right, R, matrices["T"], image_size)
     )
 
@@ -140,7 +98,7 @@ def read_euroc(folder: Path) -> Calibration:
     right_from_left = np.linalg.solve(right.pose, left.pose)
     R, T = right_from_left[:3, :3], right_from_left[:3, 3]
     source = f"{left.path} and {right.path}"
-    return _checked(Calibration(source, left.K, right.K, left.D, right.D, R, T, left.size, left.pose))
+    return checked(Calibration(source, left.K, right.K, left.D, right.D, R, T, left.size, left.pose))
 
 
 class _Camera(NamedTuple):
@@ -167,34 +125,11 @@ def _euroc_camera(folder: Path, camera: str) -> _Camera:
     model = str(data["distortion_model"]).lower()
     if model not in RADIAL_TANGENTIAL:
         raise InputError(f"{path}: key 'distortion_model': '{model}' is not one of {', '.join(RADIAL_TANGENTIAL)}")
-    fu, fv, cu, cv = _sized(path, "intrinsics", data["intrinsics"], 4)
-    width, height = _sized(path, "resolution", data["resolution"], 2)
+    fu, fv, cu, cv = sized(path, "intrinsics", data["intrinsics"], 4)
+    width, height = sized(path, "resolution", data["resolution"], 2)
     K = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
-    D = _distortion(path, "distortion_coefficients", matrix(path, "D", data["distortion_coefficients"]))
-    return _Camera(path, K, D, (int(width), int(height)), _sized(path, "T_BS", data["T_BS"], 16).reshape(4, 4))
-
-
-def _checked(calibration: Calibration) -> Calibration:
-    """The calibration, if its numbers can be those of two cameras side by side."""
-    where = calibration.source
-    for name, K in (("left", calibration.K_left), ("right", calibration.K_right)):
-        upper = np.allclose(K[1:, 0], 0) and np.isclose(K[2, 1], 0) and np.isclose(K[2, 2], 1)
-        if not upper or K[0, 0] <= 0 or K[1, 1] <= 0:
-            raise InputError(
-                f"{where}: the matrix of the {name} camera must be fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0"
-            )
-    calibration = replace(calibration, R=_rotation(where, calibration.R))
-    centre = -calibration.R.T @ calibration.T
-    if centre[0] <= 0 or abs(centre[1]) > centre[0]:
-        raise InputError(
-            f"{where}: the right camera stands at {np.round(centre, 3).tolist()} m of the left one, not to its right: "
-            "T is that of x_right = R x_left + T, in metres; are the cameras swapped?"
-        )
-    if centre[0] > WIDEST:
-        raise InputError(
-            f"{where}: the right camera stands {centre[0]:g} m from the left one; T is in metres, is it in millimetres?"
-        )
-    return calibration
+    D = distortion(path, "distortion_coefficients", matrix(path, "D", data["distortion_coefficients"]))
+    return _Camera(path, K, D, (int(width), int(height)), sized(path, "T_BS", data["T_BS"], 16).reshape(4, 4))
 
 
 def _require_known(path: Path, data: dict[str, Any], missing: list[str]) -> None:
@@ -208,27 +143,5 @@ def _require_known(path: Path, data: dict[str, Any], missing: list[str]) -> None
         raise InputError(f"{path}: key '{lonely[0]}': image_width and image_height go together")
 
 
-def _rotation(where: str, R: Array) -> Array:
-    """The rotation nearest to ``R``; calibrations print six digits or more."""
-    U, singular, Vt = np.linalg.svd(R)
-    if not np.allclose(singular, 1.0, atol=1e-3) or np.linalg.det(R) < 0:
-        raise InputError(f"{where}: the rotation between the cameras is not one (singular values {singular.round(4)})")
-    return np.asarray(U @ Vt)
-
-
-def _distortion(path: Path, key: str, values: Array) -> Array:
-    values = values.ravel()
-    if values.size not in COUNTS:
-        raise InputError(f"{path}: key '{key}': has {values.size} coefficients, not {', '.join(map(str, COUNTS))}")
-    return values
-
-
-def _sized(path: Path, key: str, value: Any, count: int) -> Array:
-    numbers = matrix(path, key, value).ravel()
-    if numbers.size != count:
-        raise InputError(f"{path}: key '{key}': has {numbers.size} numbers, not {count}")
-    return numbers
-
-
 def _number(path: Path, data: dict[str, Any], key: str) -> float:
-    return float(_sized(path, key, data[key], 1)[0])
+    return float(sized(path, key, data[key], 1)[0])

@@ -3,12 +3,20 @@
 from consistency.errors import InputError
 
 
-class PointError(InputError):
+class MatchError(InputError):
+    """Something that may be one match's fault: ``match`` is its number, from 0, or None."""
+
+    def __init__(self, message: str, match: int | None = None) -> None:
+        super().__init__(message)
+        self.match = match
+
+
+class PointError(MatchError):
     """A point at infinity, at a camera or behind it, or a match without positive disparity."""
 
 
-class DegenerateError(InputError):
-    """Points that do not fix a rigid motion: fewer than three, identical, or on one line."""
+class DegenerateError(MatchError):
+    """Points that do not fix a rigid motion: fewer than three, identical, or on one line; or one that is not fixed."""
 
 
 class ConsensusError(InputError):

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from consistency.errors import InputError
 from consistency.types import Array, Indices
-from consistency.vision.consensus import register_ransac, squared_distances
-from consistency.vision.errors import ConsensusError
+from consistency.vision.consensus import squared_distances
+from consistency.vision.errors import ConsensusError, MatchError
 from consistency.vision.features import COUNT, grey, sift
 from consistency.vision.matching import EPIPOLAR_PX, RATIO, StereoFeatures, circular_matches, stereo_matches
 from consistency.vision.pose import RelativePose
 from consistency.vision.propagation import registration_covariance, triangulation_covariance
-from consistency.vision.refinement import refine_reprojection
+from consistency.vision.refinement import Refined, refine_reprojection
 from consistency.vision.registration import register_horn, register_svd
+from consistency.vision.resection import inliers_within, resect_ransac, squared_reprojections
 from consistency.vision.rig import StereoRig, triangulable, triangulate
 
 ESTIMATORS = ("reprojection", "svd", "horn")
 FEWEST = 8  # closed circles; below, RANSAC would agree with anything
 MISFIT = 5.0  # chi2/dof at most; 0.2 to 1.4 on good images, 8 on swapped ones
-REFITS = 2  # of the pose to its inliers, at most; more change nothing but 1 % of the inliers
+FIRST_ORDER = 0.05  # relative uncertainty of a depth up to which first order holds (docs/front-end.md)
+DOMINATED = 0.5  # of the variance from points beyond: an unweighted registration is theirs
+REFITS = 5  # of the pose to its inliers, at most; two or three do
 Pair = tuple[Array, Array]
 
 
@@ -35,7 +39,7 @@ class Settings:
     epipolar_px: float = EPIPOLAR_PX
     min_disparity: float = 2.0  # px; nearer to zero, a point's depth is not Gaussian even to first order
     sigma_per_scale: float = 0.15  # px of feature noise per px of SIFT scale
-    gate: float = 4.0  # sigma of an inlier of RANSAC, 3 degrees of freedom: 0.1 % of good matches are lost
+    gate: float = 4.0  # sigma of an inlier in the four pixels: 0.3 % of good matches are lost
     estimator: str = "reprojection"
 
     def __post_init__(self) -> None:
@@ -57,6 +61,18 @@ class Estimate:
     inliers: Array  # (M,) bool
     chi2: float  # of the inliers' residuals; over dof it is 1 where the noise of the features is as stated
     dof: int
+    far_share: float = field(default=0.0, kw_only=True)  # of the points' variance: of depths that first order fails for
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong with an unweighted registration of these points; empty where nothing is known."""
+        if self.far_share <= DOMINATED:
+            return ""
+        return (
+            f"points with a depth uncertain by more than {FIRST_ORDER:.0%} bring {self.far_share:.0%} of the variance: "
+            "svd and horn give them full weight, and neither pose nor covariance can be relied on; take "
+            "estimator reprojection"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +84,7 @@ class RelativeMotion(Estimate):
     sigma0: Array  # (M, 4), of uv0, px
     sigma1: Array  # (M, 4), of uv1, px
     rows: Indices  # (M, 2), of the stereo matches at time 0 and 1
+    fault: str = ""  # why the images did not tell it: then M is 0, and the motion is a bridge between its neighbours
 
 
 def relative_motion(
@@ -81,8 +98,8 @@ def relative_motion(
 ) -> RelativeMotion:
     """Motion of a stereo rig between two pairs of images without distortion.
 
-    SIFT features, matched left0-right0-right1-left1-left0; triangulation (eq. 2.26); RANSAC over the Mahalanobis
-    distances of the points, so that far points may miss by more; then the estimator.
+    SIFT features, matched left0-right0-right1-left1-left0; triangulation (eq. 2.26); P3P inside RANSAC, judged in the
+    images; then the estimator.
 
     Parameters
     ----------
@@ -94,6 +111,11 @@ def relative_motion(
     Returns
     -------
     pose of camera 1 in camera 0 (p0 = R p1 + t) and its covariance; see :class:`RelativeMotion`
+
+    Warns
+    -----
+    UserWarning
+        Far points dominate ``svd`` or ``horn``: see :attr:`Estimate.doubt`.
 
     Raises
     ------
@@ -107,7 +129,10 @@ def relative_motion(
         stereo_features(rig, *pair, settings=settings, name=name)
         for pair, name in ((before, "before"), (after, "after"))
     ]
-    return motion_between(rig, *frames, rng=rng, settings=settings, estimator=estimator)
+    motion = motion_between(rig, *frames, rng=rng, settings=settings, estimator=estimator)
+    if motion.doubt:
+        warnings.warn(motion.doubt, stacklevel=2)
+    return motion
 
 
 def stereo_features(
@@ -143,7 +168,8 @@ def motion_between(
 ) -> RelativeMotion:
     """:func:`relative_motion` from features that are there already; errors call the pairs by ``names``."""
     settings = settings or Settings()
-    estimator = Settings(estimator=estimator).estimator if estimator else settings.estimator
+    if estimator is not None:
+        settings = replace(settings, estimator=estimator)
     rows = circular_matches(before, after, settings.ratio)
     uv0, uv1 = pixels(before)[rows[:, 0]], pixels(after)[rows[:, 1]]
     near = usable(rig, uv0, settings.min_disparity) & usable(rig, uv1, settings.min_disparity)
@@ -155,15 +181,15 @@ def motion_between(
         )
     sigma0, sigma1 = (noise(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
     try:
-        estimate = _estimate(rig, uv0, uv1, sigma0, sigma1, estimator, settings.gate, rng)
+        estimate = estimate_motion(rig, uv0, uv1, sigma0, sigma1, settings, rng)
     except ConsensusError:
         raise ConsensusError(
             f"{names[0]} to {names[1]}: too few of {len(rows)} matches through all four images agree on a motion; do "
-            "the pairs show the same scene, one soon after the other?"
+            "the pairs show the same scene, one soon after the other, and is the left image the left one?"
         ) from None
     except InputError as error:
         raise type(error)(f"{names[0]} to {names[1]}: {error}") from None
-    if estimator == "reprojection" and estimate.chi2 > MISFIT * estimate.dof:
+    if settings.estimator == "reprojection" and estimate.chi2 > MISFIT * estimate.dof:
         raise ConsensusError(
             f"{names[0]} to {names[1]}: chi2/dof of the inliers is {estimate.chi2 / estimate.dof:.1f} where 1 is "
             "right; are the cameras swapped or badly calibrated, or is sigma_per_scale too small?"
@@ -171,38 +197,61 @@ def motion_between(
     return RelativeMotion(**vars(estimate), uv0=uv0, uv1=uv1, sigma0=sigma0, sigma1=sigma1, rows=rows)
 
 
-def _estimate(
-    rig: StereoRig,
-    uv0: Array,
-    uv1: Array,
-    sigma0: Array,
-    sigma1: Array,
-    estimator: str,
-    gate: float,
-    rng: np.random.Generator,
+def estimate_motion(
+    rig: StereoRig, uv0: Array, uv1: Array, sigma0: Array, sigma1: Array, settings: Settings, rng: np.random.Generator
 ) -> Estimate:
-    """Pose and covariance of matched pixels.
+    """Pose and covariance of N matches, some of which may be wrong.
 
-    RANSAC ends with an unweighted fit, which far points spoil: what is an inlier is asked again of the refined pose.
+    What is an inlier is asked again of each refined pose; a match whose point the images do not fix is dropped.
+
+    Parameters
+    ----------
+    uv0, uv1 : (N, 4), u, v, u', v' of the same points at time 0 and 1, px; all :func:`triangulable`
+    sigma0, sigma1 : (N, 4), their standard deviations, px
+    settings : of these ``gate`` and ``estimator``
+    rng : the only source of chance
+
+    Raises
+    ------
+    InputError
+        Shapes do not fit, or OpenCV is not installed.
+    ConsensusError, DegenerateError, ConvergenceError
+        As :func:`relative_motion`.
     """
-    p0, p1 = triangulate(rig, uv0), triangulate(rig, uv1)
+    pose, inliers = resect_ransac(rig, uv0, uv1, sigma0, sigma1, gate=settings.gate, rng=rng)
     S0, S1 = diagonal(sigma0), diagonal(sigma1)
-    C0, C1 = triangulation_covariance(rig, uv0, S0), triangulation_covariance(rig, uv1, S1)
-    pose, inliers = register_ransac(p0, p1, threshold=gate, rng=rng, S1=C0, S2=C1)
-    if estimator != "reprojection":
-        near, far, C_near, C_far = (values[inliers] for values in (p0, p1, C0, C1))
-        pose = (register_horn if estimator == "horn" else register_svd)(near, far)
-        S = registration_covariance(near, far, C_near, C_far, pose)
-        chi2 = float(squared_distances(near, far, pose.R, pose.t, C_near, C_far).sum())
-        return Estimate(pose, S, inliers, chi2, 3 * len(near) - 6)
+    if settings.estimator != "reprojection":
+        before, after = triangulate(rig, uv0[inliers]), triangulate(rig, uv1[inliers])
+        C_before = triangulation_covariance(rig, uv0[inliers], S0[inliers])
+        C_after = triangulation_covariance(rig, uv1[inliers], S1[inliers])
+        pose = (register_horn if settings.estimator == "horn" else register_svd)(before, after)
+        S = registration_covariance(before, after, C_before, C_after, pose)
+        chi2 = float(squared_distances(before, after, pose.R, pose.t, C_before, C_after).sum())
+        far = np.sqrt(C_before[:, 2, 2]) > FIRST_ORDER * before[:, 2]
+        variance = np.trace(C_before, axis1=1, axis2=2)
+        far_share = float(variance[far].sum() / variance.sum())
+        return Estimate(pose, S, inliers, chi2, 3 * len(before) - 6, far_share=far_share)
     for _ in range(REFITS):
-        i = inliers
-        refined = refine_reprojection(rig, uv0[i], uv1[i], pose, S0[i], S1[i], robust="cauchy")
+        refined, used = _refined(rig, uv0, uv1, S0, S1, pose, inliers)
         pose = refined.pose
-        inliers = squared_distances(p0, p1, pose.R, pose.t, C0, C1) <= gate**2
-        if (inliers == i).all():
+        inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, pose), settings.gate, used)
+        if (inliers == used).all():
             break
-    return Estimate(pose, refined.covariance, i, refined.chi2, refined.dof)
+    return Estimate(pose, refined.covariance, used, refined.chi2, refined.dof)
+
+
+def _refined(
+    rig: StereoRig, uv0: Array, uv1: Array, S0: Array, S1: Array, pose: RelativePose, inliers: Array
+) -> tuple[Refined, Array]:
+    """The refined pose of the inliers (N,) bool, and those that were used: all whose points the images fix."""
+    used = inliers.copy()
+    while True:
+        try:
+            return refine_reprojection(rig, uv0[used], uv1[used], pose, S0[used], S1[used], robust="cauchy"), used
+        except MatchError as error:
+            if error.match is None or used.sum() <= FEWEST:
+                raise
+            used[np.flatnonzero(used)[error.match]] = False
 
 
 def pixels(features: StereoFeatures) -> Array:

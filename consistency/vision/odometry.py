@@ -6,8 +6,10 @@ from collections.abc import Sequence as Ordered
 
 import numpy as np
 
+from consistency.errors import InputError
 from consistency.terminal.progress import progress
 from consistency.types import Array
+from consistency.vision.bridging import bridged
 from consistency.vision.motion import RelativeMotion, Settings, motion_between, stereo_features
 from consistency.vision.pose import angular, cross_matrix
 from consistency.vision.sequence import Sequence
@@ -18,12 +20,15 @@ def visual_odometry(
 ) -> list[RelativeMotion]:
     """The motion from each stereo pair to the next, one less than pairs; features are found once a pair.
 
+    A motion that cannot be measured is a bridge between its neighbours, with the reason as its ``fault``; see
+    :func:`consistency.vision.bridging.bridged`.
+
     Raises
     ------
     InputError
-        As :func:`consistency.vision.relative_motion`, with the files' names.
+        An image that cannot be read; too few motions could be measured.
     """
-    rig, motions = sequence.rectification.rig, list[RelativeMotion]()
+    rig, motions = sequence.rectification.rig, list[RelativeMotion | InputError]()
     with progress(sequence.folder.name, len(sequence), "stereo pairs") as advance:
         before = None
         for frame in range(len(sequence)):
@@ -31,10 +36,13 @@ def visual_odometry(
             after = stereo_features(rig, *sequence.pair(frame), settings=settings, name=name)
             if before is not None:
                 names = (sequence.left[frame - 1].name, name)
-                motions.append(motion_between(rig, before, after, rng=rng, settings=settings, names=names))
+                try:
+                    motions.append(motion_between(rig, before, after, rng=rng, settings=settings, names=names))
+                except InputError as fault:
+                    motions.append(fault)
             before = after
             advance(1)
-    return motions
+    return bridged(motions, sequence.t)
 
 
 def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.types import Array
-from consistency.vision.calibration import Calibration
+from consistency.vision.cameras import Calibration
 from consistency.vision.features import opencv
 from consistency.vision.matching import is_rectified
 from consistency.vision.rig import StereoRig

@@ -146,7 +146,8 @@ def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
     """C_dd (6, 6) and C_dz (2N, 6, k) of the cost of the pose alone, each point at its best position."""
     inverse, definite = small.inverse(f.qq)
     if not definite.all():
-        raise DegenerateError(f"match {int(np.argmin(definite))}: its point is not fixed by the images; leave it out")
+        k = int(np.argmin(definite))
+        raise DegenerateError(f"match {k}: its point is not fixed by the images; leave it out", k)
     gain = f.dq @ inverse  # (N, 6, 3)
     dd = f.dd - gain @ np.swapaxes(f.dq, 1, 2)
     dz1, dz2 = f.dz1 - gain @ f.qz1, -gain @ f.qz2

@@ -89,7 +89,8 @@ class StereoRig:
         h = p @ np.swapaxes(self.cameras[:, :, :3], 1, 2) + self.cameras[:, None, :, 3]  # (2, N, 3)
         depth = h[:, :, 2]
         if (bad := (depth <= NEAREST * self.baseline).any(axis=0)).any():
-            raise PointError(f"points: number {int(np.argmax(bad))} is at or behind a camera; leave such points out")
+            k = int(np.argmax(bad))
+            raise PointError(f"points: number {k} is at or behind a camera; leave such points out", k)
         return np.concatenate(list(h[:, :, :2] / depth[:, :, None]), axis=1)
 
     def inside(self, uv: Array) -> Array:
@@ -115,9 +116,11 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
     """
     points, good = _points(rig, checks.rows("uv", uv, 4))
     if not good.all():
+        k = int(np.argmin(good))
         raise PointError(
-            f"uv: match {int(np.argmin(good))} has zero or negative disparity, its point is at infinity or behind a "
-            "camera; leave such matches out (triangulable tells them)"
+            f"uv: match {k} has zero or negative disparity, its point is at infinity or behind a camera; leave such "
+            "matches out (triangulable tells them)",
+            k,
         )
     return points
 

@@ -1,4 +1,4 @@
-"""Sequences of stereo pairs on disk: KITTI odometry, EuRoC / ASL, or plain folders with an OpenCV calibration."""
+"""Sequences of stereo pairs on disk: KITTI odometry and raw, EuRoC / ASL, or plain folders with a calibration."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.reading import HUGE, is_file, read_text, reading
 from consistency.types import Array
-from consistency.vision.calibration import Calibration, read_calibration
+from consistency.vision.calibration import read_calibration
+from consistency.vision.cameras import Calibration
 from consistency.vision.features import opencv
 from consistency.vision.rectification import Rectification, rectify
 
-FORMATS = ("kitti", "euroc", "opencv")
+FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")
 KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"))
+RAW_PAIRS = (("image_00", "image_01"), ("image_02", "image_03"))
+RAW_CALIBRATION = "calib_cam_to_cam.txt"  # in the folder of the day, one above a drive's
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 RATE = 10.0  # Hz, of images without timestamps: KITTI's, and a choice elsewhere
 FEWEST = 2  # stereo pairs
@@ -69,6 +72,8 @@ def read_sequence(
     Parameters
     ----------
     folder : KITTI: image_0 and image_1 (or image_2 and image_3, image_l and image_r), times.txt, calib.txt;
+        KITTI raw: a drive with image_00/data and image_01/data (or 02 and 03) and their timestamps.txt, in the folder
+        of a day with calib_cam_to_cam.txt;
         EuRoC: mav0/cam0 and mav0/cam1 with data.csv and data, or cam0 and cam1 with images named by nanoseconds
     calibration : file, or a folder for EuRoC; None where the layout holds it
     format : one of FORMATS; None to find out by the folders that are there
@@ -93,6 +98,10 @@ def read_sequence(
     kind = format or ("opencv" if left is not None else _recognised(folder))
     if kind == "kitti":
         files, t, home = _kitti(folder), _kitti_times(folder), folder / "calib.txt"
+    elif kind == "kitti-raw":
+        files, t = _kitti_raw(folder)
+        places = [place / RAW_CALIBRATION for place in (folder, folder.absolute().parent)]
+        home = next((place for place in places if place.is_file()), places[1])
     elif kind == "euroc":
         files, t = _euroc(folder)
         home = folder
@@ -103,8 +112,9 @@ def read_sequence(
     _require_pairs(folder, files, t)
     if t is None:
         _require_no_gap(files[0])
-    cameras = read_calibration(calibration or home or folder, *(side[0].parent.name for side in files))
     size = _size_of(files[0][0])
+    names = [side[0].parent.parent.name if kind == "kitti-raw" else side[0].parent.name for side in files]
+    cameras = read_calibration(calibration or home or folder, names[0], names[1], size)
     with reading(cameras.source, "its cameras cannot be rectified"):
         rectification = rectify(cameras, size)
     times = np.arange(len(files[0])) / (rate or RATE) if t is None else t
@@ -136,6 +146,8 @@ def _size_of(path: Path) -> tuple[int, int]:
 def _recognised(folder: Path) -> str:
     if any((folder / one).is_dir() and (folder / two).is_dir() for one, two in KITTI_PAIRS):
         return "kitti"
+    if any((folder / one).is_dir() and (folder / two).is_dir() for one, two in RAW_PAIRS):
+        return "kitti-raw"
     if (folder / "mav0").is_dir() or (folder / "cam0").is_dir():
         return "euroc"
     return "opencv"
@@ -198,6 +210,28 @@ def _kitti_times(folder: Path) -> Array | None:
     if t.shape[1] != 1:
         raise InputError(f"{path}: must hold one time in seconds a line")
     return np.asarray(t[:, 0])
+
+
+def _kitti_raw(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
+    """Images of the first pair of cameras that is there, and the times of the left one in seconds from the first."""
+    for one, two in RAW_PAIRS:
+        if (folder / one).is_dir() and (folder / two).is_dir():
+            files = _by_name(folder, _images(folder / one / "data"), _images(folder / two / "data"))
+            return files, _times_of_day(folder / one / "timestamps.txt")
+    raise InputError(f"{folder}: holds no folders {' or '.join(' and '.join(pair) for pair in RAW_PAIRS)}")
+
+
+def _times_of_day(path: Path) -> Array:
+    """Lines as ``2011-09-26 13:02:25.594360375`` in seconds from the first."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; a drive of KITTI raw has the times of its images there")
+    refusal = "must hold a date and a time of day in every line"
+    lines = read_text(path, refusal).split("\n")
+    with reading(path, refusal):
+        stamps = np.array([line.strip() for line in lines if line.strip()], dtype="datetime64[ns]")
+    if np.isnat(stamps).any():
+        raise InputError(f"{path}: {refusal}")
+    return np.asarray((stamps - stamps[:1]) / np.timedelta64(1, "s"))
 
 
 def read_table(path: Path, delimiter: str | None, refusal: str) -> Array:

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.frontend.truth import read_truth
 from consistency.geometry import rotation
-from consistency.vision.calibration import read_calibration, read_kitti
+from consistency.vision.calibration import read_calibration
+from consistency.vision.kitti import read_kitti
 from consistency.vision.rectification import rectify
 from consistency.vision.sequence import read_sequence
 

@@ -90,6 +90,9 @@ def test_unusable_images(wall: Array, rng: np.random.Generator) -> None:
     later = scene.pair(scene.drive(2)[1], wall)
     with pytest.raises(ConsensusError, match="cameras swapped"):
         relative_motion(rig, pair[::-1], later[::-1], rng=rng)
+    low, later_low = ((left, np.roll(right, 1, axis=0)) for left, right in (pair, later))
+    with pytest.raises(ConsensusError, match="cameras swapped or badly calibrated, or is sigma_per_scale too small"):
+        relative_motion(rig, low, later_low, rng=rng, settings=Settings(sigma_per_scale=0.02))
     elsewhere = scene.pair(scene.drive(1)[0], scene.texture(rng))
     with pytest.raises(cs.InputError, match="before to after: "):
         relative_motion(rig, pair, elsewhere, rng=rng)
@@ -109,6 +112,23 @@ def test_without_opencv(monkeypatch: pytest.MonkeyPatch, wall: Array, rng: np.ra
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(cs.InputError, match="pip install"):
         relative_motion(scene.rig(), pair, pair, rng=rng)
+
+
+def test_a_dark_frame_is_bridged(wall: Array, tmp_path: Path) -> None:
+    """Counted, with its reason, in the manifest and on the terminal; what follows is measured again."""
+    cv2, folder = pytest.importorskip("cv2"), tmp_path / "seq"
+    scene.write_kitti(folder, scene.drive(14), wall)
+    dark = sorted((folder / "image_0").iterdir())[6]
+    cv2.imwrite(str(dark), np.zeros(scene.SIZE[::-1], np.uint8))
+    summary = write_frontend_log(folder, tmp_path / "log", Options(max_landmarks=30))
+    assert len(summary.faults) == 2
+    assert "2 of 13 motions could not be measured and are bridged" in "\n".join(summary.lines(tmp_path / "log"))
+    assert list(read_manifest(tmp_path / "log")["bridged"]) == ["5", "6"]
+    (recording,) = read_recordings(
+        tmp_path / "log/trajectory.tum", tmp_path / "log/truth.tum", tmp_path / "log/covariance.txt", "so3"
+    )
+    assert recording.nees is not None
+    assert np.isfinite(recording.nees[0]).all()
 
 
 # --- tracks and trajectories ---------------------------------------------------------------------

@@ -843,7 +843,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
         ("d", "--truth", "d"),
         "d: holds no .txt or .tum file and no manifest.json",
     ),
-    "folder of nothing": (lambda at: (at / "d").mkdir(), ("d",), "manifest.json: missing"),
+    "folder of nothing": (lambda at: (at / "d").mkdir(), ("d",), "holds no results of"),
     "truth of another run": (
         lambda at: [(text()(at)), (at / "d").mkdir(), (at / "e").mkdir(), (at / "d/a.txt").write_text(TUM)],
         ("d", "--truth", "e", "--covariance", "e"),

@@ -59,6 +59,8 @@ NUMBERS = {
     "wider": "1 2 3\n2 3 4 5\n3 4 5\n",
     "all wide": "1 2 3 4 5\n2 3 4 5 6\n",
     "unequal sums": "1 2 3 4\n2 3\n3 4 5\n",
+    "equal letters": "1 2 34\n2 3 4 5\n",
+    "lone return": "1 2 3\n2 3\r4\n3 4 5\n",
     "back": "1 2 3\n3 3 4\n2 4 5\n",
     "twice": "1 2 3\n2 3 4\n2 4 5\n",
     "no time": "1 2 3\nnan 3 4\n2 4 5\n",
@@ -74,7 +76,7 @@ def test_numbers_in_blocks_are_those_line_by_line(name: str, tmp_path: Path) -> 
     whole = numbers_of(path, 2**22, slow=True)
     for size in (4, 7, 13, 2**22):
         np.testing.assert_equal(numbers_of(path, size), whole)
-    refused = {"word", "hexadecimal", "glued", "short", "wider", "all wide", "unequal sums", "back", "twice", "no time",
+    refused = {"word", "hexadecimal", "glued", "short", "wider", "all wide", "unequal sums", "equal letters", "lone return", "back", "twice", "no time",
                "empty", "only comments"}  # fmt: skip
     assert isinstance(whole, str) == (name in refused)
 

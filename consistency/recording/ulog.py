@@ -67,13 +67,13 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
     there = sorted({i for name, i in topics if name == TOPICS[0]} & {i for name, i in topics if name == TOPICS[1]})
     if not there:
         raise InputError(f"{path}: no instance of the EKF2 has both {' and '.join(TOPICS)}")
-    own = choose(path, "run", there, instance)
+    own = choose(path, "run", there, instance, "instance of the EKF2")
     pairs = _paired(path, *(topics[topic, own] for topic in TOPICS))
     sensors = _sensors(path, pairs)
     if sensor is not None and sensor not in sensors and sensor in _groups(pairs):
         raise InputError(f"--filter {sensor}: is never fused in {path}; there are: {', '.join(sensors)}")
     known = [*sensors, *(part for parts in sensors.values() for part in parts)]
-    name = choose(path, "filter", known if sensor in known else list(sensors), sensor)
+    name = choose(path, "filter", known if sensor in known else list(sensors), sensor, "sensor")
     parts = sensors.get(name, [name])
     nis, dof, held = _nis(pairs, parts)
     notes = _notes(path, name, pairs, dof, held, log)

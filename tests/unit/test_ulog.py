@@ -126,9 +126,9 @@ def test_sensors_and_instances_are_chosen(tmp_path: Path) -> None:
         log.both(10**6 + k * STEP, {"gps_hpos": (gps[k], S[k]), "baro_vpos": (baro[k], T[k])}, instance=0)
         log.both(10**6 + k * STEP, {"baro_vpos": (2.0 * baro[k], T[k])}, instance=1)
     path = log.write(tmp_path / "a.ulg")
-    with pytest.raises(InputError, match=r"holds more than one run \(0, 1\); choose with --run"):
+    with pytest.raises(InputError, match=r"holds more than one instance of the EKF2 \(0, 1\); choose with --run"):
         read_innovations(path)
-    with pytest.raises(InputError, match=r"holds more than one filter \(gps_hpos, baro_vpos\); choose with --filter"):
+    with pytest.raises(InputError, match=r"holds more than one sensor \(gps_hpos, baro_vpos\); choose with --filter"):
         read_innovations(path, run=0)
     first, second = (read_innovations(path, "baro_vpos", run) for run in (0, 1))
     np.testing.assert_allclose(first.nis, baro[:, 0] ** 2 / T[:, 0], rtol=1e-5)

@@ -38,6 +38,7 @@ from consistency.vision import (
     triangulation_covariance,
 )
 from consistency.vision.motion import RelativeMotion, Settings, diagonal
+from consistency.vision.shared import SHARED, fit_shared, sensitivities
 
 if TYPE_CHECKING:
     import front_end_data as data
@@ -67,6 +68,8 @@ ACCEPT = {
     "whose truth is not interpolated",
     "halves": "noise fitted to disjoint halves of the matches in the first half of the drive: in the other the mean "
     f"NEES between halves is right within a factor of {FACTOR:g}",
+    "shared": "calibration, mounting, clock and scatter of the truth fitted to the errors in the first half of the "
+    f"motions: in the other the mean NEES is right within a factor of {FACTOR:g}",
     "noise": "bias and a floor fitted to the errors in the first half of the motions: in the other the mean NEES is "
     f"right within a factor of {FACTOR:g} (12 numbers fitted to 20 serially correlated motions allow no less)",
 }
@@ -170,7 +173,8 @@ def measure(study: cs.Study, cases: dict[str, Case]) -> tuple[list[cs.Finding], 
     study.tables["motions"] = pd.concat([table_of(case) for case in cases.values()], ignore_index=True)
     rng = np.random.default_rng(study.seed)
     simulations, pictures = monte_carlo(study, cases, rng)
-    return [*simulations, *against_truth(study, cases), *noise(study, cases[KITTI], rng)], pictures
+    noises = [*noise(study, cases[KITTI], rng), shared(study, cases[KITTI])]
+    return [*simulations, *against_truth(study, cases), *noises], pictures
 
 
 def found(study: cs.Study, holds: bool, name: str, **text: str) -> cs.Finding:
@@ -294,6 +298,29 @@ def noise(study: cs.Study, case: Case, rng: np.random.Generator) -> list[cs.Find
             f"{np.round(1e3 * np.sqrt(floor), 2).tolist()} mm, mrad",
         ),
     ]  # fmt: skip
+
+
+def shared(study: cs.Study, case: Case) -> cs.Finding:
+    """Calibration, mounting, clock and scatter of the truth fitted to the first half, predicted for the other."""
+    keep = case.surveyed
+    J, e, S = sensitivities(case.rig, case.motions, case.t)[keep], case.errors[keep], case.covariances[keep]
+    k = len(e) // 2
+    fit = fit_shared(e[:k], J[:k], S[:k])
+    bias, P = fit.predict(J[k:], S[k:])
+    verdict, ratio = referee(e[k:] - bias, P), nees(e[k:] - bias, P) / 6
+    sigma = np.sqrt(np.diag(fit.covariance))
+    told = [
+        f"{name} {mean:+.2g} +- {std:.1g}"
+        for (name, prior), mean, std in zip(SHARED.items(), fit.mean, sigma, strict=True)
+        if std < 0.5 * prior
+    ]
+    return found(
+        study, 1 / FACTOR <= ratio.mean() <= FACTOR, "shared",
+        statistic="NEES/6 against truth, second half of the motions with a surveyed truth",
+        claim="with the errors that all motions share, fitted to one half, the covariance is honest on the other",
+        measured=f"{ratio.mean():.2f} (median {np.median(ratio):.2f}), {verdict.reasons[0]}. Told by the first {k}: "
+        f"{'; '.join(told)}; floor {np.round(1e3 * fit.floor, 2).tolist()} mm, mrad",
+    )  # fmt: skip
 
 
 def main(study: cs.Study) -> list[cs.Finding]:

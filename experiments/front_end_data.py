@@ -34,6 +34,7 @@ class Case:
     motions: list[RelativeMotion]
     truth: list[RelativePose]
     image: Array  # of the first left camera
+    t: Array  # of the stereo pairs, s
 
     @property
     def surveyed(self) -> Array:
@@ -85,7 +86,7 @@ def sequence_case(folder: Path, rng: np.random.Generator, truth: str = "poses.tx
     motions = visual_odometry(sequence, rng=rng)
     true = [RelativePose(R, t) for R, t in zip(turns, shifts, strict=True)]
     name = folder.name if step == 1 else f"{folder.name}, every {step}."
-    return Case(name, sequence.rectification.rig, motions, true, sequence.pair(0)[0])
+    return Case(name, sequence.rectification.rig, motions, true, sequence.pair(0)[0], sequence.t)
 
 
 def _minnie(folder: Path, rng: np.random.Generator) -> Case:
@@ -96,7 +97,7 @@ def _minnie(folder: Path, rng: np.random.Generator) -> Case:
     rig = StereoRig(MINNIE_K, MINNIE_K, np.eye(3), baseline, (width, height))
     motion = relative_motion(rig, (images[0], images[1]), (images[2], images[3]), rng=rng)
     before, after = (_onboard(folder / f"{MINNIE_FILES[i]}.meta") for i in (0, 2))
-    return Case(folder.name, rig, [motion], [before.inverse().compose(after)], images[0])
+    return Case(folder.name, rig, [motion], [before.inverse().compose(after)], images[0], np.arange(2.0))
 
 
 def _onboard(path: Path) -> RelativePose:

@@ -41,7 +41,7 @@ def test_numbers_that_run_together_are_told_apart(experiment: ModuleType, tmp_pa
 def test_interpolated_truth_is_told_apart(experiment: ModuleType) -> None:
     turns = [0.001, 0.001, 0.001, 0.0013, 0.0009]
     truth = [RelativePose.from_vector(np.array([0, 0, 1.0, 0, turn, 0])) for turn in turns]
-    case = experiment.Case("x", None, [], truth, np.empty((0, 0)))
+    case = experiment.Case("x", None, [], truth, np.empty((0, 0)), np.empty(0))
     assert case.surveyed.tolist() == [False, False, False, True, True]
 
 

@@ -16,10 +16,13 @@ import mutations as m
 import numpy as np
 import pandas as pd
 import tomli_w
+from drives import write_drive, write_states
 from edited import accept_changes
+from flight import Flight
 
 import consistency as cs
 from consistency.cli import main
+from consistency.recording.kitti import read_drive
 from consistency.store.log import read_log
 from consistency.store.results import Rejected, failures_table, rejections_table
 from consistency.store.storage import manifest_of
@@ -189,11 +192,38 @@ def write_all(folder: Path, seed: int = 1) -> None:
     sweep = {"summary": "s", "base": "world.toml", "filters": ["ekf-xyz"], "rule": {"max_runs": 96}, "grid": grid}
     (folder / "sweep" / "sweep.toml").write_text(tomli_w.dumps(sweep), encoding="utf-8")
     quietly(["simulate", str(folder / "scenario" / "world.toml"), "--runs", "2", "--out", str(folder / "log")])
+    quietly(
+        [
+            "simulate",
+            str(folder / "scenario/world.toml"),
+            "--runs",
+            "2",
+            "--format",
+            "csv",
+            "--out",
+            str(folder / "texts"),
+        ]
+    )
+    _write_recorded(folder)
     quietly(["baseline", str(folder / "results"), "--out", str(folder / "baseline" / "base.json")])
     entry = dict.fromkeys(("id", "source", "claim", "statistic", "published", "measured", "accept"), "x")
     entry |= {"verdict": "reproduced", "runs": 5, "seed": 0, "scenario": "s"}
     (folder / "findings" / "findings.json").write_text(json.dumps([entry]), encoding="utf-8")
     _write_cameras(folder)
+
+
+def _write_recorded(folder: Path) -> None:
+    """A drive with an estimate beside it, states of a simulation, and a flight."""
+    for name in ("drive", "states", "flight"):
+        (folder / name).mkdir()
+    lines = read_drive(write_drive(folder / "drive" / "one")).values
+    P = np.tile(np.diag(np.full(6, 1e-4)).ravel(), (len(lines), 1))
+    np.savetxt(folder / "drive" / "est.tum", np.column_stack([lines, P]), fmt="%.9g")
+    write_states(folder / "states")
+    log, rng = Flight(), np.random.default_rng(len(lines))
+    for k in range(4 * STEPS):
+        log.both(10**6 + 10**4 * k, {"baro_vpos": (rng.standard_normal(), 1.0)})
+    log.write(folder / "flight" / "one.ulg")
 
 
 def quietly(arguments: list[str]) -> int:
@@ -298,6 +328,7 @@ TARGETS = (
     Target("results", RESULTS[:2], command("compare", "{}"), m.ANY | m.COLUMNS, m.ROWS),
     Target("log", ("controls.parquet", "observations.parquet", "truth.parquet", "landmarks.parquet"), _log,
            m.ANY | m.COLUMNS, {"row_twice": m.row_twice}),
+    Target("texts", ("controls.csv", "observations.csv", "truth.csv", "landmarks.csv"), _log, m.ANY | m.TEXT, {}),
     Target("log", ("sensor.toml",), _log, TOML, LINE_TWICE),
     Target("table", ("est.csv", "truth.csv"),
            command("analyse", "{}/est.csv", "--truth", "{}/truth.csv"), m.ANY | m.TEXT, {}),
@@ -313,6 +344,12 @@ TARGETS = (
     Target("tum", ("est.tum", "truth.tum", "cov.txt"),
            command("analyse", "{}/est.tum", "--truth", "{}/truth.tum", "--covariance", "{}/cov.txt"),
            m.ANY | m.TEXT, {}),
+    Target("drive", ("one/oxts/timestamps.txt", "one/oxts/data/0000000007.txt", "calib_imu_to_velo.txt"),
+           command("analyse", "{}/est.tum", "--truth", "{}/one", "--body", "velodyne"), m.ANY | m.TEXT, {}),
+    Target("states", ("state_estimate.txt", "state_deviation.txt"),
+           command("analyse", "{}/state_estimate.txt", "--truth", "{}/state_groundtruth.txt", "--covariance",
+                   "{}/state_deviation.txt", "--axes", "x,yaw"), m.ANY | m.TEXT, {}),
+    Target("flight", ("one.ulg",), command("monitor", "{}/one.ulg", *OPTIMAL), m.ANY, {}),
     Target("scenario", ("world.toml",), _scenario, TOML, LINE_TWICE),
     Target("sweep", ("sweep.toml", "world.toml"), _sweep, TOML, LINE_TWICE),
     Target("baseline", ("base.json",), command("compare", "{}/base.json"), m.ANY | TREE,

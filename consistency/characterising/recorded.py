@@ -20,6 +20,7 @@ from consistency.geometry import rotation
 from consistency.recording.tum import read_trajectory
 from consistency.scenario import Mount, PicturedSensor, read_table
 from consistency.store.log import Log, SensorFile, read_log
+from consistency.store.tables import table_file
 from consistency.types import Array, Trial
 
 OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
@@ -40,7 +41,7 @@ class Measured:
 
 def is_log(folder: Path) -> bool:
     """Whether a folder is a recorded log, and not one of images."""
-    return (folder / "observations.parquet").exists() or (folder / "controls.parquet").exists()
+    return any(table_file(folder, name).exists() for name in ("observations", "controls"))
 
 
 def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False, free_poses: bool = False) -> Measured:

@@ -102,13 +102,14 @@ def simulate(
     out: Out,
     runs: Runs = 1,
     seed: Seed = 0,
+    form: Annotated[str, typer.Option("--format", help="Of the tables: parquet or csv; both are read.")] = "parquet",
     overwrite: Overwrite = False,
 ) -> None:
     """Write truth, controls and observations of a scenario: a log for any filter, ours or not."""
     from consistency.runs.montecarlo import simulate_log
     from consistency.scenario import load_scenario
 
-    simulate_log(load_scenario(scenario), runs, seed, out, overwrite)
+    simulate_log(load_scenario(scenario), runs, seed, out, overwrite, form)
     count = f"{runs} run{'s' * (runs != 1)}"
     print(f"{count} of {scenario} in {out}; filter them with: consistency run --log {out} --filter F")
 
@@ -261,7 +262,10 @@ def analyse(
             metavar="PATH", help="Folder written by 'run', or estimates: .csv, .parquet, .npz, TUM, ROS bags."
         ),
     ],
-    truth: Annotated[Path | None, typer.Option("--truth", help="Truth of the estimates, in the same form.")] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", help="Truth of the estimates, in the same form, or a KITTI drive's folder."),
+    ] = None,
     covariance: Annotated[
         Path | None, typer.Option("--covariance", help="Covariances of a TUM trajectory: t and 36 or 21 numbers.")
     ] = None,
@@ -292,6 +296,9 @@ def analyse(
     ] = None,
     truth_topic: Annotated[
         str | None, typer.Option("--truth-topic", help="Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
+    ] = None,
+    body: Annotated[
+        str | None, typer.Option("--body", help="Of a KITTI drive as truth: imu [default], velodyne or camera.")
     ] = None,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
     false_alarm: Annotated[
@@ -337,7 +344,7 @@ def analyse(
     options: dict[str, Any] = {
         "truth": truth, "covariance": covariance, "convention": error,
         "state": _names(state), "axes": _names(axes), "topic": topic, "truth_topic": truth_topic,
-        "covariance_order": covariance_order, "max_dt": max_dt, "time_offset": _seconds(time_offset),
+        "covariance_order": covariance_order, "max_dt": max_dt, "time_offset": _seconds(time_offset), "body": body,
     }  # fmt: skip
     written: list[Path] = []
     if overwrite and report is None:
@@ -577,7 +584,8 @@ def monitor(
     path: Annotated[
         str,
         typer.Argument(
-            metavar="FILE", help="Innovations of one run: .csv, .parquet, .npz, a folder of 'run', or - for CSV lines."
+            metavar="FILE",
+            help="Innovations of one run: .csv, .parquet, .npz, .ulg of PX4, a folder of 'run', or - for CSV lines.",
         ),
     ],
     innovations: Annotated[
@@ -596,8 +604,12 @@ def monitor(
     mission: Annotated[
         int | None, typer.Option("--mission", help="Innovations of the whole mission, if known.")
     ] = None,
-    filter_name: Annotated[str | None, typer.Option("--filter", help="Which, if FILE holds several.")] = None,
-    run: Annotated[int | None, typer.Option("--run", help="Which, if FILE holds several.")] = None,
+    filter_name: Annotated[
+        str | None, typer.Option("--filter", help="Which, if FILE holds several; of a .ulg the sensor.")
+    ] = None,
+    run: Annotated[
+        int | None, typer.Option("--run", help="Which, if FILE holds several; of a .ulg the EKF2's instance.")
+    ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
@@ -618,6 +630,8 @@ def monitor(
         watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
     else:
         log = read_innovations(Path(path), filter_name, run)
+        for note in log.notes:
+            print(f"consistency: {note}", file=sys.stderr)
         if plot is not None:
             require_plot(plot, overwrite)
         watched = watch(log, watcher)

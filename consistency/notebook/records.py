@@ -90,6 +90,7 @@ def read(
     axes: Sequence[str] | None = None,
     topic: str | None = None,
     truth_topic: str | None = None,
+    body: str | None = None,
     filter: str | None = None,
 ) -> Record:
     """Files of another estimator, as ``consistency analyse FILES`` reads them; docs/files.md has the forms.
@@ -97,7 +98,7 @@ def read(
     Parameters
     ----------
     estimates : .csv, .parquet, .npz, a TUM trajectory, or a folder of these with one for each run
-    truth : of the same kind; not with .npz
+    truth : of the same kind, or the folder of a KITTI drive; not with .npz
     covariance : of a TUM trajectory: t and 36 or 21 numbers
     error : what the covariance is of: so2, vector, left, right, so3 or so3-body; None is the default of the kind
     state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
@@ -106,6 +107,7 @@ def read(
     time_offset : s to add to the timestamps of the estimates, or "estimate"
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw
     topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
+    body : whose poses a KITTI drive gives as truth: imu (default), velodyne or camera
     filter : which estimator, where the files hold several
 
     Raises
@@ -125,6 +127,7 @@ def read(
         axes=axes,
         topic=topic,
         truth_topic=truth_topic,
+        body=body,
     )
     named = {recording.name: recording for recording in found}
     if filter is None and len(named) > 1:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,13 @@ from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
 from consistency.recording.archive import read_archive
 from consistency.recording.bags import is_bag, read_bags
+from consistency.recording.kitti import BODIES, is_drive
 from consistency.recording.record import Recording
 from consistency.recording.table import read_tables
 from consistency.recording.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
 
 __all__ = [
+    "BODIES",
     "CONVENTIONS",
     "ORDERS",
     "Recording",
@@ -48,7 +51,7 @@ def is_recording(path: Path, **options: Any) -> bool:
             known = f"trajectories ({', '.join(SUFFIXES)}) or ROS bags"
             raise InputError(f"{path}: holds no results of 'consistency run', and no {known}")
     else:
-        recording = path.is_file() or (path.suffix != "" and not path.exists())
+        recording = not path.is_dir() and (path.exists() or path.suffix != "")
     if not recording and path.exists():
         keys = [name for name, value in options.items() if value is not None]
         if keys:
@@ -70,13 +73,14 @@ def read_recordings(
     axes: Sequence[str] | None = None,
     topic: str | None = None,
     truth_topic: str | None = None,
+    body: str | None = None,
 ) -> list[Recording]:
     """What estimators said, from CSV, Parquet, TUM or NumPy files: one recording for each estimator.
 
     Parameters
     ----------
     estimates : .csv, .parquet, .npz, or a TUM trajectory, or a folder of these with one for each run
-    truth : of the same kind; not with .npz
+    truth : of the same kind, or the folder of a KITTI drive; not with .npz
     covariance : of a TUM trajectory
     convention : of the error, one of ``CONVENTIONS``; None is the default of the kind
     state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
@@ -86,6 +90,7 @@ def read_recordings(
         named in the notes
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw; None is all
     topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
+    body : whose poses a drive of KITTI gives as truth: one of ``BODIES``; None is imu
 
     Raises
     ------
@@ -108,7 +113,9 @@ def read_recordings(
     suffix = estimates.suffix.lower()
     own: dict[str, object] = {"state": state, "max-dt": max_dt, "covariance": covariance, "truth": truth}
     own |= {"covariance-order": covariance_order, "time-offset": time_offset, "axes": axes}
-    own |= {"topic": topic, "truth-topic": truth_topic}
+    own |= {"topic": topic, "truth-topic": truth_topic, "body": body}
+    if body is not None and not (truth is not None and is_drive(truth)):
+        raise InputError(f"--body {body}: goes with --truth DIR, the folder of a KITTI drive")
     if is_bag(estimates):
         _refuse(estimates, own, ("state", "covariance", "covariance-order", "truth"))
         return read_bags(estimates, topic, truth_topic, convention, max_dt, time_offset, axes)
@@ -120,12 +127,24 @@ def read_recordings(
         _refuse(estimates, own, ("covariance", "covariance-order", "axes"))
         if state is not None and (len(set(state)) < len(state) or not all(state)):
             raise InputError(f"--state {','.join(state)}: needs names of columns, each once")
-        return read_tables(estimates, truth, convention, state, max_dt, time_offset)
+        found = read_tables(estimates, truth, convention, state, max_dt, time_offset, body)
+        return _with_frame(found, truth, body)
     if suffix not in SUFFIXES and not estimates.is_dir():
         known = ", ".join((*TABLES, ".npz", ".bag", *SUFFIXES))
         raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
     _refuse(estimates, own, ("state",))
-    return read_tum(estimates, truth, covariance, convention, covariance_order, max_dt, time_offset, axes)
+    found = read_tum(estimates, truth, covariance, convention, covariance_order, max_dt, time_offset, axes, body)
+    return _with_frame(found, truth, body)
+
+
+def _with_frame(recordings: list[Recording], truth: Path | None, body: str | None) -> list[Recording]:
+    """Say whose poses a drive gives, and in which world."""
+    if truth is None or not is_drive(truth):
+        return recordings
+    note = (
+        f"{truth}: the truth is the path of the {body or 'imu'} as its first pose sees it, t in s from the first packet"
+    )
+    return [replace(recordings[0], notes=(note, *recordings[0].notes)), *recordings[1:]]
 
 
 def _refuse(path: Path, options: dict[str, object], names: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from consistency.reading import reading
 from consistency.recording.poses import Poses
 from consistency.recording.record import DEFAULT_DT, Recording, symmetric
 from consistency.recording.sheet import Places
-from consistency.recording.spatial import Source, recordings_of, require_axes
+from consistency.recording.spatial import WHOLE, Source, recordings_of, require_axes
 from consistency.recording.tum import UNIT
 from consistency.types import Array
 
@@ -70,7 +70,7 @@ def read_bags(
     poses = [_poses(bag, topic, truth, convention or "so3", DEFAULT_DT if max_dt is None else max_dt) for bag in bags]
     why = "" if convention else "; as the ROS messages define it; declare yours with --error"
     source = Source(path, [(bag, f"{truth} of {bag}") for bag in bags], path, why)
-    return recordings_of(source, poses, False, time_offset, axes)
+    return recordings_of(source, poses, WHOLE, time_offset, axes)
 
 
 def _poses(bag: Path, topic: str | None, truth: str | None, convention: str, max_dt: float) -> Poses:
@@ -150,7 +150,7 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]
     parent, child = (frame.strip().lstrip("/") for frame in frames.split(":", 1))
     connections = [connection for connection in reader.connections if connection.msgtype in TREE]
     seen = set()
-    for connection, _, raw in reader.messages(connections=connections):
+    for connection, _, raw in reader.messages(connections=connections) if connections else ():  # of none it gives all
         for each in reader.deserialize(raw, connection.msgtype).transforms:
             pair = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
             seen.add(":".join(pair))

@@ -30,6 +30,7 @@ class NisLog:
     t: Array  # (N,), s; NaN where not given
     nis: Array  # (N,), NaN where there is none
     dof: Array  # (N,), whole numbers of 0 or more
+    notes: tuple[str, ...] = ()  # what a reader must know: what was left out
 
 
 def read_nis(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
@@ -48,7 +49,7 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if suffix not in SUFFIXES:
-        raise InputError(f"{path}: unknown kind of file; known are {', '.join(SUFFIXES)}")
+        raise InputError(f"{path}: unknown kind of file; known are {', '.join(SUFFIXES)}, .ulg")
     if suffix == ".npz":
         if filter_name is not None:
             raise InputError(f"--filter {filter_name}: does not go with {path}")
@@ -59,8 +60,8 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     return _of_sheet(str(sheet.data["filter"].iloc[0]) if "filter" in sheet else path.stem, sheet)
 
 
-def choose(path: Path, option: str, there: list[Any], choice: Any) -> Any:
-    """The wanted one of those there, or the only one.
+def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
+    """The wanted one of those there, or the only one; ``what`` they are, where the option's name does not say it.
 
     Raises
     ------
@@ -70,7 +71,7 @@ def choose(path: Path, option: str, there: list[Any], choice: Any) -> Any:
     if choice is None and len(there) == 1:
         return there[0]
     if choice is None:
-        raise InputError(f"{path}: holds more than one {option} ({listed(there)}); choose with --{option}")
+        raise InputError(f"{path}: holds more than one {what or option} ({listed(there)}); choose with --{option}")
     if choice not in there:
         raise InputError(f"--{option} {choice}: is not in {path}; there are: {listed(there)}")
     return choice

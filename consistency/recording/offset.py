@@ -89,8 +89,8 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     steps = np.geomspace(0.004, REACH, 12)
     grid = np.concatenate([-steps[::-1], [0.0], steps])
     sizes = np.array([size(shift) for shift in grid])
-    if not np.isfinite(sizes).any() or np.nanmax(sizes) - np.nanmin(sizes) <= 1e-9:
-        return None
+    if not np.isfinite(sizes).any() or np.nanmax(sizes) - np.nanmin(sizes) <= 1e-9 or not size(0.0) > 0.0:
+        return None  # nothing moves, or no error is there to explain
     best = int(np.nanargmin(sizes))
     low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     found = optimize.minimize_scalar(size, bounds=(low, high), method="bounded", options={"xatol": 1e-5})

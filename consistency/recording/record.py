@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ DEFICIENT = 1e-12  # eigenvalue of a correlation matrix below which a direction 
 ZERO = 1e-24  # variance that counts as none, as in the filters of this package
 ROUNDED = 1e-4  # a singular matrix in a text file of few digits has an eigenvalue of either sign up to this
 ASYMMETRY = 1e-6  # of the largest entry: text files of seven digits pass
+ROWS = 65_536  # matrices that are looked at together: a million take no more memory than so many
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,10 @@ def assemble(
     Raises
     ------
     InputError
-        No covariance of any run has full rank.
+        No covariance of any run has full rank, or two runs are the same.
     """
     tracks = sorted(tracks, key=lambda track: track.run)
+    _require_different(file, tracks)
     notes = list(notes)
     failures, parts, skipped = [], [], 0
     for track in tracks:
@@ -133,6 +136,20 @@ def assemble(
     )
 
 
+def _require_different(file: str, tracks: Sequence[Track]) -> None:
+    """Refuse a run that is there twice: the verdict counts runs that share no noise."""
+    seen: dict[bytes, Track] = {}
+    for track in tracks:
+        if track.error is None or len(track.error) < 2 or not np.nan_to_num(track.error).any():
+            continue
+        other = seen.setdefault(hashlib.sha256(np.ascontiguousarray(track.error).tobytes()).digest(), track)
+        if other is not track:
+            raise InputError(
+                f"{file}: the errors from {track.place[0]} on are those from {other.place[0]} on to the last digit: a "
+                "run that is there twice; leave one of them out"
+            )
+
+
 def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
     """Columns of every run and the step number of every column: the different steps, in order.
 
@@ -177,14 +194,24 @@ def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, I
     return own, nearest[own]
 
 
+def _pieces(rows: int) -> Iterator[slice]:
+    """``ROWS`` at a time."""
+    return (slice(start, start + ROWS) for start in range(0, rows, ROWS))
+
+
 def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
+    out = np.empty(covariance.shape)
     with np.errstate(invalid="ignore"):  # of infinite ones
-        gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
-        bad = np.flatnonzero(gap > ASYMMETRY * np.abs(covariance).max(axis=(-2, -1)))  # false for NaN
-        if len(bad):
-            raise InputError(f"{place(int(bad[0]))}: the covariance is not symmetric; write P = (P + P') / 2")
-        return np.asarray(0.5 * (covariance + np.swapaxes(covariance, -1, -2)))
+        for piece in _pieces(len(out)):
+            P, turned = covariance[piece], np.swapaxes(covariance[piece], -1, -2)
+            gap = np.abs(P - turned).max(axis=(-2, -1))
+            bad = np.flatnonzero(gap > ASYMMETRY * np.abs(P).max(axis=(-2, -1)))  # false for NaN
+            if len(bad):
+                row = piece.start + int(bad[0])
+                raise InputError(f"{place(row)}: the covariance is not symmetric; write P = (P + P') / 2")
+            out[piece] = 0.5 * (P + turned)
+    return out
 
 
 def smallest_correlation(covariance: Array) -> Array:
@@ -192,6 +219,12 @@ def smallest_correlation(covariance: Array) -> Array:
 
     -1 where a variance is negative or a correlation is beyond 1.
     """
+    if not len(covariance):
+        return np.empty(0)
+    return np.concatenate([_smallest_correlation(covariance[piece]) for piece in _pieces(len(covariance))])
+
+
+def _smallest_correlation(covariance: Array) -> Array:
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     none = np.abs(variance) <= ZERO
     scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
@@ -237,7 +270,8 @@ def _cut(track: Track, start: int, end: int) -> Track:
     if error is not None and P is not None:
         values = np.full(end, np.nan)
         values[start:] = nees(error[start:], P[start:])
-        P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
+        if start:
+            P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
     return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values)
 
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from consistency.errors import InputError
 from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading
-from consistency.reading import read_text as read_whole
+from consistency.recording.text import Block, blocks
 from consistency.store.parquet import read_frame
 from consistency.types import Array, Indices
 
@@ -78,6 +78,10 @@ class Lines:
     def place(self, row: int) -> str:
         return f"{self.path}, line {self.line[row]}"
 
+    def of(self, columns: slice) -> Lines:
+        """Some of the columns, without holding the others in memory."""
+        return Lines(self.path, self.values[:, columns].copy(), self.line)
+
 
 class Places(Sequence[str]):
     """Where some rows of a file stand, put into words when asked for."""
@@ -130,61 +134,86 @@ def _read_parquet(path: Path) -> Sheet:
     return Sheet(path, data, np.arange(len(data)), "row")
 
 
-def read_text(path: Path) -> list[tuple[int, str]]:
-    """Lines with their numbers, without comments and empty lines."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file")
-    text = read_whole(path, "not a text file; known are .csv, .parquet, .npz, and .txt or .tum", None, "utf-8-sig")
-    numbered = enumerate(text.splitlines(), 1)
-    return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
-
-
 def _read_csv(path: Path) -> Sheet:
-    lines = read_text(path)
-    if not lines:
+    names: list[str] = []
+    separator, tables, line = ",", list[pd.DataFrame](), list[Indices]()
+    for block in blocks(path):
+        if not names:
+            lines = block.lines()
+            if not lines:
+                continue
+            names, separator = _header(path, lines[0][1])
+            found = _rows(path, lines[1:], names, separator)
+        else:
+            found = _plain_rows(block, names, separator) or _rows(path, block.lines(), names, separator)
+        if found is not None:
+            tables.append(found[0])
+            line.append(found[1])
+    if not names:
         raise InputError(f"{path}: is empty")
-    header = lines[0][1]
-    separator = max(",;\t", key=header.count)
-    names = [name.strip().strip('"') for name in header.split(separator)]
+    if not tables:
+        raise InputError(f"{path}: holds no row under its header")
+    return Sheet(path, pd.concat(tables, ignore_index=True), np.concatenate(line), "line")
+
+
+def _header(path: Path, line: str) -> tuple[list[str], str]:
+    """Names of the columns, and the character between them."""
+    separator = max(",;\t", key=line.count)
+    names = [name.strip().strip('"') for name in line.split(separator)]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise InputError(f"{path}: column '{sorted(twice)[0]}' is there twice")
-    for number, line in lines[1:]:
+    return names, separator
+
+
+def _rows(
+    path: Path, lines: list[tuple[int, str]], names: list[str], separator: str
+) -> tuple[pd.DataFrame, Indices] | None:
+    """Rows of a table from its lines, and their numbers; None without any."""
+    for number, line in lines:
         fields = line.count(separator) + 1
         if fields != len(names) and '"' not in line:
             raise InputError(f"{path}, line {number}: has {fields} columns, the header has {len(names)}")
-    body = "\n".join(line for _, line in lines[1:])
-    if not body:
-        raise InputError(f"{path}: holds no row under its header")
-    with reading(path, "cannot be read as CSV"):
-        data = pd.read_csv(
-            io.StringIO(body), sep=separator, header=None, names=names, index_col=False,
-            skipinitialspace=True, float_precision="round_trip", low_memory=False,
-        )  # fmt: skip
-    if len(data) != len(lines) - 1:
+    if not lines:
+        return None
+    data = _parsed(path, io.StringIO("\n".join(line for _, line in lines)), names, separator)
+    if len(data) != len(lines):
         raise InputError(f"{path}: cannot be read as CSV (a quoted field goes over several lines)")
-    return Sheet(path, data, np.array([number for number, _ in lines[1:]]), "line")
+    return data, np.array([number for number, _ in lines])
+
+
+def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[pd.DataFrame, Indices] | None:
+    """The same of a block that every line of is a row; None where that has to be looked at."""
+    if len(names) == 1 or not block.plain or b"\n\t" in block.data or block.data[:1] == b"\t":
+        return None
+    if (block.count_of(separator.encode()) != len(names) - 1).any():
+        return None
+    data = _parsed(block.path, io.BytesIO(block.data), names, separator)
+    return (data, block.first + np.arange(block.count)) if len(data) == block.count else None
+
+
+def _parsed(path: Path, file: io.StringIO | io.BytesIO, names: list[str], separator: str) -> pd.DataFrame:
+    with reading(path, "cannot be read as CSV"):
+        return pd.read_csv(
+            file, sep=separator, header=None, names=names, index_col=False, skipinitialspace=True,
+            float_precision="round_trip", low_memory=False, dtype={"filter": str} if "filter" in names else None,
+        )  # fmt: skip
 
 
 def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
     """A text file of numbers, every line of the same one of the ``widths``, the first column increasing."""
-    numbered = read_text(path)
-    if not numbered:
+    values, line, width = list[Array](), list[Indices](), 0
+    for block in blocks(path):
+        found = block.numbers()
+        if found is None or found[0].shape[1] not in widths or width not in (0, found[0].shape[1]):
+            found = _number_rows(path, block.lines(), widths, width, layout)
+        if len(found[1]):
+            width = found[0].shape[1]
+            values.append(bounded(found[0]))
+            line.append(found[1])
+    if not values:
         raise InputError(f"{path}: is empty; each line should be {layout}")
-    rows: list[list[float]] = []
-    for number, line in numbered:
-        fields = line.replace(",", " ").split()
-        if len(fields) not in widths:
-            raise InputError(f"{path}, line {number}: has {len(fields)} columns; should be {layout}")
-        if rows and len(fields) != len(rows[0]):
-            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the lines before {len(rows[0])}")
-        try:
-            rows.append([float(field) for field in fields])
-        except ValueError:
-            raise InputError(
-                f"{path}, line {number}: not a number in '{line.strip()[:60]}'; should be {layout}"
-            ) from None
-    lines = Lines(path, bounded(np.array(rows)), np.array([number for number, _ in numbered]))
+    lines = Lines(path, np.concatenate(values), np.concatenate(line))
     wrong = np.flatnonzero(~np.isfinite(lines.t))
     if len(wrong):
         raise InputError(f"{lines.place(int(wrong[0]))}: the timestamp is not finite")
@@ -194,3 +223,24 @@ def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
         what = "is there twice" if lines.t[row] == lines.t[row - 1] else "is less than the one before"
         raise InputError(f"{lines.place(row)}: timestamp {lines.t[row]:.10g} {what}; they must increase")
     return lines
+
+
+def _number_rows(
+    path: Path, lines: list[tuple[int, str]], widths: Sequence[int], width: int, layout: str
+) -> tuple[Array, Indices]:
+    """The same of some lines, after lines of ``width`` columns if it is not 0; refused with the number of the line."""
+    rows: list[list[float]] = []
+    for number, line in lines:
+        fields = line.replace(",", " ").split()
+        if len(fields) not in widths:
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns; should be {layout}")
+        width = width or len(fields)
+        if len(fields) != width:
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the lines before {width}")
+        try:
+            rows.append([float(field) for field in fields])
+        except ValueError:
+            raise InputError(
+                f"{path}, line {number}: not a number in '{line.strip()[:60]}'; should be {layout}"
+            ) from None
+    return np.array(rows).reshape(len(rows), -1 if rows else 0), np.array([number for number, _ in lines], int)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,9 @@ from consistency.recording.sheet import Places
 from consistency.types import Array
 
 AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
+WHOLE = {"": range(6)}  # what is one recording, by what its name ends in
+BLOCKS = {" position": range(3), " rotation": range(3, 6)}  # their cross-covariance is not known
+SINGLE = {f" {axis}": range(i, i + 1) for i, axis in enumerate(AXES)}  # no covariance is
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
 
@@ -52,13 +55,17 @@ def require_axes(axes: Sequence[str] | None) -> None:
 
 
 def recordings_of(
-    source: Source, poses: Sequence[Poses], split: bool, time_offset: float | str | None, axes: Sequence[str] | None
+    source: Source,
+    poses: Sequence[Poses],
+    parts: Mapping[str, range],
+    time_offset: float | str | None,
+    axes: Sequence[str] | None,
 ) -> list[Recording]:
     """The recording of one estimator, each of whose runs is one of ``poses``; clocks and mix-ups are looked for.
 
     Parameters
     ----------
-    split : position and rotation are two recordings, as their cross-covariance is not known
+    parts : ``WHOLE``, ``BLOCKS`` or ``SINGLE``: components whose covariance is known, each of which is a recording
     time_offset, axes : as :func:`consistency.recording.read_recordings` has them
 
     Raises
@@ -74,21 +81,19 @@ def recordings_of(
     notes = [*_notes(source.path, matches, poses[0].max_dt), *clocks, *hints(source.path.name, AXES, poses, shift)]
     notes.append(f"error convention {kind}: {SPATIAL[kind]}{source.why}")
     judged = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
-    name = source.path.stem
-    parts = {name: judged}
-    if split:
-        parts = {f"{name} position": [i for i in judged if i < 3], f"{name} rotation": [i for i in judged if i >= 3]}
     recordings = []
-    for title, part in parts.items():
-        if part:
+    for title, whole in parts.items():
+        if part := [i for i in judged if i in whole]:
             some = [_part(track, part) for track in tracks]
-            names = tuple(AXES[i] for i in part)
-            recordings.append(assemble(title, some, t, names, str(source.covariance), kind, notes))
+            names, name = tuple(AXES[i] for i in part), f"{source.path.stem}{title}"
+            recordings.append(assemble(name, some, t, names, str(source.covariance), kind, notes))
             notes = []
     return recordings
 
 
 def _part(track: Track, part: list[int]) -> Track:
+    if len(part) == len(AXES):
+        return track
     assert track.error is not None
     assert track.covariance is not None
     return replace(track, error=track.error[:, part], covariance=track.covariance[:, part][:, :, part])
@@ -103,7 +108,8 @@ def _match(poses: Poses, path: Path | str, truth: Path | str, shift: float) -> M
     if not kept.any():
         raise InputError(f"{path}: no estimate has both a truth and a covariance within {poses.max_dt:g} s")
     rows = known.rows[kept]
-    error, P = poses.error_of(rows, known.truth[kept]), poses.covariance[rows]
+    error = poses.error_of(rows, known.truth[kept])
+    P = poses.covariance if len(rows) == len(poses.t) else poses.covariance[rows]
     doubts = _doubts(error, P, known.bend[kept])
     return Match(poses.place.at(rows), poses.t[rows], error, P, len(poses.t) - len(rows), *doubts)
 

@@ -13,6 +13,7 @@ from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
 from consistency.recording.hints import hints
 from consistency.recording.interpolation import Manifold, truth_at
+from consistency.recording.kitti import drive_sheet, is_drive
 from consistency.recording.offset import clock_shift
 from consistency.recording.poses import Poses
 from consistency.recording.record import (
@@ -42,6 +43,7 @@ def read_tables(
     state: Sequence[str] | None,
     max_dt: float | None,
     time_offset: float | str | None = None,
+    body: str | None = None,
 ) -> list[Recording]:
     """Recordings of the estimators in a table, one for each value of its column ``filter``.
 
@@ -53,7 +55,9 @@ def read_tables(
     sheet = read_sheet(estimates)
     axes = tuple(state) if state else POSE
     convention = _convention(convention, axes, truth)
-    other = read_sheet(truth) if truth is not None else None
+    other = None
+    if truth is not None:
+        other = drive_sheet(truth, body) if is_drive(truth) else read_sheet(truth)
     if other is None and not {"nis", "nis_dof"} <= set(sheet.data.columns):
         raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
     key = _key(sheet, other, max_dt, time_offset)

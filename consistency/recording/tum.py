@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import SPATIAL
+from consistency.recording.kitti import is_drive, read_drive
+from consistency.recording.openvins import FULL as STATES
+from consistency.recording.openvins import LAYOUT, States, as_states, read_deviations
 from consistency.recording.poses import Poses
 from consistency.recording.record import DEFAULT_DT, Recording, associate, symmetric
 from consistency.recording.sheet import Lines, Places, read_numbers
-from consistency.recording.spatial import Source, apart, recordings_of, require_axes
+from consistency.recording.spatial import BLOCKS, SINGLE, WHOLE, Source, apart, recordings_of, require_axes
 from consistency.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")
@@ -31,13 +34,15 @@ def read_tum(
     max_dt: float | None,
     time_offset: float | str | None = None,
     axes: Sequence[str] | None = None,
+    body: str | None = None,
 ) -> list[Recording]:
     """Recording of one estimator: a file, or a folder with a file for each run.
 
     With ``axes`` only these components of the error are judged, by their part of the covariance.
 
     With the 20 columns that the tools of OpenVINS write, position and rotation are two recordings: their
-    cross-covariance is not in the file, so a joint NEES would be wrong.
+    cross-covariance is not in the file, so a joint NEES would be wrong. With the states and standard deviations of a
+    simulation each component is one. The truth may be a drive of KITTI, whose ``body`` is meant.
     """
     if convention not in (None, *SPATIAL):
         raise InputError(f"--error {convention}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
@@ -47,47 +52,54 @@ def read_tum(
     if truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
     runs = _runs(estimates, truth, covariance)
-    trajectories = [read_trajectory(path) for path, _, _ in runs]
-    split = trajectories[0].values.shape[1] == SPLIT
-    if split and order == ORDERS[0]:
-        raise InputError(f"--covariance-order: {trajectories[0].path} has {SPLIT} columns, rotation before translation")
-    error_kind = convention or ("so3-body" if split else "so3")
-    poses = []
-    for (_, true_path, P_path), own in zip(runs, trajectories, strict=True):
-        if (own.values.shape[1] == SPLIT) != split:
-            raise InputError(f"{own.path}: has {own.values.shape[1]} columns, {trajectories[0].path} another layout")
-        poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt))
-    why = "" if convention else f"; the default of this layout, {_origin(split)}"
-    source = Source(
-        estimates,
-        [(own.path, true) for own, (_, true, _) in zip(trajectories, runs, strict=True)],
-        covariance or estimates,
-        why,
-    )
-    return recordings_of(source, poses, split, time_offset, axes)
+    parts: Mapping[str, range] = WHOLE
+    poses: list[Poses] = []
+    for path, true_path, P_path in runs:
+        own = read_trajectory(path)
+        if not poses:
+            parts = _parts(own)
+            error_kind = convention or ("so3" if parts is WHOLE else "so3-body")
+        if parts is not WHOLE and order == ORDERS[0]:
+            raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
+        if _parts(own) is not parts:
+            raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
+        poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt, body))
+    why = "" if convention else f"; the default of this layout, {_origin(parts)}"
+    source = Source(estimates, [(path, true) for path, true, _ in runs], covariance or estimates, why)
+    return recordings_of(source, poses, parts, time_offset, axes)
 
 
-def _origin(split: bool) -> str:
-    if split:
-        return "written by OpenVINS; --error so3 where it comes from another ROS topic"
-    return "as in ROS messages with a covariance; declare yours with --error"
+def _parts(own: Lines) -> Mapping[str, range]:
+    """Components whose covariance is known, by the layout of a file."""
+    if isinstance(own, States):
+        return SINGLE
+    return BLOCKS if own.values.shape[1] == SPLIT else WHOLE
+
+
+def _origin(parts: Mapping[str, range]) -> str:
+    if parts is WHOLE:
+        return "as in ROS messages with a covariance; declare yours with --error"
+    return "written by OpenVINS" + "; --error so3 where it comes from another ROS topic" * (parts is BLOCKS)
 
 
 def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
     """Files of every run: estimates, truth, covariance."""
     if not estimates.is_dir():
         for option, path in (("--truth", truth), ("--covariance", covariance)):
-            if path is not None and path.is_dir():
+            if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
                 raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
         return [(estimates, truth, covariance)]
     files = trajectory_files(estimates)
     if not files:
         raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json")
+    stems = [path.stem for path in files]
+    if twice := next((path for path in files if stems.count(path.stem) > 1), None):
+        raise InputError(f"{estimates}: holds the run '{twice.stem}' twice, as .txt and .tum; keep one of them")
     if covariance is not None and not covariance.is_dir():
         raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
     out = []
     for path in files:
-        own_truth = _same_stem(truth, path, "--truth") if truth.is_dir() else truth
+        own_truth = _same_stem(truth, path, "--truth") if truth.is_dir() and not is_drive(truth) else truth
         own_covariance = None if covariance is None else _same_stem(covariance, path, "--covariance")
         out.append((path, own_truth, own_covariance))
     return out
@@ -99,6 +111,8 @@ def trajectory_files(folder: Path) -> list[Path]:
 
 
 def _same_stem(folder: Path, path: Path, option: str) -> Path:
+    if is_drive(folder / path.stem):
+        return folder / path.stem
     matches = [other for other in trajectory_files(folder) if other.stem == path.stem]
     if not matches:
         raise InputError(f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum for {path}")
@@ -106,28 +120,38 @@ def _same_stem(folder: Path, path: Path, option: str) -> Path:
 
 
 def _poses(
-    own: Lines, truth_path: Path, covariance_path: Path | None, convention: str, order: str, max_dt: float | None
+    own: Lines,
+    truth_path: Path,
+    covariance_path: Path | None,
+    convention: str,
+    order: str,
+    max_dt: float | None,
+    body: str | None,
 ) -> Poses:
     """A run with its truth; the covariance is NaN where none is near."""
     tolerance = DEFAULT_DT if max_dt is None else max_dt
-    truth = read_trajectory(truth_path, true=True)
+    truth = read_drive(truth_path, body) if is_drive(truth_path) else read_trajectory(truth_path, true=True)
     covariance, source = _inline(own, order), own
     rows = picked = np.arange(len(own.t))
     if covariance_path is not None:
         if covariance is not None:
             raise InputError(f"--covariance {covariance_path}: {own.path} holds covariances already; give one of them")
-        source = read_covariances(covariance_path)
-        covariance = _matrices(source.values[:, 1:], order)
+        if isinstance(own, States):
+            source, covariance = read_deviations(covariance_path)
+        else:
+            source = read_covariances(covariance_path)
+            covariance = _matrices(source.values[:, 1:], order)
         rows, picked = _pairs(own, source, tolerance, "covariance")
     if covariance is None:
-        raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, lines of t and {FULL} numbers")
+        of = f"the standard deviations of {LAYOUT}" if isinstance(own, States) else f"lines of t and {FULL} numbers"
+        raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
     P = np.full((len(own.t), 6, 6), np.nan)
-    P[rows] = symmetric(covariance[picked], lambda row: source.place(int(picked[row])))
+    P[rows] = symmetric(covariance if source is own else covariance[picked], lambda row: source.place(int(picked[row])))
     with_P = np.zeros(len(own.t), bool)
     with_P[rows] = True
-    place = Places(own.place, np.arange(len(own.t)))
-    estimate = own.values[:, 1:8]
-    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:8], "spatial", convention, tolerance)
+    own = own.of(slice(0, POSE))
+    place, estimate = Places(own.place, np.arange(len(own.t))), own.values[:, 1:]
+    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance)
 
 
 def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indices, Indices]:
@@ -143,7 +167,14 @@ def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indic
 def read_trajectory(path: Path, true: bool = False) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
     widths = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
-    lines = read_numbers(path, widths, f"t tx ty tz qx qy qz qw ({', '.join(map(str, widths))} columns)")
+    layout = f"t tx ty tz qx qy qz qw ({', '.join(map(str, widths))} columns)"
+    lines = read_numbers(path, (*widths, *STATES), layout)
+    columns = "5 to 8"
+    if lines.values.shape[1] not in widths:
+        states = as_states(lines)
+        if states is None:
+            raise InputError(f"{lines.place(0)}: has {lines.values.shape[1]} columns; should be {layout}")
+        lines, columns = states, "2 to 5"
     pose = lines.values[:, 1:8]
     if true and not np.isfinite(pose).all():
         row = int(np.flatnonzero(~np.isfinite(pose).all(axis=1))[0])
@@ -153,8 +184,8 @@ def read_trajectory(path: Path, true: bool = False) -> Lines:
     if len(bad):
         row = int(bad[0])
         raise InputError(
-            f"{lines.place(row)}: the quaternion has length {length[row]:.4g}, not 1; columns 5 to 8 must be "
-            "qx qy qz qw"
+            f"{lines.place(row)}: the quaternion has length {length[row]:.4g}, not 1; columns {columns} must "
+            "be qx qy qz qw"
         )
     return lines
 

@@ -26,6 +26,7 @@ from consistency.store.journal import Journal
 from consistency.store.log import Log, write_log
 from consistency.store.results import Results, StoredResults, Tables
 from consistency.store.storage import manifest_of, require_free
+from consistency.store.tables import require_format
 
 
 # fmt: off
@@ -203,9 +204,12 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
     return instances
 
 
-def simulate_log(scenario: Scenario, runs: int, seed: int, out: Path, overwrite: bool = False) -> None:
-    """Write ``runs`` simulated trials as a log folder; raises as :func:`run_trials`."""
+def simulate_log(
+    scenario: Scenario, runs: int, seed: int, out: Path, overwrite: bool = False, form: str = "parquet"
+) -> None:
+    """Write ``runs`` simulated trials as a log folder, in Parquet or as CSV; raises as :func:`run_trials`."""
     _require_counts(runs, seed)
+    require_format(form)
     world = require_landmarks_in_view(scenario)
     require_free(out, overwrite, "log")
     started = time.monotonic()
@@ -214,7 +218,7 @@ def simulate_log(scenario: Scenario, runs: int, seed: int, out: Path, overwrite:
     manifest |= _scenario_entry(scenario) | {"failures": 0}
     sensor = scenario.truth.sensor
     view = None if sensor.image is None else (sensor.image, sensor.centre)
-    write_log(out, trials, scenario.belief, _landmarks_table(scenario), manifest, overwrite, view)
+    write_log(out, trials, scenario.belief, _landmarks_table(scenario), manifest, overwrite, view, form=form)
 
 
 def _require_counts(runs: int, seed: int) -> None:

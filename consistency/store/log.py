@@ -26,9 +26,10 @@ from consistency.scenario import (
     read_table,
 )
 from consistency.scenario.tables import SIGMA_UNITS
-from consistency.store.parquet import COLUMNS, read_parquet, require_table
+from consistency.store.parquet import COLUMNS
 from consistency.store.results import POSE, controls_table, observations_table, truth_of
 from consistency.store.storage import write_folder
+from consistency.store.tables import read_table_file, require_format, table_file
 from consistency.types import Array, Indices, Trial
 
 STRAY = 0.05  # share of pixels that gross errors may put outside the image; other units put more there
@@ -66,8 +67,8 @@ class Log:
 def read_log(folder: str | Path) -> Log:
     """Read a log folder.
 
-    ``controls.parquet``, ``observations.parquet`` and ``sensor.toml`` are needed, ``truth.parquet`` and
-    ``landmarks.parquet`` are optional. A folder of ``consistency simulate`` is a log.
+    ``controls``, ``observations`` (.parquet or .csv) and ``sensor.toml`` are needed, ``truth`` and ``landmarks``
+    (likewise) are optional. A folder of ``consistency simulate`` is a log.
 
     Raises
     ------
@@ -86,9 +87,9 @@ def read_log(folder: str | Path) -> Log:
     if sensor.motion is None:
         raise InputError(f"{path}: key 'motion': missing; give sigma_v and sigma_omega of the odometry")
     belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points, guard=sensor.guard)
-    controls, observations = read_parquet(folder, "controls"), _observations(folder, sensor)
+    controls, observations = read_table_file(folder, "controls"), _observations(folder, sensor)
     tables = {
-        name: read_parquet(folder, name) if (folder / f"{name}.parquet").exists() else None
+        name: read_table_file(folder, name) if table_file(folder, name).exists() else None
         for name in ("truth", "landmarks")
     }
     _check(folder, controls, observations, belief)
@@ -103,7 +104,8 @@ def read_log(folder: str | Path) -> Log:
         _trial(folder, run, of_controls(run), of_observations(run), names, of_truth and of_truth(run), start, positions)
         for run in sorted({int(run) for run in controls["run"]})
     ]
-    files = [path, *sorted(folder.glob("*.parquet"))]
+    texts = [file for file in folder.glob("*.csv") if file.stem in COLUMNS]
+    files = [path, *sorted([*folder.glob("*.parquet"), *texts])]
     with reading(folder):
         digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
     return Log(str(folder), trials, belief, tables["landmarks"], digests)
@@ -118,11 +120,18 @@ def write_log(
     overwrite: bool = False,
     view: View | None = None,
     files: Mapping[str, str] = MappingProxyType({}),
+    form: str = "parquet",
 ) -> None:
     """Write trials as a log folder, whole or not at all.
 
-    ``view`` is image size and principal point in px, ``files`` are other texts by name.
+    ``view`` is image size and principal point in px, ``files`` are other texts by name, ``form`` is one of ``FORMATS``.
+
+    Raises
+    ------
+    InputError
+        Another ``form``; the folder is there already or cannot be written.
     """
+    require_format(form)
     tables = {"controls": controls_table(trials), "observations": observations_table(trials)}
     if trials[0].truth is not None:
         tables["truth"] = truth_of(trials)
@@ -133,8 +142,11 @@ def write_log(
     def contents(at: Path) -> None:
         for name, text in texts.items():
             _write_text(at / name, text)
+        if form == "csv":
+            for name, table in tables.items():
+                table.to_csv(at / f"{name}.csv", index=False)
 
-    write_folder(folder, tables, manifest, contents, overwrite)
+    write_folder(folder, tables if form == "parquet" else {}, manifest, contents, overwrite)
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -162,13 +174,12 @@ def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, o
 def _observations(folder: Path, sensor: SensorFile) -> pd.DataFrame:
     """``observations.parquet`` with as many values in a row as the sensor measures."""
     values = [f"z{i}" for i in range(sensor.size)]
-    require_table(folder, "observations", [*COLUMNS["observations"], *values[2:]])
-    table = read_parquet(folder, "observations")
+    table = read_table_file(folder, "observations", values[2:])
     return table if sensor.size == 3 else table.drop(columns="z2", errors="ignore")
 
 
 def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, belief: Belief) -> None:
-    path = folder / "controls.parquet"
+    path = table_file(folder, "controls")
     if controls.empty:
         raise InputError(f"{path}: holds no control; at least one step is needed")
     for run, part in controls.groupby("run"):
@@ -177,7 +188,7 @@ def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, bel
     if (controls["dt"] <= 0).any():
         row = int(np.flatnonzero(controls["dt"] <= 0)[0])
         raise InputError(f"{path}: column 'dt', row {row}: must be positive")
-    path = folder / "observations.parquet"
+    path = table_file(folder, "observations")
     if observations.empty:
         raise InputError(f"{path}: holds no observation; no landmark was ever in view")
     twice = observations.duplicated(["run", "step", "landmark"])
@@ -186,7 +197,8 @@ def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, bel
     known = pd.MultiIndex.from_frame(controls[["run", "step"]])
     stray = ~pd.MultiIndex.from_frame(observations[["run", "step"]]).isin(known)
     if stray.any():
-        raise InputError(f"{path}: row {int(np.flatnonzero(stray)[0])}: controls.parquet has no such run and step")
+        controls_file = table_file(folder, "controls").name
+        raise InputError(f"{path}: row {int(np.flatnonzero(stray)[0])}: {controls_file} has no such run and step")
     if belief.sensor.model == "uvd" and (observations["z2"] <= 0).any():
         row = int(np.flatnonzero(observations["z2"] <= 0)[0])
         raise InputError(f"{path}: column 'z2', row {row}: a disparity must be positive")
@@ -203,7 +215,7 @@ def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) 
             row = int(np.flatnonzero(outside)[0])
             value = observations[column].iloc[row]
             raise InputError(
-                f"{folder / 'observations.parquet'}: column '{column}', row {row}: {value:.1f} px "
+                f"{table_file(folder, 'observations')}: column '{column}', row {row}: {value:.1f} px "
                 "is outside the image of sensor.toml; u and v must be relative to the principal point"
             )
 
@@ -228,7 +240,7 @@ def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | N
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])
         raise InputError(
-            f"{folder / 'observations.parquet'}: row {row}: beside a column 'source' landmarks are numbered from 0, "
+            f"{table_file(folder, 'observations')}: row {row}: beside a column 'source' landmarks are numbered from 0, "
             "and a source is one of them or -1"
         )
     source = np.unique(observations["source"])
@@ -240,13 +252,13 @@ def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | N
 def _require_landmarks_only(folder: Path, names: _Names, belief: Belief) -> None:
     if belief.sensor.model == "linear" and len(names.things):
         raise InputError(
-            f"{folder / 'observations.parquet'}: column 'landmark': {names.things[0]} is no landmark, and a linear "
+            f"{table_file(folder, 'observations')}: column 'landmark': {names.things[0]} is no landmark, and a linear "
             "world needs one that it is linearised about"
         )
 
 
 def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, belief: Belief) -> Array | None:
-    path = folder / "landmarks.parquet"
+    path = table_file(folder, "landmarks")
     if landmarks is None:
         if belief.sensor.model == "linear":
             raise InputError(f"{path}: missing; a linear world needs the landmarks it is linearised about")
@@ -279,7 +291,7 @@ def _trial(
     steps, path = len(controls), None
     if truth is not None:
         if not np.array_equal(truth["step"], np.arange(steps + 1)):
-            raise InputError(f"{folder / 'truth.parquet'}: run {run} must have the steps 0 to {steps}, each once")
+            raise InputError(f"{table_file(folder, 'truth')}: run {run} must have the steps 0 to {steps}, each once")
         path = truth[POSE].to_numpy(float)
     if start is None:
         start = path[0] if path is not None else np.zeros(3)

@@ -162,7 +162,7 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
         if kind == "str":
             _require_text(path, read.column(column))
         else:
-            _check_column(path, table[column], kind)
+            check_column(path, table[column], kind)
     with reading(path):
         checked: pd.DataFrame = table.astype(dtypes)
     return checked
@@ -184,7 +184,7 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
                 table = {column: batch.column(column).to_pandas() for column in columns}
                 for column, values in table.items():
                     values.name = column
-                    _check_column(path, values, dtypes[column], first)
+                    check_column(path, values, dtypes[column], first)
                 mask: Any = slice(None)
                 if filter_name is not None:
                     _require_text(path, batch.column("filter"), first)
@@ -270,7 +270,7 @@ def _require_text(path: Path, names: Any, first: int = 0) -> None:
         raise InputError(f"{path}: a column of text, row {row}: nothing there")
 
 
-def _check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
+def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
     """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
     with reading(path, f"column '{column.name}' cannot be read as numbers"):
         if column.dtype.kind in "bmMc":

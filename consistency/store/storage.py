@@ -30,6 +30,7 @@ from consistency.store.parquet import COLUMNS, require_table, write_table
 from consistency.store.stopping import undisturbed
 
 SCHEMA_VERSION = 1
+TABLES = (".parquet", ".csv")  # the latter of logs alone
 PACKAGES = (
     "filter-consistency", "numpy", "scipy", "numba", "filterpy", "pandas", "pyarrow", "joblib", "bokeh", "matplotlib",
     "typst",
@@ -186,7 +187,7 @@ class NewFolder:
             The place was taken meanwhile; the folder then stands beside it, by the name that is said. The system
             refuses.
         """
-        tables = sorted(path.stem for path in self.path.glob("*.parquet") if path.stem in COLUMNS)
+        tables = sorted(COLUMNS.keys() & {file.stem for file in self.path.iterdir() if file.suffix in TABLES})
         with self.writing():
             manifest = manifest | {"tables": tables}
             if self.kind == "results":

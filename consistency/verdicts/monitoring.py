@@ -13,6 +13,7 @@ import numpy as np
 from consistency.diagnostics import Alarm, Monitor
 from consistency.errors import InputError
 from consistency.recording.nis import NisLog, checked_dof, choose, read_nis, stream_nis
+from consistency.recording.ulog import SUFFIX, read_ulog
 from consistency.store.results import open_results
 from consistency.types import Array
 
@@ -59,11 +60,15 @@ def make_monitor(innovations: str | None, **options: Any) -> Monitor:
 def read_innovations(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
     """The innovations of one run from a file, or from a folder of ``consistency run``.
 
+    Of a PX4 flight log (.ulg), ``filter_name`` is the sensor, and ``run`` the instance of the EKF2.
+
     Raises
     ------
     InputError
         Something cannot be used, or there are several filters or runs and none is named.
     """
+    if path.suffix.lower() == SUFFIX:
+        return read_ulog(path, filter_name, run)
     return _of_results(path, filter_name, run) if path.is_dir() else read_nis(path, filter_name, run)
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def flat(v: Verdict) -> dict[str, Any]:
     """Every number of a verdict under one name each; parts that could not be looked at are left out."""
     s: dict[str, Any] = {
-        "runs": v.runs, "steps": v.steps, "false_alarm": v.settings.false_alarm,
+        "runs": v.runs, "steps": v.steps, "unit": v.unit, "false_alarm": v.settings.false_alarm,
         "confidence": 1.0 - v.settings.false_alarm, "detect": v.settings.detect, "power": v.settings.power,
         "tolerance": v.settings.tolerance, "allow": v.settings.allow,
         "failures": [[f.run, f.step, f.reason] for f in v.failures],
@@ -155,7 +155,7 @@ def _joint(v: Verdict) -> dict[str, Any]:
 
 def figures(v: Verdict) -> list[tuple[str, str]]:
     """The numbers that matter, with their names."""
-    rows = [("evidence", f"{plural(v.runs, 'run')} of {plural(v.steps, v.places[:-1])}")]
+    rows = [("evidence", f"{plural(v.runs, v.unit)} of {plural(v.steps, v.places[:-1])}")]
     if v.scale is not None and v.scale.judged_steps:
         s, shown = v.scale, v.scale.equivalence
         low, high = s.accepted
@@ -180,7 +180,7 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("map NEES / 3", f"{map_text(v.map)}, after the last step{_map_status(v.map)}"))
     if v.rejection is not None:
         rows.append(("rejected", rejection_text(v.rejection)))
-    rows.append(("failed runs", f"{len({f.run for f in v.failures})} of {v.runs}"))
+    rows.append((f"failed {v.unit}s", f"{len({f.run for f in v.failures})} of {v.runs}"))
     faults = [
         f"{question_text(v, a.question)} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated
     ]

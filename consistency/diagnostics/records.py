@@ -70,6 +70,7 @@ class Evidence:
     run_numbers: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
+    unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
 
 
 @dataclass(frozen=True)
@@ -324,6 +325,7 @@ class Verdict:
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
     joint: JointScore | None = None  # of the verdict on a map
     rejection: RejectionScore | None = None  # of a filter with a guard
+    unit: str = "run"  # what a run is called, as in :class:`Evidence`
 
     @property
     def in_world(self) -> Verdict:

@@ -90,6 +90,9 @@ def read(
     axes: Sequence[str] | None = None,
     topic: str | None = None,
     truth_topic: str | None = None,
+    relative: str | float | None = None,
+    motions: bool = False,
+    windows: str | None = None,
     filter: str | None = None,
 ) -> Record:
     """Files of another estimator, as ``consistency analyse FILES`` reads them; docs/files.md has the forms.
@@ -106,6 +109,9 @@ def read(
     time_offset : s to add to the timestamps of the estimates, or "estimate"
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw
     topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
+    relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m")
+    motions : with ``relative``: each row is a motion with a covariance of its own, not a pose
+    windows : "independent": errors of different windows are, so that each is a run
     filter : which estimator, where the files hold several
 
     Raises
@@ -125,6 +131,9 @@ def read(
         axes=axes,
         topic=topic,
         truth_topic=truth_topic,
+        relative=relative,
+        motions=motions,
+        windows=windows,
     )
     named = {recording.name: recording for recording in found}
     if filter is None and len(named) > 1:

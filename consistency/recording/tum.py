@@ -13,11 +13,13 @@ from consistency.recording.poses import Poses
 from consistency.recording.record import DEFAULT_DT, Recording, associate, symmetric
 from consistency.recording.sheet import Lines, Places, read_numbers
 from consistency.recording.spatial import Source, apart, recordings_of, require_axes
+from consistency.recording.windows import Relative
 from consistency.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
 FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
+BOTH = 2 * FULL  # and a cross-covariance with the line before
 UNIT = 1e-3  # quaternions of four decimals pass
 SUFFIXES = (".txt", ".tum")
 
@@ -31,6 +33,7 @@ def read_tum(
     max_dt: float | None,
     time_offset: float | str | None = None,
     axes: Sequence[str] | None = None,
+    relative: Relative | None = None,
 ) -> list[Recording]:
     """Recording of one estimator: a file, or a folder with a file for each run.
 
@@ -64,7 +67,7 @@ def read_tum(
         covariance or estimates,
         why,
     )
-    return recordings_of(source, poses, split, time_offset, axes)
+    return recordings_of(source, poses, split, time_offset, axes, relative)
 
 
 def _origin(split: bool) -> str:
@@ -111,14 +114,16 @@ def _poses(
     """A run with its truth; the covariance is NaN where none is near."""
     tolerance = DEFAULT_DT if max_dt is None else max_dt
     truth = read_trajectory(truth_path, true=True)
-    covariance, source = _inline(own, order), own
+    covariance, source, cross = _inline(own, order), own, None
     rows = picked = np.arange(len(own.t))
     if covariance_path is not None:
         if covariance is not None:
             raise InputError(f"--covariance {covariance_path}: {own.path} holds covariances already; give one of them")
         source = read_covariances(covariance_path)
-        covariance = _matrices(source.values[:, 1:], order)
+        covariance = _matrices(source.values[:, 1 : 1 + FULL], order)
         rows, picked = _pairs(own, source, tolerance, "covariance")
+        if source.values.shape[1] == 1 + BOTH:
+            cross = _cross(own, source, rows, picked, order)
     if covariance is None:
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, lines of t and {FULL} numbers")
     P = np.full((len(own.t), 6, 6), np.nan)
@@ -127,7 +132,19 @@ def _poses(
     with_P[rows] = True
     place = Places(own.place, np.arange(len(own.t)))
     estimate = own.values[:, 1:8]
-    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:8], "spatial", convention, tolerance)
+    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:8], "spatial", convention, tolerance, cross)
+
+
+def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:
+    """Cross-covariances with the line before, on the rows of ``own``, (N, 6, 6)."""
+    if len(gap := np.flatnonzero(np.diff(picked) != 1)):
+        raise InputError(
+            f"{source.place(int(picked[gap[0]]) + 1)}: no pose of {own.path} has this time, but the cross-covariance of "
+            "the next line is with this one; give each line its pose"
+        )
+    out = np.full((len(own.t), 6, 6), np.nan)
+    out[rows] = _matrices(source.values[picked, 1 + FULL :], order)
+    return out
 
 
 def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indices, Indices]:
@@ -160,8 +177,12 @@ def read_trajectory(path: Path, true: bool = False) -> Lines:
 
 
 def read_covariances(path: Path) -> Lines:
-    """A file of covariances: t, then 36 numbers row by row, or the 21 of the upper triangle."""
-    return read_numbers(path, (1 + TRIANGLE, 1 + FULL), f"t and {FULL} numbers, or t and {TRIANGLE}")
+    """A file of covariances: t, then 36 numbers row by row, or the 21 of the upper triangle.
+
+    72 numbers are the 36 and the cross-covariance E e_before e' with the line before, row by row.
+    """
+    widths, layout = (1 + TRIANGLE, 1 + FULL, 1 + BOTH), f"t and {FULL} numbers, or t and {TRIANGLE}, or t and {BOTH}"
+    return read_numbers(path, widths, layout)
 
 
 def _inline(own: Lines, order: str) -> Array | None:

@@ -253,10 +253,13 @@ def analyse_recordings(
         if name not in named:
             raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
         r = named[name]
-        evidence = Evidence(
-            name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
-            failures=r.failures, axes=r.axes, run_numbers=r.runs,
-        )  # fmt: skip
+        if r.independent:
+            evidence = _evidence_of_windows(r)
+        else:
+            evidence = Evidence(
+                name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
+                failures=r.failures, axes=r.axes, run_numbers=r.runs,
+            )  # fmt: skip
         verdicts[name] = replace(
             judge(evidence, settings),
             convention=r.convention or None,
@@ -264,6 +267,24 @@ def analyse_recordings(
             left_out_steps=tuple(r.left_out_steps),
         )
     return verdicts
+
+
+def _evidence_of_windows(r: Recording) -> Evidence:
+    """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
+    assert r.error is not None
+    assert r.covariance is not None
+    assert r.nees is not None
+    runs, steps = r.error.shape[:2]
+    there = np.isfinite(r.nees)
+    number = np.arange(1, runs * steps + 1).reshape(runs, steps)
+    failures = [(int(np.flatnonzero(r.runs == f.run)[0]), f) for f in r.failures]
+    for row, f in failures:
+        there[row, f.step - 1] = True
+    return Evidence(
+        r.name, r.error[there][:, None], r.covariance[there][:, None], r.nees[there][:, None], r.dof,
+        failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures), axes=r.axes,
+        run_numbers=number[there], unit="window",
+    )  # fmt: skip
 
 
 def plan(

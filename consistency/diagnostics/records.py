@@ -150,6 +150,17 @@ class Equivalence:
 
 
 @dataclass(frozen=True)
+class Within:
+    """What a single run says of the scale, if errors go on to decorrelate as within it; reported, not judged."""
+
+    ratio: Interval  # of true to stated covariance, 95 %
+    correlation: float  # time over which the NEES decorrelates, in steps
+    effective_dof: float  # of the run: its mean NEES spreads as chi-square(nu) / nu
+    steps: int | None  # in all, that would probably decide as ``pieces`` runs; None where it is not known
+    pieces: int | None
+
+
+@dataclass(frozen=True)
 class Scale:
     """Size of the errors against the stated covariance; T steps."""
 
@@ -166,6 +177,7 @@ class Scale:
     worst_run: float
     share_inside: float  # of steps inside ``band``
     equivalence: Equivalence
+    within: Within | None = None  # of a single run whose errors decorrelate
 
     @property
     def judged_steps(self) -> int:

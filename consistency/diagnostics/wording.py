@@ -16,6 +16,7 @@ VISIBLE = 0.05  # difference of correlations that is worth a word
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 MUCH = 100_000  # runs; more are no advice
 MOST = 3  # axes that a sentence names with their figures
+MOST_STEPS = 10_000_000  # of a log; more are no advice
 TINY = 1e-12  # ratio of an error that is rounding
 
 Faults = Mapping[str, Answer]
@@ -29,7 +30,7 @@ def reasons(v: Verdict) -> list[str]:
     lines: list[str] = []
     if judged:
         assert v.scale is not None
-        lines = [_sentence(v, faults), *_level(v), *_together(v), *_coverage(v)]
+        lines = [_sentence(v, faults), *_level(v), *_within_one(v), *_together(v), *_coverage(v)]
     elif v.scale is not None:
         lines = ["no step has a covariance of full rank to judge"]
     elif v.innovations is not None and v.innovations.dof:
@@ -291,6 +292,24 @@ def _level(v: Verdict) -> list[str]:
             f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"
         )
     return lines
+
+
+def _within_one(v: Verdict) -> list[str]:
+    """How far a single run is off, and what would decide."""
+    assert v.scale is not None
+    if v.runs != 1 or v.landmarks is not None or v.unit != "run":
+        return []
+    if (w := v.scale.within) is None:
+        return ["the log is too short to show how its errors decorrelate; further runs, or a far longer log, would decide"]
+    text = (
+        f"if errors go on to decorrelate as within this log (over {short(w.correlation)} steps), the covariance ratio is "
+        f"{plain(w.ratio)}, reported and not judged"
+    )
+    if w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
+        return [text]
+    if w.steps <= v.scale.judged_steps:
+        return [f"{text}; cut into {w.pieces} runs, this log would then probably decide"]
+    return [f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"]
 
 
 def _joint_scale(joint: JointScore) -> str:

@@ -47,7 +47,7 @@ class Record(Recording):
         return _drawn(record_sheet(self), path)
 
     def __repr__(self) -> str:
-        size = f"{plural(len(self.runs), 'run')} x {plural(len(self.t), 'step')}"
+        size = f"{plural(len(self.runs), 'run')} x {plural(len(self.t), 'step' if self.window is None else 'window')}"
         return f"<Record {self.name}: {size}, error {self.convention or '-'} of {', '.join(self.axes)}>"
 
     def _repr_html_(self) -> str:

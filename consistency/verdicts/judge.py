@@ -33,6 +33,7 @@ from consistency.types import Array, Indices
 from consistency.verdicts.curves import Curves, Ends, Landmarks, curves, landmarks_of, run_means, steps_of
 
 POINT = ("x", "y", "z")
+POSES = {"heading", "yaw", "pitch", "roll"}  # what a pose has beside its position
 OPTION = {
     "ratio": "detect",
     "false_alarm": "false-alarm",
@@ -260,13 +261,25 @@ def analyse_recordings(
                 name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
                 failures=r.failures, axes=r.axes, run_numbers=r.runs,
             )  # fmt: skip
+        verdict = judge(evidence, settings)
         verdicts[name] = replace(
-            judge(evidence, settings),
+            verdict,
+            reasons=(*verdict.reasons, *_other_ways(verdict, r)),
             convention=r.convention or None,
             notes=tuple(r.notes),
             left_out_steps=tuple(r.left_out_steps),
         )
     return verdicts
+
+
+def _other_ways(verdict: Verdict, r: Recording) -> list[str]:
+    """What else would decide on a single log of poses."""
+    if verdict.status != "undecided" or len(r.runs) != 1 or r.window is not None or not (r.convention and POSES & set(r.axes)):
+        return []
+    return [
+        "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances or "
+        "cross-covariances (docs/files.md)"
+    ]
 
 
 def _evidence_of_windows(r: Recording) -> Evidence:

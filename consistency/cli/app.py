@@ -293,7 +293,9 @@ def analyse(
     relative: Annotated[
         str | None,
         typer.Option(
-            "--relative", metavar="N|Ns|Nm", help="Judge motions over windows of N steps, seconds (10s) or metres (50m)."
+            "--relative",
+            metavar="N|Ns|Nm",
+            help="Judge motions over windows: N steps, seconds (10s), metres (50m).",
         ),
     ] = None,
     motions: Annotated[

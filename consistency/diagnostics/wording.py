@@ -96,7 +96,8 @@ def _failures(v: Verdict) -> list[str]:
     lines = []
     if v.failures:
         first, count = v.failures[0], len({f.run for f in v.failures})
-        lines.append(f"{count} of {v.runs} {v.unit}s failed, first {v.unit} {first.run} in step {first.step}: {first.reason}")
+        where = f"{v.unit} {first.run}" + f" in step {first.step}" * (v.unit == "run")
+        lines.append(f"{count} of {v.runs} {v.unit}s failed, first {where}: {first.reason}")
     if v.impossible:
         row, step = v.impossible[0]
         count = len({r for r, _ in v.impossible})
@@ -300,10 +301,12 @@ def _within_one(v: Verdict) -> list[str]:
     if v.runs != 1 or v.landmarks is not None or v.unit != "run":
         return []
     if (w := v.scale.within) is None:
-        return ["the log is too short to show how its errors decorrelate; further runs, or a far longer log, would decide"]
+        return [
+            "the log is too short to show how its errors decorrelate; further runs, or a far longer log, would decide"
+        ]
     text = (
-        f"if errors go on to decorrelate as within this log (over {short(w.correlation)} steps), the covariance ratio is "
-        f"{plain(w.ratio)}, reported and not judged"
+        f"if errors go on to decorrelate as within this log (over {short(w.correlation)} steps), the covariance ratio "
+        f"is {plain(w.ratio)}, reported and not judged"
     )
     if w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
         return [text]

@@ -13,7 +13,7 @@ from consistency.types import Array
 
 
 def matrices(pose: Array) -> Array:
-    """Homogeneous matrices (N, d + 1, d + 1) of poses (x, y, heading) or (x, y, z, qx, qy, qz, qw), (N, 3) or (N, 7)."""
+    """Homogeneous matrices (N, d + 1, d + 1) of poses x, y, heading (N, 3) or x, y, z, qx, qy, qz, qw (N, 7)."""
     pose = np.asarray(pose, float)
     d = 2 if pose.shape[1] == 3 else 3
     out = np.zeros((len(pose), d + 1, d + 1))

@@ -88,8 +88,7 @@ def read_recordings(
         named in the notes
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw; None is all
     topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
-
-    relative : errors of motions over windows of so many steps (100), seconds ("10s") or metres ("50m") in place of poses
+    relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m") in place of poses
     motions : with ``relative``: each row is the motion since the row before, and errors of motions are independent
     windows : "independent": errors of different windows are; with motions they are anyway
 

@@ -50,7 +50,6 @@ class Stretch:
         return 2 if self.covariance.shape[-1] == 3 else 3
 
 
-
 @dataclass(frozen=True)
 class Windows:
     """The windows of one run, W of them."""
@@ -80,25 +79,23 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
         raise InputError(f"{s.file}: --relative: {MARGINAL}")
     first, last, left_out = windows(s.t, s.truth[:, : s.d], s.rows, relative, s.file)
     sound = _sound(s, relative)
-    good = last < sound
-    if not good.all():  # the first window with a broken row ends the run
-        first, last, good = (each[: int(np.argmin(good)) + 1] for each in (first, last, good))
-    T = _poses(s, sound, relative)
-    i, j = first[good], last[good]
-    error, covariance = (np.full((len(good), *s.covariance.shape[k:]), np.nan) for k in (2, 1))
-    if not good.all() and np.isfinite(s.estimate[sound]).all():
-        error[~good] = 0.0  # it is the covariance that is not finite
-    true = matrices(s.truth)
-    k, m = np.searchsorted(s.rows, i), np.searchsorted(s.rows, j)
-    D, M = inverse(T[i]) @ T[j], inverse(true[k]) @ true[m]
-    error[good] = log(inverse(D) @ M)
-    covariance[good] = _of_motions(s, T, i, j) if relative.motions else _of_poses(s, T, D, i, j, relative)
-    return Windows(s.run, s.place.at(np.minimum(last, sound)), s.t[last], error, covariance, left_out)
+    first, last = first[last < sound], last[last < sound]
+    T, true = _poses(s, sound, relative), matrices(s.truth)
+    start, end = np.searchsorted(s.rows, first), np.searchsorted(s.rows, last)
+    D, M = inverse(T[first]) @ T[last], inverse(true[start]) @ true[end]
+    error = log(inverse(D) @ M)
+    covariance = _of_motions(s, T, first, last) if relative.motions else _of_poses(s, T, D, first, last, relative)
+    if sound < len(s.t):  # a broken row ends the run, in a window of its own
+        finite = np.isfinite(s.estimate[sound]).all()
+        last = np.append(last, sound)
+        error = np.concatenate([error, np.full((1, error.shape[1]), 0.0 if finite else np.nan)])
+        covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
+    return Windows(s.run, s.place.at(last), s.t[last], error, covariance, left_out)
 
 
 def _sound(s: Stretch, relative: Relative) -> int:
     """The first row that is broken; the first row of motions is only where they start."""
-    ok = np.isfinite(s.estimate).all(axis=1) & np.isfinite(s.covariance).all(axis=(1, 2))
+    ok: Array = np.asarray(np.isfinite(s.estimate).all(axis=1) & np.isfinite(s.covariance).all(axis=(1, 2)))
     if s.cross is not None:
         ok[1:] &= np.isfinite(s.cross[1:]).all(axis=(1, 2))
     if relative.motions:
@@ -131,8 +128,9 @@ def _of_poses(s: Stretch, T: Array, D: Array, first: Indices, last: Indices, rel
     assert s.cross is not None
     if (wide := np.flatnonzero(last - first != 1)).size:
         raise InputError(
-            f"{s.place[int(last[wide[0]])]}: --relative {relative.option}: the window spans {last[wide[0]] - first[wide[0]]}"
-            " rows, but a cross-covariance reaches one row back; keep one row for each end of a window, or --relative 1"
+            f"{s.place[int(last[wide[0]])]}: --relative {relative.option}: the window spans "
+            f"{(last - first)[wide[0]]} rows, but a cross-covariance reaches one row back; keep only the rows at the "
+            "ends of windows, or take --relative 1"
         )
     start, end = to_left(T[first], s.convention), to_left(T[last], s.convention)
     J = np.concatenate([-adjoint(inverse(D)) @ start, end], axis=-1)
@@ -182,7 +180,7 @@ def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention:
     ]
     if relative.independent:
         notes.append(
-            f"{name}: errors of different {_whose(relative)} are declared to be independent, so that each window is a run"
+            f"{name}: errors of different {_whose(relative)} are declared to be independent: each window is a run"
         )
         notes += _doubt(name, found, relative)
     else:

@@ -130,7 +130,9 @@ def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift:
     if relative.motions:
         bare = np.flatnonzero(~poses.stated[1:])
         if bare.size:
-            raise InputError(f"{poses.place[int(bare[0]) + 1]}: this motion has no covariance within {poses.max_dt:g} s")
+            raise InputError(
+                f"{poses.place[int(bare[0]) + 1]}: this motion has no covariance within {poses.max_dt:g} s"
+            )
     elif poses.cross is not None:
         rows = rows[poses.stated]
     t = poses.t[rows] + shift

@@ -132,15 +132,17 @@ def _poses(
     with_P[rows] = True
     place = Places(own.place, np.arange(len(own.t)))
     estimate = own.values[:, 1:8]
-    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:8], "spatial", convention, tolerance, cross)
+    return Poses(
+        place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:8], "spatial", convention, tolerance, cross
+    )
 
 
 def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:
     """Cross-covariances with the line before, on the rows of ``own``, (N, 6, 6)."""
     if len(gap := np.flatnonzero(np.diff(picked) != 1)):
         raise InputError(
-            f"{source.place(int(picked[gap[0]]) + 1)}: no pose of {own.path} has this time, but the cross-covariance of "
-            "the next line is with this one; give each line its pose"
+            f"{source.place(int(picked[gap[0]]) + 1)}: no pose of {own.path} has this time, but the "
+            "cross-covariance of the next line is with this one; give each line its pose"
         )
     out = np.full((len(own.t), 6, 6), np.nan)
     out[rows] = _matrices(source.values[picked, 1 + FULL :], order)

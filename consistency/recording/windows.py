@@ -49,7 +49,9 @@ def relative_of(size: str | float | None, motions: bool = False, windows: str | 
         raise InputError(f"--windows must be 'independent', got '{windows}'")
     if size is None:
         if motions:
-            raise InputError("--motions: motions share no world with the truth; judge them with --relative 1, 10s or 50m")
+            raise InputError(
+                "--motions: motions share no world with the truth; judge them with --relative 1, 10s or 50m"
+            )
         if windows is not None:
             raise InputError("--windows goes with --relative, which cuts a log into windows")
         return None
@@ -110,7 +112,7 @@ def _along(t: Array, position: Array, rows: Indices, relative: Relative, file: s
 def _none(place: Array, relative: Relative, file: str) -> str:
     length, unit = float(place[-1] - place[0]), {"step": " steps"}.get(relative.unit, f" {relative.unit}")
     if length < relative.size - ROUNDING:
-        return f"{file}: --relative {relative.option}: there are {length:.4g}{unit} with truth only; ask for shorter windows"
+        return f"{file}: --relative {relative.option}: only {length:.4g}{unit} have truth; ask for shorter windows"
     gap = float(np.median(np.diff(place)))
     return (
         f"{file}: --relative {relative.option}: rows with truth are {gap:.4g}{unit} apart in the median; "

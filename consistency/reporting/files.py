@@ -225,15 +225,15 @@ def _nees_of_windows(record: Recording) -> Figure | None:
     if record.nees is None or not np.isfinite(record.nees).any():
         return None
     clock, window = clock_of(record), record.window or "a step"
-    low, high = (float(stats.chi2.ppf(q, record.dof)) for q in (0.025, 0.975))
-    ends = (np.full(len(record.t), end) for end in (low, high))
+    low, high = (np.full(len(record.t), stats.chi2.ppf(q, record.dof)) for q in (0.025, 0.975))
     tips = ((clock.word, "@x"), ("NEES", "@y{0.000}"))
-    marks: list[Mark] = [Band(clock.values, *ends, SHADE), Rule("y", float(record.dof), EXPECTED)]
+    marks: list[Mark] = [Band(clock.values, low, high, SHADE), Rule("y", float(record.dof), EXPECTED)]
     marks += [Points(clock.values, values, replace(style(0), size=3.0, alpha=0.7), tips=tips) for values in record.nees]
     keys = (Key("95 % band of one window", SHADE, "band"), Key("expected", EXPECTED))
     caption = (
-        f"NEES of the motion over each window of {window}; {record.dof} is expected (line). Above is overconfident, below "
-        f"conservative. Shaded: where 95 % of the windows of a right estimator lie, which is not judged.{clock.note}"
+        f"NEES of the motion over each window of {window}; {record.dof} is expected (line). Above is overconfident, "
+        "below conservative. Shaded: where 95 % of the windows of a right estimator lie, which is not judged."
+        f"{clock.note}"
     )
     panel = Panel(
         clock.axis, Axis("NEES", log=wide([record.nees.ravel()])), tuple(marks), f"NEES of windows of {record.name}",

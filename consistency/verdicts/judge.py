@@ -274,11 +274,16 @@ def analyse_recordings(
 
 def _other_ways(verdict: Verdict, r: Recording) -> list[str]:
     """What else would decide on a single log of poses."""
-    if verdict.status != "undecided" or len(r.runs) != 1 or r.window is not None or not (r.convention and POSES & set(r.axes)):
+    if (
+        verdict.status != "undecided"
+        or len(r.runs) != 1
+        or r.window is not None
+        or not (r.convention and POSES & set(r.axes))
+    ):
         return []
     return [
-        "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances or "
-        "cross-covariances (docs/files.md)"
+        "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "
+        "or poses with cross-covariances (docs/files.md)"
     ]
 
 

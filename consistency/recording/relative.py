@@ -26,7 +26,7 @@ MARGINAL = (
 )
 FEWEST = 20  # neighbouring windows that are compared
 CLEAR = 3.3  # standard errors: one right log in a thousand goes beyond
-BENT = 0.3  # rad: sigma of a rotation from which first order is doubtful; benchmarks/relative.py measures it
+BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
 
 
 @dataclass(frozen=True)

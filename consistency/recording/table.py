@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -207,16 +208,17 @@ def _stretches(
 
 def _cross(sheet: Sheet) -> Array | None:
     """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
-    names = {f"C_{a}{b}": (i, j) for i, a in enumerate("xyh") for j, b in enumerate("xyh")}
-    there = [name for name in names if name in sheet]
-    if not there:
-        return None
-    if missing := [name for name in names if name not in sheet]:
+    out, missing = np.empty((len(sheet.data), 3, 3)), []
+    for (i, a), (j, b) in itertools.product(enumerate(POSE), repeat=2):
+        names = f"C_{a[0]}{b[0]}", f"C_{a}_{b}"
+        there = [name for name in names if name in sheet]
+        if there:
+            out[:, i, j] = sheet.numbers(there[0])
+        else:
+            missing.append(names[0])
+    if missing and len(missing) < len(POSE) ** 2:
         raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; a cross-covariance is no symmetric matrix")
-    out = np.empty((len(sheet.data), 3, 3))
-    for name, (i, j) in names.items():
-        out[:, i, j] = sheet.numbers(name)
-    return out
+    return None if missing else out
 
 
 def row_order(sheet: Sheet, runs: Array, key: str) -> Indices:

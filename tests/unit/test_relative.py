@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -505,3 +506,13 @@ def test_a_real_sequence_from_images_to_windows(tmp_path: Path, name: str, truth
     record = cs.read(log_folder / "motions.tum", log_folder / "truth.tum", relative=size, motions=True)
     verdict = cs.judge(record)
     assert (verdict.runs, verdict.status) == (count, "overconfident")
+
+
+def test_the_example_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    manual = (Path(__file__).parents[2] / "docs/files.md").read_text()
+    (example,) = (block for block in re.findall(r"```python\n(.*?)```", manual, re.DOTALL) if "wheels" in block)
+    names: dict[str, Record] = {}
+    exec(example, names)
+    verdict = cs.judge(names["record"])
+    assert (verdict.runs, verdict.unit, verdict.status) == (60, "window", "consistent")

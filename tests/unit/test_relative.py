@@ -266,7 +266,7 @@ def test_declared_windows_are_runs(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
 
 
-@pytest.mark.parametrize("row", [7, 12, 29])
+@pytest.mark.parametrize("row", [1, 7, 12, 29])
 def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> None:
     stretch = motion_stretch(drive(rng, "SE(3)", 29))
     stretch.estimate[row] = np.nan
@@ -282,6 +282,15 @@ def test_a_covariance_that_is_not_finite_is_named(rng: np.random.Generator) -> N
     stretch = motion_stretch(drive(rng, "SE(2)", 20))
     stretch.covariance[8, 0, 0] = np.inf
     assert recorded([stretch], "5", True).failures[0].reason == "covariance is not finite (row 8)"
+
+
+def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
+    for group in GROUPS:
+        stretch = pose_stretch(rng, group, 6, 5, 1.0, 0)
+        stretch.estimate[0] = np.nan
+        record = recorded([stretch], "1", False)
+        assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
+        assert analyse_recordings([record])["log"].status == "failed"
 
 
 def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None:
@@ -441,6 +450,8 @@ def test_the_command_and_its_report(motion_file: Path, capsys: pytest.CaptureFix
     page = (out / "report.html").read_text()
     assert "24 windows of 0.5 s" in page
     assert "NEES of the motion over each window of 0.5 s" in page
+    assert "24 windows, each of which counts as a run" in page
+    assert "Windows of a log count as runs of one step here" in page
     told = json.loads((out / "verdict.json").read_text())["motions"]["statistics"]
     assert (told["runs"], told["unit"], told["convention"]) == (24, "window", "left")
 

@@ -300,6 +300,20 @@ def analyse(
     body: Annotated[
         str | None, typer.Option("--body", help="Of a KITTI drive as truth: imu [default], velodyne or camera.")
     ] = None,
+    relative: Annotated[
+        str | None,
+        typer.Option(
+            "--relative",
+            metavar="N|Ns|Nm",
+            help="Judge motions over windows: N steps, seconds (10s), metres (50m).",
+        ),
+    ] = None,
+    motions: Annotated[
+        bool, typer.Option("--motions", help="With --relative: each row is a motion with a covariance of its own.")
+    ] = False,
+    windows: Annotated[
+        str | None, typer.Option("--windows", help="'independent': errors of windows are, so that each is a run.")
+    ] = None,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
     false_alarm: Annotated[
         float | None, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none [0.05].")
@@ -345,6 +359,7 @@ def analyse(
         "truth": truth, "covariance": covariance, "convention": error,
         "state": _names(state), "axes": _names(axes), "topic": topic, "truth_topic": truth_topic,
         "covariance_order": covariance_order, "max_dt": max_dt, "time_offset": _seconds(time_offset), "body": body,
+        "relative": relative, "motions": motions or None, "windows": windows,
     }  # fmt: skip
     written: list[Path] = []
     if overwrite and report is None:

@@ -32,7 +32,7 @@ def equivalence(means: Array, dof: int, steps: int, settings: Settings, factor: 
         scale_test(means / factor, dof, steps).below,
         scale_test(means * factor, dof, steps).above,
     )
-    return _result(below, above, factor, settings, _deciding_runs(scale_test(means, dof, steps), factor, settings))
+    return _result(below, above, factor, settings, deciding_runs(scale_test(means, dof, steps), factor, settings))
 
 
 def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:
@@ -63,7 +63,7 @@ def _result(below: float, above: float, factor: float, settings: Settings, runs:
     return Equivalence(factor, float(p_value), 1.0 - settings.power, runs)
 
 
-def _deciding_runs(test: MeanTest, factor: float, settings: Settings) -> int | None:
+def deciding_runs(test: MeanTest, factor: float, settings: Settings) -> int | None:
     """Runs that would probably show the ratio inside, or find it at fault, if it is what it seems to be.
 
     Fewer than 20 runs do not know their ratio: then it is taken to be right. Chi-square of k degrees of freedom

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.diagnostics.wording import p_text, plural, question_text, short
+from consistency.diagnostics.wording import p_text, plain, plural, question_text, short
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
-    from consistency.diagnostics.records import Equivalence, Interval, MapScore, RejectionScore, Verdict
+    from consistency.diagnostics.records import Equivalence, Interval, MapScore, RejectionScore, Verdict, Within
 
 
 def flat(v: Verdict) -> dict[str, Any]:
     """Every number of a verdict under one name each; parts that could not be looked at are left out."""
     s: dict[str, Any] = {
-        "runs": v.runs, "steps": v.steps, "false_alarm": v.settings.false_alarm,
+        "runs": v.runs, "steps": v.steps, "unit": v.unit, "false_alarm": v.settings.false_alarm,
         "confidence": 1.0 - v.settings.false_alarm, "detect": v.settings.detect, "power": v.settings.power,
         "tolerance": v.settings.tolerance, "allow": v.settings.allow,
         "failures": [[f.run, f.step, f.reason] for f in v.failures],
@@ -41,7 +41,16 @@ def _scale(v: Verdict) -> dict[str, Any]:
         "mean_anees": s.mean_anees, "acceptance": s.accepted, "effective_dof": s.effective_dof,
         "ratio": s.inflation.value, "ratio_interval": tuple(s.inflation[1:]), "detectable": s.detectable,
         "median_run": s.median_run, "worst_run": s.worst_run, "share_inside": s.share_inside,
-        "equivalence": _equivalence(s.equivalence),
+        "equivalence": _equivalence(s.equivalence), "within": _within(s.within),
+    }  # fmt: skip
+
+
+def _within(w: Within | None) -> dict[str, Any] | None:
+    if w is None:
+        return None
+    return {
+        "ratio": w.ratio.value, "ratio_interval": tuple(w.ratio[1:]), "correlation_steps": w.correlation,
+        "effective_dof": w.effective_dof, "deciding_steps": w.steps, "deciding_pieces": w.pieces,
     }  # fmt: skip
 
 
@@ -155,13 +164,16 @@ def _joint(v: Verdict) -> dict[str, Any]:
 
 def figures(v: Verdict) -> list[tuple[str, str]]:
     """The numbers that matter, with their names."""
-    rows = [("evidence", f"{plural(v.runs, 'run')} of {plural(v.steps, v.places[:-1])}")]
+    size = f" of {plural(v.steps, v.places[:-1])}" if v.unit == "run" else ""
+    rows = [("evidence", f"{plural(v.runs, v.unit)}{size}")]
     if v.scale is not None and v.scale.judged_steps:
         s, shown = v.scale, v.scale.equivalence
         low, high = s.accepted
         rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {short(low)} to {short(high)} accepted)"))
         value, low, high = s.inflation
         rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], truth over stated"))
+        if s.within is not None:
+            rows.append(("within the log", f"{plain(s.within.ratio)}, if errors decorrelate as within it"))
         ends = f"[{short(1 / shown.factor)}, {short(shown.factor)}]"
         rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)})"))
     if v.accuracy is not None and v.axes is not None:
@@ -180,7 +192,7 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("map NEES / 3", f"{map_text(v.map)}, after the last step{_map_status(v.map)}"))
     if v.rejection is not None:
         rows.append(("rejected", rejection_text(v.rejection)))
-    rows.append(("failed runs", f"{len({f.run for f in v.failures})} of {v.runs}"))
+    rows.append((f"failed {v.unit}s", f"{len({f.run for f in v.failures})} of {v.runs}"))
     faults = [
         f"{question_text(v, a.question)} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated
     ]

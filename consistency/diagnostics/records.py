@@ -70,6 +70,7 @@ class Evidence:
     run_numbers: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
+    unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
 
 
 @dataclass(frozen=True)
@@ -149,6 +150,17 @@ class Equivalence:
 
 
 @dataclass(frozen=True)
+class Within:
+    """What a single run says of the scale, if errors go on to decorrelate as within it; reported, not judged."""
+
+    ratio: Interval  # of true to stated covariance, 95 %
+    correlation: float  # time over which the NEES decorrelates, in steps
+    effective_dof: float  # of the run: its mean NEES spreads as chi-square(nu) / nu
+    steps: int | None  # in all, that would probably decide as ``pieces`` runs; None where it is not known
+    pieces: int | None
+
+
+@dataclass(frozen=True)
 class Scale:
     """Size of the errors against the stated covariance; T steps."""
 
@@ -165,6 +177,7 @@ class Scale:
     worst_run: float
     share_inside: float  # of steps inside ``band``
     equivalence: Equivalence
+    within: Within | None = None  # of a single run whose errors decorrelate
 
     @property
     def judged_steps(self) -> int:
@@ -324,6 +337,7 @@ class Verdict:
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
     joint: JointScore | None = None  # of the verdict on a map
     rejection: RejectionScore | None = None  # of a filter with a guard
+    unit: str = "run"  # what a run is called, as in :class:`Evidence`
 
     @property
     def in_world(self) -> Verdict:

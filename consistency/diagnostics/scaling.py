@@ -12,6 +12,7 @@ from consistency.diagnostics.questions import MAIN, SHARES
 from consistency.diagnostics.records import Equivalence, Location, Scale, Settings
 from consistency.diagnostics.sample import Sample
 from consistency.diagnostics.scale import acceptance, ratio_interval
+from consistency.diagnostics.within import within
 from consistency.types import Array, Indices
 
 INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
@@ -42,6 +43,7 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
         worst_run=float(means.max()) * dof if some else np.nan,
         share_inside=float(inside[judged].mean()) if some else np.nan,
         equivalence=shown,
+        within=within(sample.nees[0], dof, settings, shown.factor) if len(sample.nees) == 1 else None,
     )
 
 

@@ -16,6 +16,7 @@ VISIBLE = 0.05  # difference of correlations that is worth a word
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 MUCH = 100_000  # runs; more are no advice
 MOST = 3  # axes that a sentence names with their figures
+MOST_STEPS = 10_000_000  # of a log; more are no advice
 TINY = 1e-12  # ratio of an error that is rounding
 
 Faults = Mapping[str, Answer]
@@ -29,7 +30,7 @@ def reasons(v: Verdict) -> list[str]:
     lines: list[str] = []
     if judged:
         assert v.scale is not None
-        lines = [_sentence(v, faults), *_level(v), *_together(v), *_coverage(v)]
+        lines = [_sentence(v, faults), *_level(v), *_within_one(v), *_together(v), *_coverage(v)]
     elif v.scale is not None:
         lines = ["no step has a covariance of full rank to judge"]
     elif v.innovations is not None and v.innovations.dof:
@@ -95,13 +96,14 @@ def _failures(v: Verdict) -> list[str]:
     lines = []
     if v.failures:
         first, count = v.failures[0], len({f.run for f in v.failures})
-        lines.append(f"{count} of {v.runs} runs failed, first run {first.run} in step {first.step}: {first.reason}")
+        where = f"{v.unit} {first.run}" + f" in step {first.step}" * (v.unit == "run")
+        lines.append(f"{count} of {v.runs} {v.unit}s failed, first {where}: {first.reason}")
     if v.impossible:
         row, step = v.impossible[0]
         count = len({r for r, _ in v.impossible})
         lines.append(
-            f"{count} of {v.runs} runs {'has' if count == 1 else 'have'} an infinite error or a covariance with a "
-            f"negative variance, first run {row} in {v.place(step)}; those {v.places} are left out"
+            f"{count} of {v.runs} {v.unit}s {'has' if count == 1 else 'have'} an infinite error or a covariance with a "
+            f"negative variance, first {v.unit} {row} in {v.place(step)}; those {v.places} are left out"
         )
     if v.joint is not None and v.joint.not_definite:
         lines.append(
@@ -132,10 +134,11 @@ def _sentence(v: Verdict, faults: Faults) -> str:
         parts += [_shape(v, faults)] if any(q in faults for q in SHAPE) else []
     if "outliers" in faults:
         assert v.tails is not None
-        where = f"run {v.tails.run} lies {short(v.tails.distance)} sigma from the other runs in {v.place(v.tails.step)}"
+        where = f"{v.unit} {v.tails.run} lies {short(v.tails.distance)} sigma from the other {v.unit}s"
+        where += f" in {v.place(v.tails.step)}" * (v.steps > 1)
         parts.insert(0 if v.status == "heavy-tailed" else len(parts), f"heavy tails: {where}")
     elif v.status == "heavy-tailed":
-        parts.insert(0, "heavy tails: the runs differ more than Gaussian errors would")
+        parts.insert(0, f"heavy tails: the {v.unit}s differ more than Gaussian errors would")
     if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
         parts.append(_joint_scale(v.joint))
     if JOINT_DISTRIBUTION in faults and len(faults) == 1:
@@ -163,11 +166,11 @@ def _no_fault(v: Verdict) -> str:
     none = "no fault beyond the tolerance" if tolerated else "no fault found"
     size = f"covariance ratio {plain(inflation)}"
     if shown.shown:
-        return f"{none} in {plural(v.runs, 'run')}, and the {size} is shown to be {_within(v, shown)}"
+        return f"{none} in {plural(v.runs, v.unit)}, and the {size} is shown to be {_within(v, shown)}"
     advice = ""
     if shown.runs is not None and shown.runs <= MUCH:
-        advice = f"; {max(shown.runs, v.runs + 1)} such runs would probably decide"
-    return f"{none}, but {plural(v.runs, 'run')} {_do(v.runs)} not show the {size} to be {_within(v, shown)}{advice}"
+        advice = f"; {max(shown.runs, v.runs + 1)} such {v.unit}s would probably decide"
+    return f"{none}, but {plural(v.runs, v.unit)} {_do(v.runs)} not show the {size} to be {_within(v, shown)}{advice}"
 
 
 def _within(v: Verdict, shown: Equivalence) -> str:
@@ -198,9 +201,9 @@ def _scale(v: Verdict, faults: Faults) -> str:
     text = f"covariance{about} {off_by(inflation)}"
     if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
         size = short(max(inflation.value, 1.0 / inflation.value))
-        text = f"covariance{about} {_side(inflation.value)} by x{size} in the mean, which a few runs make"
+        text = f"covariance{about} {_side(inflation.value)} by x{size} in the mean, which a few {v.unit}s make"
     elif inflation.holds(1.0) and v.runs > 1:
-        text += ", an interval that holds 1: the runs differ more than Gaussian errors would"
+        text += f", an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
     if where.subset:
         text += f", mainly {where.subset}"
     if where.lasting and where.since is None and where.first_step is not None and where.first_step > _first(v.scale):
@@ -277,7 +280,7 @@ def _level(v: Verdict) -> list[str]:
     s, (low, high) = v.scale, v.scale.accepted
     text = f"mean NEES {short(s.mean_anees)}, accepted {short(low)} to {short(high)} ({s.dof} expected)"
     if s.worst_run > SPREAD * s.median_run:
-        text += f"; {short(s.median_run)} in the median and {short(s.worst_run)} in the worst run"
+        text += f"; {short(s.median_run)} in the median and {short(s.worst_run)} in the worst {v.unit}"
     if s.judged_steps > 1:
         counts = {"above": v.location.above, "below": v.location.below}
         where = [f"{count} {side}" for side, count in counts.items() if count]
@@ -290,6 +293,26 @@ def _level(v: Verdict) -> list[str]:
             f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"
         )
     return lines
+
+
+def _within_one(v: Verdict) -> list[str]:
+    """How far a single run is off, and what would decide."""
+    assert v.scale is not None
+    if v.runs != 1 or v.landmarks is not None or v.unit != "run":
+        return []
+    if (w := v.scale.within) is None:
+        return [
+            "the log is too short to show how its errors decorrelate; further runs, or a far longer log, would decide"
+        ]
+    text = (
+        f"if errors go on to decorrelate as within this log (over {short(w.correlation)} steps), the covariance ratio "
+        f"is {plain(w.ratio)}, reported and not judged"
+    )
+    if w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
+        return [text]
+    if w.steps <= v.scale.judged_steps:
+        return [f"{text}; cut into {w.pieces} runs, this log would then probably decide"]
+    return [f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"]
 
 
 def _joint_scale(joint: JointScore) -> str:

@@ -11,14 +11,14 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.frontend.planar_log import MIN_LIFE, log_of
 from consistency.frontend.truth import find_truth, read_truth
-from consistency.frontend.tum import covariance_text, trajectory_text
+from consistency.frontend.tum import covariance_text, motions_text, trajectory_text
 from consistency.store.log import write_log
 from consistency.store.storage import manifest_of, require_free
 from consistency.types import Array
 from consistency.vision.features import opencv
 from consistency.vision.matching import is_rectified
 from consistency.vision.motion import RelativeMotion, Settings
-from consistency.vision.odometry import trajectory, visual_odometry
+from consistency.vision.odometry import motion_covariances, trajectory, visual_odometry
 from consistency.vision.sequence import Sequence, read_sequence
 
 LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
@@ -65,10 +65,14 @@ class Summary:
         u, v, d = self.sigma_px
         times = [] if self.timed else [f"the images have no times: {self.rate:g} Hz assumed, --rate says otherwise"]
         judge = f"consistency analyse {out}/trajectory.tum --truth {out}/truth.tum --covariance {out}/covariance.txt"
+        windows = f"consistency analyse {out}/motions.tum --truth {out}/truth.tum --motions --relative 1"
         judged = (
-            "no truth found: --truth FILE takes one"
+            ["no truth found: --truth FILE takes one"]
             if self.truth is None
-            else f"truth from {self.truth}; next: {judge} --error so3"
+            else [
+                f"truth from {self.truth}; next: {judge} --error so3",
+                f"or motion by motion, whatever the world: {windows}",
+            ]
         )
         bridges = f"{len(self.faults)} of {self.frames - 1} motions could not be measured and are bridged"
         return [
@@ -82,14 +86,15 @@ class Summary:
             "controls come from these images too: a filter that takes both uses the images twice",
             *times,
             f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
-            judged,
+            *judged,
         ]
 
 
 def write_frontend_log(images: Path, out: Path, options: Options, overwrite: bool = False) -> Summary:
     """Run the front-end on ``images`` and write the log folder ``out``, whole or not at all.
 
-    Beside the files of a log: trajectory.tum and covariance.txt (error convention so3), truth.tum where known.
+    Beside the files of a log: trajectory.tum and covariance.txt (error convention so3), motions.tum with covariances of
+    the motions (likewise), truth.tum where known.
 
     Raises
     ------
@@ -141,12 +146,17 @@ def write_frontend_log(images: Path, out: Path, options: Options, overwrite: boo
 def trajectory_files(
     sequence: Sequence, motions: list[RelativeMotion], truth: tuple[Array, Array] | None
 ) -> dict[str, str]:
-    """Texts of trajectory.tum, covariance.txt and truth.tum, all in the first camera's frame.
+    """Texts of trajectory.tum, covariance.txt and truth.tum, all in the first camera's frame, and of motions.tum.
 
     ``truth`` is R (frames, 3, 3) and t (frames, 3), m; without it there is no truth.tum.
     """
     R, t, P = trajectory(motions)
-    files = {"trajectory.tum": trajectory_text(sequence.t, R, t), "covariance.txt": covariance_text(sequence.t, P)}
+    turns, steps = (np.array(part) for part in zip(*((m.pose.R, m.pose.t) for m in motions), strict=True))
+    files = {
+        "trajectory.tum": trajectory_text(sequence.t, R, t),
+        "covariance.txt": covariance_text(sequence.t, P),
+        "motions.tum": motions_text(sequence.t, turns, steps, motion_covariances(motions)),
+    }
     if truth is not None:
         true_R, true_t = truth
         back = true_R[0].T

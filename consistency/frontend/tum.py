@@ -20,6 +20,17 @@ def covariance_text(stamps: Array, P: Array) -> str:
     return _lines(stamps[known], P[known].reshape(-1, 36))
 
 
+def motions_text(stamps: Array, R: Array, t: Array, P: Array) -> str:
+    """Lines of t, the motion since the line before (7 numbers) and 36 of its covariance, translation first.
+
+    The first line is where the motions (T, 3, 3), (T, 3), (T, 6, 6) start, for T + 1 stamps.
+    """
+    quaternion = Rotation.from_matrix(R).as_quat(canonical=True)
+    rows = np.column_stack([t, quaternion, P.reshape(-1, 36)])
+    start = np.concatenate([np.zeros((1, 6)), np.ones((1, 1)), np.zeros((1, 36))], axis=1)
+    return _lines(stamps, np.concatenate([start, rows]))
+
+
 def _lines(stamps: Array, values: Array) -> str:
     rows = (" ".join([f"{t:.9f}", *(f"{x:.17g}" for x in row)]) for t, row in zip(stamps, values, strict=True))
     return "\n".join(rows) + "\n"

@@ -47,7 +47,7 @@ class Record(Recording):
         return _drawn(record_sheet(self), path)
 
     def __repr__(self) -> str:
-        size = f"{plural(len(self.runs), 'run')} x {plural(len(self.t), 'step')}"
+        size = f"{plural(len(self.runs), 'run')} x {plural(len(self.t), 'step' if self.window is None else 'window')}"
         return f"<Record {self.name}: {size}, error {self.convention or '-'} of {', '.join(self.axes)}>"
 
     def _repr_html_(self) -> str:
@@ -91,6 +91,9 @@ def read(
     topic: str | None = None,
     truth_topic: str | None = None,
     body: str | None = None,
+    relative: str | float | None = None,
+    motions: bool = False,
+    windows: str | None = None,
     filter: str | None = None,
 ) -> Record:
     """Files of another estimator, as ``consistency analyse FILES`` reads them; docs/files.md has the forms.
@@ -108,6 +111,9 @@ def read(
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw
     topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
     body : whose poses a KITTI drive gives as truth: imu (default), velodyne or camera
+    relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m")
+    motions : with ``relative``: each row is a motion with a covariance of its own, not a pose
+    windows : "independent": errors of different windows are, so that each is a run
     filter : which estimator, where the files hold several
 
     Raises
@@ -128,6 +134,9 @@ def read(
         topic=topic,
         truth_topic=truth_topic,
         body=body,
+        relative=relative,
+        motions=motions,
+        windows=windows,
     )
     named = {recording.name: recording for recording in found}
     if filter is None and len(named) > 1:

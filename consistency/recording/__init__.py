@@ -17,8 +17,10 @@ from consistency.recording.archive import read_archive
 from consistency.recording.bags import is_bag, read_bags
 from consistency.recording.kitti import BODIES, is_drive
 from consistency.recording.record import Recording
+from consistency.recording.relative import MARGINAL
 from consistency.recording.table import read_tables
 from consistency.recording.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
+from consistency.recording.windows import relative_of
 
 __all__ = [
     "BODIES",
@@ -74,6 +76,9 @@ def read_recordings(
     topic: str | None = None,
     truth_topic: str | None = None,
     body: str | None = None,
+    relative: str | float | None = None,
+    motions: bool | None = None,
+    windows: str | None = None,
 ) -> list[Recording]:
     """What estimators said, from CSV, Parquet, TUM or NumPy files: one recording for each estimator.
 
@@ -91,6 +96,9 @@ def read_recordings(
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw; None is all
     topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
     body : whose poses a drive of KITTI gives as truth: one of ``BODIES``; None is imu
+    relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m") in place of poses
+    motions : with ``relative``: each row is the motion since the row before, and errors of motions are independent
+    windows : "independent": errors of different windows are; with motions they are anyway
 
     Raises
     ------
@@ -98,6 +106,7 @@ def read_recordings(
         Something cannot be used: names file, line, column or option, and what is allowed.
     """
     estimates = Path(estimates)
+    over = relative_of(relative, bool(motions), windows)
     if convention is not None and convention not in CONVENTIONS:
         raise InputError(f"--error {convention}: must be one of {', '.join(CONVENTIONS)}")
     if max_dt is not None and not (math.isfinite(max_dt) and max_dt >= 0):
@@ -108,6 +117,8 @@ def read_recordings(
         raise InputError(f"--time-offset {time_offset}: must be a number of seconds, or 'estimate'")
     if time_offset is not None and truth is None and truth_topic is None:
         raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
+    if over is not None and time_offset == "estimate":
+        raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
     suffix = estimates.suffix.lower()
@@ -118,22 +129,24 @@ def read_recordings(
         raise InputError(f"--body {body}: goes with --truth DIR, the folder of a KITTI drive")
     if is_bag(estimates):
         _refuse(estimates, own, ("state", "covariance", "covariance-order", "truth"))
+        if over is not None:
+            raise InputError(f"{estimates}: --relative: {MARGINAL}")
         return read_bags(estimates, topic, truth_topic, convention, max_dt, time_offset, axes)
     _refuse(estimates, own, ("topic", "truth-topic"))
     if suffix == ".npz":
         _refuse(estimates, own, ("state", "max-dt", "covariance", "covariance-order", "truth", "time-offset", "axes"))
-        return read_archive(estimates, convention)
+        return read_archive(estimates, convention, over)
     if suffix in TABLES:
         _refuse(estimates, own, ("covariance", "covariance-order", "axes"))
         if state is not None and (len(set(state)) < len(state) or not all(state)):
             raise InputError(f"--state {','.join(state)}: needs names of columns, each once")
-        found = read_tables(estimates, truth, convention, state, max_dt, time_offset, body)
+        found = read_tables(estimates, truth, convention, state, max_dt, time_offset, body, over)
         return _with_frame(found, truth, body)
     if suffix not in SUFFIXES and not estimates.is_dir():
         known = ", ".join((*TABLES, ".npz", ".bag", *SUFFIXES))
         raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
     _refuse(estimates, own, ("state",))
-    found = read_tum(estimates, truth, covariance, convention, covariance_order, max_dt, time_offset, axes, body)
+    found = read_tum(estimates, truth, covariance, convention, covariance_order, max_dt, time_offset, axes, body, over)
     return _with_frame(found, truth, body)
 
 

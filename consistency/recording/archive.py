@@ -11,21 +11,24 @@ from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, planar_error
 from consistency.reading import is_file, reading, require_room
 from consistency.recording.record import Recording, Track, assemble, symmetric
-from consistency.recording.sheet import are_dof, bounded
+from consistency.recording.relative import Stretch, relative_recording
+from consistency.recording.sheet import Places, are_dof, bounded
+from consistency.recording.windows import Relative
 from consistency.types import Array, Failure
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
 NEEDED = (("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof"))
-OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths"}
+OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "cross_covariances"}
 
 
-def read_archive(path: Path, convention: str | None) -> list[Recording]:
+def read_archive(path: Path, convention: str | None, relative: Relative | None = None) -> list[Recording]:
     """The recording of an archive.
 
     ``errors`` (runs, steps, n) with ``covariances`` (runs, steps, n, n); or ``estimates`` and ``truth``, both
     (runs, steps, n), with ``covariances``; or ``nees`` (runs, steps) with ``dof``. One run may lack the first
     dimension. Optional: ``nis`` and ``nis_dof`` (runs, steps), ``axes`` (n,), ``t`` (steps,), and ``lengths``
-    (runs,), the number of steps of each run, where they differ.
+    (runs,), the number of steps of each run, where they differ. With ``relative`` estimates and truth are planar
+    poses, or estimates are motions; ``cross_covariances`` (runs, steps, 3, 3) are those with the step before.
     """
     arrays = load_arrays(path)
     kind = next((keys for keys in NEEDED if set(keys) <= set(arrays)), None)
@@ -36,6 +39,8 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
         raise InputError(f"{path}: key '{unknown[0]}' does not go with {', '.join(kind)}; needs {KINDS}")
     if convention is not None and kind != NEEDED[1]:
         raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")
+    if relative is not None and kind != NEEDED[1]:
+        raise InputError(f"{path}: --relative needs the keys {', '.join(NEEDED[1])}, of poses or motions")
     if kind == NEEDED[2]:
         return [_of_nees(path, arrays)]
     covariances = _array(path, arrays, "covariances", 4)
@@ -50,6 +55,8 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
         if error_kind not in PLANAR or (error_kind != "vector" and n != 3):
             raise InputError(f"--error {error_kind}: here it is 'vector', or so2, left or right for x, y, heading")
         _require_truth(path, truth, estimates)
+        if relative is not None:
+            return [_relative(path, arrays, estimates, truth, covariances, convention or "so2", relative)]
         error = planar_error(truth, estimates, error_kind) if n == 3 else truth - estimates
     runs, steps, n = error.shape
     if covariances.shape != (runs, steps, n, n):
@@ -68,6 +75,35 @@ def read_archive(path: Path, convention: str | None) -> list[Recording]:
             path.stem, tracks, step_times(path, arrays, steps), _axes(path, arrays, n), str(path), error_kind, notes
         )
     ]
+
+
+def _relative(
+    path: Path, arrays: dict[str, Array], estimates: Array, truth: Array, covariances: Array, convention: str,
+    relative: Relative,
+) -> Recording:  # fmt: skip
+    """Motions over windows of planar poses, or of motions."""
+    runs, steps, n = estimates.shape
+    if n != 3 or convention == "vector":
+        raise InputError(f"{path}: --relative needs poses x, y, heading, with --error so2, left or right")
+    shape = (runs, steps, n, n)
+    cross = None
+    if "cross_covariances" in arrays and not relative.motions:
+        cross = _array(path, arrays, "cross_covariances", 4)
+    for key, matrices in (("covariances", covariances), ("cross_covariances", cross)):
+        if matrices is not None and matrices.shape != shape:
+            raise InputError(f"{path}: key '{key}' has shape {matrices.shape}, needs {shape}")
+    t, stretches = step_times(path, arrays, steps), []
+    for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
+        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
+        P = symmetric(covariances[run, :length], place.__getitem__)
+        known = np.flatnonzero(np.isfinite(truth[run, :length]).all(axis=-1))
+        own = None if cross is None else cross[run, :length]
+        stretches.append(
+            Stretch(
+                run, str(path), place, t[:length], estimates[run, :length], P, own, known, truth[run, known], convention
+            )
+        )
+    return relative_recording(path.stem, str(path), stretches, ("x", "y", "heading"), range(3), relative)
 
 
 def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:

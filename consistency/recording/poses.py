@@ -29,6 +29,7 @@ class Poses:
     manifold: Manifold
     convention: str
     max_dt: float  # s
+    cross: Array | None = None  # (N, n, n), E e_before e' with the row before; dropped where rows are chosen
 
     def known(self, shift: float = 0.0) -> Known:
         """The truth at the timestamps, ``shift`` s later."""
@@ -69,5 +70,5 @@ class Poses:
     def _of(self, rows: Indices) -> Poses:
         return replace(
             self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
-            covariance=self.covariance[rows], stated=self.stated[rows],
+            covariance=self.covariance[rows], stated=self.stated[rows], cross=None,
         )  # fmt: skip

@@ -41,6 +41,8 @@ class Recording:
     failures: tuple[Failure, ...]  # Failure.step counts the columns from 1, as the verdict does
     convention: str = ""
     notes: tuple[str, ...] = ()  # what a reader must know: the convention, what was left out
+    window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
+    independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
 
     @property
     def left_out_steps(self) -> list[int]:

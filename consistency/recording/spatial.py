@@ -11,10 +11,13 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.geometry.conventions import SPATIAL
 from consistency.recording.hints import hints
+from consistency.recording.interpolation import truth_at
 from consistency.recording.offset import clock_shift
 from consistency.recording.poses import Poses
 from consistency.recording.record import Recording, Track, assemble, common_times
+from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places
+from consistency.recording.windows import Relative
 from consistency.types import Array
 
 AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
@@ -60,6 +63,7 @@ def recordings_of(
     parts: Mapping[str, range],
     time_offset: float | str | None,
     axes: Sequence[str] | None,
+    relative: Relative | None = None,
 ) -> list[Recording]:
     """The recording of one estimator, each of whose runs is one of ``poses``; clocks and mix-ups are looked for.
 
@@ -67,12 +71,23 @@ def recordings_of(
     ----------
     parts : ``WHOLE``, ``BLOCKS`` or ``SINGLE``: components whose covariance is known, each of which is a recording
     time_offset, axes : as :func:`consistency.recording.read_recordings` has them
+    relative : judge motions over windows in place of poses
 
     Raises
     ------
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
+    judged = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
+    if relative is not None:
+        if parts is not WHOLE:
+            raise InputError(f"{source.path}: --relative needs covariances of whole poses; here parts are stated apart")
+        shift = time_offset if isinstance(time_offset, float) else 0.0
+        stretches = [
+            _stretch(run, one, *files, shift, relative)
+            for run, (one, files) in enumerate(zip(poses, source.files, strict=True))
+        ]
+        return [relative_recording(source.path.stem, str(source.covariance), stretches, AXES, judged, relative)]
     shift, clocks = clock_shift(source.path.name, poses, time_offset)
     matches = [_match(one, *files, shift) for one, files in zip(poses, source.files, strict=True)]
     columns, t = common_times([run.t for run in matches])
@@ -80,7 +95,6 @@ def recordings_of(
     kind = poses[0].convention
     notes = [*_notes(source.path, matches, poses[0].max_dt), *clocks, *hints(source.path.name, AXES, poses, shift)]
     notes.append(f"error convention {kind}: {SPATIAL[kind]}{source.why}")
-    judged = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
     recordings = []
     for title, whole in parts.items():
         if part := [i for i in judged if i in whole]:
@@ -112,6 +126,28 @@ def _match(poses: Poses, path: Path | str, truth: Path | str, shift: float) -> M
     P = poses.covariance if len(rows) == len(poses.t) else poses.covariance[rows]
     doubts = _doubts(error, P, known.bend[kept])
     return Match(poses.place.at(rows), poses.t[rows], error, P, len(poses.t) - len(rows), *doubts)
+
+
+def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: float, relative: Relative) -> Stretch:
+    """A run before its windows are taken: all its motions, or the poses that have a covariance."""
+    rows = np.arange(len(poses.t))
+    if relative.motions:
+        bare = np.flatnonzero(~poses.stated[1:])
+        if bare.size:
+            raise InputError(
+                f"{poses.place[int(bare[0]) + 1]}: this motion has no covariance within {poses.max_dt:g} s"
+            )
+    elif poses.cross is not None:
+        rows = rows[poses.stated]
+    t = poses.t[rows] + shift
+    known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
+    if not len(known.rows):
+        raise apart(path, t, truth, poses.true_t, poses.max_dt, "truth")
+    cross = None if poses.cross is None else poses.cross[rows]
+    return Stretch(
+        run, str(path), poses.place.at(rows), t, poses.estimate[rows], poses.covariance[rows], cross,
+        known.rows, known.truth, poses.convention,
+    )  # fmt: skip
 
 
 def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, tolerance: float, what: str) -> InputError:

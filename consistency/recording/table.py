@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,9 @@ from consistency.recording.record import (
     smallest_correlation,
     symmetric,
 )
+from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places, Sheet, are_dof, read_sheet
+from consistency.recording.windows import Relative
 from consistency.store.parquet import COVARIANCE, OWN_COVARIANCE
 from consistency.types import Array, Indices
 
@@ -44,6 +47,7 @@ def read_tables(
     max_dt: float | None,
     time_offset: float | str | None = None,
     body: str | None = None,
+    relative: Relative | None = None,
 ) -> list[Recording]:
     """Recordings of the estimators in a table, one for each value of its column ``filter``.
 
@@ -55,6 +59,8 @@ def read_tables(
     sheet = read_sheet(estimates)
     axes = tuple(state) if state else POSE
     convention = _convention(convention, axes, truth)
+    if relative is not None:
+        require_poses(estimates, axes, convention, truth)
     other = None
     if truth is not None:
         other = drive_sheet(truth, body) if is_drive(truth) else read_sheet(truth)
@@ -70,7 +76,7 @@ def read_tables(
     recordings = []
     for name in names:
         own = sheet.rows((sheet.data["filter"].astype(str) == name).to_numpy()) if "filter" in sheet else sheet
-        recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset))
+        recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset, relative))
     return recordings
 
 
@@ -84,6 +90,14 @@ def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | Non
     if convention not in (None, "vector"):
         raise InputError(f"--error {convention}: needs the states x,y,heading; for {','.join(axes)} it is 'vector'")
     return "vector"
+
+
+def require_poses(path: Path, axes: tuple[str, ...], convention: str, truth: Path | None) -> None:
+    """Refuse windows of what are no planar poses beside a truth."""
+    if truth is None:
+        raise InputError(f"{path}: --relative needs --truth FILE, poses in any world")
+    if axes != POSE or convention == "vector":
+        raise InputError(f"{path}: --relative needs poses x, y, heading, with --error so2, left or right")
 
 
 def _key(sheet: Sheet, truth: Sheet | None, max_dt: float | None, time_offset: float | str | None) -> str:
@@ -112,6 +126,7 @@ def _recording(
     convention: str,
     max_dt: float | None,
     time_offset: float | str | None,
+    relative: Relative | None,
 ) -> Recording:
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet.data), int)
     order = row_order(sheet, runs, key)
@@ -130,11 +145,17 @@ def _recording(
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
         samples = _samples(truth, axes, key)
         shift, clocks = 0.0, list[str]()
-        if key == "t":
+        if relative is not None:
+            shift = time_offset if isinstance(time_offset, float) else 0.0
+        elif key == "t":
             poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, _default_dt(max_dt))
             shift, clocks = clock_shift(name, poses, time_offset)
             clocks += hints(name, axes, poses, shift)
         keep, true, notes = _matched(name, sheet, truth, samples, runs, keys + shift, key, axes, convention, max_dt)
+        if relative is not None:
+            stretches = _stretches(sheet, runs, keep, true, estimate, covariance, convention, relative)
+            record = relative_recording(name, str(sheet.path), stretches, axes, range(len(axes)), relative)
+            return replace(record, notes=(*notes, *record.notes))
         notes += clocks
         error = planar_error(true, estimate, convention) if axes == POSE else true - estimate
         notes.append(f"error convention {convention}: {PLANAR[convention]}")
@@ -167,6 +188,41 @@ def _recording(
     ]
     record = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
     return record if truth is not None else replace(record, error=None, dof=0)
+
+
+def _stretches(
+    sheet: Sheet, runs: Array, keep: Array, true: Array, estimate: Array, covariance: Array, convention: str,
+    relative: Relative,
+) -> list[Stretch]:  # fmt: skip
+    """Each run before its windows are taken."""
+    t = sheet.numbers("t", finite=True) if "t" in sheet else np.full(len(runs), np.nan)
+    cross = None if relative.motions else _cross(sheet)
+    found = []
+    for run in np.unique(runs[keep]):
+        rows = np.flatnonzero(runs == run)
+        known = np.flatnonzero(keep[rows])
+        found.append(
+            Stretch(
+                int(run), str(sheet.path), Places(sheet.place, rows), t[rows], estimate[rows], covariance[rows],
+                None if cross is None else cross[rows], known, true[rows[known]], convention,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _cross(sheet: Sheet) -> Array | None:
+    """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
+    out, missing = np.empty((len(sheet.data), 3, 3)), []
+    for (i, a), (j, b) in itertools.product(enumerate(POSE), repeat=2):
+        names = f"C_{a[0]}{b[0]}", f"C_{a}_{b}"
+        there = [name for name in names if name in sheet]
+        if there:
+            out[:, i, j] = sheet.numbers(there[0])
+        else:
+            missing.append(names[0])
+    if missing and len(missing) < len(POSE) ** 2:
+        raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; a cross-covariance is no symmetric matrix")
+    return None if missing else out
 
 
 def row_order(sheet: Sheet, runs: Array, key: str) -> Indices:

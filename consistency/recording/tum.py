@@ -16,11 +16,13 @@ from consistency.recording.poses import Poses
 from consistency.recording.record import DEFAULT_DT, Recording, associate, symmetric
 from consistency.recording.sheet import Lines, Places, read_numbers
 from consistency.recording.spatial import BLOCKS, SINGLE, WHOLE, Source, apart, recordings_of, require_axes
+from consistency.recording.windows import Relative
 from consistency.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
 FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
+BOTH = 2 * FULL  # and a cross-covariance with the line before
 UNIT = 1e-3  # quaternions of four decimals pass
 SUFFIXES = (".txt", ".tum")
 
@@ -35,6 +37,7 @@ def read_tum(
     time_offset: float | str | None = None,
     axes: Sequence[str] | None = None,
     body: str | None = None,
+    relative: Relative | None = None,
 ) -> list[Recording]:
     """Recording of one estimator: a file, or a folder with a file for each run.
 
@@ -66,7 +69,7 @@ def read_tum(
         poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt, body))
     why = "" if convention else f"; the default of this layout, {_origin(parts)}"
     source = Source(estimates, [(path, true) for path, true, _ in runs], covariance or estimates, why)
-    return recordings_of(source, poses, parts, time_offset, axes)
+    return recordings_of(source, poses, parts, time_offset, axes, relative)
 
 
 def _parts(own: Lines) -> Mapping[str, range]:
@@ -131,7 +134,7 @@ def _poses(
     """A run with its truth; the covariance is NaN where none is near."""
     tolerance = DEFAULT_DT if max_dt is None else max_dt
     truth = read_drive(truth_path, body) if is_drive(truth_path) else read_trajectory(truth_path, true=True)
-    covariance, source = _inline(own, order), own
+    covariance, source, cross = _inline(own, order), own, None
     rows = picked = np.arange(len(own.t))
     if covariance_path is not None:
         if covariance is not None:
@@ -140,8 +143,10 @@ def _poses(
             source, covariance = read_deviations(covariance_path)
         else:
             source = read_covariances(covariance_path)
-            covariance = _matrices(source.values[:, 1:], order)
+            covariance = _matrices(source.values[:, 1 : 1 + FULL], order)
         rows, picked = _pairs(own, source, tolerance, "covariance")
+        if source.values.shape[1] == 1 + BOTH:
+            cross = _cross(own, source, rows, picked, order)
     if covariance is None:
         of = f"the standard deviations of {LAYOUT}" if isinstance(own, States) else f"lines of t and {FULL} numbers"
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
@@ -151,7 +156,21 @@ def _poses(
     with_P[rows] = True
     own = own.of(slice(0, POSE))
     place, estimate = Places(own.place, np.arange(len(own.t))), own.values[:, 1:]
-    return Poses(place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance)
+    return Poses(
+        place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance, cross
+    )
+
+
+def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:
+    """Cross-covariances with the line before, on the rows of ``own``, (N, 6, 6)."""
+    if len(gap := np.flatnonzero(np.diff(picked) != 1)):
+        raise InputError(
+            f"{source.place(int(picked[gap[0]]) + 1)}: no pose of {own.path} has this time, but the "
+            "cross-covariance of the next line is with this one; give each line its pose"
+        )
+    out = np.full((len(own.t), 6, 6), np.nan)
+    out[rows] = _matrices(source.values[picked, 1 + FULL :], order)
+    return out
 
 
 def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indices, Indices]:
@@ -191,8 +210,12 @@ def read_trajectory(path: Path, true: bool = False) -> Lines:
 
 
 def read_covariances(path: Path) -> Lines:
-    """A file of covariances: t, then 36 numbers row by row, or the 21 of the upper triangle."""
-    return read_numbers(path, (1 + TRIANGLE, 1 + FULL), f"t and {FULL} numbers, or t and {TRIANGLE}")
+    """A file of covariances: t, then 36 numbers row by row, or the 21 of the upper triangle.
+
+    72 numbers are the 36 and the cross-covariance E e_before e' with the line before, row by row.
+    """
+    widths, layout = (1 + TRIANGLE, 1 + FULL, 1 + BOTH), f"t and {FULL} numbers, or t and {TRIANGLE}, or t and {BOTH}"
+    return read_numbers(path, widths, layout)
 
 
 def _inline(own: Lines, order: str) -> Array | None:

@@ -72,8 +72,9 @@ def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
 
 def _counts(record: Recording, verdict: Verdict) -> str:
     clock = clock_of(record.t)
-    size = f"{plural(verdict.runs, 'run')} of {plural(verdict.steps, 'step')}"
-    return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and verdict.steps > 1 else size
+    length = plural(verdict.steps, "step" if record.window is None else "window")
+    size = f"{plural(verdict.runs, verdict.unit)} of {record.window if record.independent else length}"
+    return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and len(record.t) > 1 else size
 
 
 def _of_one(record: Recording, verdict: Verdict, said: bool) -> tuple[Block, ...]:
@@ -133,7 +134,7 @@ def _errors(record: Recording) -> Figure | None:
     keys += [Key("other runs", OTHERS)] if others else []
     left_out = len(record.axes) - len(names)
     caption = (
-        f"Error (truth minus estimate) of run {record.runs[row]} with the 2-sigma bounds that the estimator states "
+        f"Error ({_meaning(record)}) of run {record.runs[row]} with the 2-sigma bounds that the estimator states "
         "(dashed). Honest errors stay inside about 95 % of the time."
         + (f" {plural(left_out, 'further component')} not drawn." if left_out else "")
         + clock.note
@@ -141,6 +142,10 @@ def _errors(record: Recording) -> Figure | None:
     columns = _columns(len(panels))
     sheet = Sheet(panels, 0.3 + 1.4 * -(-len(panels) // columns), columns=columns, keys=tuple(keys))
     return Figure("Errors and stated bounds", caption, panels, (sheet,), tuple(keys))
+
+
+def _meaning(record: Recording) -> str:
+    return "truth minus estimate" if record.window is None else f"of the motion over each window of {record.window}"
 
 
 def _columns(panels: int) -> int:
@@ -168,6 +173,8 @@ def _error_panel(record: Recording, clock: Clock, row: int, others: list[int], i
 def _nees(record: Recording, verdict: Verdict) -> Figure | None:
     """NEES of one run, or its average over runs, with the bands of a right estimator."""
     scale, location = verdict.scale, verdict.location
+    if record.independent:
+        return _nees_of_windows(record)
     if scale is None or len(scale.anees) != len(record.t):
         return None
     clock, single = clock_of(record.t), verdict.runs == 1
@@ -188,6 +195,28 @@ def _nees(record: Recording, verdict: Verdict) -> Figure | None:
     )
     panel = Panel(clock.axis, Axis("NEES", log=wide(curves)), tuple(marks), f"{name} of {record.name}", height=300)
     return Figure("NEES", caption, (panel,), (Sheet((panel,), 2.2, keys=tuple(keys)),), tuple(keys))
+
+
+def _nees_of_windows(record: Recording) -> Figure | None:
+    """NEES of each window, independent of the others."""
+    if record.nees is None or not np.isfinite(record.nees).any():
+        return None
+    clock, window = clock_of(record.t), record.window or "a step"
+    low, high = (np.full(len(record.t), stats.chi2.ppf(q, record.dof)) for q in (0.025, 0.975))
+    tips = ((clock.word, "@x"), ("NEES", "@y{0.000}"))
+    marks: list[Mark] = [Band(clock.values, low, high, SHADE), Rule("y", float(record.dof), EXPECTED)]
+    marks += [Points(clock.values, values, replace(style(0), size=3.0, alpha=0.7), tips=tips) for values in record.nees]
+    keys = (Key("95 % band of one window", SHADE, "band"), Key("expected", EXPECTED))
+    caption = (
+        f"NEES of the motion over each window of {window}; {record.dof} is expected (line). Above is overconfident, "
+        "below conservative. Shaded: where 95 % of the windows of a right estimator lie, which is not judged."
+        f"{clock.note}"
+    )
+    panel = Panel(
+        clock.axis, Axis("NEES", log=wide([record.nees.ravel()])), tuple(marks), f"NEES of windows of {record.name}",
+        height=300,
+    )  # fmt: skip
+    return Figure("NEES", caption, (panel,), (Sheet((panel,), 2.2, keys=keys),), keys)
 
 
 # --- coverage ---------------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ from consistency.types import Array, Indices
 from consistency.verdicts.curves import Curves, Ends, Landmarks, curves, landmarks_of, run_means, steps_of
 
 POINT = ("x", "y", "z")
+POSES = {"heading", "yaw", "pitch", "roll"}  # what a pose has beside its position
 OPTION = {
     "ratio": "detect",
     "false_alarm": "false-alarm",
@@ -253,17 +254,55 @@ def analyse_recordings(
         if name not in named:
             raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
         r = named[name]
-        evidence = Evidence(
-            name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
-            failures=r.failures, axes=r.axes, run_numbers=r.runs,
-        )  # fmt: skip
+        if r.independent:
+            evidence = _evidence_of_windows(r)
+        else:
+            evidence = Evidence(
+                name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
+                failures=r.failures, axes=r.axes, run_numbers=r.runs,
+            )  # fmt: skip
+        verdict = judge(evidence, settings)
         verdicts[name] = replace(
-            judge(evidence, settings),
+            verdict,
+            reasons=(*verdict.reasons, *_other_ways(verdict, r)),
             convention=r.convention or None,
             notes=tuple(r.notes),
             left_out_steps=tuple(r.left_out_steps),
         )
     return verdicts
+
+
+def _other_ways(verdict: Verdict, r: Recording) -> list[str]:
+    """What else would decide on a single log of poses."""
+    if (
+        verdict.status != "undecided"
+        or len(r.runs) != 1
+        or r.window is not None
+        or not (r.convention and POSES & set(r.axes))
+    ):
+        return []
+    return [
+        "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "
+        "or poses with cross-covariances (docs/files.md)"
+    ]
+
+
+def _evidence_of_windows(r: Recording) -> Evidence:
+    """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
+    assert r.error is not None
+    assert r.covariance is not None
+    assert r.nees is not None
+    runs, steps = r.error.shape[:2]
+    there = np.isfinite(r.nees)
+    number = np.arange(1, runs * steps + 1).reshape(runs, steps)
+    failures = [(int(np.flatnonzero(r.runs == f.run)[0]), f) for f in r.failures]
+    for row, f in failures:
+        there[row, f.step - 1] = True
+    return Evidence(
+        r.name, r.error[there][:, None], r.covariance[there][:, None], r.nees[there][:, None], r.dof,
+        failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures), axes=r.axes,
+        run_numbers=number[there], unit="window",
+    )  # fmt: skip
 
 
 def plan(

@@ -7,6 +7,7 @@ from collections.abc import Sequence as Ordered
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.geometry.groups import carried
 from consistency.terminal.progress import progress
 from consistency.types import Array
 from consistency.vision.bridging import bridged
@@ -72,6 +73,17 @@ def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
         t.append(t[-1] + arm)
         R.append(_orthonormal(R[-1] @ motion.pose.R))
     return np.array(R), np.array(t), np.array(P)
+
+
+def motion_covariances(motions: Ordered[RelativeMotion]) -> Array:
+    """Covariances (T, 6, 6) of the motions, of position and rotation vector in the frame that each begins in.
+
+    Error convention so3 of :mod:`consistency.geometry.conventions`, m and rad.
+    """
+    G = np.zeros((len(motions), 6, 6))
+    G[:, :3, :3] = np.eye(3)
+    G[:, 3:, 3:] = [angular(motion.pose) for motion in motions]
+    return carried(G, np.array([motion.covariance for motion in motions]))
 
 
 def _orthonormal(R: Array) -> Array:

@@ -38,6 +38,14 @@ def test_the_trajectory_is_judged(folder: Path) -> None:
     assert "trajectory" in done.stdout
 
 
+def test_the_motions_are_judged_over_windows(folder: Path) -> None:
+    """In whatever world: the truth of the log begins at the first camera, that of the sequence where it was driven."""
+    files = ("--truth", "log/truth.tum", "--motions", "--relative", "0.2s")
+    verdicts = consistency("analyse", "log/motions.tum", *files, "--json", cwd=folder)
+    assert json.loads(verdicts.stdout)["motions"]["statistics"]["runs"] == 3
+    assert "3 windows of 0.2 s" in verdicts.stderr
+
+
 def test_a_log_is_not_overwritten_by_accident(folder: Path) -> None:
     done = consistency("frontend", "images", "--out", "log", cwd=folder, status=2)
     assert "exists already" in done.stderr

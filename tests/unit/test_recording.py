@@ -640,7 +640,7 @@ def test_the_filterpy_filter_of_the_manual(
 
 def test_the_notebook_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "make.py").write_text(example("KalmanFilter("))
-    (tmp_path / "notebook.py").write_text(example("cs.read("))
+    (tmp_path / "notebook.py").write_text(example("record.plot("))
     monkeypatch.chdir(tmp_path)
     runpy.run_path("make.py")
     assert runpy.run_path("notebook.py")["verdict"].status == "consistent"
@@ -650,7 +650,7 @@ def test_the_notebook_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_the_archive_of_the_manual(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "make.py").write_text(example("np.savez"))
+    (tmp_path / "make.py").write_text(example("errors.npz"))
     monkeypatch.chdir(tmp_path)
     runpy.run_path("make.py")
     code, out, _ = consistency("analyse", "errors.npz", "--json", capsys=capsys)

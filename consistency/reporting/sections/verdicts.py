@@ -137,6 +137,8 @@ def nis(track: Estimator) -> str:
 def caption(study: Judged) -> str:
     """How large the study is, and how to read the table of verdicts."""
     text = f"{plural(study.runs, 'run')} of {plural(len(study.steps), 'step')}"
+    if _windows(study):
+        text = f"{plural(study.runs, 'window')}, each of which counts as a run"
     if study.single and study.has_truth:
         text += "; with one run the ANEES is the NEES of that run"
     if study.until_decided:
@@ -149,6 +151,11 @@ def caption(study: Judged) -> str:
     if own := study.own_errors:
         text += f". Judged in an error of their own, but for the RMSE: {listed(own)}; see Errors of their own"
     return f"{text}."
+
+
+def _windows(study: Judged) -> bool:
+    """Do independent windows of logs stand in the place of runs?"""
+    return any(track.verdict.unit == "window" for track in study.tracks)
 
 
 def method(studies: Sequence[Judged]) -> str:
@@ -180,6 +187,10 @@ def _conditions(studies: Sequence[Judged]) -> tuple[tuple[bool, str], ...]:
             " Without truth the ratio is that of the NIS to its degrees of freedom, and only the innovations of a "
             "filter that declares an optimal gain are judged: those of any other need be neither white nor of the "
             "stated size.",
+        ),
+        (
+            any(_windows(study) for study in studies),
+            " Windows of a log count as runs of one step here, because their errors are declared to be independent.",
         ),
         (
             any(study.until_decided for study in studies),

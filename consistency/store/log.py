@@ -137,6 +137,19 @@ def write_log(
     write_folder(folder, tables, manifest, contents, overwrite)
 
 
+def sensor_text(folder: Path, belief: Belief) -> str:
+    """``sensor.toml`` of a log folder as text, with the noises of ``belief`` in the place of its own.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged.
+    """
+    sensor = read_table(folder / "sensor.toml", SensorFile)
+    changed = sensor.model_copy(update={"motion": belief.motion, "sigma": belief.sensor.sigma})
+    return tomli_w.dumps(changed.model_dump(mode="json", exclude_none=True))
+
+
 def _write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from consistency.errors import InputError
 from consistency.filters.compiled import one_blas_thread
 from consistency.filters.stepping import name_of
 from consistency.protocols import Filter
@@ -94,15 +93,3 @@ class Bench:
             self._told = now
             count = f"{self.settings} settings on {len(self.trials)} run{'s' * (len(self.trials) != 1)}"
             say(f"fitting {name_of(self.filter)} by {self.by}: {count} each, {now - self.began:.0f} s")
-
-
-def require_usable(scores: Scores, belief_text: str) -> None:
-    """Refuse runs without anything to score.
-
-    Raises
-    ------
-    InputError
-        No step has an innovation or an error.
-    """
-    if not np.isfinite(scores.ratio):
-        raise InputError(f"{belief_text}: no step has anything to score; give longer runs with landmarks seen again")

@@ -41,8 +41,8 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> Fit | None:
     one Newton step at its end. The score is smooth, for all settings see the same trials.
 
     Intervals are those of misspecified likelihoods, H^-1 J H^-1 (White 1982, Econometrica 50(1), th. 3.2): H is the
-    curvature of the total, J the spread of the slopes of runs, which are independent, whatever ties steps to each other.
-    Fewer than 20 runs are cut into blocks of steps. The quantile is Student's.
+    curvature of the total, J the spread of the slopes of runs, which are independent whatever ties steps to each
+    other. Fewer than 20 runs are cut into blocks of steps. The quantile is Student's.
     """
     search = _Search(score)
     start = next((start for start in starts if np.isfinite(search.total(start))), None)

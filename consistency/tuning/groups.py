@@ -40,7 +40,7 @@ def groups_of(text: str, belief: Belief) -> tuple[Group, ...]:
         An unknown channel, one that is named twice, or one whose noise is zero and stays so whatever its factor.
     """
     known = {"Q": [f"Q.{name}" for name in MOTION], "R": [f"R.{name}" for name in CHANNELS[belief.sensor.model]]}
-    sigma, groups, seen = _sigma(belief), [], set[str]()
+    sigma, groups, seen = sigma_by_channel(belief), [], set[str]()
     for name in (part.strip() for part in text.split(",")):
         channels: list[str] = []
         for member in (part.strip() for part in name.split("+")):
@@ -63,7 +63,7 @@ def groups_of(text: str, belief: Belief) -> tuple[Group, ...]:
 
 def scaled(belief: Belief, groups: Sequence[Group], log_factors: Array) -> Belief:
     """The belief with the variances of each group times its factor; ``log_factors`` (groups,)."""
-    sigma = _sigma(belief)
+    sigma = sigma_by_channel(belief)
     for group, log_factor in zip(groups, log_factors, strict=True):
         for channel in group.channels:
             sigma[channel] *= float(np.exp(log_factor / 2.0))
@@ -72,11 +72,13 @@ def scaled(belief: Belief, groups: Sequence[Group], log_factors: Array) -> Belie
 
 def rounded(belief: Belief) -> Belief:
     """The belief with the digits that are written of its standard deviations."""
-    return _with_sigma(belief, {channel: float(f"{value:.{DIGITS}g}") for channel, value in _sigma(belief).items()})
+    return _with_sigma(
+        belief, {channel: float(f"{value:.{DIGITS}g}") for channel, value in sigma_by_channel(belief).items()}
+    )
 
 
-def _sigma(belief: Belief) -> dict[str, float]:
-    """Standard deviation of each channel."""
+def sigma_by_channel(belief: Belief) -> dict[str, float]:
+    """Standard deviation of each channel, SI units and px."""
     values = (belief.motion.sigma_v, belief.motion.sigma_omega, *belief.sensor.sigma)
     names = (*(f"Q.{name}" for name in MOTION), *(f"R.{name}" for name in CHANNELS[belief.sensor.model]))
     return dict(zip(names, values, strict=True))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 
 import numpy as np
 
@@ -18,118 +17,88 @@ from consistency.store.log import Log
 from consistency.store.results import Results
 from consistency.types import Trial
 
+Judging = Callable[[Filter, Belief, int, float | None], Results]  # with so many jobs, and seconds a trial
 
-class Parts(ABC):
+
+@dataclass(frozen=True)
+class Parts:
     """Two parts of one world that share no noise."""
 
-    name: str
-    belief: Belief  # as it is before
+    world: Scenario | Log
+    trials: list[Trial]  # of the fit
+    on_fitted: Judging  # results on these
+    on_fresh: Judging  # and on the other part
+    about: tuple[str, str]  # what is fitted, and what is judged
+    again: str  # options by which ``consistency run`` judges again; empty where it cannot
     has_truth: bool
 
-    @abstractmethod
-    def fitted(self) -> list[Trial]:
-        """Trials of the fit."""
-
-    @abstractmethod
-    def run(self, filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
-        """The filter with a belief on the trials that are judged."""
+    @property
+    def belief(self) -> Belief:
+        """As it was before the fit."""
+        return self.world.belief
 
     @property
-    @abstractmethod
-    def about(self) -> tuple[str, str]:
-        """What is fitted, and what is judged, for a sentence."""
+    def scenario(self) -> Scenario | None:
+        """The world, where it is simulated."""
+        return self.world if isinstance(self.world, Scenario) else None
 
 
-@dataclass(frozen=True)
-class Fresh(Parts):
-    """So many runs of a scenario for the fit, and as many with another seed."""
+def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
+    """So many runs of a scenario and as many fresh ones; or the first half of a log and its second.
 
-    scenario: Scenario
-    runs: int
-    seed: int
-    has_truth = True
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return self.scenario.name
-
-    @property
-    def belief(self) -> Belief:  # type: ignore[override]
-        return self.scenario.belief
-
-    @property
-    def seeds(self) -> tuple[int, int]:
-        """Of the fit, and of the runs that are judged."""
-        fit, judged = np.random.SeedSequence(self.seed).generate_state(2)
-        return int(fit), int(judged)
-
-    def fitted(self) -> list[Trial]:
-        simulated = Simulated(self.scenario, self.seeds[0])
-        return [simulated(run) for run in range(self.runs)]
-
-    def run(self, filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
-        return run_trials(with_belief(self.scenario, belief), [filter_], self.runs, self.seeds[1], jobs, timeout)
-
-    @property
-    def about(self) -> tuple[str, str]:
-        count = f"{self.runs} run{'s' * (self.runs != 1)}"
-        return count, f"{count} that the fit has not seen"
-
-
-@dataclass(frozen=True)
-class Recorded(Parts):
-    """The first half of the runs of a log for the fit, or of the steps of its only run.
+    A log of one run is divided in the middle of its steps. The second part begins anew, with an empty map.
 
     Raises
     ------
     InputError
-        The only run is too short, or of a linear world, in which a filter is told the path from its beginning.
+        A number out of its range, nothing in view, or a log that cannot be divided.
     """
+    if isinstance(world, Log):
+        return _of_log(world)
+    if runs < 1:
+        raise InputError(f"runs must be at least 1, got {runs}")
+    if seed < 0:
+        raise InputError(f"seed must not be negative, got {seed}")
+    for_fit, for_verdict = (int(state) for state in np.random.SeedSequence(seed).generate_state(2))
+    simulated = Simulated(world, for_fit)
+    count = f"{runs} run{'s' * (runs != 1)}"
+    return Parts(
+        world, [simulated(run) for run in range(runs)], partial(_simulated, world, runs, for_fit),
+        partial(_simulated, world, runs, for_verdict),
+        (count, f"{count} that the fit has not seen"), f"--runs {runs} --seed {for_verdict}", True,
+    )  # fmt: skip
 
-    log: Log
 
-    def __post_init__(self) -> None:
-        _ = self._halves
+def _simulated(
+    scenario: Scenario, runs: int, seed: int, filter_: Filter, belief: Belief, jobs: int, timeout: float | None
+) -> Results:
+    return run_trials(with_belief(scenario, belief), [filter_], runs, seed, jobs, timeout)
 
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return self.log.name
 
-    @property
-    def belief(self) -> Belief:  # type: ignore[override]
-        return self.log.belief
-
-    @property
-    def has_truth(self) -> bool:  # type: ignore[override]
-        return all(trial.truth is not None for trial in self.log.trials)
-
-    @cached_property
-    def _halves(self) -> tuple[list[Trial], list[Trial]]:
-        trials = self.log.trials
-        if len(trials) > 1:
-            half = (len(trials) + 1) // 2
-            return trials[:half], trials[half:]
+def _of_log(log: Log) -> Parts:
+    trials = log.trials
+    if len(trials) > 1:
+        half = (len(trials) + 1) // 2
+        first, second = trials[:half], trials[half:]
+        about = f"the first {half} run{'s' * (half != 1)}", f"the other {len(second)}"
+    else:
         [only] = trials
-        if self.log.belief.sensor.model == "linear":
-            raise InputError(f"--log {self.log.name}: one run of a linear world cannot be divided; give two or more")
-        if only.steps < 2:
-            raise InputError(f"--log {self.log.name}: one run of one step cannot be divided; give a longer one")
+        if log.belief.sensor.model == "linear":
+            raise InputError(f"--log {log.name}: one run of a linear world cannot be divided; give two or more")
         middle = only.steps // 2
-        return [part_of(only, 0, middle)], [part_of(only, middle, only.steps)]
+        if middle < 1:
+            raise InputError(f"--log {log.name}: one run of one step cannot be divided; give a longer one")
+        first, second = [part_of(only, 0, middle)], [part_of(only, middle, only.steps)]
+        about = f"the first {middle} steps", f"the other {only.steps - middle}, which begin with an empty map"
 
-    def fitted(self) -> list[Trial]:
-        return self._halves[0]
+    has_truth = all(trial.truth is not None for trial in trials)
+    return Parts(log, first, partial(_recorded, log, first), partial(_recorded, log, second), about, "", has_truth)
 
-    def run(self, filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
-        return run_log(replace(self.log, trials=self._halves[1], belief=belief), [filter_], jobs, timeout)
 
-    @property
-    def about(self) -> tuple[str, str]:
-        if len(self.log.trials) > 1:
-            first, second = map(len, self._halves)
-            return f"the first {first} runs", f"the other {second}"
-        first, second = (trials[0].steps for trials in self._halves)
-        return f"the first {first} steps", f"the other {second}, which begin anew"
+def _recorded(
+    log: Log, trials: list[Trial], filter_: Filter, belief: Belief, jobs: int, timeout: float | None
+) -> Results:
+    return run_log(replace(log, trials=trials, belief=belief), [filter_], jobs, timeout)
 
 
 def part_of(trial: Trial, start: int, end: int) -> Trial:
@@ -144,17 +113,8 @@ def part_of(trial: Trial, start: int, end: int) -> Trial:
     )  # fmt: skip
 
 
-def with_belief(scenario: Scenario, belief: Belief, name: str | None = None, summary: str = "") -> Scenario:
+def with_belief(scenario: Scenario, belief: Belief, name: str | None = None, summary: str | None = None) -> Scenario:
     """The scenario with another belief."""
-    named = {"summary": summary} if summary else {}
-    return scenario.variant(name or scenario.name, belief=belief.model_dump(), **named)
-
-
-def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
-    """The two parts of a scenario or of a log."""
-    return Recorded(world) if isinstance(world, Log) else Fresh(world, runs, seed)
-
-
-def numbers(trials: Sequence[Trial]) -> int:
-    """Observations of all trials."""
-    return sum(len(trial.landmark) for trial in trials)
+    return scenario.variant(
+        name or scenario.name, belief=belief.model_dump(), summary=scenario.summary if summary is None else summary
+    )

@@ -3,9 +3,9 @@
     python benchmarks/tuning.py                                   # 100 fits, and the speed: some 15 minutes
     python benchmarks/tuning.py --repetitions 20 --seed 500       # quicker
 
-In each repetition the Kalman filter of ``linear-gaussian``, exact in its world, believes in variances of Q and R that are
-off by factors drawn between 1/4 and 4. Exit status 1 if an interval holds its factor less often, or the tuned filter is
-found at fault more often, than the stated rate explains (binomial, 1 % each).
+In each repetition the Kalman filter of ``linear-gaussian``, exact in its world, believes in variances of Q and R that
+are off by factors drawn between 1/4 and 4. Exit status 1 if an interval holds its factor less often, or the tuned
+filter is found at fault more often, than the stated rate explains (binomial, 1 % each).
 """
 
 from __future__ import annotations
@@ -68,8 +68,12 @@ def coverage(options: argparse.Namespace) -> bool:
         statuses[tuning.verdict.status] += 1
         before[tuning.before.status] += 1
         settings.append(tuning.chosen.settings)
+        if tuning.verdict.status not in ("consistent", "undecided"):
+            print(f"seed {seed}: {tuning.verdict.reasons[0]}; found {tuning.verdict.faults}", flush=True)
         if not all(inside):
-            missed = ", ".join(f"{f.group.name} {f.interval} (true {v:.3f})" for f, v in zip(tuning.factors, true))
+            missed = ", ".join(
+                f"{f.group.name} {f.interval} (true {v:.3f})" for f, v in zip(tuning.factors, true, strict=True)
+            )
             print(f"seed {seed}: {missed}", flush=True)
     n = options.repetitions
     rates = []
@@ -77,7 +81,7 @@ def coverage(options: argparse.Namespace) -> bool:
         p = float(stats.binom.cdf(held[name], n, COVERAGE))
         rates.append(p)
         print(
-            f"{name}: the true factor inside its 95 % interval in {held[name]} of {n} (p {p:.3f}); half width x{width:.3f}"
+            f"{name}: true factor inside its 95 % interval in {held[name]} of {n} (p {p:.3f}), half width x{width:.3f}"
         )
     faults = n - statuses["consistent"] - statuses["undecided"]
     rates.append(float(stats.binom.sf(faults - 1, n, FALSE_ALARM)))

@@ -31,7 +31,8 @@ class Record:
         """Room for one run."""
         at, rejected = np.zeros(1, np.int64), np.zeros(observations, bool)
         pose, covariance, own = (np.empty((steps, *shape)) for shape in ((3,), (3, 3), (3, 3)))
-        return cls(at, pose, covariance, own, *(np.empty(steps) for _ in range(3)), rejected).begun()
+        nis, dof, log_det = (np.empty(steps) for _ in range(3))
+        return cls(at, pose, covariance, own, nis, dof, log_det, rejected).begun()
 
     def begun(self) -> Record:
         """The same arrays, as they are before the first step."""

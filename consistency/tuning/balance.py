@@ -38,8 +38,8 @@ def directions(p: int) -> Array:
     if p == 2:
         apart = np.linspace(-SPAN, SPAN, ALONG)
         return np.column_stack([-apart / 2.0, apart / 2.0])
-    points = SPAN * (qmc.Sobol(p, scramble=False).random(AROUND) - 0.5)
-    return points - points.mean(axis=1, keepdims=True)
+    points: Array = SPAN * (qmc.Sobol(p, scramble=False).random(AROUND) - 0.5)
+    return np.asarray(points - points.mean(axis=1, keepdims=True))
 
 
 def balanced(centre: Array, ratio: Callable[[Array], float], judge: Callable[[Array], Verdict]) -> list[Balanced]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy import stats
-from scipy.optimize import Bounds, brentq, minimize
+from scipy.optimize import brentq, minimize
 
 from consistency.types import Array
 
@@ -49,10 +50,14 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> Fit | None:
     if start is None:
         return None
     first, size = search.total(start), float(search(start).size)
+    options: Any = {"initial_tr_radius": RADIUS, "final_tr_radius": SETTLED, "maxfev": MOST, "scale": False}
     found = minimize(
-        lambda x: -search.total(x) / size, start, method="COBYQA", bounds=Bounds(-LIMIT, LIMIT),
-        options={"initial_tr_radius": RADIUS, "final_tr_radius": SETTLED, "maxfev": MOST, "scale": False},
-    )  # fmt: skip
+        lambda x: -search.total(x) / size,
+        start,
+        method="COBYQA",
+        bounds=[(-LIMIT, LIMIT)] * len(start),
+        options=options,
+    )
     best = np.clip(found.x, -LIMIT, LIMIT)
     edge = tuple(int(np.sign(x)) if abs(x) > LIMIT - AT_EDGE else 0 for x in best)
     free = [i for i, at in enumerate(edge) if at == 0]

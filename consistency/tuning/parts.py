@@ -29,6 +29,7 @@ class Parts:
     on_fitted: Judging  # results on these
     on_fresh: Judging  # and on the other part
     about: tuple[str, str]  # what is fitted, and what is judged
+    spare_seed: int  # of runs for neither
     again: str  # options by which ``consistency run`` judges again; empty where it cannot
     has_truth: bool
 
@@ -59,13 +60,13 @@ def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
         raise InputError(f"runs must be at least 1, got {runs}")
     if seed < 0:
         raise InputError(f"seed must not be negative, got {seed}")
-    for_fit, for_verdict = (int(state) for state in np.random.SeedSequence(seed).generate_state(2))
+    for_fit, for_verdict, spare = (int(state) for state in np.random.SeedSequence(seed).generate_state(3))
     simulated = Simulated(world, for_fit)
     count = f"{runs} run{'s' * (runs != 1)}"
     return Parts(
         world, [simulated(run) for run in range(runs)], partial(_simulated, world, runs, for_fit),
         partial(_simulated, world, runs, for_verdict),
-        (count, f"{count} that the fit has not seen"), f"--runs {runs} --seed {for_verdict}", True,
+        (count, f"{count} that the fit has not seen"), spare, f"--runs {runs} --seed {for_verdict}", True,
     )  # fmt: skip
 
 
@@ -92,7 +93,7 @@ def _of_log(log: Log) -> Parts:
         about = f"the first {middle} steps", f"the other {only.steps - middle}, which begin with an empty map"
 
     has_truth = all(trial.truth is not None for trial in trials)
-    return Parts(log, first, partial(_recorded, log, first), partial(_recorded, log, second), about, "", has_truth)
+    return Parts(log, first, partial(_recorded, log, first), partial(_recorded, log, second), about, 0, "", has_truth)
 
 
 def _recorded(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +25,13 @@ from consistency.tuning.fit import Fit, maximise
 from consistency.tuning.groups import Group, groups_of, rounded, scaled
 from consistency.tuning.parts import Judging, Parts, parts_of
 from consistency.tuning.scores import require_scorable
-from consistency.tuning.why import reasons_of
+from consistency.tuning.why import Probe, is_at_fault, reasons_of
 from consistency.types import Array
 from consistency.verdicts.judge import analyse
 
 OTHER_STARTS = (10.0, 0.1, 100.0)  # common factors to begin with where a run fails at the one that the data ask for
+
+MOST_TOLERATED = 1.1  # ratio of true to stated covariance: what a verdict may excuse as the uncertainty of a fit
 
 
 @dataclass(frozen=True)
@@ -56,13 +58,18 @@ class Setting:
     settings: int  # that were tried
 
 
+# another setting, how many were tried, whether none is consistent, and why
+Explanation = tuple[Setting | None, int, bool, tuple[str, ...]]
+
+
 @dataclass(frozen=True)
 class Tuning:
     """What came of a fit.
 
     ``chosen`` is the setting that was asked for. Where a fault is found in it and the truth is known, ``other`` is, of
     settings at which errors have the size that is stated, the one that comes nearest to consistent on the runs of the
-    fit; ``tried`` are those settings.
+    fit; ``tried`` is the number of those settings. ``no_setting`` says that a fault is found in both, and also in other
+    runs of a scenario with its true noises believed.
     """
 
     filter: str
@@ -71,7 +78,8 @@ class Tuning:
     chosen: Setting
     other: Setting | None
     tried: int
-    why: tuple[str, ...]  # no setting is consistent; empty where one is, or may be
+    no_setting: bool  # no setting is consistent, as far as they were tried
+    why: tuple[str, ...]  # what the referee finds, and the cause
     seconds: float
 
     @property
@@ -140,17 +148,11 @@ def tune(
     require_scorable(instance, by, parts.has_truth)
     tuner = _Tuner(instance, parts, parsed, jobs, timeout, settings or Settings())
     chosen = tuner.fitted(by)
-    before = tuner.judged(parts.belief)
-    other, tried = tuner.nearest(chosen) if is_at_fault(chosen.verdict) and parts.has_truth else (None, 0)
-    why: tuple[str, ...] = ()
-    if is_at_fault(chosen.verdict) and (other is None or is_at_fault(other.verdict)):
-        why = reasons_of(instance, parts, chosen.verdict, jobs, timeout, tuner.settings)
-    return Tuning(name_of(instance), parts, before, chosen, other, tried, why, time.monotonic() - began)
-
-
-def is_at_fault(verdict: Verdict) -> bool:
-    """Was a fault found? An undecided verdict has none."""
-    return verdict.status not in ("consistent", "undecided")
+    before = tuner.before()
+    nothing: Explanation = (None, 0, False, ())
+    other, tried, no_setting, why = tuner.explained(chosen) if is_at_fault(chosen.verdict) else nothing
+    seconds = time.monotonic() - began
+    return Tuning(name_of(instance), parts, before, chosen, other, tried, no_setting, why, seconds)
 
 
 class _Tuner:
@@ -175,9 +177,27 @@ class _Tuner:
         fit = self._fit(bench)
         return self._setting(by, fit.log_factors, fit.interval, fit.edge, bench.settings)
 
+    def explained(self, chosen: Setting) -> Explanation:
+        """For a setting with a fault: another one, how many were tried, whether none is consistent, and why."""
+        probe, scenario = None, self.parts.scenario
+        if scenario is not None:
+            say("a fault is found; asking whether it is there with the true noises, too")
+            count, seed = len(self.parts.trials), self.parts.spare_seed
+            probe = Probe(self.filter, scenario, count, seed, self.jobs, self.timeout, self.settings)
+            if not is_at_fault(at_truth := probe()):
+                return None, 0, False, (
+                    f"with the true noises, on other runs: {at_truth.reasons[0]}",
+                    "so the fit is off, or the fault was found by chance, as in one of "
+                    f"{1.0 / self.settings.false_alarm:.3g} verdicts on a right filter: fit on more runs (--runs)",
+                )  # fmt: skip
+        other, tried = self.nearest(chosen) if self.parts.has_truth else (None, 0)
+        if other is not None and not is_at_fault(other.verdict):
+            return other, tried, False, ()
+        return other, tried, True, reasons_of(chosen.verdict, probe)
+
     def nearest(self, fitted: Setting) -> tuple[Setting | None, int]:
         """Of settings at which errors have the size that is stated, the one nearest to consistent; and their number."""
-        say("a fault is found; looking for settings at which errors are as large as stated")
+        say("looking for settings at which errors are as large as stated")
         bench = Bench(self.filter, self.parts.trials, "nees", self.jobs, self.timeout)
 
         def ratio(log_factors: Array) -> float:
@@ -185,7 +205,8 @@ class _Tuner:
             return np.nan if scores.failures else scores.ratio
 
         def judge(log_factors: Array) -> Verdict:
-            return self._verdict(self.parts.on_fitted, scaled(self.parts.belief, self.groups, log_factors))
+            belief = scaled(self.parts.belief, self.groups, log_factors)
+            return self._verdict(self.parts.on_fitted, belief, self.settings)
 
         centre = np.array([0.0 if factor.edge else np.log(factor.value) for factor in fitted.factors])
         settings = balanced(centre, ratio, judge)
@@ -198,16 +219,17 @@ class _Tuner:
     def _setting(self, by: str, x: Array, interval: Array, edge: Sequence[int], settings: int) -> Setting:
         factors = tuple(map(_factor, self.groups, x, interval, edge))
         belief = rounded(scaled(self.parts.belief, self.groups, x))
-        return Setting(by, factors, belief, self.judged(belief), settings)
+        verdict = self._verdict(self.parts.on_fresh, belief, tolerant(self.settings, interval))
+        return Setting(by, factors, belief, verdict, settings)
 
-    def judged(self, belief: Belief) -> Verdict:
-        """The verdict on the other part."""
-        return self._verdict(self.parts.on_fresh, belief)
+    def before(self) -> Verdict:
+        """The verdict on the other part with the belief as it is."""
+        return self._verdict(self.parts.on_fresh, self.parts.belief, self.settings)
 
-    def _verdict(self, judging: Judging, belief: Belief) -> Verdict:
+    def _verdict(self, judging: Judging, belief: Belief, settings: Settings) -> Verdict:
         with quiet():
             results = judging(self.filter, belief, self.jobs, self.timeout)
-        return analyse(results, settings=self.settings)[name_of(self.filter)]
+        return analyse(results, settings=settings)[name_of(self.filter)]
 
     def _fit(self, bench: Bench) -> Fit:
         at_first = bench(self.parts.belief)
@@ -228,6 +250,18 @@ class _Tuner:
                 f"{count} of {len(self.parts.trials)} runs ({first})"
             )
         return fit
+
+
+def tolerant(settings: Settings, interval: Array) -> Settings:
+    """Settings that take no ratio for a fault that is within the uncertainty of a fit, (groups, 2) in log factors.
+
+    A verdict knows the size of innovations as well as the fit does, and would find the error of the fit.
+    """
+    half_widths = np.diff(interval, axis=1) / 2.0
+    unsure = float(np.exp(half_widths[np.isfinite(half_widths)].max(initial=0.0)))
+    known = unsure if np.isfinite(half_widths).all() else MOST_TOLERATED
+    tolerance = max(settings.tolerated, min(known, MOST_TOLERATED))
+    return replace(settings, tolerance=tolerance) if tolerance > 1.0 else settings
 
 
 def _wanted(by: str) -> str:

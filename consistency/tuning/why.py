@@ -1,4 +1,4 @@
-"""Why no setting of the noises makes a filter consistent: what the referee finds, and what less noise tells."""
+"""Why no setting of the noises makes a filter consistent: what the referee finds, and what other noise tells."""
 
 from __future__ import annotations
 
@@ -9,19 +9,54 @@ from consistency.filters.stepping import name_of
 from consistency.protocols import Filter
 from consistency.runs.montecarlo import run_trials
 from consistency.scenario import Scenario, misbelief
-from consistency.terminal.progress import say
-from consistency.tuning.parts import Parts
+from consistency.terminal.progress import quiet
 from consistency.verdicts.judge import analyse
 
 LESS = 0.1  # of all standard deviations: what is of second order in the errors is then a hundredth
 FIT = 1.1  # NIS per degree of freedom within this factor of 1: innovations look right
-PROBE = 50  # runs of the world with less noise
+PROBE = 50  # runs of a probe, at least
 
 
-def reasons_of(
-    filter_: Filter, parts: Parts, verdict: Verdict, jobs: int, timeout: float | None, settings: Settings
-) -> tuple[str, ...]:
-    """Sentences: what the referee says of the fitted filter, and where a scenario shows it, the cause."""
+def is_at_fault(verdict: Verdict) -> bool:
+    """Was a fault found? An undecided verdict has none."""
+    return verdict.status not in ("consistent", "undecided")
+
+
+class Probe:
+    """A filter that is told the true noises, in a world with these or with smaller ones, on runs of its own."""
+
+    def __init__(
+        self, filter_: Filter, scenario: Scenario, runs: int, seed: int, jobs: int, timeout: float | None,
+        settings: Settings,
+    ) -> None:  # fmt: skip
+        self.filter, self.scenario, self.runs, self.seed = filter_, scenario, max(runs, PROBE), seed
+        self.jobs, self.timeout, self.settings = jobs, timeout, settings
+
+    def __call__(self, factor: float = 1.0) -> Verdict:
+        """The verdict where all standard deviations are ``factor`` times those of the world."""
+        world = with_noise(self.scenario, factor)
+        with quiet():
+            results = run_trials(world, [self.filter], self.runs, self.seed, self.jobs, self.timeout)
+        return analyse(results, settings=self.settings)[name_of(self.filter)]
+
+    def cause(self) -> str:
+        """What is wrong with the filter: something that it is not told, its linearisation, or something else."""
+        if unknown := misbelief(with_noise(self.scenario, 1.0)):
+            return f"cause: the belief is wrong in more than its noises: {unknown}"
+        small = self(LESS)
+        if is_at_fault(small):
+            return (
+                f"cause: neither its noises nor linearisation alone. With {LESS:g} times the true standard deviations "
+                f"in world and belief it still is {small.reasons[0]}"
+            )
+        return (
+            f"cause: linearisation. With {LESS:g} times the true standard deviations in world and belief no fault is "
+            f"found in {self.runs} runs; take a filter of another kind (docs/filters.md), or better sensors"
+        )
+
+
+def reasons_of(verdict: Verdict, probe: Probe | None) -> tuple[str, ...]:
+    """What the referee says of a filter whose noises are fitted, and where a scenario shows it, the cause."""
     found = [verdict.reasons[0]]
     innovations, scale = verdict.innovations, verdict.scale
     if set(verdict.faults) & set(BIAS):
@@ -31,33 +66,12 @@ def reasons_of(
             f"innovations are as large as stated (NIS per degree of freedom {innovations.ratio:.3f}) while errors are "
             f"not (covariance ratio {short(scale.inflation.value)}): what is wrong with them, innovations do not show"
         )
-    if parts.scenario is not None:
-        found.append(_cause(filter_, parts.scenario, jobs, timeout, settings))
-    return tuple(found)
+    return (*found, probe.cause()) if probe is not None else tuple(found)
 
 
 def _is_blind(verdict: Verdict, nis: float, ratio: float) -> bool:
     """Do innovations look right where errors are larger than stated?"""
     return 1.0 / FIT < nis < FIT and ratio > 1.0 and bool(set(verdict.faults) & set(SCALE))
-
-
-def _cause(filter_: Filter, scenario: Scenario, jobs: int, timeout: float | None, settings: Settings) -> str:
-    """What is wrong with the filter in a world: something that it is not told, its linearisation, or something else."""
-    told = with_noise(scenario, 1.0)
-    if unknown := misbelief(told):
-        return f"other than by its noises the belief is wrong: {unknown}"
-    say("asking whether the filter is consistent where the noise is small")
-    results = run_trials(with_noise(scenario, LESS), [filter_], PROBE, jobs=jobs, timeout=timeout)
-    small = analyse(results, settings=settings)[name_of(filter_)]
-    if small.status in ("consistent", "undecided"):
-        return (
-            f"cause: linearisation. With {LESS:g} times the true standard deviations in world and belief no fault is "
-            f"found in {PROBE} runs; take a filter of another kind (docs/filters.md), or better sensors"
-        )
-    return (
-        f"cause: neither its noises nor linearisation alone. With {LESS:g} times the true standard deviations in world "
-        f"and belief it still is {small.reasons[0]}"
-    )
 
 
 def with_noise(scenario: Scenario, factor: float) -> Scenario:

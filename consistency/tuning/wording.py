@@ -40,18 +40,16 @@ def lines(tuning: Tuning, out: Path | None = None) -> list[str]:
             f"of {tuning.tried} other settings, at which errors are as large as stated, the nearest to consistent is:",
             *_factors(other, parts.belief), f"on {parts.about[1]}: {other.verdict.reasons[0]}{_power(other.verdict)}",
         ]  # fmt: skip
-        if not tuning.why:
+        if not tuning.no_setting:
             text += [
                 "it leaves no fault, but is not the setting of the greatest score: its noises make up for something "
                 "else, and hold in worlds like this one alone"
             ]
-    if tuning.why:
+    if tuning.no_setting:
         names = " and ".join(factor.group.name for factor in tuning.factors)
-        text += [f"no setting of {names} is consistent:", *(f"  - {reason}" for reason in tuning.why)]
-    if tuning.other is None or tuning.why:
-        text += ["", noise_table(tuning).rstrip()]
-    else:
-        text += ["", noise_table(tuning, tuning.other).rstrip()]
+        text += [f"no setting of {names} is consistent:"]
+    text += [f"  - {reason}" for reason in tuning.why]
+    text += ["", noise_table(tuning).rstrip()]
     if out is not None:
         text += ["", f"{out} has {', '.join(files(tuning))}; again: {command(tuning, out)}"]
     return text
@@ -93,9 +91,9 @@ def _power(verdict: Verdict) -> str:
     return f" (a covariance too small by x{ratio} would be found with power {verdict.settings.power:g})"
 
 
-def noise_table(tuning: Tuning, setting: Setting | None = None) -> str:
+def noise_table(tuning: Tuning) -> str:
     """The believed noises as TOML to paste: into a scenario, or into ``sensor.toml`` of a log."""
-    belief = (setting or tuning.chosen).belief
+    belief = tuning.belief
     motion = {"sigma_v": belief.motion.sigma_v, "sigma_omega": belief.motion.sigma_omega}
     sigma = {f"sigma{SIGMA_UNITS[belief.sensor.model]}": list(belief.sensor.sigma)}
     is_log = isinstance(tuning.parts.world, Log)
@@ -156,6 +154,7 @@ def as_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
         "nearest": None if tuning.other is None else _setting(tuning.other),
         "tried": tuning.tried,
         "consistent": tuning.consistent,
+        "no_setting": tuning.no_setting,
         "why": list(tuning.why),
         "seconds": tuning.seconds,
         "out": None if out is None else str(out),

@@ -50,19 +50,18 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> Fit | None:
     if start is None:
         return None
     first, size = search.total(start), float(search(start).size)
-    options: Any = {"initial_tr_radius": RADIUS, "final_tr_radius": SETTLED, "maxfev": MOST, "scale": False}
-    found = minimize(
-        lambda x: -search.total(x) / size,
-        start,
-        method="COBYQA",
-        bounds=[(-LIMIT, LIMIT)] * len(start),
-        options=options,
-    )
+    how: dict[str, Any] = {"method": "COBYQA", "bounds": [(-LIMIT, LIMIT)] * len(start)}
+    how["options"] = {"initial_tr_radius": RADIUS, "final_tr_radius": SETTLED, "maxfev": MOST, "scale": False}
+
+    def loss(x: Array) -> float:
+        return -search.total(x) / size
+
+    found: Any = minimize(loss, start, **how)
     best = np.clip(found.x, -LIMIT, LIMIT)
     edge = tuple(int(np.sign(x)) if abs(x) > LIMIT - AT_EDGE else 0 for x in best)
     free = [i for i, at in enumerate(edge) if at == 0]
     interval = np.array([_beyond(search, best, i) if at else (-np.inf, np.inf) for i, at in enumerate(edge)])
-    slopes, curvature = _derivatives(search, best, free)
+    slopes, curvature = _derivatives(search, best, free) if free else (np.zeros((0, 0)), np.zeros((0, 0)))
     if free and np.isfinite(curvature).all() and np.linalg.eigvalsh(curvature)[-1] < 0.0:
         moved = best.copy()
         moved[free] -= np.clip(np.linalg.solve(curvature, slopes.sum(axis=0)), -STEP, STEP)
@@ -77,6 +76,7 @@ class _Search:
     def __init__(self, score: Scoring) -> None:
         self.score = score
         self._known: dict[bytes, Array | None] = {}
+        self._shape: tuple[int, ...] = (1, 1)
 
     def __call__(self, x: Array) -> Array:
         """Log densities (R, T); NaN where a run failed."""
@@ -84,7 +84,8 @@ class _Search:
         if key not in self._known:
             self._known[key] = self.score(np.asarray(x, float))
         density = self._known[key]
-        return np.full((1, 1), np.nan) if density is None else density
+        self._shape = self._shape if density is None else density.shape
+        return np.full(self._shape, np.nan) if density is None else density
 
     def total(self, x: Array) -> float:
         total = float(self(x).sum())
@@ -105,7 +106,7 @@ def _derivatives(search: _Search, x: Array, free: Sequence[int]) -> tuple[Array,
         return search(moved)
 
     up, down, here = [at((i, STEP)) for i in free], [at((i, -STEP)) for i in free], search(x)
-    slopes = np.array([_units(u - d) / (2.0 * STEP) for u, d in zip(up, down, strict=True)]).reshape(len(free), -1).T
+    slopes = np.array([_units(u - d) / (2.0 * STEP) for u, d in zip(up, down, strict=True)]).T
     curvature = np.diag([(u.sum() - 2.0 * here.sum() + d.sum()) / STEP**2 for u, d in zip(up, down, strict=True)])
     for a, b in combinations(range(len(free)), 2):
         i, j = free[a], free[b]

@@ -46,8 +46,8 @@ def lines(tuning: Tuning, out: Path | None = None) -> list[str]:
                 "else, and hold in worlds like this one alone"
             ]
     if tuning.no_setting:
-        names = " and ".join(factor.group.name for factor in tuning.factors)
-        text += [f"no setting of {names} is consistent:"]
+        names = ", ".join(factor.group.name for factor in tuning.factors)
+        text += [f"no setting of {names} is consistent, of {tuning.tried + 1} tried:"]
     text += [f"  - {reason}" for reason in tuning.why]
     text += ["", noise_table(tuning).rstrip()]
     if out is not None:

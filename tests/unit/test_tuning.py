@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -187,8 +190,8 @@ def test_the_two_parts_of_a_scenario_share_no_trial(uvd: cs.Scenario) -> None:
     on_fitted, on_fresh = (
         run(cs.get_filter("ekf-uvd"), uvd.belief, 1, None) for run in (parts.on_fitted, parts.on_fresh)
     )
-    ends = [estimates.estimates["x"].to_numpy() for estimates in (on_fitted, on_fresh)]
-    fitted = run_filter(cs.get_filter("ekf-uvd"), parts.trials[0], uvd.belief).pose[:, 0]
+    ends = [estimates.estimates["heading"].to_numpy() for estimates in (on_fitted, on_fresh)]
+    fitted = run_filter(cs.get_filter("ekf-uvd"), parts.trials[0], uvd.belief).pose[:, 2]
     assert np.array_equal(ends[0][: len(fitted)], fitted)
     assert not np.isclose(ends[0], ends[1], rtol=1e-9, atol=0.0).any()
     assert f"--runs 2 --seed {on_fresh.manifest['seed']}" == parts.again
@@ -360,7 +363,7 @@ def test_no_setting_is_said_only_where_all_are_at_fault(monkeypatch: pytest.Monk
     other, tried, none, why = scripted(monkeypatch, tuned, "overconfident", "biased")
     assert (tried, none, why[0], why[-1]) == (9, True, "bad", "cause: scripted")
     hopeless = replace(tuned, other=other, tried=tried, no_setting=none, why=why)
-    assert "no setting of Q and R is consistent:\n  - bad\n" in str(hopeless)
+    assert "no setting of Q, R is consistent, of 10 tried:\n  - bad\n" in str(hopeless)
     assert "of 9 other settings, at which errors are as large as stated, the nearest to consistent is" in str(hopeless)
 
 
@@ -437,13 +440,52 @@ def test_a_log_is_tuned_to_a_sensor_file(capsys: pytest.CaptureFixture[str], tmp
     assert cs.read_log(log).belief.sensor.B == scenario.belief.sensor.B
 
 
+# --- the manual --------------------------------------------------------------------------------------
+
+MANUAL = (Path(__file__).parents[2] / "docs/tuning.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^ {4}consistency (tune [^\[\n]*)$", MANUAL, re.MULTILINE)
+
+
+def test_the_manual_has_commands() -> None:
+    assert len(COMMANDS) == 5
+
+
+def reached(self: Any, by: str) -> None:
+    raise cs.InputError("reached")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_commands_of_the_manual_are_taken(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, uvd: cs.Scenario
+) -> None:
+    """Up to the fit: names, options and groups are as they must be; the log is one of its sensor."""
+    sensor = {"model": "range-bearing", "sigma": (0.1, 0.01)}
+    plane = uvd.belief.model_copy(update={"sensor": type(uvd.belief.sensor)(**sensor)})
+    belief = plane if "-rb" in command else uvd.belief
+    trial = cs.simulate(uvd, seed=SEED)
+    monkeypatch.setattr("consistency.store.log.read_log", lambda folder: Log(str(folder), [trial], belief, None))
+    monkeypatch.setattr(tuning_module._Tuner, "fitted", reached)
+    status, out, err = status_of(capsys, *command.split()[1:])
+    assert (status, out, err) == (2, "", "consistency: reached\n")
+
+
+def test_the_filterpy_filter_of_the_manual(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    [block] = re.findall(r"```python\n(.*?)```", MANUAL, re.DOTALL)
+    short = block.replace("runs=20", "runs=2").replace("truth__steps=50", "truth__steps=12")
+    assert short != block
+    (tmp_path / "mine.py").write_text(short)
+    found = runpy.run_path(str(tmp_path / "mine.py"))
+    assert found["tuning"].factors[0].value > 2.0  # 8 in truth, of 24 steps: 1 is 5 standard deviations away
+    assert capsys.readouterr().out.startswith(
+        "my-ekf on doubtful: fitted by the likelihood of the innovations on 2 runs"
+    )
+
+
 # --- a real robot ------------------------------------------------------------------------------------
 
 
 def test_one_robot_of_mrclam() -> None:
     """Innovations of the second half are as large as stated after a fit to the first; the drive is still at fault."""
-    import os
-
     folder = Path(os.environ.get("CONSISTENCY_DATA", "")) / "mrclam" / "MRCLAM_Dataset6"
     if not os.environ.get("CONSISTENCY_DATA") or not folder.is_dir():
         pytest.skip("set CONSISTENCY_DATA to the folder that holds mrclam/MRCLAM_Dataset6")

@@ -24,6 +24,7 @@ from consistency.scenario import (
     SigmaPoints,
     Table,
     read_table,
+    toml_text,
 )
 from consistency.scenario.tables import SIGMA_UNITS
 from consistency.store.parquet import COLUMNS, read_parquet, require_table
@@ -147,7 +148,7 @@ def sensor_text(folder: Path, belief: Belief) -> str:
     """
     sensor = read_table(folder / "sensor.toml", SensorFile)
     changed = sensor.model_copy(update={"motion": belief.motion, "sigma": belief.sensor.sigma})
-    return tomli_w.dumps(changed.model_dump(mode="json", exclude_none=True))
+    return toml_text(changed.model_dump(mode="json", exclude_none=True))
 
 
 def _write_text(path: Path, text: str) -> None:

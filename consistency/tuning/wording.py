@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from consistency.diagnostics import Verdict
 from consistency.diagnostics.wording import short
-from consistency.scenario import Belief, scenario_text
+from consistency.scenario import Belief, scenario_text, toml_text
 from consistency.scenario.tables import SIGMA_UNITS
 from consistency.store.log import Log, sensor_text
 from consistency.store.storage import manifest_of, plain, write_folder
@@ -51,7 +50,7 @@ def lines(tuning: Tuning, out: Path | None = None) -> list[str]:
     text += [f"  - {reason}" for reason in tuning.why]
     text += ["", noise_table(tuning).rstrip()]
     if out is not None:
-        text += ["", f"{out} has {', '.join(files(tuning))}; again: {command(tuning, out)}"]
+        text += ["", f"{out} has {', '.join(files(tuning))}{_next(tuning, out)}"]
     return text
 
 
@@ -97,7 +96,7 @@ def noise_table(tuning: Tuning) -> str:
     motion = {"sigma_v": belief.motion.sigma_v, "sigma_omega": belief.motion.sigma_omega}
     sigma = {f"sigma{SIGMA_UNITS[belief.sensor.model]}": list(belief.sensor.sigma)}
     is_log = isinstance(tuning.parts.world, Log)
-    return tomli_w.dumps(sigma | {"motion": motion} if is_log else {"belief": {"motion": motion, "sensor": sigma}})
+    return toml_text(sigma | {"motion": motion} if is_log else {"belief": {"motion": motion, "sensor": sigma}})
 
 
 def files(tuning: Tuning) -> dict[str, str]:
@@ -133,13 +132,14 @@ def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
     write_folder(out, {}, manifest, contents, overwrite)
 
 
-def command(tuning: Tuning, out: Path) -> str:
-    """The command that judges the tuned filter again, or uses it."""
-    world = tuning.parts.world
+def _next(tuning: Tuning, out: Path) -> str:
+    """What to do with the files."""
+    world, run = tuning.parts.world, "consistency run"
     if isinstance(world, Log):
-        return f"cp {out}/sensor.toml {world.name}/ && consistency run --log {world.name} --filter {tuning.filter} ..."
+        use = f"{run} --log {world.name} --filter {tuning.filter} --out results"
+        return f"; put it in the place of {Path(world.name) / 'sensor.toml'}, and run: {use}"
     [name] = files(tuning)
-    return f"consistency run {out / name} --filter {tuning.filter} {tuning.parts.again} --out results"
+    return f"; judged again by: {run} {out / name} --filter {tuning.filter} {tuning.parts.again} --out results"
 
 
 def as_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from consistency.tuning.fit import LIMIT, UNITS, Fit, maximise
+from consistency.tuning.fit import LIMIT, UNITS, Fit, _derivatives, _Search, maximise
 from consistency.types import Array
 
 SIGMAS = 4.8  # bound on a normal number, so that each assertion fails by chance in less than 1e-5 of all runs
@@ -72,6 +72,18 @@ def test_two_factors_that_share_what_is_seen(rng: np.random.Generator) -> None:
     information = 0.5 * n * (np.outer(share, share) + np.diag([1.0, 0.0]))
     wanted = QUANTILE * np.sqrt(np.diag(np.linalg.inv(information)))
     assert np.diff(fit.interval, axis=1)[:, 0] / 2.0 == pytest.approx(wanted, rel=SIGMAS * 0.1)
+
+
+def test_slopes_and_curvature_are_those_of_a_parabola() -> None:
+    A, runs = np.array([[2.0, -0.7], [-0.7, 1.0]]), 25
+    slope = np.linspace(-1.0, 1.0, runs)
+
+    def score(x: Array) -> Array:
+        return (-0.5 * x @ A @ x / runs + slope * x[0])[:, None]
+
+    slopes, curvature = _derivatives(_Search(score), np.zeros(2), [0, 1])
+    assert curvature == pytest.approx(-A, abs=1e-9)
+    assert slopes == pytest.approx(np.column_stack([slope, np.zeros(runs)]), abs=1e-9)
 
 
 def test_a_noise_that_is_not_there_is_bounded_from_above(rng: np.random.Generator) -> None:

@@ -19,8 +19,12 @@ from .scenario import Scenario as Scenario
 from .scenario import load_scenario as load_scenario
 from .scenario import scenario_names as scenario_names
 from .simulation import simulate as simulate
+from .store.log import Log as Log
+from .store.log import read_log as read_log
 from .store.results import Results as Results
 from .store.results import read_results as read_results
+from .tuning.tune import Tuning as Tuning
+from .tuning.tune import tune as tune
 from .types import Control as Control
 from .types import Finding as Finding
 from .types import Gaussian as Gaussian

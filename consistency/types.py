@@ -50,6 +50,11 @@ class Info:
         """Normalized innovation squared, innovation' S^-1 innovation."""
         return float(self.innovation @ np.linalg.solve(self.S, self.innovation))
 
+    @property
+    def log_det(self) -> float:
+        """log det S."""
+        return float(np.linalg.slogdet(self.S)[1])
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -149,6 +154,7 @@ class Estimates:
     own: Array | None = None  # (T, 3, 3), where that error is not the additive one of the world
     map: Map | None = None  # after the last step; None where the filter gives none or the run failed
     rejected: Array | None = None  # (M,), observations that a guard kept from the filter; None without a guard
+    log_det: Array | None = None  # (T,), log det S of the innovations of ``nis``, NaN where there is none
 
 
 @dataclass(frozen=True)

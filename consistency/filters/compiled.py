@@ -145,7 +145,7 @@ class Compiled:
         map_ = Map(labels, out.points[labels], out.spread[labels], out.joint) if out.code == 0 else None
         return Estimates(
             self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_,
-            None if self.guard is None else out.rejected,
+            None if self.guard is None else out.rejected, out.log_det,
         )  # fmt: skip
 
     def _arguments(self, trial: Trial, belief: Belief) -> tuple[Slam, Data, int]:

@@ -106,6 +106,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: Record |
             mean, covariances = _pose_and_covariances(filter_, state, error)
             if info is not None and len(info.innovation):
                 record.nis[step - 1], record.dof[step - 1] = _nis(info), len(info.innovation)
+                record.log_det[step - 1] = info.log_det
             _require_finite(mean, *covariances)
             rank.require(covariances)
             map_ = _map(filter_, state, trial) if step == T else None

@@ -39,6 +39,7 @@ IDLE = 300.0  # s without a study, after which a supervisor ends
 GLANCE = 0.5  # s between looks at whether a process still lives, whose pipe a child of its own may hold open
 STOPPED = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))  # from outside, as no filter ends by itself
 GIB = 2**30
+PER_STEP = 24  # numbers of a record in a step: pose, two covariances, NIS, its degrees of freedom, log det S
 LOADING = 60.0  # s that loading a filter may take where there is a time-out
 READY = b"ready"
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -192,17 +193,18 @@ class _Room:
 
     def __init__(self, steps: int, observations: int) -> None:
         self.steps, self.observations = steps, observations
-        self._numbers = _context.RawArray("d", 23 * steps)
+        self._numbers = _context.RawArray("d", PER_STEP * steps)
         self._at, self._rejected = _context.RawArray("q", 1), _context.RawArray("b", max(observations, 1))
 
     def record(self, trial: Trial) -> Record:
         """The part of it that a trial needs."""
         T, numbers = trial.steps, np.frombuffer(self._numbers)
-        parts = np.split(numbers[: 23 * T], np.cumsum([3 * T, 9 * T, 9 * T, T]))
-        pose, covariance, own, nis, dof = parts
+        parts = np.split(numbers[: PER_STEP * T], np.cumsum([3 * T, 9 * T, 9 * T, T, T]))
+        pose, covariance, own, nis, dof, log_det = parts
         rejected: Array = np.frombuffer(self._rejected, bool)[: len(trial.landmark)]
         at = np.frombuffer(self._at, np.int64)
-        return Record(at, pose.reshape(T, 3), covariance.reshape(T, 3, 3), own.reshape(T, 3, 3), nis, dof, rejected)
+        pose, covariance, own = pose.reshape(T, 3), covariance.reshape(T, 3, 3), own.reshape(T, 3, 3)
+        return Record(at, pose, covariance, own, nis, dof, log_det, rejected)
 
 
 def _reason(code: int | None) -> str:

@@ -47,7 +47,7 @@ from consistency.scenario.truth import (
     UniformLandmarks,
     Waypoints,
 )
-from consistency.scenario.writing import scenario_text
+from consistency.scenario.writing import scenario_text, toml_text
 
 __all__ = [
     "PLANAR_SENSORS",
@@ -96,4 +96,5 @@ __all__ = [
     "read_table",
     "scenario_names",
     "scenario_text",
+    "toml_text",
 ]

@@ -24,6 +24,7 @@ from consistency.scenario import (
     SigmaPoints,
     Table,
     read_table,
+    toml_text,
 )
 from consistency.scenario.tables import SIGMA_UNITS
 from consistency.store.parquet import COLUMNS
@@ -147,6 +148,19 @@ def write_log(
                 table.to_csv(at / f"{name}.csv", index=False)
 
     write_folder(folder, tables if form == "parquet" else {}, manifest, contents, overwrite)
+
+
+def sensor_text(folder: Path, belief: Belief) -> str:
+    """``sensor.toml`` of a log folder as text, with the noises of ``belief`` in the place of its own.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged.
+    """
+    sensor = read_table(folder / "sensor.toml", SensorFile)
+    changed = sensor.model_copy(update={"motion": belief.motion, "sigma": belief.sensor.sigma})
+    return toml_text(changed.model_dump(mode="json", exclude_none=True))
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -293,6 +293,9 @@ def difference(a: Estimates, b: Estimates) -> float:
     assert b.failure is None
     size = np.abs(b.covariance).max(axis=(1, 2), keepdims=True)
     nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
+    assert a.log_det is not None
+    assert b.log_det is not None
+    nis = max(nis, np.nanmax(np.abs(a.log_det - b.log_det)))
     return float(max(np.abs(a.pose - b.pose).max(), (np.abs(a.covariance - b.covariance) / size).max(), nis))
 
 

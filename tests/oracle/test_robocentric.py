@@ -223,6 +223,7 @@ def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any
     assert np.abs(ours.pose - twin.pose).max() < 1e-9
     assert (np.abs(ours.covariance - twin.covariance) / size).max() < 1e-8
     assert np.nanmax(np.abs(ours.nis - twin.nis) / np.maximum(twin.nis, 1.0)) < 1e-8
+    assert np.nanmax(np.abs(ours.log_det - twin.log_det)) < 1e-8
     assert ours.map is not None
     assert twin.map is not None
     assert np.allclose(ours.map.mean, twin.map.mean, rtol=1e-7, atol=1e-9)

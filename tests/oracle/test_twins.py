@@ -24,7 +24,7 @@ EIGHT = {"shape": "figure-of-eight", "radius": 2.0, "start": (0.0, 0.0), "headin
 
 
 def differences(a: Estimates, b: Estimates) -> tuple[float, float, float]:
-    """Largest difference of poses (m, rad), of covariances in correlation units, and of NIS relative to it."""
+    """Largest difference of poses (m, rad), of covariances in correlation units, and of NIS, relative, or log det S."""
     sigma = np.sqrt(np.einsum("kii->ki", b.covariance))
     scale = np.maximum(sigma[:, :, None] * sigma[:, None, :], 1e-30)
     pose = np.abs(a.pose - b.pose).max()
@@ -32,7 +32,10 @@ def differences(a: Estimates, b: Estimates) -> tuple[float, float, float]:
     assert np.array_equal(a.nis_dof, b.nis_dof)
     assert np.array_equal(np.isfinite(a.nis), b.nis_dof > 0)
     nis = np.nanmax(np.abs(a.nis - b.nis) / np.maximum(b.nis, 1.0))
-    return float(pose), float(covariance), float(nis)
+    assert a.log_det is not None
+    assert b.log_det is not None
+    log_det = np.nanmax(np.abs(a.log_det - b.log_det))
+    return float(pose), float(covariance), float(max(nis, log_det))
 
 
 def agree(a: Estimates, b: Estimates, tolerance: float = 1e-9) -> bool:

@@ -35,7 +35,7 @@ RANK = {
     "verdicts.curves": 7, "verdicts.judge": 10, "verdicts.monitoring": 10, "verdicts.comparison": 11,
     "runs.sequential": 11,
     "terminal.table": 12,
-    "runs.findings": 13, "sweeps": 13, "challenging": 13, "characterising": 13,
+    "runs.findings": 13, "sweeps": 13, "challenging": 13, "characterising": 13, "tuning": 13,
     "reporting": 14, "gating": 14,
     "cli": 15, "notebook": 15, "testing": 15, "pytest_plugin": 15,
     "__main__": 16,

@@ -108,22 +108,22 @@ def correct_at_once(
     is_foreseen: bool,
     local: Factors,
     work: Work[NamedTuple],
-) -> tuple[int, float]:
+) -> tuple[int, float, float]:
     """The update of a filter that does not iterate: it is led by what :func:`foresee` leaves in ``work``."""
     code, total = 0, 0.0
     if not is_foreseen:
         code, total = foresee(update, slam, state, data, k, m, local, work)
     if code > 0:
-        return code, np.nan
-    code, nis = divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+        return code, np.nan, np.nan
+    code, nis, log_det = divide_by_root(state, observed_width(slam.sensor) * m, work, total)
     if code == 0:
         apply(slam, state, m, local, work)
-    return code, nis
+    return code, nis, log_det
 
 
 @inner
-def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float]:
-    """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. Gives a code of REASONS or 0, and NIS."""
+def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float, float]:
+    """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. As :func:`divide_by_root`."""
     total = add_noise(slam, state, data, m, work)
     return divide_by_root(state, observed_width(slam.sensor) * m, work, total)
 
@@ -145,20 +145,24 @@ def add_noise(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTupl
 
 
 @inner
-def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float) -> tuple[int, float]:
-    """S <- its root, and A and the innovation <- divided by it; ``total`` is finite if all that is given is."""
+def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float) -> tuple[int, float, float]:
+    """S <- its root, and A and the innovation <- divided by it; ``total`` is finite if all that is given is.
+
+    Returns a code of REASONS, 0 where all is well, the NIS, and log det S.
+    """
     width = state.n + state.base
     S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
     y = joined[:, width]
     if not definite_root(S, work.scale):
-        return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan
+        return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
     solve_transposed(S, joined)
-    nis = 0.0
+    nis, log_det = 0.0, 0.0
     for r in range(rows):
         nis += y[r] * y[r]
+        log_det += 2.0 * np.log(S[r, r])
     if np.isfinite(nis):
-        return 0, nis
-    return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan
+        return 0, nis, log_det
+    return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
 
 
 @inner

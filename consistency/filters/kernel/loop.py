@@ -51,6 +51,7 @@ class Outcome(NamedTuple):
     own: Array  # (T, r, r), of the filter's own error
     nis: Array  # (T,)
     nis_dof: Indices  # (T,)
+    log_det: Array  # (T,), of S
     step: int  # of the failure, or 0
     code: int  # of REASONS, or 0
     points: Array  # (n_landmarks, 3), landmarks in the world after the last step, NaN where none was seen
@@ -95,19 +96,19 @@ def _insert_new(
 @inner
 def _step(
     slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
-) -> tuple[State, int, int, float]:
-    """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, and the NIS."""
+) -> tuple[State, int, int, float, float]:
+    """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, the NIS, and log det S."""
     predict(slam.update, slam, state, k, data.controls[k], local, work)
-    m, nis = _find_known(data, k, state.offset, work), np.nan
+    m, nis, log_det = _find_known(data, k, state.offset, work), np.nan, np.nan
     code, m, is_foreseen = screen(slam.guard, slam, state, data, k, m, local, work, watch)
     if code > 0:
-        return state, code, 0, nis
+        return state, code, 0, nis, log_det
     if m > 0:
-        code, nis = correct(slam.update, slam, state, data, k, m, is_foreseen, local, work)
+        code, nis, log_det = correct(slam.update, slam, state, data, k, m, is_foreseen, local, work)
         if code > 0:
-            return state, code, 0, nis
+            return state, code, 0, nis, log_det
     state = _insert_new(slam, state, data, k, local, work, watch)
-    return state, 0 if np.isfinite(state.x[: state.n].sum()) else NOT_FINITE, m, nis
+    return state, 0 if np.isfinite(state.x[: state.n].sum()) else NOT_FINITE, m, nis, log_det
 
 
 @inner
@@ -205,6 +206,7 @@ def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
         np.full((T, r, r), np.nan),
         np.full(T, np.nan),
         np.zeros(T, np.int64),
+        np.full(T, np.nan),
         0,
         0,
         np.full((n_landmarks, 3), np.nan),
@@ -273,9 +275,9 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     for k in range(T):
         labels = data.landmark[data.first[k] : data.first[k + 1]]
         whole, state = prepare(slam.covariance, slam, whole, state, labels, local)
-        state, code, m, nis = _step(slam, state, data, k, local, work, watch)
+        state, code, m, nis, log_det = _step(slam, state, data, k, local, work, watch)
         if m > 0:
-            out.nis[k], out.nis_dof[k] = nis, observed_width(slam.sensor) * m
+            out.nis[k], out.nis_dof[k], out.log_det[k] = nis, observed_width(slam.sensor) * m, log_det
         if code == 0:
             rank = _keep_pose(slam, state, k, out, work)
             if rank < 0 or (full_rank and rank == 0):
@@ -293,7 +295,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     rejected = rejected_rows(slam.guard, own_watch)
     keep((own_slam, own_data, own_memory, own_work, own_local, own_watch))
     return Outcome(
-        own_out.pose, own_out.covariance, own_out.own, own_out.nis, own_out.nis_dof, step, code,
+        own_out.pose, own_out.covariance, own_out.own, own_out.nis, own_out.nis_dof, own_out.log_det, step, code,
         own_out.points, own_out.spread, joint, rejected,
     )  # fmt: skip
 

@@ -367,11 +367,11 @@ def correct(
     is_foreseen: bool,
     local: NamedTuple,
     work: NamedTuple,
-) -> tuple[int, float]:
+) -> tuple[int, float, float]:
     """x (n,), P (n, n) <- the joint update in step k + 1 with the ``m`` landmarks that ``work`` lists.
 
     ``is_foreseen`` says whether :func:`foresee` has been called for these, and nothing since. Returns a code of
-    REASONS, 0 where all is well, and the NIS.
+    REASONS, 0 where all is well, the NIS, and log det S of that innovation.
     """
     raise NotImplementedError
 

@@ -81,26 +81,27 @@ def correct_by_iterated_points(
     is_foreseen: bool,
     local: Factors,
     work: Work[SigmaRoom],
-) -> tuple[int, float]:
+) -> tuple[int, float, float]:
     r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    involved, first_nis = r + w * m, np.nan
+    involved, first_nis, first_log_det = r + w * m, np.nan, np.nan
     gather(slam, state, m, local, work)
     for a in range(involved):
         work.room.prior[a] = state.x[state_index(r, w, a, work.at)]
     for i in range(update.passes):
         if not innovate_by_points(update.points, slam, state, m, work):
-            return POSE, np.nan
+            return POSE, np.nan, np.nan
         _relate_to_prior(r, w, state, m, innovate(slam, state, data, m, work), work)
-        code, nis = whiten(slam, state, data, m, work)
+        code, nis, log_det = whiten(slam, state, data, m, work)
         if code > 0:
-            return code, nis
-        first_nis = nis if i == 0 else first_nis
+            return code, nis, log_det
+        if i == 0:
+            first_nis, first_log_det = nis, log_det
         is_last = i == update.passes - 1
         for a in range(involved):
             j = state_index(r, w, a, work.at)
             state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
     apply(slam, state, m, local, work)
-    return 0, first_nis
+    return 0, first_nis, first_log_det
 
 
 @implement(foresee, IteratedPoints)

@@ -43,7 +43,7 @@ def correct_converted(
     is_foreseen: bool,
     local: Clones,
     work: Work[ConvertingRoom],
-) -> tuple[int, float]:
+) -> tuple[int, float, float]:
     room, rho, in_doubt = work.room, work.at[0] + 2, _is_any_in_doubt(m, local, work)
     waits = in_doubt and m == 1
     waits = waits and state.P[rho, rho] < (update.waiting * state.x[rho]) ** 2
@@ -51,8 +51,8 @@ def correct_converted(
     if in_doubt or not is_foreseen:
         code, clones, chained, total = _aim(update, slam, state, data, m, local, work)
     if code > 0:
-        return code, np.nan
-    code, nis = divide_by_root(state, 3 * m, work, total)
+        return code, np.nan, np.nan
+    code, nis, log_det = divide_by_root(state, 3 * m, work, total)
     if code == 0:
         _move(state, m, work)
         apply_beyond(state, 3 * m, local.factors, work)
@@ -64,7 +64,7 @@ def correct_converted(
         for i in range(m):
             if room.clone[i] >= 0 and not waits:
                 _reclaim(slam, state, work.label[i], local, work)
-    return code, nis
+    return code, nis, log_det
 
 
 @implement(foresee, Converting)
@@ -225,7 +225,7 @@ def _iterate(
         if local.new[0]:
             _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), local, work)
         total = _innovate(cast, size, room.place, m, work)
-        code, _ = divide_by_root(alone, 3 * m, work, total)
+        code, _, _ = divide_by_root(alone, 3 * m, work, total)
         if code > 0:
             return code, False
         fill(delta, 0.0)

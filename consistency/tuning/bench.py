@@ -1,0 +1,95 @@
+"""All runs at one setting: the same trials each time, on all workers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.filters.compiled import one_blas_thread
+from consistency.filters.stepping import name_of
+from consistency.protocols import Filter
+from consistency.runs.backends.local import worker_count
+from consistency.runs.isolating import Isolation
+from consistency.runs.work import compile_for
+from consistency.scenario import Belief
+from consistency.terminal.progress import say
+from consistency.tuning.scores import Score, score_of
+from consistency.types import Array, Trial
+
+EVERY = 5.0  # seconds between lines of progress
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Of R runs of up to T steps at one setting."""
+
+    log_density: Array  # (R, T), 0 in steps that a run does not have
+    ratio: float  # total NIS or NEES over its degrees of freedom
+    failures: tuple[str, ...]  # of runs that failed
+
+    @property
+    def total(self) -> float:
+        """Sum over all runs; minus infinity where a run failed, for nobody knows what it would have come to."""
+        return -np.inf if self.failures else float(self.log_density.sum())
+
+
+class Bench:
+    """Scores a filter on trials under any belief.
+
+    Parameters
+    ----------
+    by : one of :data:`consistency.tuning.scores.BY`
+    timeout : seconds a trial of a filter that is not compiled
+    """
+
+    def __init__(
+        self, filter_: Filter, trials: Sequence[Trial], by: str, jobs: int = -1, timeout: float | None = None
+    ) -> None:
+        self.filter, self.trials, self.by, self.timeout = filter_, list(trials), by, timeout
+        self.workers = min(worker_count(jobs), len(self.trials))
+        self.settings, self.began = 0, time.monotonic()
+        self._told = self.began
+
+    def compile(self, belief: Belief) -> None:
+        """Compile what the filter needs, and is not yet compiled."""
+        compile_for([self.filter], self.trials[0], belief)
+
+    def __call__(self, belief: Belief) -> Scores:
+        """Scores of all runs.
+
+        Raises
+        ------
+        InputError
+            The filter reports no innovations, or needs what a trial does not have.
+        """
+        pool = ThreadPoolExecutor(self.workers)  # kernels release the GIL; other filters run in processes
+        try:
+            with one_blas_thread(), Isolation([self.filter], belief, self.timeout) as isolation:
+                scores = list(pool.map(lambda trial: self._score(trial, isolation), self.trials))
+        finally:
+            pool.shutdown(cancel_futures=True)
+        self.settings += 1
+        self._tell()
+        density = np.zeros((len(scores), max(trial.steps for trial in self.trials)))
+        for row, score in zip(density, scores, strict=True):
+            row[: len(score.log_density)] = score.log_density
+        dof = sum(score.dof for score in scores)
+        ratio = sum(score.squares for score in scores) / dof if dof else np.nan
+        failed = [(trial.run, score.failure) for trial, score in zip(self.trials, scores, strict=True) if score.failure]
+        return Scores(density, ratio, tuple(f"run {run}, {reason}" for run, reason in failed))
+
+    def _score(self, trial: Trial, isolation: Isolation) -> Score:
+        [estimates] = isolation.run(trial)
+        return score_of(trial, estimates, self.by)
+
+    def _tell(self) -> None:
+        """A line of progress, every few seconds."""
+        now = time.monotonic()
+        if now - self._told >= EVERY:
+            self._told = now
+            count = f"{self.settings} settings on {len(self.trials)} run{'s' * (len(self.trials) != 1)}"
+            say(f"fitting {name_of(self.filter)} by {self.by}: {count} each, {now - self.began:.0f} s")

@@ -70,6 +70,7 @@ class Evidence:
     run_numbers: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
+    reduced: bool = False  # a fit to the truth may have made the errors smaller than the covariance says: no fault
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,7 @@ class Equivalence:
     p_value: float  # the larger of both; NaN where there is nothing to judge
     level: float  # at which it is shown
     runs: int | None  # that would probably decide, shown or found at fault; None where it is not known
+    one_sided: bool = False  # only that the ratio is below ``factor``
 
     @property
     def shown(self) -> bool:
@@ -319,6 +321,7 @@ class Verdict:
     accuracy: Accuracy | None = None
     convention: str | None = None  # of the error that is judged, where files or the filter declare one
     notes: tuple[str, ...] = ()  # of whoever read the files
+    align: str | None = None  # how estimates in files were moved into the world of the truth
     world: Verdict | None = None  # the same runs in the additive error of the world, where the filter has another
     map: MapScore | None = None
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps

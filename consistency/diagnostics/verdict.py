@@ -62,6 +62,9 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     Innovations are judged where an optimal gain is declared, otherwise they are reported: only those of an optimal gain
     are white. Without truth they are judged alone.
 
+    Where a fit to the truth took of the errors (``Evidence.reduced``) what is not known, a covariance that is too large
+    is no fault, as with ``allow="conservative"``; but consistent is shown on both sides.
+
     A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
     pose and map together, where it is given.
 
@@ -71,6 +74,8 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
         Nothing to judge is given, or shapes or options do not fit.
     """
     runs, steps = shape_of_arrays(evidence)
+    both_sides = settings
+    settings = replace(settings, allow="conservative") if evidence.reduced else settings
     innovations, p_values = _innovations(evidence, settings)
     sample = sample_of(evidence, settings)
     joint = None
@@ -91,7 +96,7 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
         innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
     )  # fmt: skip
     if sample is not None and tests is not None:
-        verdict = _with_records(verdict, evidence, sample, tests, look)
+        verdict = _with_records(verdict, evidence, sample, tests, _equivalence(sample, both_sides, look, evidence.reduced))
     verdict = replace(verdict, status=_status(verdict, sample, tests, joint))
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 
@@ -129,9 +134,8 @@ def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | 
 # --- what is known beside the p values -----------------------------------------------------------------
 
 
-def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: Tests, look: Look | None) -> Verdict:
+def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: Tests, shown: Equivalence) -> Verdict:
     settings = verdict.settings
-    shown = _equivalence(sample, settings, look)
     if settings.tolerance is not None:
         verdict = replace(verdict, answers=_excused(verdict.answers, _tolerated(sample, tests, settings)))
     by_question = {a.question: a for a in verdict.answers if not a.tolerated}
@@ -160,11 +164,11 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
     )
 
 
-def _equivalence(sample: Sample, settings: Settings, look: Look | None) -> Equivalence:
+def _equivalence(sample: Sample, settings: Settings, look: Look | None, reduced: bool) -> Equivalence:
     if look is not None:
         return equivalence_by_betting(sample.means(), sample.dof, settings)
     factor = max(settings.factor, settings.tolerated)
-    return equivalence(sample.means(), sample.dof, sample.longest, settings, factor)
+    return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, not reduced)
 
 
 def _excused(all_answers: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:

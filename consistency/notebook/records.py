@@ -90,6 +90,7 @@ def read(
     axes: Sequence[str] | None = None,
     topic: str | None = None,
     truth_topic: str | None = None,
+    align: str | None = None,
     filter: str | None = None,
 ) -> Record:
     """Files of another estimator, as ``consistency analyse FILES`` reads them; docs/files.md has the forms.
@@ -106,6 +107,7 @@ def read(
     time_offset : s to add to the timestamps of the estimates, or "estimate"
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw
     topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
+    align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
     filter : which estimator, where the files hold several
 
     Raises
@@ -125,6 +127,7 @@ def read(
         axes=axes,
         topic=topic,
         truth_topic=truth_topic,
+        align=align,
     )
     named = {recording.name: recording for recording in found}
     if filter is None and len(named) > 1:

@@ -12,6 +12,7 @@ from typing import Any
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
+from consistency.recording.alignment import ALIGNMENTS, require_alignment
 from consistency.recording.archive import read_archive
 from consistency.recording.bags import is_bag, read_bags
 from consistency.recording.record import Recording
@@ -19,6 +20,7 @@ from consistency.recording.table import read_tables
 from consistency.recording.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
 
 __all__ = [
+    "ALIGNMENTS",
     "CONVENTIONS",
     "ORDERS",
     "Recording",
@@ -67,6 +69,7 @@ def read_recordings(
     axes: Sequence[str] | None = None,
     topic: str | None = None,
     truth_topic: str | None = None,
+    align: str | None = None,
 ) -> list[Recording]:
     """What estimators said, from CSV, Parquet, TUM or NumPy files: one recording for each estimator.
 
@@ -83,6 +86,7 @@ def read_recordings(
         named in the notes
     axes : components of the error of a trajectory that are judged: of x, y, z, roll, pitch, yaw; None is all
     topic, truth_topic : of a ROS bag: PoseWithCovarianceStamped or Odometry; poses, or PARENT:CHILD of /tf
+    align : one of ``ALIGNMENTS``: how the estimates are moved into the world of the truth; None is none
 
     Raises
     ------
@@ -100,29 +104,30 @@ def read_recordings(
         raise InputError(f"--time-offset {time_offset}: must be a number of seconds, or 'estimate'")
     if time_offset is not None and truth is None and truth_topic is None:
         raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
+    align = require_alignment(align, truth or truth_topic)
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
     suffix = estimates.suffix.lower()
     own: dict[str, object] = {"state": state, "max-dt": max_dt, "covariance": covariance, "truth": truth}
     own |= {"covariance-order": covariance_order, "time-offset": time_offset, "axes": axes}
-    own |= {"topic": topic, "truth-topic": truth_topic}
+    own |= {"topic": topic, "truth-topic": truth_topic, "align": align}
     if is_bag(estimates):
         _refuse(estimates, own, ("state", "covariance", "covariance-order", "truth"))
-        return read_bags(estimates, topic, truth_topic, convention, max_dt, time_offset, axes)
+        return read_bags(estimates, topic, truth_topic, convention, max_dt, time_offset, axes, align)
     _refuse(estimates, own, ("topic", "truth-topic"))
     if suffix == ".npz":
-        _refuse(estimates, own, ("state", "max-dt", "covariance", "covariance-order", "truth", "time-offset", "axes"))
+        _refuse(estimates, own, ("state", "max-dt", "covariance", "covariance-order", "truth", "time-offset", "axes", "align"))
         return read_archive(estimates, convention)
     if suffix in TABLES:
         _refuse(estimates, own, ("covariance", "covariance-order", "axes"))
         if state is not None and (len(set(state)) < len(state) or not all(state)):
             raise InputError(f"--state {','.join(state)}: needs names of columns, each once")
-        return read_tables(estimates, truth, convention, state, max_dt, time_offset)
+        return read_tables(estimates, truth, convention, state, max_dt, time_offset, align)
     if suffix not in SUFFIXES and not estimates.is_dir():
         known = ", ".join((*TABLES, ".npz", ".bag", *SUFFIXES))
         raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
     _refuse(estimates, own, ("state",))
-    return read_tum(estimates, truth, covariance, convention, covariance_order, max_dt, time_offset, axes)
+    return read_tum(estimates, truth, covariance, convention, covariance_order, max_dt, time_offset, axes, align)
 
 
 def _refuse(path: Path, options: dict[str, object], names: Sequence[str]) -> None:

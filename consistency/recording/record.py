@@ -39,6 +39,9 @@ class Recording:
     failures: tuple[Failure, ...]  # Failure.step counts the columns from 1, as the verdict does
     convention: str = ""
     notes: tuple[str, ...] = ()  # what a reader must know: the convention, what was left out
+    align: str = "none"  # how the estimates were moved into the world of the truth
+    face: str = ""  # what the verdict has to say of that
+    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
 
     @property
     def left_out_steps(self) -> list[int]:

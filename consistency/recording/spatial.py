@@ -10,8 +10,8 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import SPATIAL
+from consistency.recording.alignment import clocks_and_frames
 from consistency.recording.hints import hints
-from consistency.recording.offset import clock_shift
 from consistency.recording.poses import Poses
 from consistency.recording.record import Recording, Track, assemble, common_times
 from consistency.recording.sheet import Places
@@ -52,28 +52,34 @@ def require_axes(axes: Sequence[str] | None) -> None:
 
 
 def recordings_of(
-    source: Source, poses: Sequence[Poses], split: bool, time_offset: float | str | None, axes: Sequence[str] | None
+    source: Source,
+    poses: Sequence[Poses],
+    split: bool,
+    time_offset: float | str | None,
+    axes: Sequence[str] | None,
+    align: str | None = None,
 ) -> list[Recording]:
     """The recording of one estimator, each of whose runs is one of ``poses``; clocks and mix-ups are looked for.
 
     Parameters
     ----------
     split : position and rotation are two recordings, as their cross-covariance is not known
-    time_offset, axes : as :func:`consistency.recording.read_recordings` has them
+    time_offset, axes, align : as :func:`consistency.recording.read_recordings` has them
 
     Raises
     ------
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
-    shift, clocks = clock_shift(source.path.name, poses, time_offset)
+    judged = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
+    shift, clocks, moved = clocks_and_frames(source.path.name, poses, time_offset, align, judged)
+    poses = moved.runs
     matches = [_match(one, *files, shift) for one, files in zip(poses, source.files, strict=True)]
     columns, t = common_times([run.t for run in matches])
     tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, matches, strict=True))]
     kind = poses[0].convention
-    notes = [*_notes(source.path, matches, poses[0].max_dt), *clocks, *hints(source.path.name, AXES, poses, shift)]
+    notes = [*_notes(source.path, matches, poses[0].max_dt), *clocks, *moved.notes, *hints(source.path.name, AXES, poses, shift)]
     notes.append(f"error convention {kind}: {SPATIAL[kind]}{source.why}")
-    judged = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
     name = source.path.stem
     parts = {name: judged}
     if split:
@@ -83,7 +89,7 @@ def recordings_of(
         if part:
             some = [_part(track, part) for track in tracks]
             names = tuple(AXES[i] for i in part)
-            recordings.append(assemble(title, some, t, names, str(source.covariance), kind, notes))
+            recordings.append(moved.on(assemble(title, some, t, names, str(source.covariance), kind, notes)))
             notes = []
     return recordings
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
+from consistency.recording.alignment import Aligned, clocks_and_frames
 from consistency.recording.hints import hints
 from consistency.recording.interpolation import Manifold, truth_at
-from consistency.recording.offset import clock_shift
 from consistency.recording.poses import Poses
 from consistency.recording.record import (
     DEFAULT_DT,
@@ -42,6 +42,7 @@ def read_tables(
     state: Sequence[str] | None,
     max_dt: float | None,
     time_offset: float | str | None = None,
+    align: str | None = None,
 ) -> list[Recording]:
     """Recordings of the estimators in a table, one for each value of its column ``filter``.
 
@@ -53,6 +54,8 @@ def read_tables(
     sheet = read_sheet(estimates)
     axes = tuple(state) if state else POSE
     convention = _convention(convention, axes, truth)
+    if align is not None and _manifold(convention) != "planar":
+        raise InputError(f"--align {align}: needs poses x,y,heading, and an error that is not 'vector'")
     other = read_sheet(truth) if truth is not None else None
     if other is None and not {"nis", "nis_dof"} <= set(sheet.data.columns):
         raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
@@ -66,7 +69,7 @@ def read_tables(
     recordings = []
     for name in names:
         own = sheet.rows((sheet.data["filter"].astype(str) == name).to_numpy()) if "filter" in sheet else sheet
-        recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset))
+        recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset, align))
     return recordings
 
 
@@ -108,6 +111,7 @@ def _recording(
     convention: str,
     max_dt: float | None,
     time_offset: float | str | None,
+    align: str | None,
 ) -> Recording:
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet.data), int)
     order = row_order(sheet, runs, key)
@@ -116,6 +120,7 @@ def _recording(
     error = covariance = None
     keep = np.ones(len(runs), bool)
     notes: list[str] = []
+    moved = Aligned(())
     if truth is None:
         broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *_present(sheet, axes)])).all(axis=1)
         error = None if not broken.any() else np.where(broken, np.nan, 0.0)[:, None]
@@ -126,10 +131,15 @@ def _recording(
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
         samples = _samples(truth, axes, key)
         shift, clocks = 0.0, list[str]()
-        if key == "t":
-            poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, _default_dt(max_dt))
-            shift, clocks = clock_shift(name, poses, time_offset)
-            clocks += hints(name, axes, poses, shift)
+        if key == "t" or align is not None:
+            reach = _default_dt(max_dt) if key == "t" else 0.0
+            poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, reach)
+            shift, clocks, moved = clocks_and_frames(name, poses, time_offset, align, range(len(axes)))
+            clocks += [*moved.notes, *hints(name, axes, moved.runs, shift)]
+            if align is not None:
+                there = np.isin(runs, np.unique(samples.runs)) if samples.runs is not None else np.ones(len(runs), bool)
+                estimate[there] = np.concatenate([p.estimate for p in moved.runs])
+                covariance[there] = np.concatenate([p.covariance for p in moved.runs])
         keep, true, notes = _matched(name, sheet, truth, samples, runs, keys + shift, key, axes, convention, max_dt)
         notes += clocks
         error = planar_error(true, estimate, convention) if axes == POSE else true - estimate
@@ -162,7 +172,7 @@ def _recording(
         for run, rows, column in zip(numbers, members, columns, strict=True)
     ]
     record = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
-    return record if truth is not None else replace(record, error=None, dof=0)
+    return moved.on(record) if truth is not None else replace(record, error=None, dof=0)
 
 
 def row_order(sheet: Sheet, runs: Array, key: str) -> Indices:

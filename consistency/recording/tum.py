@@ -31,6 +31,7 @@ def read_tum(
     max_dt: float | None,
     time_offset: float | str | None = None,
     axes: Sequence[str] | None = None,
+    align: str | None = None,
 ) -> list[Recording]:
     """Recording of one estimator: a file, or a folder with a file for each run.
 
@@ -64,7 +65,7 @@ def read_tum(
         covariance or estimates,
         why,
     )
-    return recordings_of(source, poses, split, time_offset, axes)
+    return recordings_of(source, poses, split, time_offset, axes, align)
 
 
 def _origin(split: bool) -> str:

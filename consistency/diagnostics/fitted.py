@@ -11,6 +11,7 @@ from consistency.types import Array
 
 ENOUGH = 20  # runs that show how their errors depend on each other
 REACH = 10  # longest time constant that a run shows is this part of its steps
+SHORTEST = 0.5  # steps; errors of a shorter time constant are white
 MARGIN = 2.0  # standard errors by which more is taken to be left than seems
 LONGEST = 2  # and the longest lag that is looked at is this part
 
@@ -78,7 +79,7 @@ def _kernels(longest: int, shared: bool) -> Array:
     """Correlations at lags 0 to ``longest`` - 1: white, exponentials, and where ``shared`` a constant; (J, longest)."""
     lag = np.arange(longest)
     most = longest if shared else longest / REACH
-    times = 0.5 * 2.0 ** np.arange(0, max(np.floor(np.log2(max(2.0 * most, 1.0))), 0) + 1)
+    times = max(most, SHORTEST) / 2.0 ** np.arange(max(np.floor(np.log2(most / SHORTEST)), 0.0) + 1.0)
     rows = [lag == 0, *(np.exp(-lag / tau) for tau in times)]
     return np.array([*rows, np.ones(longest)] if shared else rows, float)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -71,6 +71,7 @@ class Evidence:
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
     reduced: bool = False  # a fit to the truth may have made the errors smaller than the covariance says: no fault
+    spoilt: Collection[str] = ()  # questions that such a fit leaves no answer to, which are not asked
 
 
 @dataclass(frozen=True)

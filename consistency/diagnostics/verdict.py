@@ -37,6 +37,7 @@ from consistency.diagnostics.whitening import entries
 from consistency.types import Array
 
 DEFAULT = Settings()
+CERTAIN = 0.999  # false-alarm rate, at most
 SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones
 
 
@@ -63,7 +64,8 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     are white. Without truth they are judged alone.
 
     Where a fit to the truth took of the errors (``Evidence.reduced``) what is not known, a covariance that is too large
-    is no fault, as with ``allow="conservative"``; but consistent is shown on both sides.
+    is no fault, as with ``allow="conservative"``; but consistent is shown on both sides. Questions that it leaves no
+    answer to (``Evidence.spoilt``) are not asked.
 
     A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
     pose and map together, where it is given.
@@ -85,7 +87,7 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     tests = None
     if sample is not None:
         tests = ask(sample, settings, p_values, look.scale if look else None)
-        p_values |= tests.p_values
+        p_values |= {q: p for q, p in tests.p_values.items() if q not in evidence.spoilt}
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)
@@ -145,7 +147,7 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
         rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
         band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     location = location_of(sample, band, by_question, ordered=evidence.landmarks is None)
-    scale = scale_of(sample, tests, settings, location, shown)
+    scale = scale_of(sample, tests, _at_share(verdict), location, shown)
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
         return replace(verdict, scale=scale, location=location, tails=tails_of(tests, None))
     odd = impossible(evidence, sample.counted)
@@ -219,10 +221,16 @@ def _status(verdict: Verdict, sample: Sample | None, tests: Tests | None, joint:
     if sample is None or tests is None:
         return _by_innovations(verdict, faults)
     if not faults & set(BIAS):
-        return _with_joint(verdict.settings, faults, sample, tests, joint)
+        return _with_joint(_at_share(verdict), faults, sample, tests, joint)
     sample, tests, rest = _without_bias(verdict, sample)
-    status = _by_errors(verdict.settings, rest, sample, tests) if rest else "biased"
+    status = _by_errors(_at_share(verdict), rest, sample, tests) if rest else "biased"
     return "biased" if status == "heavy-tailed" else status  # a few errors explain less than the mean of all
+
+
+def _at_share(verdict: Verdict) -> Settings:
+    """Settings at whose usual share the scale is asked as it was: at the whole rate where nothing else is asked."""
+    share = next((a.share for a in verdict.answers if a.question == MAIN), SHARES[MAIN])
+    return replace(verdict.settings, false_alarm=min(verdict.settings.false_alarm * share / SHARES[MAIN], CERTAIN))
 
 
 def _with_joint(settings: Settings, faults: set[str], sample: Sample, tests: Tests, joint: JointTest | None) -> str:

@@ -89,6 +89,18 @@ def fitted_frame(runs: Sequence[Poses]) -> Frame | None:
     return Frame(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)))
 
 
+def turned_frame(runs: Sequence[Poses]) -> Frame:
+    """The frame that makes the orientations of poses in space, and then positions, right in the mean."""
+    turns = []
+    for p in runs:
+        own, true = _pairs(p)
+        if len(own):
+            turns.append((Rotation.from_quat(true[:, 3:]) * Rotation.from_quat(own[:, 3:]).inv()).mean())
+    turn = Rotation.concatenate(turns).mean() if turns else IDENTITY.turn
+    own, true = _positions(runs)
+    return Frame(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)) if len(own) else np.zeros(3))
+
+
 def spread(runs: Sequence[Poses]) -> float:
     """Root mean square distance of the true positions from their mean, m; 0 where there are none."""
     true = _positions(runs)[1]
@@ -98,9 +110,16 @@ def spread(runs: Sequence[Poses]) -> float:
 def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
     """Estimated and true positions (N, 3) of all runs, z = 0 in the plane."""
     own, true = [np.empty((0, 3))], [np.empty((0, 3))]
-    for poses in runs:
-        known, d = poses.known(), 3 if poses.manifold == "spatial" else 2
-        finite = np.isfinite(poses.estimate[known.rows]).all(axis=1)
-        for side, values in ((own, poses.estimate[known.rows]), (true, known.truth)):
-            side.append(np.pad(values[finite, :d], ((0, 0), (0, 3 - d))))
+    for p in runs:
+        d = 3 if p.manifold == "spatial" else 2
+        for side, values in zip((own, true), _pairs(p), strict=True):
+            side.append(np.pad(values[:, :d], ((0, 0), (0, 3 - d))))
     return np.concatenate(own), np.concatenate(true)
+
+
+def _pairs(p: Poses) -> tuple[Array, Array]:
+    """Estimates that are finite and have a truth, and that truth, (k, m) both."""
+    known = p.known()
+    estimate = p.estimate[known.rows]
+    finite = np.isfinite(estimate).all(axis=1)
+    return estimate[finite], known.truth[finite]

@@ -42,6 +42,7 @@ class Recording:
     align: str = "none"  # how the estimates were moved into the world of the truth
     face: str = ""  # what the verdict has to say of that
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
+    spoilt: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
 
     @property
     def left_out_steps(self) -> list[int]:

@@ -255,7 +255,7 @@ def analyse_recordings(
         r = named[name]
         evidence = Evidence(
             name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
-            failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced,
+            failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, spoilt=r.spoilt,
         )  # fmt: skip
         verdict = judge(evidence, settings)
         first, *rest = verdict.reasons

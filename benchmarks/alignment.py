@@ -57,7 +57,8 @@ def first_order(rng: np.random.Generator, shape: tuple[int, ...], correlation: f
 
 def drift(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     """Partial sums of white noise, each over its own standard deviation."""
-    return rng.standard_normal(shape).cumsum(axis=1) / np.sqrt(np.arange(1.0, shape[1] + 1.0))[:, None]
+    sums: Array = rng.standard_normal(shape).cumsum(axis=1)
+    return sums / np.sqrt(np.arange(1.0, shape[1] + 1.0))[:, None]
 
 
 def turn_on(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
@@ -136,9 +137,7 @@ def drawn(rng: np.random.Generator, case: Case) -> list[Poses]:
         estimate[:, 2] = wrap(estimate[:, 2])
         place = Places("row {}".format, np.arange(case.steps))
         stated = np.ones(case.steps, bool)
-        runs.append(
-            Poses(place, true_t[rows], estimate, covariance, stated, true_t, truth, "planar", "so2", 0.01)
-        )
+        runs.append(Poses(place, true_t[rows], estimate, covariance, stated, true_t, truth, "planar", "so2", 0.01))
     return runs
 
 
@@ -166,7 +165,9 @@ def verdict(runs: Sequence[Poses], mode: str) -> Verdict:
 
 def evidence(found: Aligned, shift: float) -> Evidence:
     error = np.stack([p.errors(shift) for p in found.runs])
-    return Evidence("bench", error, np.stack([p.covariance for p in found.runs]), reduced=found.reduced, spoilt=found.spoilt)
+    return Evidence(
+        "bench", error, np.stack([p.covariance for p in found.runs]), reduced=found.reduced, spoilt=found.spoilt
+    )
 
 
 def batch(case: Case, numbers: Sequence[int], seed: int) -> dict[str, Counter[str]]:

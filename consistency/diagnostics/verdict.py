@@ -98,7 +98,9 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
         innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
     )  # fmt: skip
     if sample is not None and tests is not None:
-        verdict = _with_records(verdict, evidence, sample, tests, _equivalence(sample, both_sides, look, evidence.reduced))
+        verdict = _with_records(
+            verdict, evidence, sample, tests, _equivalence(sample, both_sides, look, evidence.reduced)
+        )
     verdict = replace(verdict, status=_status(verdict, sample, tests, joint))
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 

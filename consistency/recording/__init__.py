@@ -116,7 +116,11 @@ def read_recordings(
         return read_bags(estimates, topic, truth_topic, convention, max_dt, time_offset, axes, align)
     _refuse(estimates, own, ("topic", "truth-topic"))
     if suffix == ".npz":
-        _refuse(estimates, own, ("state", "max-dt", "covariance", "covariance-order", "truth", "time-offset", "axes", "align"))
+        _refuse(
+            estimates,
+            own,
+            ("state", "max-dt", "covariance", "covariance-order", "truth", "time-offset", "axes", "align"),
+        )
         return read_archive(estimates, convention)
     if suffix in TABLES:
         _refuse(estimates, own, ("covariance", "covariance-order", "axes"))

@@ -1,4 +1,4 @@
-"""Estimates in a world of their own, moved into that of the truth; what the fit takes is taken out of the covariance."""
+"""Estimates in a world of their own, moved into that of the truth, and what is left of their errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from consistency.recording.offset import clock_shift
 from consistency.recording.origin import frame_of_first_pose, from_first_pose
 from consistency.recording.poses import Poses
 from consistency.recording.record import Recording
-from consistency.types import Array
 
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
@@ -120,8 +119,8 @@ def aligned(
 
     The covariance is multiplied by the share of the NEES that a run keeps, which
     :func:`consistency.diagnostics.fitted.left_covariances` finds; the sum of the NEES of a run is all that is known of
-    it, as a frame may make errors larger in some steps or axes. Fewer than ``ENOUGH`` runs do not show it: their covariance
-    stays, and is too large. After ``origin`` it is a bound, as files do not have the correlation with the first pose.
+    it, as a frame may make errors larger in some steps or axes. Fewer than ``ENOUGH`` runs do not show it: their
+    covariance stays, and is too large. After ``origin`` it is a bound, as files do not have the correlation with the first pose.
 
     Parameters
     ----------
@@ -151,13 +150,17 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
     dof = max(Q.shape[-1] for Q in bases)
     what = f"aligned by {mode}, a frame of {dof} degrees of freedom for {'all runs' if for_all else 'each run'}"
     if len(some) < ENOUGH:
-        note = f"{name}: fewer than {ENOUGH} runs do not show what the frame takes of the errors; nothing makes up for it"
+        note = (
+            f"{name}: fewer than {ENOUGH} runs do not show what the frame takes of the errors; nothing makes up for it"
+        )
         return Aligned(runs, notes=(note,), face=f"{what}: {OF_RUNS}", reduced=True, spoilt=ALL_BUT_SCALE)
     left = left_covariances([found[i].whitened for i in some], bases, bool(for_all))
     kept = [max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST) for M in left]
     factors = dict(zip(some, kept, strict=True))
     out = [replace(p, covariance=p.covariance * factors.get(i, 1.0)) for i, p in enumerate(runs)]
-    note = f"{name}: the frame takes {100.0 * (1.0 - np.mean(kept)):.2g} % of the NEES of a right covariance, made up for"
+    note = (
+        f"{name}: the frame takes {100.0 * (1.0 - np.mean(kept)):.2g} % of the NEES of a right covariance, made up for"
+    )
     if not for_all:
         return Aligned(out, notes=(note,), face=f"{what}: {OF_RUNS}", reduced=True, spoilt=ALL_BUT_SCALE)
     added = len(some) * (max(float(np.linalg.eigvalsh(M)[:, -1].max()) for M in left) - 1.0)
@@ -194,7 +197,8 @@ def _sizes(name: str, mode: str, frames: Sequence[Frame]) -> str:
         return f"{name}: aligned by {mode}: turned by ({axis}) degrees about x, y, z and shifted by ({where}) m"
     turns = _span([float(np.rad2deg(frame.turn.magnitude())) for frame in frames])
     shifts = _span([float(np.linalg.norm(frame.shift)) for frame in frames])
-    return f"{name}: aligned by {mode}, each of {len(frames)} runs by itself: turned by {turns} degrees and shifted by {shifts} m"
+    each = f"each of {len(frames)} runs by itself"
+    return f"{name}: aligned by {mode}, {each}: turned by {turns} degrees and shifted by {shifts} m"
 
 
 def _span(values: Sequence[float]) -> str:

@@ -110,7 +110,7 @@ def _sizes(A: Array) -> Array:
 
 
 def orthonormal(tangents: Sequence[Array]) -> list[Array]:
-    """Columns Q, (k, n, d) for each run, that span the tangents of a frame of all these runs; fewer where some are 0."""
+    """Columns Q, (k, n, d) of each run, that span the tangents of one frame of all runs; fewer where some are 0."""
     A = np.concatenate([each.reshape(-1, each.shape[-1]) for each in tangents])
     U, s, _ = np.linalg.svd(A / _sizes(A), full_matrices=False)
     U = U[:, s > RANK * s[0]]

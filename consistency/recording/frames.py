@@ -1,4 +1,4 @@
-"""World frames that differ by a turn and a shift: estimates, and what covariances are of, carried from one to another."""
+"""World frames that differ by a turn and a shift: estimates and errors carried from one to the other."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,7 +27,9 @@ def frame_of_first_pose(name: str, p: Poses) -> Frame:
     row, truth = _first(name, p)
     estimate = p.estimate[row]
     if p.manifold == "planar":
-        return _onto(Rotation.from_euler("z", truth[2] - estimate[2]), np.append(estimate[:2], 0), np.append(truth[:2], 0))
+        return _onto(
+            Rotation.from_euler("z", truth[2] - estimate[2]), np.append(estimate[:2], 0), np.append(truth[:2], 0)
+        )
     turn = Rotation.from_quat(truth[3:]) * Rotation.from_quat(estimate[3:]).inv()
     return _onto(turn, estimate[:3], truth[:3])
 
@@ -60,7 +63,7 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     """
     row, _ = _first(name, p)
     sound, P, index = sound_of(p, judged), p.covariance.copy(), list(judged)
-    block = np.ix_(sound.rows, index, index)
+    block: Any = np.ix_(sound.rows, np.array(index), np.array(index))
     seen = _seen(name, p, row, sound)[:, index][:, :, index]
     size = np.trace(np.linalg.solve(P[block], seen), axis1=1, axis2=2) / len(index)
     t = np.sqrt(np.maximum(size, 0.0))

@@ -78,7 +78,12 @@ def recordings_of(
     columns, t = common_times([run.t for run in matches])
     tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, matches, strict=True))]
     kind = poses[0].convention
-    notes = [*_notes(source.path, matches, poses[0].max_dt), *clocks, *moved.notes, *hints(source.path.name, AXES, poses, shift)]
+    notes = [
+        *_notes(source.path, matches, poses[0].max_dt),
+        *clocks,
+        *moved.notes,
+        *hints(source.path.name, AXES, poses, shift),
+    ]
     notes.append(f"error convention {kind}: {SPATIAL[kind]}{source.why}")
     name = source.path.stem
     parts = {name: judged}

@@ -118,9 +118,10 @@ def aligned(
     """Runs moved into the world of the truth by frames of least NEES, or by their first poses (``origin``).
 
     The covariance is multiplied by the share of the NEES that a run keeps, which
-    :func:`consistency.diagnostics.fitted.left_covariances` finds; the sum of the NEES of a run is all that is known of
-    it, as a frame may make errors larger in some steps or axes. Fewer than ``ENOUGH`` runs do not show it: their
-    covariance stays, and is too large. After ``origin`` it is a bound, as files do not have the correlation with the first pose.
+    :func:`consistency.diagnostics.fitted.left_covariances` finds. The sum of the NEES of a run is all that is known: a
+    frame may make errors larger in some steps or axes. Fewer than ``ENOUGH`` runs do not show the share; their
+    covariance stays, and is too large. After ``origin`` it is a bound, as files lack the correlation with the first
+    pose.
 
     Parameters
     ----------

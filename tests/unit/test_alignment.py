@@ -230,8 +230,8 @@ def residuals_of(
 def test_what_is_left_of_white_errors_and_of_slow_ones(rng: np.random.Generator) -> None:
     """1 - 1/T of white ones, and 1 - 0.17 of AR(.8) in 50 steps: the variance of a mean is 0.168.
 
-    The correlation of 40 runs of 50 steps spreads by 0.01, so that 0.17 does by 0.008 and the margin adds twice as much:
-    five of these spreads are allowed, 6e-7.
+    The correlation of 40 runs of 50 steps spreads by 0.01, so that 0.168 does by 0.008, and the margin takes twice as
+    much back: five of these spreads are allowed, 6e-7.
     """
     for correlation, taken, spread in ((0.0, 0.02, 0.004), (0.8, 0.168, 0.04)):
         residuals, bases = residuals_of(rng, 40, 50, correlation)

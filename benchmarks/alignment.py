@@ -57,8 +57,9 @@ def first_order(rng: np.random.Generator, shape: tuple[int, ...], correlation: f
 
 def drift(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     """Partial sums of white noise, each over its own standard deviation."""
-    sums: Array = rng.standard_normal(shape).cumsum(axis=1)
-    return sums / np.sqrt(np.arange(1.0, shape[1] + 1.0))[:, None]
+    sums = rng.standard_normal(shape).cumsum(axis=1)
+    out: Array = sums / np.sqrt(np.arange(1.0, shape[1] + 1.0))[:, None]
+    return out
 
 
 def turn_on(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:

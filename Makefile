@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: reproduce calibrate calibrate-quick regime test test-all bench lint format clean
+.PHONY: reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-all bench lint format clean
 
 .venv/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -23,6 +23,12 @@ calibrate: .venv/.done
 
 calibrate-quick: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --quick
+
+calibrate-alignment: .venv/.done
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/alignment.py --docs docs/align.md
+
+calibrate-alignment-quick: .venv/.done
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/alignment.py --quick
 
 RECURSIVE := ekf-uvd ukf-uvd parked-ekf-uvd robocentric-ekf-uvd anchored-ekf-uvd eqf-uvd ri-ekf-uvd fej-ekf-uvd oc-ekf-uvd \
 	ckf-uvd iekf-uvd ispkf-uvd

@@ -314,6 +314,15 @@ def analyse(
     windows: Annotated[
         str | None, typer.Option("--windows", help="'independent': errors of windows are, so that each is a run.")
     ] = None,
+    align: Annotated[
+        str | None,
+        typer.Option(
+            "--align",
+            metavar="MODE",
+            help="Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
+            "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
+        ),
+    ] = None,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
     false_alarm: Annotated[
         float | None, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none [0.05].")
@@ -360,6 +369,7 @@ def analyse(
         "state": _names(state), "axes": _names(axes), "topic": topic, "truth_topic": truth_topic,
         "covariance_order": covariance_order, "max_dt": max_dt, "time_offset": _seconds(time_offset), "body": body,
         "relative": relative, "motions": motions or None, "windows": windows,
+        "align": None if align == "none" else align,
     }  # fmt: skip
     written: list[Path] = []
     if overwrite and report is None:

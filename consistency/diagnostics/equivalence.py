@@ -14,7 +14,9 @@ from consistency.diagnostics.scale import FEW, MeanTest, scale_test
 from consistency.types import Array
 
 
-def equivalence(means: Array, dof: int, steps: int, settings: Settings, factor: float | None = None) -> Equivalence:
+def equivalence(
+    means: Array, dof: int, steps: int, settings: Settings, factor: float | None = None, low_is_fault: bool = True
+) -> Equivalence:
     """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
 
     The ratio is below ``factor`` if the test of run means Y / factor finds them too small, and above its inverse if
@@ -26,13 +28,15 @@ def equivalence(means: Array, dof: int, steps: int, settings: Settings, factor: 
     means : (runs,), mean NEES of each run over ``dof``
     steps : of the longest run
     factor : ``settings.factor`` where it is not given
+    low_is_fault : more runs may also find that the ratio is below 1
     """
     factor = settings.factor if factor is None else factor
     below, above = (
         scale_test(means / factor, dof, steps).below,
         scale_test(means * factor, dof, steps).above,
     )
-    return _result(below, above, factor, settings, deciding_runs(scale_test(means, dof, steps), factor, settings))
+    runs = deciding_runs(scale_test(means, dof, steps), factor, settings, low_is_fault)
+    return _result(below, above, factor, settings, runs)
 
 
 def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:
@@ -60,10 +64,10 @@ def equivalence_of_innovations(test: NisTest, settings: Settings, factor: float 
 
 def _result(below: float, above: float, factor: float, settings: Settings, runs: int | None) -> Equivalence:
     p_value = below if settings.one_sided else max(below, above)
-    return Equivalence(factor, float(p_value), 1.0 - settings.power, runs)
+    return Equivalence(factor, float(p_value), 1.0 - settings.power, runs, settings.one_sided)
 
 
-def deciding_runs(test: MeanTest, factor: float, settings: Settings) -> int | None:
+def deciding_runs(test: MeanTest, factor: float, settings: Settings, low_is_fault: bool = True) -> int | None:
     """Runs that would probably show the ratio inside, or find it at fault, if it is what it seems to be.
 
     Fewer than 20 runs do not know their ratio: then it is taken to be right. Chi-square of k degrees of freedom
@@ -75,9 +79,10 @@ def deciding_runs(test: MeanTest, factor: float, settings: Settings) -> int | No
     gap = off if settings.one_sided else abs(off)  # one-sided, a ratio below 1 is no fault and farther from the end
     tail = SHARES[MAIN] * settings.false_alarm / (1 if settings.one_sided else 2)
     power, room = float(special.ndtri(settings.power)), float(np.log(factor)) - gap
+    fault = gap if low_is_fault or off > 0 else 0.0
 
     def runs(quantile: float, distance: float) -> float:
         return 2.0 / test.effective_dof * ((quantile + power) / distance) ** 2 if distance > 0 else float("inf")
 
-    least = min(runs(power, room), runs(float(special.ndtri(1.0 - tail)), gap))
+    least = min(runs(power, room), runs(float(special.ndtri(1.0 - tail)), fault))
     return None if least > LARGEST else max(int(np.ceil(least)), FEW)

@@ -27,7 +27,7 @@ def flat(v: Verdict) -> dict[str, Any]:
     for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy, _map, _joint, _rejection):
         s |= part(v)
     if v.convention is not None or v.notes:
-        s |= {"convention": v.convention, "notes": list(v.notes)}
+        s |= {"convention": v.convention, "align": v.align, "notes": list(v.notes)}
     if v.world is not None:
         s["world"] = {"status": v.world.status, "reasons": v.world.reasons, "statistics": flat(v.world)}
     return s

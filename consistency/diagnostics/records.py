@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -71,6 +71,8 @@ class Evidence:
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
     unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
+    reduced: bool = False  # a fit to the truth may have made the errors smaller than the covariance says: no fault
+    spoilt: Collection[str] = ()  # questions that such a fit leaves no answer to, which are not asked
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,7 @@ class Equivalence:
     p_value: float  # the larger of both; NaN where there is nothing to judge
     level: float  # at which it is shown
     runs: int | None  # that would probably decide, shown or found at fault; None where it is not known
+    one_sided: bool = False  # only that the ratio is below ``factor``
 
     @property
     def shown(self) -> bool:
@@ -332,6 +335,7 @@ class Verdict:
     accuracy: Accuracy | None = None
     convention: str | None = None  # of the error that is judged, where files or the filter declare one
     notes: tuple[str, ...] = ()  # of whoever read the files
+    align: str | None = None  # how estimates in files were moved into the world of the truth
     world: Verdict | None = None  # the same runs in the additive error of the world, where the filter has another
     map: MapScore | None = None
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps

@@ -37,6 +37,7 @@ from consistency.diagnostics.whitening import entries
 from consistency.types import Array
 
 DEFAULT = Settings()
+CERTAIN = 0.999  # false-alarm rate, at most
 SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones
 
 
@@ -62,6 +63,10 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     Innovations are judged where an optimal gain is declared, otherwise they are reported: only those of an optimal gain
     are white. Without truth they are judged alone.
 
+    Where a fit to the truth took of the errors (``Evidence.reduced``) what is not known, a covariance that is too large
+    is no fault, as with ``allow="conservative"``; but consistent is shown on both sides. Questions that it leaves no
+    answer to (``Evidence.spoilt``) are not asked.
+
     A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
     pose and map together, where it is given.
 
@@ -71,6 +76,8 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
         Nothing to judge is given, or shapes or options do not fit.
     """
     runs, steps = shape_of_arrays(evidence)
+    both_sides = settings
+    settings = replace(settings, allow="conservative") if evidence.reduced else settings
     innovations, p_values = _innovations(evidence, settings)
     sample = sample_of(evidence, settings)
     joint = None
@@ -80,7 +87,7 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     tests = None
     if sample is not None:
         tests = ask(sample, settings, p_values, look.scale if look else None)
-        p_values |= tests.p_values
+        p_values |= {q: p for q, p in tests.p_values.items() if q not in evidence.spoilt}
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)
@@ -92,7 +99,9 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
         unit=evidence.unit,
     )  # fmt: skip
     if sample is not None and tests is not None:
-        verdict = _with_records(verdict, evidence, sample, tests, look)
+        verdict = _with_records(
+            verdict, evidence, sample, tests, _equivalence(sample, both_sides, look, evidence.reduced)
+        )
     verdict = replace(verdict, status=_status(verdict, sample, tests, joint))
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 
@@ -130,9 +139,8 @@ def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | 
 # --- what is known beside the p values -----------------------------------------------------------------
 
 
-def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: Tests, look: Look | None) -> Verdict:
+def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: Tests, shown: Equivalence) -> Verdict:
     settings = verdict.settings
-    shown = _equivalence(sample, settings, look)
     if settings.tolerance is not None:
         verdict = replace(verdict, answers=_excused(verdict.answers, _tolerated(sample, tests, settings)))
     by_question = {a.question: a for a in verdict.answers if not a.tolerated}
@@ -142,7 +150,7 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
         rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
         band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     location = location_of(sample, band, by_question, ordered=evidence.landmarks is None)
-    scale = scale_of(sample, tests, settings, location, shown)
+    scale = scale_of(sample, tests, _at_share(verdict), location, shown)
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
         return replace(verdict, scale=scale, location=location, tails=tails_of(tests, None))
     odd = impossible(evidence, sample.counted)
@@ -161,11 +169,11 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
     )
 
 
-def _equivalence(sample: Sample, settings: Settings, look: Look | None) -> Equivalence:
+def _equivalence(sample: Sample, settings: Settings, look: Look | None, reduced: bool) -> Equivalence:
     if look is not None:
         return equivalence_by_betting(sample.means(), sample.dof, settings)
     factor = max(settings.factor, settings.tolerated)
-    return equivalence(sample.means(), sample.dof, sample.longest, settings, factor)
+    return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, not reduced)
 
 
 def _excused(all_answers: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:
@@ -216,10 +224,16 @@ def _status(verdict: Verdict, sample: Sample | None, tests: Tests | None, joint:
     if sample is None or tests is None:
         return _by_innovations(verdict, faults)
     if not faults & set(BIAS):
-        return _with_joint(verdict.settings, faults, sample, tests, joint)
+        return _with_joint(_at_share(verdict), faults, sample, tests, joint)
     sample, tests, rest = _without_bias(verdict, sample)
-    status = _by_errors(verdict.settings, rest, sample, tests) if rest else "biased"
+    status = _by_errors(_at_share(verdict), rest, sample, tests) if rest else "biased"
     return "biased" if status == "heavy-tailed" else status  # a few errors explain less than the mean of all
+
+
+def _at_share(verdict: Verdict) -> Settings:
+    """Settings at whose usual share the scale is asked as it was: at the whole rate where nothing else is asked."""
+    share = next((a.share for a in verdict.answers if a.question == MAIN), SHARES[MAIN])
+    return replace(verdict.settings, false_alarm=min(verdict.settings.false_alarm * share / SHARES[MAIN], CERTAIN))
 
 
 def _with_joint(settings: Settings, faults: set[str], sample: Sample, tests: Tests, joint: JointTest | None) -> str:

@@ -174,7 +174,7 @@ def _no_fault(v: Verdict) -> str:
 
 
 def _within(v: Verdict, shown: Equivalence) -> str:
-    if v.settings.one_sided:
+    if shown.one_sided:
         return f"below {short(shown.factor)}"
     return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
 

@@ -94,6 +94,7 @@ def read(
     relative: str | float | None = None,
     motions: bool = False,
     windows: str | None = None,
+    align: str | None = None,
     filter: str | None = None,
 ) -> Record:
     """Files of another estimator, as ``consistency analyse FILES`` reads them; docs/files.md has the forms.
@@ -114,6 +115,7 @@ def read(
     relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m")
     motions : with ``relative``: each row is a motion with a covariance of its own, not a pose
     windows : "independent": errors of different windows are, so that each is a run
+    align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
     filter : which estimator, where the files hold several
 
     Raises
@@ -137,6 +139,7 @@ def read(
         relative=relative,
         motions=motions,
         windows=windows,
+        align=align,
     )
     named = {recording.name: recording for recording in found}
     if filter is None and len(named) > 1:

@@ -13,6 +13,7 @@ from typing import Any
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
+from consistency.recording.alignment import ALIGNMENTS, require_alignment
 from consistency.recording.archive import read_archive
 from consistency.recording.bags import is_bag, read_bags
 from consistency.recording.kitti import BODIES, is_drive
@@ -23,6 +24,7 @@ from consistency.recording.tum import ORDERS, SUFFIXES, read_tum, trajectory_fil
 from consistency.recording.windows import relative_of
 
 __all__ = [
+    "ALIGNMENTS",
     "BODIES",
     "CONVENTIONS",
     "ORDERS",
@@ -79,6 +81,7 @@ def read_recordings(
     relative: str | float | None = None,
     motions: bool | None = None,
     windows: str | None = None,
+    align: str | None = None,
 ) -> list[Recording]:
     """What estimators said, from CSV, Parquet, TUM or NumPy files: one recording for each estimator.
 
@@ -99,6 +102,7 @@ def read_recordings(
     relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m") in place of poses
     motions : with ``relative``: each row is the motion since the row before, and errors of motions are independent
     windows : "independent": errors of different windows are; with motions they are anyway
+    align : one of ``ALIGNMENTS``: how the estimates are moved into the world of the truth; None is none
 
     Raises
     ------
@@ -119,34 +123,43 @@ def read_recordings(
         raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
     if over is not None and time_offset == "estimate":
         raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
+    align = require_alignment(align, truth or truth_topic)
+    if over is not None and align is not None:
+        raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
     suffix = estimates.suffix.lower()
     own: dict[str, object] = {"state": state, "max-dt": max_dt, "covariance": covariance, "truth": truth}
     own |= {"covariance-order": covariance_order, "time-offset": time_offset, "axes": axes}
-    own |= {"topic": topic, "truth-topic": truth_topic, "body": body}
+    own |= {"topic": topic, "truth-topic": truth_topic, "body": body, "align": align}
     if body is not None and not (truth is not None and is_drive(truth)):
         raise InputError(f"--body {body}: goes with --truth DIR, the folder of a KITTI drive")
     if is_bag(estimates):
         _refuse(estimates, own, ("state", "covariance", "covariance-order", "truth"))
         if over is not None:
             raise InputError(f"{estimates}: --relative: {MARGINAL}")
-        return read_bags(estimates, topic, truth_topic, convention, max_dt, time_offset, axes)
+        return read_bags(estimates, topic, truth_topic, convention, max_dt, time_offset, axes, align)
     _refuse(estimates, own, ("topic", "truth-topic"))
     if suffix == ".npz":
-        _refuse(estimates, own, ("state", "max-dt", "covariance", "covariance-order", "truth", "time-offset", "axes"))
+        _refuse(
+            estimates,
+            own,
+            ("state", "max-dt", "covariance", "covariance-order", "truth", "time-offset", "axes", "align"),
+        )
         return read_archive(estimates, convention, over)
     if suffix in TABLES:
         _refuse(estimates, own, ("covariance", "covariance-order", "axes"))
         if state is not None and (len(set(state)) < len(state) or not all(state)):
             raise InputError(f"--state {','.join(state)}: needs names of columns, each once")
-        found = read_tables(estimates, truth, convention, state, max_dt, time_offset, body, over)
+        found = read_tables(estimates, truth, convention, state, max_dt, time_offset, body, over, align)
         return _with_frame(found, truth, body)
     if suffix not in SUFFIXES and not estimates.is_dir():
         known = ", ".join((*TABLES, ".npz", ".bag", *SUFFIXES))
         raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
     _refuse(estimates, own, ("state",))
-    found = read_tum(estimates, truth, covariance, convention, covariance_order, max_dt, time_offset, axes, body, over)
+    found = read_tum(
+        estimates, truth, covariance, convention, covariance_order, max_dt, time_offset, axes, body, over, align
+    )
     return _with_frame(found, truth, body)
 
 

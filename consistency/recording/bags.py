@@ -50,6 +50,7 @@ def read_bags(
     max_dt: float | None,
     time_offset: float | str | None,
     axes: Sequence[str] | None,
+    align: str | None = None,
 ) -> list[Recording]:
     """Recording of one estimator: a bag, or a folder with a bag for each run.
 
@@ -70,7 +71,7 @@ def read_bags(
     poses = [_poses(bag, topic, truth, convention or "so3", DEFAULT_DT if max_dt is None else max_dt) for bag in bags]
     why = "" if convention else "; as the ROS messages define it; declare yours with --error"
     source = Source(path, [(bag, f"{truth} of {bag}") for bag in bags], path, why)
-    return recordings_of(source, poses, WHOLE, time_offset, axes)
+    return recordings_of(source, poses, WHOLE, time_offset, axes, align=align)
 
 
 def _poses(bag: Path, topic: str | None, truth: str | None, convention: str, max_dt: float) -> Poses:

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
-from scipy.spatial.transform import Rotation
 
 from consistency.diagnostics.whitening import whiten
 from consistency.geometry import wrap
 from consistency.geometry.conventions import PLANAR, SPATIAL
+from consistency.recording.frames import fitted_frame, moved, spread
 from consistency.recording.poses import Poses
 from consistency.types import Array
 
@@ -194,80 +194,19 @@ def _inverted(p: Poses) -> Poses:
 
 
 def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
-    """The worlds of the files differ by a turn about z and a shift, the same in all runs."""
+    """The worlds of the files differ by a turn about z and a shift, the same in all runs, or another in each."""
     frame = fitted_frame(runs)
-    if frame is None:
+    if frame is None or not (size := spread(runs)) > 0:
         return
-    angle, shift = frame
-    turn = f"turned by {np.rad2deg(angle):.1f} degrees about z and " if abs(np.rad2deg(angle)) > TURN else ""
-    where = ", ".join(f"{value:.3g}" for value in shift)
-    words = (
-        f"the world of the estimates is {turn}shifted by ({where}) m to meet that of the truth; write both in one world"
-    )
-    yield Guess(words, lambda p: moved(p, angle, shift))
-
-
-def fitted_frame(runs: Sequence[Poses]) -> tuple[float, Array] | None:
-    """Turn about z, rad, and shift (d,), m, with which the estimates of all runs are nearest to the truth.
-
-    Umeyama (1991), in the plane. None where frames hardly differ, or where positions do not spread.
-    """
-    d = 3 if runs[0].manifold == "spatial" else 2
-    pairs = [
-        (poses.estimate[known.rows, :d], known.truth[:, :d]) for poses in runs if len((known := poses.known()).rows)
-    ]
-    if not pairs:
-        return None
-    own, true = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    finite = np.isfinite(own).all(axis=1)
-    own, true = own[finite], true[finite]
-    if len(own) < 3:
-        return None
-    a, b = own - own.mean(axis=0), true - true.mean(axis=0)
-    angle = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
-    turned = own.copy()
-    turned[:, :2] = _turned(own[:, :2], angle)
-    shift = true.mean(axis=0) - turned.mean(axis=0)
-    size = float(np.sqrt(np.square(b).sum(axis=1).mean()))
-    if not size > 0 or (abs(np.rad2deg(angle)) < TURN and np.linalg.norm(shift) < SHIFT * size):
-        return None
-    return angle, shift
-
-
-def _turned(points: Array, angle: float) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(points @ np.array([[c, s], [-s, c]]))
-
-
-def moved(p: Poses, angle: float, shift: Array) -> Poses:
-    """The estimates in a world that is turned about z and shifted, with their covariance."""
-    d = len(shift)
-    estimate, n = p.estimate.copy(), p.covariance.shape[-1]
-    estimate[:, :2] = _turned(p.estimate[:, :2], angle)
-    estimate[:, :d] += shift
-    if p.manifold == "planar":
-        estimate[:, 2] = wrap(estimate[:, 2] + angle)
-    else:
-        sound = np.isfinite(estimate).all(axis=1)
-        estimate[sound, 3:] = (Rotation.from_euler("z", angle) * Rotation.from_quat(estimate[sound, 3:])).as_quat()
-    T = carried(p.convention, angle, shift, n)
-    return replace(p, estimate=estimate, covariance=T @ p.covariance @ T.T)
-
-
-def carried(convention: str, angle: float, shift: Array, n: int) -> Array:
-    """Matrix (n, n) that carries an error over to a world that is turned about z and shifted by (d,).
-
-    An error in the frame of the body stays; that of ``right`` goes by the adjoint (Sola et al. 2018, eq. 159 and 175).
-    """
-    T, d = np.eye(n), len(shift)
-    if convention == "left":
-        return T
-    turn = Rotation.from_euler("z", angle).as_matrix()
-    T[:d, :d] = turn[:d, :d]
-    if n == 6 and convention in ("so3", "right"):
-        T[3:, 3:] = turn
-    if convention == "right":
-        x, y, z = np.append(shift, np.zeros(3 - d))
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        T[:d, d:] = cross @ turn if n == 6 else cross[:2, 2:]
-    return T
+    angle = np.rad2deg(frame.heading)
+    if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
+        turn = f"turned by {angle:.1f} degrees about z and " if abs(angle) > TURN else ""
+        where = ", ".join(f"{value:.3g}" for value in frame.shift[: 3 if runs[0].manifold == "spatial" else 2])
+        words = (
+            f"the world of the estimates is {turn}shifted by ({where}) m to meet that of the truth; "
+            f"write both in one world, or add --align posyaw{'-all' * (len(runs) > 1)}"
+        )
+        yield Guess(words, lambda p: moved(p, frame))
+    if len(runs) > 1:
+        words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
+        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame))

@@ -43,6 +43,10 @@ class Recording:
     notes: tuple[str, ...] = ()  # what a reader must know: the convention, what was left out
     window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
     independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
+    align: str = "none"  # how the estimates were moved into the world of the truth
+    face: str = ""  # what the verdict has to say of that
+    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
+    spoilt: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
 
     @property
     def left_out_steps(self) -> list[int]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import SPATIAL
+from consistency.recording.alignment import clocks_and_frames
 from consistency.recording.hints import hints
 from consistency.recording.interpolation import truth_at
-from consistency.recording.offset import clock_shift
 from consistency.recording.poses import Poses
 from consistency.recording.record import Recording, Track, assemble, common_times
 from consistency.recording.relative import Stretch, relative_recording
@@ -64,13 +64,14 @@ def recordings_of(
     time_offset: float | str | None,
     axes: Sequence[str] | None,
     relative: Relative | None = None,
+    align: str | None = None,
 ) -> list[Recording]:
     """The recording of one estimator, each of whose runs is one of ``poses``; clocks and mix-ups are looked for.
 
     Parameters
     ----------
     parts : ``WHOLE``, ``BLOCKS`` or ``SINGLE``: components whose covariance is known, each of which is a recording
-    time_offset, axes : as :func:`consistency.recording.read_recordings` has them
+    time_offset, axes, align : as :func:`consistency.recording.read_recordings` has them
     relative : judge motions over windows in place of poses
 
     Raises
@@ -88,19 +89,25 @@ def recordings_of(
             for run, (one, files) in enumerate(zip(poses, source.files, strict=True))
         ]
         return [relative_recording(source.path.stem, str(source.covariance), stretches, AXES, judged, relative)]
-    shift, clocks = clock_shift(source.path.name, poses, time_offset)
+    shift, clocks, moved = clocks_and_frames(source.path.name, poses, time_offset, align, judged)
+    poses = moved.runs
     matches = [_match(one, *files, shift) for one, files in zip(poses, source.files, strict=True)]
     columns, t = common_times([run.t for run in matches])
     tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, matches, strict=True))]
     kind = poses[0].convention
-    notes = [*_notes(source.path, matches, poses[0].max_dt), *clocks, *hints(source.path.name, AXES, poses, shift)]
+    notes = [
+        *_notes(source.path, matches, poses[0].max_dt),
+        *clocks,
+        *moved.notes,
+        *hints(source.path.name, AXES, poses, shift),
+    ]
     notes.append(f"error convention {kind}: {SPATIAL[kind]}{source.why}")
     recordings = []
     for title, whole in parts.items():
         if part := [i for i in judged if i in whole]:
             some = [_part(track, part) for track in tracks]
             names, name = tuple(AXES[i] for i in part), f"{source.path.stem}{title}"
-            recordings.append(assemble(name, some, t, names, str(source.covariance), kind, notes))
+            recordings.append(moved.on(assemble(name, some, t, names, str(source.covariance), kind, notes)))
             notes = []
     return recordings
 

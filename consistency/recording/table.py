@@ -12,10 +12,10 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
+from consistency.recording.alignment import Aligned, clocks_and_frames
 from consistency.recording.hints import hints
 from consistency.recording.interpolation import Manifold, truth_at
 from consistency.recording.kitti import drive_sheet, is_drive
-from consistency.recording.offset import clock_shift
 from consistency.recording.poses import Poses
 from consistency.recording.record import (
     DEFAULT_DT,
@@ -48,6 +48,7 @@ def read_tables(
     time_offset: float | str | None = None,
     body: str | None = None,
     relative: Relative | None = None,
+    align: str | None = None,
 ) -> list[Recording]:
     """Recordings of the estimators in a table, one for each value of its column ``filter``.
 
@@ -61,6 +62,8 @@ def read_tables(
     convention = _convention(convention, axes, truth)
     if relative is not None:
         require_poses(estimates, axes, convention, truth)
+    if align is not None and _manifold(convention) != "planar":
+        raise InputError(f"--align {align}: needs poses x,y,heading, and an error that is not 'vector'")
     other = None
     if truth is not None:
         other = drive_sheet(truth, body) if is_drive(truth) else read_sheet(truth)
@@ -76,7 +79,7 @@ def read_tables(
     recordings = []
     for name in names:
         own = sheet.rows((sheet.data["filter"].astype(str) == name).to_numpy()) if "filter" in sheet else sheet
-        recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset, relative))
+        recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset, relative, align))
     return recordings
 
 
@@ -127,6 +130,7 @@ def _recording(
     max_dt: float | None,
     time_offset: float | str | None,
     relative: Relative | None,
+    align: str | None,
 ) -> Recording:
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet.data), int)
     order = row_order(sheet, runs, key)
@@ -135,6 +139,7 @@ def _recording(
     error = covariance = None
     keep = np.ones(len(runs), bool)
     notes: list[str] = []
+    moved = Aligned(())
     if truth is None:
         broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *_present(sheet, axes)])).all(axis=1)
         error = None if not broken.any() else np.where(broken, np.nan, 0.0)[:, None]
@@ -147,10 +152,15 @@ def _recording(
         shift, clocks = 0.0, list[str]()
         if relative is not None:
             shift = time_offset if isinstance(time_offset, float) else 0.0
-        elif key == "t":
-            poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, _default_dt(max_dt))
-            shift, clocks = clock_shift(name, poses, time_offset)
-            clocks += hints(name, axes, poses, shift)
+        elif key == "t" or align is not None:
+            reach = _default_dt(max_dt) if key == "t" else 0.0
+            poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, reach)
+            shift, clocks, moved = clocks_and_frames(name, poses, time_offset, align, range(len(axes)))
+            clocks += [*moved.notes, *hints(name, axes, moved.runs, shift)]
+            if align is not None:
+                there = np.isin(runs, np.unique(samples.runs)) if samples.runs is not None else np.ones(len(runs), bool)
+                estimate[there] = np.concatenate([p.estimate for p in moved.runs])
+                covariance[there] = np.concatenate([p.covariance for p in moved.runs])
         keep, true, notes = _matched(name, sheet, truth, samples, runs, keys + shift, key, axes, convention, max_dt)
         if relative is not None:
             stretches = _stretches(sheet, runs, keep, true, estimate, covariance, convention, relative)
@@ -187,7 +197,7 @@ def _recording(
         for run, rows, column in zip(numbers, members, columns, strict=True)
     ]
     record = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
-    return record if truth is not None else replace(record, error=None, dof=0)
+    return moved.on(record) if truth is not None else replace(record, error=None, dof=0)
 
 
 def _stretches(

@@ -38,6 +38,7 @@ def read_tum(
     axes: Sequence[str] | None = None,
     body: str | None = None,
     relative: Relative | None = None,
+    align: str | None = None,
 ) -> list[Recording]:
     """Recording of one estimator: a file, or a folder with a file for each run.
 
@@ -69,7 +70,7 @@ def read_tum(
         poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt, body))
     why = "" if convention else f"; the default of this layout, {_origin(parts)}"
     source = Source(estimates, [(path, true) for path, true, _ in runs], covariance or estimates, why)
-    return recordings_of(source, poses, parts, time_offset, axes, relative)
+    return recordings_of(source, poses, parts, time_offset, axes, relative, align)
 
 
 def _parts(own: Lines) -> Mapping[str, range]:

@@ -259,13 +259,15 @@ def analyse_recordings(
         else:
             evidence = Evidence(
                 name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
-                failures=r.failures, axes=r.axes, run_numbers=r.runs,
+                failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, spoilt=r.spoilt,
             )  # fmt: skip
         verdict = judge(evidence, settings)
+        first, *rest = verdict.reasons
         verdicts[name] = replace(
             verdict,
-            reasons=(*verdict.reasons, *_other_ways(verdict, r)),
+            reasons=(f"{first}; {r.face}" if r.face else first, *rest, *_other_ways(verdict, r)),
             convention=r.convention or None,
+            align=r.align if r.convention else None,
             notes=tuple(r.notes),
             left_out_steps=tuple(r.left_out_steps),
         )

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from consistency.geometry import wrap
 from consistency.geometry.conventions import planar_error, spatial_error
 from consistency.recording import read_recordings
-from consistency.recording.hints import carried, decades, fitted_frame, hints, moved
+from consistency.recording.frames import Frame, carried, fitted_frame, moved
+from consistency.recording.hints import decades, hints
 from consistency.recording.poses import Poses
 from consistency.recording.sheet import Places
 from consistency.types import Array
@@ -128,7 +129,7 @@ MIXED: dict[str, tuple[Make, Mess, str]] = {
     ),
     "deviations": (lambda rng: spatial(rng, plain=True), deviations, "its diagonal holds standard deviations"),
     "information": (spatial, lambda p: replace(p, covariance=np.linalg.inv(p.covariance)), "information matrix"),
-    "turned world": (spatial, lambda p: moved(p, -np.pi / 4.5, FAR), "turned by 40."),
+    "turned world": (spatial, lambda p: moved(p, Frame.about_z(-np.pi / 4.5, FAR)), "turned by 40."),
     "headings in degrees": (
         planar, lambda p: replace(p, estimate=p.estimate * ANGLES), "the headings of the estimates are in degrees",
     ),
@@ -136,7 +137,9 @@ MIXED: dict[str, tuple[Make, Mess, str]] = {
         planar, lambda p: replace(p, truth=p.truth * ANGLES), "the headings of the truth are in degrees",
     ),
     "planar deviations": (lambda rng: planar(rng, plain=True), deviations, "its diagonal holds standard deviations"),
-    "shifted world": (planar, lambda p: moved(p, 0.0, FAR[:2]), "the world of the estimates is shifted by (-"),
+    "shifted world": (
+        planar, lambda p: moved(p, Frame.about_z(0.0, FAR[:2])), "the world of the estimates is shifted by (-",
+    ),
 }  # fmt: skip
 
 
@@ -174,19 +177,20 @@ def test_the_frame_is_found(angle: float, rng: np.random.Generator) -> None:
         runs = make(rng)
         for p in runs:
             p.truth[:, : len(shift)] = p.estimate[:, : len(shift)]
-        found = fitted_frame([moved(p, angle, shift) for p in runs])
+        frame = Frame.about_z(angle, shift)
+        found = fitted_frame([moved(p, frame) for p in runs])
         assert found is not None
-        assert found[0] == pytest.approx(-angle, abs=1e-9)
-        back = moved(moved(runs[0], angle, shift), *found)
+        assert found.heading == pytest.approx(-angle, abs=1e-9)
+        back = moved(moved(runs[0], frame), found)
         np.testing.assert_allclose(back.estimate[:, : len(shift)], runs[0].estimate[:, : len(shift)], atol=1e-9)
-        assert fitted_frame(runs) is None
+        assert not any("world" in note for note in hints("est", SIX if len(shift) == 3 else THREE, runs))
 
 
 @pytest.mark.parametrize("convention", ["so3", "so3-body", "left", "right"])
 def test_errors_in_space_are_carried_over(convention: str) -> None:
     """To first order: the change of the error by small errors of each kind, in the moved world, is the matrix."""
     own = np.array([[3.0, -1.0, 2.0, *Rotation.from_euler("ZYX", [0.7, 0.2, -0.3]).as_quat()]])
-    step = 1e-6
+    step, world = 1e-6, Frame(Rotation.from_rotvec([0.2, -0.5, 0.9]), FAR)
     found = np.zeros((6, 6))
     for i, xi in enumerate(step * np.eye(6)):
         true = np.zeros((1, 7))
@@ -198,23 +202,21 @@ def test_errors_in_space_are_carried_over(convention: str) -> None:
             G[:3, 3] += xi[:3]
             G[:3, :3] = E[:3, :3] @ T[:3, :3] if convention == "so3" else T[:3, :3] @ E[:3, :3]
         true[0] = [*G[:3, 3], *Rotation.from_matrix(G[:3, :3]).as_quat()]
-        both = [
-            moved(poses(np.zeros(1), each, np.eye(6), each, "spatial", convention), 0.9, FAR) for each in (own, true)
-        ]
+        both = [moved(poses(np.zeros(1), each, np.eye(6), each, "spatial", convention), world) for each in (own, true)]
         found[:, i] = spatial_error(both[1].estimate, both[0].estimate, convention)[0] / step
-    np.testing.assert_allclose(found, carried(convention, 0.9, FAR, 6), atol=1e-4)
+    np.testing.assert_allclose(found, carried(convention, world, 6), atol=1e-4)
 
 
 @pytest.mark.parametrize("convention", ["so2", "left", "right"])
 def test_errors_in_the_plane_are_carried_over(convention: str) -> None:
-    own, step = np.array([[3.0, -1.0, 0.4]]), 1e-6
+    own, step, world = np.array([[3.0, -1.0, 0.4]]), 1e-6, Frame.about_z(0.9, FAR[:2])
     change, found = np.zeros((3, 3)), np.zeros((3, 3))
     for i, xi in enumerate(step * np.eye(3)):
         pair = [poses(np.zeros(1), each, np.eye(3), each, "planar", convention) for each in (own, own + xi)]
         change[:, i] = planar_error(own + xi, own, convention)[0] / step
-        both = [moved(p, 0.9, FAR[:2]).estimate for p in pair]
+        both = [moved(p, world).estimate for p in pair]
         found[:, i] = planar_error(both[1], both[0], convention)[0] / step
-    np.testing.assert_allclose(found, carried(convention, 0.9, FAR[:2], 3) @ change, atol=1e-4)
+    np.testing.assert_allclose(found, carried(convention, world, 3) @ change, atol=1e-4)
 
 
 # --- files ------------------------------------------------------------------------------------------

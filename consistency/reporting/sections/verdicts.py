@@ -104,8 +104,9 @@ def equivalence_interval(study: Judged) -> str:
     if not study.tracks:
         return ""
     verdict = study.tracks[0].verdict
-    factor = verdict.settings.factor if verdict.equivalence is None else verdict.equivalence.factor
-    low = "(0" if verdict.settings.one_sided else f"[{short(1.0 / factor)}"
+    shown = verdict.equivalence
+    factor = verdict.settings.factor if shown is None else shown.factor
+    low = "(0" if (verdict.settings if shown is None else shown).one_sided else f"[{short(1.0 / factor)}"
     return f"{low},\u00a0{short(factor)}]"
 
 
@@ -203,10 +204,10 @@ def _conditions(studies: Sequence[Judged]) -> tuple[tuple[bool, str], ...]:
 
 def _consistent(track: Estimator) -> str:
     """What consistent and undecided mean."""
-    settings = track.verdict.settings
+    settings, shown = track.verdict.settings, track.verdict.equivalence
     upper = short(settings.factor)
     tests, inside = "two one-sided tests, each", f"between {short(1.0 / settings.factor)} and {upper}"
-    if settings.one_sided:
+    if (settings if shown is None else shown).one_sided:
         tests, inside = "a one-sided test", f"below {upper}"
     return (
         f" Consistent is shown: no question found a fault, and {tests} at {100 * (1.0 - settings.power):.2g} %, put "

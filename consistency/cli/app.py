@@ -255,74 +255,10 @@ def run(
 
 
 @app.command()
+@reads_files
 def analyse(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="PATH", help="Folder written by 'run', or estimates: .csv, .parquet, .npz, TUM, ROS bags."
-        ),
-    ],
-    truth: Annotated[
-        Path | None,
-        typer.Option("--truth", help="Truth of the estimates, in the same form, or a KITTI drive's folder."),
-    ] = None,
-    covariance: Annotated[
-        Path | None, typer.Option("--covariance", help="Covariances of a TUM trajectory: t and 36 or 21 numbers.")
-    ] = None,
-    error: Annotated[
-        str | None,
-        typer.Option("--error", help="Error that the covariance is of: so2, vector, left, right, so3 or so3-body."),
-    ] = None,
-    state: Annotated[
-        str | None, typer.Option("--state", metavar="A,B,C", help="Columns that make up the state [x,y,heading].")
-    ] = None,
-    covariance_order: Annotated[
-        str | None,
-        typer.Option("--covariance-order", help="translation-rotation [default] or rotation-translation."),
-    ] = None,
-    max_dt: Annotated[
-        float | None, typer.Option("--max-dt", help="Seconds between an estimate and its truth at most [0.01].")
-    ] = None,
-    time_offset: Annotated[
-        str | None,
-        typer.Option("--time-offset", metavar="S|estimate", help="Seconds to add to the estimates' timestamps."),
-    ] = None,
-    axes: Annotated[
-        str | None,
-        typer.Option("--axes", metavar="A,B,C", help="Components of a trajectory to judge, as x,y,yaw in the plane."),
-    ] = None,
-    topic: Annotated[
-        str | None, typer.Option("--topic", help="Of a ROS bag: Odometry or PoseWithCovarianceStamped.")
-    ] = None,
-    truth_topic: Annotated[
-        str | None, typer.Option("--truth-topic", help="Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
-    ] = None,
-    body: Annotated[
-        str | None, typer.Option("--body", help="Of a KITTI drive as truth: imu [default], velodyne or camera.")
-    ] = None,
-    relative: Annotated[
-        str | None,
-        typer.Option(
-            "--relative",
-            metavar="N|Ns|Nm",
-            help="Judge motions over windows: N steps, seconds (10s), metres (50m).",
-        ),
-    ] = None,
-    motions: Annotated[
-        bool, typer.Option("--motions", help="With --relative: each row is a motion with a covariance of its own.")
-    ] = False,
-    windows: Annotated[
-        str | None, typer.Option("--windows", help="'independent': errors of windows are, so that each is a run.")
-    ] = None,
-    align: Annotated[
-        str | None,
-        typer.Option(
-            "--align",
-            metavar="MODE",
-            help="Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
-            "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
-        ),
-    ] = None,
+    path: Judged,
+    files: FileOptions,
     filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
     false_alarm: Annotated[
         float | None, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none [0.05].")
@@ -350,7 +286,6 @@ def analyse(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
 ) -> None:
     """Judge results, or files of another estimator: consistent, overconfident, conservative, undecided ..., and why."""
-    from consistency.recording import is_recording, read_recordings
     from consistency.reporting import write_file_reports
     from consistency.store.results import open_results
     from consistency.store.storage import require_free
@@ -364,23 +299,14 @@ def analyse(
         raise InputError(f"--innovations must be 'optimal', got '{innovations}'")
     changes = _options(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance)
     settings = settings_of(**changes) if changes else None
-    options: dict[str, Any] = {
-        "truth": truth, "covariance": covariance, "convention": error,
-        "state": _names(state), "axes": _names(axes), "topic": topic, "truth_topic": truth_topic,
-        "covariance_order": covariance_order, "max_dt": max_dt, "time_offset": _seconds(time_offset), "body": body,
-        "relative": relative, "motions": motions or None, "windows": windows,
-        "align": None if align == "none" else align,
-    }  # fmt: skip
     written: list[Path] = []
     if overwrite and report is None:
         raise InputError("--overwrite goes with --report: nothing else is written")
-    if is_recording(path, **options):
+    if files.are(path):
         if report is not None:
             require_free(report, overwrite, "verdict", "--report")
-        recordings = read_recordings(path, **options)
+        (recordings,) = files.read(path)
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
-        for note in dict.fromkeys(note for recording in recordings for note in recording.notes):
-            print(f"consistency: {note}", file=sys.stderr)
         if report is not None:
             data = verdicts_json(verdicts)
             written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
@@ -407,18 +333,6 @@ def analyse(
             print(file)
     if fail_on and not all(verdict.consistent for verdict in verdicts.values()):
         raise typer.Exit(1)
-
-
-def _names(text: str | None) -> list[str] | None:
-    return None if text is None else [name.strip() for name in text.split(",")]
-
-
-def _seconds(text: str | None) -> float | str | None:
-    """A number where the text is one."""
-    try:
-        return text if text is None else float(text)
-    except ValueError:
-        return text
 
 
 @app.command()

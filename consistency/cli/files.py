@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 class FileOptions:
     """How files are read; None where an option is not given."""
 
-    truth: Annotated[Path | None, typer.Option("--truth", help="Truth of the estimates, in the same form.")] = None
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", help="Truth of the estimates, in the same form, or a KITTI drive's folder."),
+    ] = None
     covariance: Annotated[
         Path | None, typer.Option("--covariance", help="Covariances of a TUM trajectory: t and 36 or 21 numbers.")
     ] = None
@@ -52,6 +55,35 @@ class FileOptions:
     truth_topic: Annotated[
         str | None, typer.Option("--truth-topic", help="Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
     ] = None
+    body: Annotated[
+        str | None, typer.Option("--body", help="Of a KITTI drive as truth: imu [default], velodyne or camera.")
+    ] = None
+    relative: Annotated[
+        str | None,
+        typer.Option(
+            "--relative",
+            metavar="N|Ns|Nm",
+            help="Judge motions over windows: N steps, seconds (10s), metres (50m).",
+        ),
+    ] = None
+    motions: Annotated[
+        bool | None,
+        typer.Option(
+            "--motions/", help="With --relative: each row is a motion with a covariance of its own.", show_default=False
+        ),
+    ] = None
+    windows: Annotated[
+        str | None, typer.Option("--windows", help="'independent': errors of windows are, so that each is a run.")
+    ] = None
+    align: Annotated[
+        str | None,
+        typer.Option(
+            "--align",
+            metavar="MODE",
+            help="Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
+            "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
+        ),
+    ] = None
 
     def given(self) -> list[str]:
         """Options that were given, as they are written."""
@@ -63,6 +95,7 @@ class FileOptions:
         options["convention"] = options.pop("error")
         return options | {
             "state": _names(self.state), "axes": _names(self.axes), "time_offset": _seconds(self.time_offset),
+            "align": None if self.align == "none" else self.align,
         }  # fmt: skip
 
     def are(self, path: Path) -> bool:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from consistency.diagnostics import Comparison, RunSummary, compare, summary
+from consistency.diagnostics import Comparison, Evidence, RunSummary, compare, summary
 from consistency.diagnostics.comparison import FailedRuns
 from consistency.errors import InputError
 from consistency.reading import HUGE, read_json, reading
@@ -21,6 +21,7 @@ from consistency.store.atomic import write_whole
 from consistency.store.results import POSE, Tables, open_results
 from consistency.store.storage import SCHEMA_VERSION, manifest_of, plain
 from consistency.verdicts.curves import Curves, curves, steps_of
+from consistency.verdicts.judge import evidence_of_windows
 
 DETECT = 1.5  # ratio that a sentence speaks of
 HIGHEST_DOF = 1000  # of an error in a baseline
@@ -116,7 +117,10 @@ def baseline_of_files(recordings: Sequence[Recording], name: str, truth: Path | 
     for r in recordings:
         if r.nees is None:
             raise InputError(f"{name}: has no truth of {r.name}; give it with --truth, as only a NEES can be compared")
-        filters[r.name] = summary(r.nees, r.dof, r.error, r.covariance, r.runs)
+        of = evidence_of_windows(r) if r.independent else r
+        assert of.nees is not None
+        numbers = of.run_numbers if isinstance(of, Evidence) else r.runs
+        filters[r.name] = summary(of.nees, r.dof, of.error, of.covariance, numbers)
     failures = {r.name: len(r.failures) for r in recordings}
     origin = (None if truth is None else _digest(truth), None)
     return Baseline(name, None, origin, filters, failures, {}, {r.name: r.axes for r in recordings})

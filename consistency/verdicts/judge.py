@@ -255,7 +255,7 @@ def analyse_recordings(
             raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
         r = named[name]
         if r.independent:
-            evidence = _evidence_of_windows(r)
+            evidence = evidence_of_windows(r)
         else:
             evidence = Evidence(
                 name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
@@ -289,7 +289,7 @@ def _other_ways(verdict: Verdict, r: Recording) -> list[str]:
     ]
 
 
-def _evidence_of_windows(r: Recording) -> Evidence:
+def evidence_of_windows(r: Recording) -> Evidence:
     """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
     assert r.error is not None
     assert r.covariance is not None

@@ -1,7 +1,8 @@
 """The command line: parses, calls, prints; no logic. Every command imports what it needs when it is called."""
 
 from consistency.cli import challenging, characterising, sweeping, tuning
-from consistency.cli.app import main
+from consistency.cli.app import app, main
+from consistency.cli.examples import show_examples
 
 __all__ = [
     "challenging",
@@ -10,3 +11,5 @@ __all__ = [
     "sweeping",
     "tuning",
 ]  # importing the modules registers their commands
+
+show_examples(app)

@@ -19,7 +19,7 @@ Abort: Any = typer.Abort
 
 app = typer.Typer(
     help="Does a stereo-SLAM filter tell the truth about its own uncertainty?",
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -167,7 +167,9 @@ def _options(**options: Any) -> dict[str, Any]:
 @app.command()
 def run(
     out: Out,
-    filters: Annotated[list[str], typer.Option("--filter", help="Filter name, or FILTER+gate; again for more.")],
+    filters: Annotated[
+        list[str], typer.Option("--filter", metavar="NAME", help="Filter name, or FILTER+gate; again for more.")
+    ],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
     runs: Annotated[int | None, typer.Option("--runs", help="Number of Monte Carlo runs [default: 50].")] = None,
@@ -259,7 +261,9 @@ def run(
 def analyse(
     path: Judged,
     files: FileOptions,
-    filters: Annotated[list[str] | None, typer.Option("--filter", help="Only this filter; may be repeated.")] = None,
+    filters: Annotated[
+        list[str] | None, typer.Option("--filter", metavar="NAME", help="Only this filter; may be repeated.")
+    ] = None,
     false_alarm: Annotated[
         float | None, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none [0.05].")
     ] = None,
@@ -340,7 +344,9 @@ def plan(
     scenario: Annotated[
         str | None, typer.Argument(metavar="[SCENARIO]", help="Run a short pilot of it to learn how steps depend.")
     ] = None,
-    filters: Annotated[list[str] | None, typer.Option("--filter", help="Filter of the pilot; may be repeated.")] = None,
+    filters: Annotated[
+        list[str] | None, typer.Option("--filter", metavar="NAME", help="Filter of the pilot; may be repeated.")
+    ] = None,
     like: Annotated[
         Path | None, typer.Option("--like", metavar="RESULTS", help="Results to learn from, in place of a pilot.")
     ] = None,
@@ -392,7 +398,9 @@ def compare(
     ] = None,
     filters: Annotated[
         list[str] | None,
-        typer.Option("--filter", help="Without OTHER: the first against the rest. With it: this filter in both."),
+        typer.Option(
+            "--filter", metavar="NAME", help="Without OTHER: the first against the rest. With it: this filter in both."
+        ),
     ] = None,
     false_alarm: FalseAlarm = 0.05,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
@@ -492,7 +500,8 @@ def report(
 @app.command()
 def reproduce(
     only: Annotated[
-        list[str] | None, typer.Option("--only", help="Only this finding or experiment; may be repeated.")
+        list[str] | None,
+        typer.Option("--only", metavar="NAME", help="Only this finding or experiment; may be repeated."),
     ] = None,
     long: Annotated[bool, typer.Option("--all", help="Also experiments that take from minutes to hours.")] = False,
     runs: Runs = 50,

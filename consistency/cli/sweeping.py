@@ -24,7 +24,8 @@ def sweep(
         Path | None, typer.Option("--out", help="Folder to write; one with a part of the same sweep goes on.")
     ] = None,
     filters: Annotated[
-        list[str] | None, typer.Option("--filter", help="In place of the file's filters; may be repeated.")
+        list[str] | None,
+        typer.Option("--filter", metavar="NAME", help="In place of the file's filters; may be repeated."),
     ] = None,
     share: Annotated[
         str | None,

@@ -20,7 +20,10 @@ def test_an_example_parses(line: str) -> None:
     name, *arguments = shlex.split(line)
     command = COMMANDS[name]
     assert line in command.epilog
-    with command.make_context(name, arguments) as context:
+    with (
+        ROOT.make_context("consistency", [name]) as root,
+        command.make_context(name, arguments, parent=root) as context,
+    ):
         assert context.params
 
 

@@ -157,6 +157,16 @@ class Estimates:
     log_det: Array | None = None  # (T,), log det S of the innovations of ``nis``, NaN where there is none
 
 
+OURS = "this project"  # how the source of a question begins that no paper asks
+
+
+def outcome(source: str, verdict: str) -> str:
+    """The verdict on a finding in words: what nobody published holds or does not, and is not reproduced."""
+    if not source.startswith(OURS):
+        return verdict
+    return "holds" if verdict == "reproduced" else "does not hold"
+
+
 @dataclass(frozen=True)
 class Finding:
     """One published claim and what was measured; ``accept`` was written before the run."""

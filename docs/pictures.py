@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -12,9 +13,11 @@ from matplotlib.figure import Figure
 
 import consistency as cs
 from consistency.diagnostics import anees_interval
+from consistency.reporting.front_end import samples_png
 from consistency.reporting.looks import BAND, style
 from consistency.sweeps.regime import read_regime
 from consistency.verdicts.curves import curves
+from consistency.vision import RelativePose, StereoRig, refine_reprojection
 
 IMAGES = Path(__file__).parent / "images"
 RUNS, SEED = 50, 101
@@ -67,11 +70,54 @@ def regime() -> Figure:
     return figure
 
 
+def own_file() -> bytes:
+    """The verdict on a file of somebody else's filter, whose measurements are noisier than it believes."""
+    rng, runs, steps, sigma = np.random.default_rng(SEED), 60, 100, 0.5
+    F, H, R = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[1.0, 0.0]]), 0.5 * sigma**2
+    Q = 0.05 * np.array([[0.1**4 / 4, 0.1**3 / 2], [0.1**3 / 2, 0.1**2]])
+    errors, covariances = np.empty((runs, steps, 2)), np.empty((runs, steps, 2, 2))
+    for run in range(runs):
+        x, P = np.zeros(2), np.eye(2)
+        error = rng.multivariate_normal(x, P)  # truth minus estimate
+        for step in range(steps):
+            error = F @ error + rng.multivariate_normal(np.zeros(2), Q)
+            P = F @ P @ F.T + Q
+            K = P @ H.T / (H @ P @ H.T + R)
+            error = error - K @ (H @ error + rng.normal(0.0, sigma, 1))
+            P = (np.eye(2) - K @ H) @ P
+            errors[run, step], covariances[run, step] = error, P
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mine.npz"
+        np.savez(
+            path, errors=errors, covariances=covariances, axes=["position", "speed"], t=0.1 * np.arange(1, steps + 1)
+        )
+        cs.judge(cs.read(path)).plot(Path(folder) / "picture.png")
+        return (Path(folder) / "picture.png").read_bytes()
+
+
+def ellipses() -> bytes:
+    """Motions from simulated stereo matches, the scatter of 1,000 and the covariance that each states."""
+    rng, K, sigma = np.random.default_rng(SEED), np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), 0.3
+    rig = StereoRig(K, K, np.eye(3), np.array([0.54, 0.0, 0.0]), (1200, 360))
+    true = RelativePose.from_vector(np.array([0.05, -0.02, 1.2, 0.002, -0.01, 0.003]))
+    z = rng.uniform(6.0, 40.0, 60)
+    p = np.column_stack([rng.uniform(-0.7, 0.7, 60) * z, rng.uniform(-0.2, 0.2, 60) * z, z])
+    uv0, uv1, S = rig.project(p), rig.project((p - true.t) @ true.R), sigma**2 * np.eye(4)
+    found = [
+        refine_reprojection(rig, *(uv + rng.normal(0.0, sigma, uv.shape) for uv in (uv0, uv1)), true, S)
+        for _ in range(1000)
+    ]
+    poses = np.array([each.pose.vector for each in found])
+    return samples_png(poses, true.vector, found[0].covariance)
+
+
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     with mpl.rc_context(RC):
         nine_centimetres().savefig(IMAGES / "nine-centimetres.png", dpi=160)
         regime().savefig(IMAGES / "regime.png", dpi=160)
+    (IMAGES / "own-file.png").write_bytes(own_file())
+    (IMAGES / "ellipses.png").write_bytes(ellipses())
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import plural
 from consistency.reporting.model import Study, Track
 from consistency.reporting.wording import listed
+from consistency.types import outcome
 
 LISTED = 6  # pairs of filter and scenario that the first paragraph names one by one
 
@@ -76,6 +77,14 @@ def _failure_sentence(studies: Sequence[Study]) -> str:
 
 
 def _finding_sentence(findings: Sequence[dict[str, Any]]) -> str:
-    verdicts = [str(finding["verdict"]) for finding in findings]
-    counts = [f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts)]
-    return f"Of {plural(len(findings), 'finding')}, {listed(counts)}."
+    said = [outcome(str(finding["source"] or ""), str(finding["verdict"])) for finding in findings]
+    own = [verdict for verdict in said if verdict in ("holds", "does not hold")]
+    published = [verdict for verdict in said if verdict not in ("holds", "does not hold")]
+    parts = []
+    if published:
+        counts = [f"{published.count(verdict)} {verdict}" for verdict in dict.fromkeys(published)]
+        parts.append(f"Of {plural(len(published), 'published finding')}, {listed(counts)}.")
+    if own:
+        holding = own.count("holds")
+        parts.append(f"Of {plural(len(own), 'finding')} of this project, {holding} hold{'s' * (holding == 1)}.")
+    return " ".join(parts)

@@ -14,6 +14,7 @@ from consistency.reporting.model import Report
 from consistency.reporting.section import Part, Section
 from consistency.reporting.tables import extra_table
 from consistency.reporting.wording import number, p_cell
+from consistency.types import outcome
 
 OF_FINDINGS = (
     Column("Finding", width="2.5cm"),
@@ -111,7 +112,7 @@ def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
         Stack(str(finding["claim"]), tuple(below)),
         str(finding["published"]),
         str(finding["measured"]),
-        Status(str(finding["verdict"])),
+        Status(outcome(source, str(finding["verdict"]))),
     )
 
 

@@ -24,11 +24,11 @@ from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.store.results import Results, joined
 from consistency.store.storage import manifest_of, require_free, write_folder
 from consistency.terminal.table import print_findings
+from consistency.types import OURS as OURS
 from consistency.types import Finding
 from consistency.verdicts.curves import Curves, curves
 from consistency.verdicts.judge import analyse
 
-OURS = "this project"  # how the source of a question begins that no paper asks
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"
 

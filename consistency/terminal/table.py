@@ -19,14 +19,15 @@ from consistency.diagnostics.monitor import CAVEAT, accepted_scales
 from consistency.diagnostics.wording import short
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 from consistency.store.storage import plain
-from consistency.types import Finding
+from consistency.types import Finding, outcome
 from consistency.verdicts.comparison import Compared
 from consistency.verdicts.monitoring import Watched
 
 COLOURS = {
     "consistent": "green", "overconfident": "red", "conservative": "yellow", "biased": "red", "heavy-tailed": "red",
     "inconsistent": "red", "failed": "red", "undecided": "yellow",
-    "reproduced": "green", "not reproduced": "yellow", "refuted": "red",
+    "reproduced": "green", "not reproduced": "yellow", "refuted": "red", "holds": "green",
+    "does not hold": "yellow",
 }  # fmt: skip
 
 
@@ -113,9 +114,10 @@ def print_findings(findings: Sequence[Finding]) -> None:
     for column in ("finding", "published", "measured", "verdict"):
         table.add_column(column, overflow="fold")
     for finding in findings:
-        colour = COLOURS[finding.verdict]
+        said = outcome(finding.source, finding.verdict)
+        colour = COLOURS[said]
         texts = (escape(text) for text in (finding.id, finding.published, finding.measured))
-        table.add_row(*texts, f"[{colour}]{finding.verdict}[/{colour}]")
+        table.add_row(*texts, f"[{colour}]{said}[/{colour}]")
     open_console().print(table)
 
 

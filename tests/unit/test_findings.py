@@ -135,3 +135,11 @@ def test_processes_end_with_the_work(scripts: Path, tmp_path: Path) -> None:
     assert time.monotonic() - begun < 60
     with pytest.raises(ProcessLookupError):
         os.kill(int(mark.read_text()), 0)
+
+
+def test_what_nobody_published_holds_or_does_not() -> None:
+    from consistency.types import outcome
+
+    assert [outcome("Herath 2007", verdict) for verdict in ("reproduced", "refuted")] == ["reproduced", "refuted"]
+    assert outcome("this project, measured", "reproduced") == "holds"
+    assert {outcome("this project", verdict) for verdict in ("not reproduced", "refuted")} == {"does not hold"}

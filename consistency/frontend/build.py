@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from consistency.frontend.planar_log import MIN_LIFE, log_of
 from consistency.frontend.truth import find_truth, read_truth
 from consistency.frontend.tum import covariance_text, motions_text, trajectory_text
 from consistency.store.log import write_log
-from consistency.store.storage import manifest_of, require_free
+from consistency.store.storage import manifest_of, require_free, write_folder
 from consistency.types import Array
 from consistency.vision.features import opencv
 from consistency.vision.matching import is_rectified
@@ -22,7 +23,8 @@ from consistency.vision.odometry import motion_covariances, trajectory, visual_o
 from consistency.vision.sequence import Sequence, read_sequence
 
 LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
-FEWEST = MIN_LIFE + 1  # stereo pairs: the first is no observation of a log
+FEWEST = MIN_LIFE + 1  # stereo pairs of a log: the first is no observation
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
@@ -42,18 +44,35 @@ class Options:
 
 
 @dataclass(frozen=True)
+class Logged:
+    """What of a sequence is in a log."""
+
+    landmarks: int
+    observations: int
+    sigma_px: tuple[float, ...]  # u, v, d
+    sigma_v: float  # m/s
+    sigma_omega: float  # rad/s
+
+    def lines(self, out: Path) -> list[str]:
+        u, v, d = self.sigma_px
+        return [
+            f"log: {self.landmarks} landmarks, {self.observations} observations; "
+            f"sigma u {u:.2f} v {v:.2f} d {d:.2f} px, v {self.sigma_v:.3g} m/s, omega {self.sigma_omega:.3g} rad/s",
+            "controls come from these images too: a filter that takes both uses the images twice",
+            f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
+        ]
+
+
+@dataclass(frozen=True)
 class Summary:
     """What came of it."""
 
     frames: int
-    landmarks: int
-    observations: int
+    log: Logged | None  # None of fewer pairs than a log takes
+    first: RelativeMotion
     distance: float  # m along the path
     inliers: float  # median of the motions
     noise_ratio: float  # chi2/dof of all motions: measured variance of the pixels over the stated one
-    sigma_px: tuple[float, ...]  # u, v, d
-    sigma_v: float  # m/s
-    sigma_omega: float  # rad/s
     timed: bool  # whether images had timestamps
     rate: float  # Hz
     truth: Path | None
@@ -62,7 +81,6 @@ class Summary:
 
     def lines(self, out: Path) -> list[str]:
         """What a terminal shows, and what to do next."""
-        u, v, d = self.sigma_px
         times = [] if self.timed else [f"the images have no times: {self.rate:g} Hz assumed, --rate says otherwise"]
         judge = f"consistency analyse {out}/trajectory.tum --truth {out}/truth.tum --covariance {out}/covariance.txt"
         windows = f"consistency analyse {out}/motions.tum --truth {out}/truth.tum --motions --relative 1"
@@ -81,17 +99,25 @@ class Summary:
             *([f"{bridges}, with the covariance of that; the first: {self.faults[0]}"] if self.faults else []),
             f"residuals: chi2/dof {self.noise_ratio:.2f}; 1 where the stated noise of the features "
             "(--sigma-per-scale) is right",
-            f"log: {self.landmarks} landmarks, {self.observations} observations; "
-            f"sigma u {u:.2f} v {v:.2f} d {d:.2f} px, v {self.sigma_v:.3g} m/s, omega {self.sigma_omega:.3g} rad/s",
-            "controls come from these images too: a filter that takes both uses the images twice",
+            *(_motion_lines(self.first, out) if self.log is None else self.log.lines(out)),
             *times,
-            f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
             *judged,
         ]
 
 
+def _motion_lines(motion: RelativeMotion, out: Path) -> list[str]:
+    """A single motion with its standard deviations."""
+    scale = np.repeat([1e3, 180.0 / np.pi], 3)
+    values, sigmas = scale * motion.pose.vector, scale * np.sqrt(np.diagonal(motion.covariance))
+    said = [f"{name} {value:+.2f} +- {sigma:.2g}" for name, value, sigma in zip(AXES, values, sigmas, strict=True)]
+    shift, turn = ", ".join(said[:3]), ", ".join(said[3:])
+    return [f"motion of the left camera: {shift} mm; {turn} deg", f"no log of {FEWEST - 1} pairs; motion in {out}"]
+
+
 def write_frontend_log(images: Path, out: Path, options: Options, overwrite: bool = False) -> Summary:
     """Run the front-end on ``images`` and write the log folder ``out``, whole or not at all.
+
+    Two pairs make one motion and no log.
 
     Beside the files of a log: trajectory.tum and covariance.txt (error convention so3), motions.tum with covariances of
     the motions (likewise), truth.tum where known.
@@ -109,38 +135,58 @@ def write_frontend_log(images: Path, out: Path, options: Options, overwrite: boo
         raise InputError(f"--lever {options.lever}: must be a finite number of metres")
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must not be negative")
-    require_free(out, overwrite, "log")
     sequence = read_sequence(
         images, options.calibration, options.format, options.left, options.right, options.rate
     )  # fmt: skip
+    kind = "log" if len(sequence) >= FEWEST else "motion"
+    require_free(out, overwrite, kind)
     if not is_rectified(sequence.rectification.rig):
         raise InputError(f"{sequence.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
-    if len(sequence) < FEWEST:
-        raise InputError(
-            f"{images}: holds {len(sequence)} stereo pairs; a log takes at least {FEWEST}, one motion by itself comes "
-            "from consistency.vision.relative_motion"
-        )
     path = options.truth or find_truth(sequence)
     truth = None if path is None else read_truth(path, sequence)
     motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed), settings=options.settings)
-    trial, belief = log_of(sequence, motions, truth, options.max_landmarks, options.lever)
-    rig = sequence.rectification.rig
+    files = trajectory_files(sequence, motions, truth)
     manifest = manifest_of(
-        kind="log", seed=options.seed, runs=1, complete=True, failures=0, wall=time.monotonic() - started,
+        kind=kind, seed=options.seed, runs=1, complete=True, failures=0, wall=time.monotonic() - started,
         opencv=opencv().__version__, images=str(images), calibration=sequence.calibration.source,
         settings=asdict(options.settings), timestamps="read" if sequence.timed else "assumed",
         bridged={str(k): m.fault for k, m in enumerate(motions) if m.fault},
     )  # fmt: skip
-    view = (rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2])))
-    write_log(out, [trial], belief, None, manifest, overwrite, view, trajectory_files(sequence, motions, truth))
+    logged = None
+    if kind == "log":
+        logged = _write_log(out, sequence, motions, truth, options, manifest, overwrite, files)
+    else:
+        write_folder(out, {}, manifest, lambda at: _write_texts(at, files), overwrite)
     chi2, dof = (sum(values) for values in zip(*((m.chi2, m.dof) for m in motions), strict=True))
     return Summary(
-        len(sequence), trial.n_landmarks, len(trial.z),
+        len(sequence), logged, motions[0],
         float(sum(np.linalg.norm(m.pose.t) for m in motions)), float(np.median([m.inliers.sum() for m in motions])),
-        chi2 / dof, belief.sensor.sigma, belief.motion.sigma_v, belief.motion.sigma_omega, sequence.timed,
-        (len(sequence) - 1) / float(sequence.t[-1] - sequence.t[0]), path,
+        chi2 / dof, sequence.timed, (len(sequence) - 1) / float(sequence.t[-1] - sequence.t[0]), path,
         tuple(m.fault for m in motions if m.fault), tuple(m.doubt for m in motions if m.doubt),
     )  # fmt: skip
+
+
+def _write_log(
+    out: Path,
+    sequence: Sequence,
+    motions: list[RelativeMotion],
+    truth: tuple[Array, Array] | None,
+    options: Options,
+    manifest: dict[str, Any],
+    overwrite: bool,
+    files: dict[str, str],
+) -> Logged:
+    trial, belief = log_of(sequence, motions, truth, options.max_landmarks, options.lever)
+    rig = sequence.rectification.rig
+    view = (rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2])))
+    write_log(out, [trial], belief, None, manifest, overwrite, view, files)
+    noise = belief.sensor.sigma, belief.motion.sigma_v, belief.motion.sigma_omega
+    return Logged(trial.n_landmarks, len(trial.z), *noise)
+
+
+def _write_texts(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
 
 
 def trajectory_files(

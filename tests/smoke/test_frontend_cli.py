@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ def test_a_log_is_not_overwritten_by_accident(folder: Path) -> None:
     [
         (("nowhere",), "nowhere: no such folder of images"),
         (("images", "--calibration", "none.yaml"), "--calibration none.yaml: no such file"),
-        (("images", "--format", "ros"), "--format ros: must be one of kitti, euroc, opencv"),
+        (("images", "--format", "ros"), "--format ros: must be one of kitti, kitti-raw, euroc, opencv"),
         (("images", "--estimator", "icp"), "estimator 'icp': must be one of reprojection, svd, horn"),
         (("images", "--sigma-per-scale", "0"), "sigma_per_scale: 0.0, must be a positive number"),
         (("images", "--max-landmarks", "0"), "--max-landmarks 0: must be at least 1"),
@@ -75,10 +76,23 @@ def test_bad_input(folder: Path, arguments: tuple[str, ...], said: str) -> None:
     assert not (folder / "other").exists()
 
 
-def test_two_pairs_make_no_log(folder: Path) -> None:
-    scene.write_kitti(folder / "short", scene.drive(2), scene.texture(np.random.default_rng(0)))
-    done = consistency("frontend", "short", "--out", "other", cwd=folder, status=2)
-    assert "short: holds 2 stereo pairs; a log takes at least 3" in done.stderr
+def test_two_pairs_make_a_motion_and_no_log(folder: Path) -> None:
+    """The rendered motion is known to 0.02 px, far below 7 stated sigma (1e-8 by chance)."""
+    poses = scene.drive(2)
+    scene.write_kitti(folder / "short", poses, scene.texture(np.random.default_rng(0)))
+    done = consistency("frontend", "short", "--out", "one", cwd=folder)
+    said = re.findall(r"(x|y|z|roll|pitch|yaw) ([+-][\d.]+) \+- ([\d.e-]+)", done.stdout)
+    scale = np.repeat([1e3, 180.0 / np.pi], 3)
+    for (_, value, sigma), true in zip(said, scale * poses[1].vector, strict=True):
+        assert abs(float(value) - true) < 7.0 * float(sigma) + 0.01
+    assert "no log of 2 pairs; motion in one" in done.stdout
+    names = ("trajectory.tum", "covariance.txt", "motions.tum", "truth.tum", "manifest.json")
+    assert {path.name for path in (folder / "one").iterdir()} == set(names)
+    done = consistency("run", "--log", "one", "--filter", "ekf-uvd", "--out", "other", cwd=folder, status=2)
+    assert "one/sensor.toml: missing" in done.stderr
+    again = consistency("frontend", "short", "--out", "one", cwd=folder, status=2)
+    assert "--out one: exists already" in again.stderr
+    consistency("frontend", "short", "--out", "one", "--overwrite", cwd=folder)
 
 
 def test_images_are_no_log(folder: Path) -> None:

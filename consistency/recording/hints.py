@@ -33,6 +33,7 @@ class Guess:
 
     text: str
     change: Change
+    last: bool = False  # named only where nothing else fits: it has a fit of its own for each run
 
 
 def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 0.0) -> list[str]:
@@ -48,6 +49,8 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
         return []
     guesses = _guesses(some)
     left = np.array([np.abs(decades([guess.change(poses) for poses in some])).max() for guess in guesses])
+    first = np.where([guess.last for guess in guesses], np.nan, left)
+    left = first if np.nanmin(first) < RIGHT else left
     if not np.nanmin(left) < RIGHT:
         return []
     best = int(np.flatnonzero(left <= np.nanmin(left) + ALIKE)[0])
@@ -209,4 +212,4 @@ def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
         yield Guess(words, lambda p: moved(p, frame))
     if len(runs) > 1:
         words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
-        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame))
+        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True)

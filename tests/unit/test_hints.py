@@ -154,6 +154,22 @@ def test_a_mix_up_is_named(name: str, rng: np.random.Generator) -> None:
     assert words in said
 
 
+@pytest.mark.parametrize("name", ["turned world", "shifted world"])
+def test_one_world_is_named_with_its_size_before_a_world_of_each_run(name: str) -> None:
+    """In 20 draws; a frame for each run always fits as well."""
+    make, mess, words = MIXED[name]
+    for seed in range(30, 50):
+        runs = make(np.random.default_rng(seed))
+        (said,) = hints("est", SIX if runs[0].manifold == "spatial" else THREE, [mess(p) for p in runs])
+        assert words in said
+
+
+def test_worlds_of_each_run_are_named(rng: np.random.Generator) -> None:
+    runs = [moved(p, Frame.about_z(0.7 * i, FAR)) for i, p in enumerate(spatial(rng))]
+    (said,) = hints("est", SIX, runs)
+    assert said.endswith("each run is turned about z and shifted by itself to meet the truth; add --align posyaw")
+
+
 @pytest.mark.parametrize("ratio", [0.2, 5.0])
 def test_a_filter_that_is_wrong_by_itself_gets_no_hint(ratio: float, rng: np.random.Generator) -> None:
     for make, axes in ((spatial, SIX), (planar, THREE)):

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from consistency.cli.files import FileOptions, reads_files
+from consistency.cli.files import FileOptions, reads_files, tell_notes
 from consistency.errors import InputError
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
@@ -309,8 +309,9 @@ def analyse(
     if files.are(path):
         if report is not None:
             require_free(report, overwrite, "verdict", "--report")
-        (recordings,) = files.read(path)
+        recordings = files.read(path)
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
+        tell_notes(recordings)
         if report is not None:
             data = verdicts_json(verdicts)
             written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
@@ -428,7 +429,7 @@ def compare(
         raise InputError(
             f"--covariance: would be read with {path} and with {other}; keep one of them with 'consistency baseline'"
         )
-    read = dict(zip(estimates, files.read(*estimates), strict=True))
+    read = {each: files.read(each) for each in estimates}
     new, *old = (
         baseline_of_files(read[each], str(each), files.truth) if each in read else read_baseline(each) for each in sides
     )
@@ -436,6 +437,7 @@ def compare(
         compared = compare_with(new, old[0], filters or [], false_alarm)
     else:
         compared = compare_filters(new, filters or [], false_alarm)
+    tell_notes(*read.values())
     if as_json:
         print(comparisons_json(compared))
     else:
@@ -457,8 +459,9 @@ def baseline(
     from consistency.verdicts.comparison import baseline_of_files, write_baseline
 
     if files.are(path):
-        (recordings,) = files.read(path)
+        recordings = files.read(path)
         write_baseline(baseline_of_files(recordings, str(path), files.truth), out, overwrite)
+        tell_notes(recordings)
     else:
         write_baseline(open_results(path), out, overwrite)
     print(f"baseline in {out}; next: consistency compare NEW {out}")
@@ -488,8 +491,9 @@ def report(
     targets = (html, pdf) if html or pdf else (stem.with_name(f"{stem.name}.html"), stem.with_name(f"{stem.name}.pdf"))
     if estimates:
         require_pages(*targets, overwrite)
-        (recordings,) = files.read(path)
+        recordings = files.read(path)
         write_file_pages(recordings, analyse_recordings(recordings), *targets, path.name)
+        tell_notes(recordings)
     else:
         write_reports(path, *targets, overwrite)
     for target in targets:

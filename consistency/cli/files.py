@@ -104,14 +104,17 @@ class FileOptions:
 
         return is_recording(path, **self.reading())
 
-    def read(self, *paths: Path) -> list[list[Recording]]:
-        """Files of other estimators; what was assumed and left out goes to standard error."""
+    def read(self, path: Path) -> list[Recording]:
+        """Files of another estimator."""
         from consistency.recording import read_recordings
 
-        found = [read_recordings(path, **self.reading()) for path in paths]
-        for note in dict.fromkeys(note for recordings in found for one in recordings for note in one.notes):
-            print(f"consistency: {note}", file=sys.stderr)
-        return found
+        return read_recordings(path, **self.reading())
+
+
+def tell_notes(*read: list[Recording]) -> None:
+    """What was assumed and left out, to standard error; said when nothing is refused any more."""
+    for note in dict.fromkeys(note for recordings in read for one in recordings for note in one.notes):
+        print(f"consistency: {note}", file=sys.stderr)
 
 
 def reads_files(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -158,8 +158,8 @@ def test_nothing_runs_over_the_edge(browser, width):
 def test_hovering_shows_step_and_the_odd_name_as_text(browser):
     from selenium.webdriver import ActionChains
 
-    browser.execute_script("document.querySelectorAll('.chart')[4].scrollIntoView({block: 'center'})")
-    chart = browser.find_elements("css selector", ".chart")[4]
+    place = "[...document.querySelectorAll('.chart')].find((e) => e.ariaLabel.startsWith('ANEES of'))"
+    chart = browser.execute_script(f"const chart = {place}; chart.scrollIntoView({{block: 'center'}}); return chart")
     spot = browser.execute_script(
         """
         const chart = Bokeh.documents[0].roots().find((c) => c.left[0].axis_label === 'ANEES of the pose');

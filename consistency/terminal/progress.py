@@ -97,6 +97,8 @@ def _speed(rate: float, unit: str) -> str:
 def _lines(label: str, total: int, unit: str, every: float = 5.0) -> Advance:
     started = last = time.monotonic()
     done = 0
+    if unit == KERNELS:  # takes half a minute, and nothing else is to be seen meanwhile
+        print(f"{label} ...", file=_Forgiving(), flush=True)
 
     def advance(count: int) -> None:
         nonlocal done, last

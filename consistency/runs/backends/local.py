@@ -61,8 +61,10 @@ def _in_threads(work: Work, runs: Sequence[int], workers: int) -> Outcomes:
                 if not waiting:
                     break
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in sorted(done, key=_failed):  # what is finished counts, whatever ends the rest
-                    yield future.result()
+                ready = sorted(done, key=_failed, reverse=True)  # what is finished counts, whatever ends the rest
+                del done  # an outcome that was handed on is kept by nobody here
+                while ready:
+                    yield ready.pop().result()
     finally:
         pool.shutdown(cancel_futures=True)
 

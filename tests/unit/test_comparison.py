@@ -17,11 +17,13 @@ from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.diagnostics.contrast import Contrast, contrast, margin
 from consistency.gating.session import needed_at
 from consistency.gating.watch import Watch, watching
+from consistency.recording import read_recordings
 from consistency.testing import InsufficientTrials, assert_not_worse
 from consistency.types import Array
 from consistency.verdicts.comparison import (
     Compared,
     baseline_of,
+    baseline_of_files,
     compare_filters,
     compare_with,
     read_baseline,
@@ -471,3 +473,16 @@ def test_bad_baselines_are_refused(results: cs.Results, tmp_path: Path) -> None:
         compare_filters(base, ["ekf-uvd", "nix"])
     with pytest.raises(cs.InputError, match="give two filters"):
         compare_filters(base, ["ekf-uvd"])
+
+
+def test_files_whose_truth_is_not_known_are_other_trials(tmp_path) -> None:
+    """Archives hold errors alone: runs of one number need not belong together."""
+    rng = np.random.default_rng(515)
+    for name in ("a", "b"):
+        np.savez(tmp_path / f"{name}.npz", errors=rng.normal(size=(9, 5, 1)), covariances=np.ones((9, 5, 1, 1)))
+    a, b = (baseline_of_files(read_recordings(tmp_path / f"{name}.npz"), name) for name in ("a", "b"))
+    assert a.of_the_trials_of(a)
+    assert not a.of_the_trials_of(b)
+    (compared,) = compare_with(a, b, [])
+    assert not compared.comparison.paired
+    assert "Log or truth differ" in compared.sentence

@@ -12,7 +12,7 @@ import consistency as cs
 from consistency.types import Array
 from consistency.vision import RelativePose, StereoRig, refine_reprojection
 from consistency.vision.motion import RelativeMotion, diagonal
-from consistency.vision.shared import FEWEST, RIG, SHARED, fit_shared, perturbed, sensitivities
+from consistency.vision.shared import FEWEST, RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
 
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
 ROTATED = Rotation.from_rotvec([0.01, -0.02, 0.005]).as_matrix()
@@ -133,3 +133,12 @@ def test_what_cannot_be_fitted(rng: np.random.Generator) -> None:
         fit_shared(errors, J, S)
     with pytest.raises(cs.InputError, match="do not fit"):
         fit_shared(errors, J[:, :, :5], S)
+
+
+def test_a_prediction_has_all_three_parts(rng: np.random.Generator) -> None:
+    J, S = rng.normal(size=(2, 6, len(PRIOR))), np.tile(np.eye(6), (2, 1, 1))
+    root = rng.normal(size=(len(PRIOR),) * 2)
+    shared = SharedError(PRIOR, root @ root.T, np.arange(1.0, 7.0))
+    bias, P = shared.predict(J, S)
+    np.testing.assert_allclose(bias[1], J[1] @ PRIOR)
+    np.testing.assert_allclose(P[1], S[1] + J[1] @ root @ root.T @ J[1].T + np.diag(np.arange(1.0, 7.0) ** 2))

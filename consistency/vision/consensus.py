@@ -63,7 +63,7 @@ def register_ransac(
         raise InputError("S1, S2: give both covariances or none")
     if S1 is not None and S2 is not None:
         S1, S2 = checks.covariances("S1", S1, len(p1), 3), checks.covariances("S2", S2, len(p1), 3)
-    least = max(4, int(np.ceil(SHARE * len(p1)))) if minimum is None else minimum
+    least = fewest(len(p1), minimum)
 
     def inliers_of(R: Array, t: Array) -> Array:
         return squared_distances(p1, p2, R, t, S1, S2) <= threshold**2
@@ -83,6 +83,17 @@ def register_ransac(
             "must; look at the matches, or allow a larger threshold"
         )
     return register_svd(p1[best], p2[best]), best
+
+
+def fewest(points: int, minimum: int | None) -> int:
+    """Inliers that a motion needs."""
+    return max(4, int(np.ceil(SHARE * points))) if minimum is None else minimum
+
+
+def draws_for(share: float, most: int) -> float:
+    """Draws of three until one is of inliers only with :data:`CONFIDENCE`, by their share; ``most`` at most."""
+    clean = share**3  # probability that a draw has inliers only
+    return min(most, np.log1p(-CONFIDENCE) / np.log1p(-min(clean, 1.0 - 1e-12))) if clean > 0.0 else float(most)
 
 
 def squared_distances(
@@ -114,7 +125,7 @@ def squared_distances(
 
 def _search(p1: Array, p2: Array, inliers_of: Callable[[Array, Array], Array], rng: np.random.Generator) -> Array:
     """Inliers (N,) of the best of adaptively many draws."""
-    best, draws, needed = np.zeros(len(p1), bool), 0, MOST
+    best, draws, needed = np.zeros(len(p1), bool), 0, float(MOST)
     while draws < needed:
         triples = rng.random((ROUND, len(p1))).argpartition(2, axis=1)[:, :3]
         R, t, fixed = rigid_motions(p1[triples], p2[triples])
@@ -123,7 +134,5 @@ def _search(p1: Array, p2: Array, inliers_of: Callable[[Array, Array], Array], r
         if first.sum() > best.sum():
             best = first
         draws += ROUND
-        clean = best.mean() ** 3  # probability that a draw has inliers only
-        if clean > 0.0:
-            needed = min(MOST, np.log1p(-CONFIDENCE) / np.log1p(-min(clean, 1.0 - 1e-12)))
+        needed = draws_for(float(best.mean()), MOST)
     return best

@@ -11,7 +11,7 @@ from scipy import stats
 
 from consistency.types import Array
 from consistency.vision import checks
-from consistency.vision.consensus import CONFIDENCE, SHARE
+from consistency.vision.consensus import draws_for, fewest
 from consistency.vision.errors import ConsensusError
 from consistency.vision.features import opencv
 from consistency.vision.pose import RelativePose
@@ -67,7 +67,7 @@ def resect_ransac(
     sigma0, sigma1 = checks.rows("sigma0", sigma0, 4), checks.rows("sigma1", sigma1, 4)
     checks.same_length("sigma0, sigma1", sigma0, sigma1)
     checks.same_length("uv0, sigma0", uv0, sigma0)
-    least = max(4, int(np.ceil(SHARE * len(uv0)))) if minimum is None else minimum
+    least = fewest(len(uv0), minimum)
     found, inliers = _search(rig, triangulate(rig, uv0), uv1, sigma0**2 + sigma1**2 + SLACK_PX**2, gate, rng)
     if found is not None:
         inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, found), gate, inliers)
@@ -134,9 +134,7 @@ def _search(
         k = int(np.argmin(cost))
         if cost[k] < least:
             least, best, inliers = cost[k], RelativePose(R[k], t[k]), squared[k] <= gate**2
-            clean = float(inliers.mean()) ** 3  # probability that a draw has inliers only
-            if clean > 0.0:
-                needed = min(MOST, np.log1p(-CONFIDENCE) / np.log1p(-min(clean, 1.0 - 1e-12)))
+            needed = draws_for(float(inliers.mean()), MOST)
     return best, inliers
 
 

@@ -172,6 +172,14 @@ def run(
     ],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
+    screen: Annotated[
+        str | None,
+        typer.Option(
+            "--screen",
+            metavar="U,V,D",
+            help="Landmarks of a log begin anew that leave the common motion by more, in px.",
+        ),
+    ] = None,
     runs: Annotated[int | None, typer.Option("--runs", help="Number of Monte Carlo runs [default: 50].")] = None,
     until_decided: Annotated[
         bool, typer.Option("--until-decided", help="As many runs as the verdict takes, instead of --runs.")
@@ -210,6 +218,8 @@ def run(
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
+    if screen is not None and log is None:
+        raise InputError("--screen goes with --log: a scenario says which of its observations are spurious")
     planned = _options(max_runs=max_runs, detect=detect, false_alarm=false_alarm)
     if planned and not until_decided:
         raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
@@ -227,6 +237,11 @@ def run(
             if runs is not None or seed is not None or until_decided:
                 raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
             recorded = read_log(log)
+            if screen is not None:
+                from consistency.frontend.screening import screened_log, screening_line
+
+                recorded = screened_log(recorded, screen)
+                say(screening_line(recorded))
             resolve_filters(filters, recorded.belief)
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")

@@ -126,7 +126,10 @@ def frontend(
         ),
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option("--truth", help="True poses: KITTI, EuRoC .csv or TUM; found if in IMAGES.")
+        Path | None,
+        typer.Option(
+            "--truth", help="True poses: KITTI, EuRoC .csv, TUM, or a drive of KITTI raw; found if in IMAGES."
+        ),
     ] = None,
     format: Annotated[
         str | None, typer.Option("--format", help="kitti, kitti-raw, euroc or opencv (plain) [by the folders].")
@@ -143,6 +146,9 @@ def frontend(
         typer.Option("--max-landmarks", help="Most landmarks in the log; filters are quadratic in them [200]."),
     ] = None,
     lever: Annotated[float, typer.Option("--lever", help="Metres from the robot's point forward to the camera.")] = 0.0,
+    planar: Annotated[
+        bool, typer.Option("--planar", help="Write the log even where the camera leaves the plane of a robot.")
+    ] = False,
     seed: Annotated[int, typer.Option("--seed", help="Seed of RANSAC.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
@@ -152,7 +158,7 @@ def frontend(
 
     settings = Settings(estimator=estimator, **_options(sigma_per_scale=sigma_per_scale))
     options = Options(
-        calibration, truth, format, left, right, rate, lever=lever, seed=seed, settings=settings,
+        calibration, truth, format, left, right, rate, lever=lever, planar=planar, seed=seed, settings=settings,
         **_options(max_landmarks=max_landmarks),
     )  # fmt: skip
     for line in write_frontend_log(images, out, options, overwrite).lines(out):

@@ -19,7 +19,8 @@ from consistency.models import planar, point, stereo
 from consistency.scenario import Belief, BelievedSensor
 from consistency.types import Array, Indices, Trial
 
-SOFT = 0.5  # of the gate, where the Cauchy weight of a misfit is one half
+GATE = 4.0  # standard deviations that a gate is taken for, as that of an inlier of the front-end
+SOFT = 2.0  # standard deviations, at which the Cauchy weight of a misfit is one half
 LOOSE = np.array([0.0, 0.1, 0.1, 0.02, 0.02, 0.0])  # m, rad a step, of what odometry does not tell: slip, bumps
 STEPS = 10  # of reweighted least squares
 NEAREST = 0.5  # m, depth of a point that a fit may move behind the camera
@@ -82,11 +83,11 @@ def _misfits(trial: Trial, before: Indices, after: Indices, belief: Belief, gate
         mean = np.array([dt * v, 0.0, 0.0, 0.0, 0.0, dt * omega])
         noise = dt * np.repeat([belief.motion.sigma_v, belief.motion.sigma_omega], 3)
         points, seen = _points(trial.z[before[rows]], belief.sensor), trial.z[after[rows]]
-        out[rows] = _misfit(points, seen, mean, np.hypot(noise, LOOSE), SOFT * gate, belief.sensor)
+        out[rows] = _misfit(points, seen, mean, np.hypot(noise, LOOSE), gate / GATE, belief.sensor)
     return out
 
 
-def _misfit(points: Array, seen: Array, mean: Array, sigma: Array, soft: Array, sensor: BelievedSensor) -> Array:
+def _misfit(points: Array, seen: Array, mean: Array, sigma: Array, scale: Array, sensor: BelievedSensor) -> Array:
     """Misfits (n, s) of points (n, 3) in the robot frame a step before, by reweighted least squares from the odometry.
 
     A fit takes after the observations that it rests on: a misfit is divided by sqrt(1 - leverage) (Cook & Weisberg
@@ -95,13 +96,13 @@ def _misfit(points: Array, seen: Array, mean: Array, sigma: Array, soft: Array, 
     move = mean.copy()
     for _ in range(STEPS):
         error, slope = _error_and_slope(points, seen, move, sensor)
-        weight = 1.0 / (1.0 + ((error / soft) ** 2).sum(axis=1))
-        J = slope / soft[:, None]
+        weight = 1.0 / (1.0 + ((error / (SOFT * scale)) ** 2).sum(axis=1))
+        J = slope / scale[:, None]
         normal = np.einsum("n,nij,nik->jk", weight, J, J) + np.diag(sigma**-2)
-        right = np.einsum("n,nij,ni->j", weight, J, error / soft) + (mean - move) / sigma**2
+        right = np.einsum("n,nij,ni->j", weight, J, error / scale) + (mean - move) / sigma**2
         move = move + np.linalg.solve(normal, right)
     error, slope = _error_and_slope(points, seen, move, sensor)
-    J = slope / soft[:, None]
+    J = slope / scale[:, None]
     leverage = weight[:, None] * np.einsum("nij,jk,nik->ni", J, np.linalg.inv(normal), J)
     return np.asarray(error / np.sqrt(np.maximum(1.0 - leverage, 1e-3)))
 

@@ -106,13 +106,13 @@ def test_an_unusable_drive_of_kitti_raw(day: Path, tmp_path: Path) -> None:
     for camera in ("image_00", "image_01"):
         (folder / camera).mkdir(parents=True)
         (folder / camera / "data").symlink_to(day / "2011_09_26_drive_0001_sync" / camera / "data")
-    with pytest.raises(cs.InputError, match=r"timestamps\.txt: no such file"):
+    with pytest.raises(cs.InputError, match=r"timestamps\.txt: cannot be read \(No such file"):
         read_sequence(folder)
     (folder / "image_00/timestamps.txt").write_text("yesterday\n" * 8)
-    with pytest.raises(cs.InputError, match="must hold a date and a time of day"):
+    with pytest.raises(cs.InputError, match=r"timestamps\.txt, line 1: not a timestamp; should be like 2011"):
         read_sequence(folder)
     (folder / "image_00/timestamps.txt").write_text("2011-09-26 13:00:00.1\n" * 8)
-    with pytest.raises(cs.InputError, match="or not increasing"):
+    with pytest.raises(cs.InputError, match=r"line 2: timestamps must increase"):
         read_sequence(folder)
     (folder / "image_00/timestamps.txt").write_text("".join(f"2011-09-26 13:00:0{k}.1\n" for k in range(8)))
     with pytest.raises(cs.InputError, match=r"calib_cam_to_cam\.txt: no such file"):

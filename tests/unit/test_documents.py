@@ -149,7 +149,7 @@ def test_the_script_is_there_and_knows_the_options(command: Command, monkeypatch
         return
     if any(f"Save as `{script}`" in block.before for block in blocks(command.page, "python")):
         return
-    assert (ROOT / script).is_file()
+    assert any((folder / script).is_file() for folder in (ROOT, (ROOT / command.page).parent))
     options = [word for word in words if word.startswith("--")]
     if options:
         monkeypatch.setattr(sys, "argv", [script, "--help"])
@@ -228,7 +228,14 @@ def reads_toml(block: Block, folder: Path) -> None:
         raise AssertionError(f"{block}: no reader takes the tables {set(content)}")
 
 
-READERS: dict[str, Callable[[Block, Path], None]] = {"toml": reads_toml}
+def reads_workflow(block: Block, folder: Path) -> None:
+    pytest.importorskip("yaml", reason="PyYAML (the extra vision) is not installed")
+    from action import require_uses
+
+    require_uses(block.text)
+
+
+READERS: dict[str, Callable[[Block, Path], None]] = {"toml": reads_toml, "yaml": reads_workflow}
 
 
 @pytest.mark.parametrize("block", [b for page in PAGES for b in blocks(page, *READERS)], ids=str)

@@ -6,11 +6,8 @@ import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
 
-import matplotlib as mpl
-
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_extensions"))
-mpl.use("agg")
 
 project = "filter-consistency"
 author = "The filter-consistency developers"
@@ -55,6 +52,7 @@ sphinx_gallery_conf = {
     "examples_dirs": "gallery",
     "gallery_dirs": "generated/gallery",
     "image_scrapers": ("figures.figure_scraper",),
+    "reset_modules": ("figures.plain_look",),
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
     "show_memory": False,

@@ -17,7 +17,6 @@ version = release = version_of("filter-consistency")
 extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "myst_nb",
     "commands",
@@ -26,6 +25,7 @@ extensions = [
 ]
 root_doc = "index"
 exclude_patterns = ["_build", "examples/README.md", "gallery", "generated/gallery/*.ipynb", "generated/gallery/*.json"]
+smartquotes = False  # they would make a dash of the two of an option
 highlight_language = "none"  # an indented block is a command or what it prints
 nitpicky = True
 nitpick_ignore_regex = [
@@ -58,6 +58,7 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "show_signature": False,
     "write_computation_times": False,
+    "min_reported_time": 60,
     "remove_config_comments": True,
     "abort_on_example_error": True,
 }
@@ -67,6 +68,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = project
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_sidebars = {"tutorial": []}  # one page, no section around it
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {

@@ -2,8 +2,8 @@
 
 - ``name : (runs, n), what it is`` describes a parameter; napoleon would take it for the name of a type.
 - A doctest below the last section is an example.
-- The comment behind a field is its description, without the colon of ``#:``. A colon in it is one of a sentence; napoleon
-  would take what is before it for a type.
+- The comment behind a field is its description, without the colon of ``#:``. A colon in it is one of a sentence;
+  napoleon would take what is before it for a type.
 """
 
 from __future__ import annotations

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import consistency as cs
+from consistency.reporting import pdf
 from consistency.reporting.answer import answer
 from consistency.reporting.blocks import Document, Name, Status, Table
 from consistency.reporting.build import build_report, compose
@@ -100,6 +103,14 @@ def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> N
         page.index('class="answer"') < page.index(overview.TITLE) < page.index("Every verdict of this report") < first
     )
     assert page[:first].count('class="chart') == 1
+
+
+def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
+    monkeypatch.setattr(pdf.paper, "render", lambda sheet: b"")
+    data = json.loads(pdf.render_pdf(compose(report)))
+    assert [block["kind"] for block in data["opening"]] == ["Figure", "Table"]
+    assert data["opening"][0]["caption"].startswith(overview.TITLE)
 
 
 def test_the_answer_counts_where_the_table_names(report: Report) -> None:

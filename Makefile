@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-all bench lint format clean
+.PHONY: docs tutorial reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-all bench lint format clean
 
 .venv/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -12,10 +12,10 @@ reproduce: .venv/.done
 	$(BIN)/consistency reproduce --overwrite
 
 test: .venv/.done
-	$(BIN)/python -m pytest -n 2 -m "not slow and not browser"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser"
 
 test-all: .venv/.done
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 calibrate: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py \
@@ -36,6 +36,13 @@ regime: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/consistency sweep regime $(addprefix --filter ,$(RECURSIVE)) --out reports/regime
 	cp reports/regime/map.json reports/reference/regime.json
 
+docs: .venv/.done
+	$(BIN)/python -m sphinx -q -W --keep-going -d docs/_build/doctrees docs docs/_build/html
+	$(BIN)/python docs/check.py docs/_build/html
+
+tutorial: .venv/.done
+	$(BIN)/python docs/tutorial.py
+
 bench: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/bench.py
 
@@ -49,4 +56,4 @@ format: .venv/.done
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf .venv dist build .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv dist build docs/_build docs/generated .pytest_cache .mypy_cache .ruff_cache

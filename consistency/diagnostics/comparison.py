@@ -131,7 +131,7 @@ def compare(
     log ratio_a > -log ratio_b, or if both hold with < in place of >. Of a direction the larger of its two one-sided p
     values counts, and the p value is twice the smaller of the two directions. So the false-alarm rate is
     ``false_alarm`` at most wherever the ratios are, and half of it where both filters err to the same side. The
-    one-sided tests are those of :func:`consistency.diagnostics.contrast.contrast`.
+    one-sided tests are those of ``consistency.diagnostics.contrast``.
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ def whiteness(innovations: Array, covariances: Array, lags: int = LAGS) -> White
     """Are innovations independent over steps? Portmanteau test of their autocorrelation matrices.
 
     With u the innovations in units of their stated covariance and C_l the mean of u_k u_{k+l}' over the M
-    pairs of all runs, sum M |C_l|^2 / s^4 is chi-square with lags m^2 degrees of freedom (Box & Pierce 1970;
+    pairs of all runs, sum M ``|C_l|^2`` / s^4 is chi-square with lags m^2 degrees of freedom (Box & Pierce 1970;
     Hosking 1980 for vectors), s^2 the mean square of u: a wrong scale alone does not fire it.
 
     Parameters

@@ -15,11 +15,16 @@ from scene import BASELINE, SIZE, K, drive, texture, write_kitti
 
 import consistency as cs
 from consistency.frontend import Options, write_frontend_log
+from consistency.frontend.planar_log import plane_of
 from consistency.frontend.truth import find_truth, missing_of_drive, read_truth
 from consistency.geometry import rotation
 from consistency.recording.kitti import drive_poses
+from consistency.scenario import Belief, BelievedMotion, BelievedSensor
 from consistency.store.log import read_log
+from consistency.types import Trial
+from consistency.vision import RelativePose
 from consistency.vision.calibration import read_calibration
+from consistency.vision.motion import RelativeMotion
 from consistency.vision.rectification import rectify
 from consistency.vision.sequence import read_sequence
 
@@ -224,6 +229,29 @@ def test_an_unusable_drive_of_kitti_raw(day: Path, tmp_path: Path) -> None:
     with pytest.raises(cs.InputError, match=r"calib_cam_to_cam\.txt: no such file"):
         read_sequence(folder)
     assert len(read_sequence(folder, day / "calib_cam_to_cam.txt")) == 8
+
+
+# --- motions that leave the plane --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sigma", "holds"),
+    [((30.0, 30.0, 1.9), True), ((33.0, 1.0, 0.1), False), ((1.0, 33.0, 0.1), False), ((1.0, 1.0, 2.1), False)],
+)
+def test_a_plane_holds_where_landmarks_are_off_by_less_than_a_tenth(sigma: tuple[float, ...], holds: bool) -> None:
+    """Of f = 320 px, and of the disparity of 20 px in the median; a turn about up is no tilt, 2 degrees ahead are."""
+    turns = [RelativePose.from_vector(np.deg2rad([0, 0, 0, *angles])) for angles in ((0, 5, 0), (2, 0, 0), (1, 0, 1))]
+    ahead = [RelativePose(turn.R, np.array([0.0, 0.0, 1.0])) for turn in turns]
+    motions = [RelativeMotion(pose, *[None] * 9) for pose in ahead]  # type: ignore[arg-type]
+    z = np.array([[9.0, 9.0, d] for d in (10.0, 20.0, 90.0)])
+    trial = Trial(0, np.zeros(3), np.ones((3, 3)), np.arange(4), np.arange(3), z, 3)
+    sensor = BelievedSensor(model="uvd", sigma=sigma, f=320.0, B=0.2)
+    plane = plane_of(motions, trial, Belief(motion=BelievedMotion(sigma_v=1.0, sigma_omega=1.0), sensor=sensor))
+    assert plane.limit == (32.0, 32.0, 2.0)
+    assert plane.holds is holds
+    np.testing.assert_allclose(np.rad2deg(plane.tilts), [0.0, 2.0, np.sqrt(2.0)], atol=1e-3)
+    assert plane.leaving == 1
+    assert "1 of 3 motions tilt the camera by more than 1.7 deg (1.4 in the median, 2 at most)" in plane.line
 
 
 # --- BoofCV ----------------------------------------------------------------------------------------

@@ -106,6 +106,14 @@ def test_the_derivative_of_what_is_expected(model: str) -> None:
         np.testing.assert_allclose(slope[:, :, i], (ends[1] - ends[0]) / 2e-6, rtol=1e-5, atol=1e-5)
 
 
+def test_a_bearing_may_cross_half_a_turn() -> None:
+    sensor, points = SENSORS["range-bearing"], np.array([[8.0, 1.0, 0.0], [9.0, -1.0, 0.0]])
+    seen, _ = common_motion._expected(points, sensor)
+    beyond = seen + np.array([0.0, 2.0 * np.pi])
+    error, _ = common_motion._error_and_slope(points, beyond, np.zeros(6), sensor)
+    np.testing.assert_allclose(error, 0.0, atol=1e-12)
+
+
 def test_a_landmark_that_was_not_seen_a_step_before_is_not_judged() -> None:
     sensor = SENSORS["uvd"]
     trial = drive(sensor, np.random.default_rng(78))

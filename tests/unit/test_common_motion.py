@@ -11,6 +11,7 @@ import pytest
 import consistency as cs
 from consistency.frontend.screening import screened_log, screening_line
 from consistency.models import planar, point, stereo
+from consistency.reporting.sections.provenance import facts
 from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.store.log import Log
 from consistency.types import Array, Trial
@@ -190,6 +191,8 @@ def test_numbers_of_landmarks_that_are_known_and_of_things() -> None:
     assert after.screening is not None
     assert after.screening["broken"] == 16
     assert "screen: 16 of 308 observations" in screening_line(after)
+    assert ("Screened", "16 of 308 observations leave the common motion") in facts({"screening": after.screening})
+    assert "Screened" not in dict(facts({}))
 
 
 @pytest.mark.parametrize("gate", ["2,2", "2,2,0", "2,2,nan", "a,b,c", ""])

@@ -14,6 +14,7 @@ from consistency.recording.kitti import BODIES, drive_poses, is_drive
 from consistency.recording.record import associate
 from consistency.recording.tum import UNIT, read_trajectory
 from consistency.types import Array
+from consistency.vision.cameras import CAMERA_0, EUROC_BODY
 from consistency.vision.sequence import RAW_CALIBRATION, Sequence, read_table
 
 MAX_DT = 0.01  # s between an image and its truth, as in `consistency analyse`
@@ -36,7 +37,7 @@ def missing_of_drive(sequence: Sequence) -> list[str]:
         return []
     names = [f"calib_{name}.txt" for name in BODIES["camera"]]
     lacking = [name for name in names if place_of(sequence.folder, name) is None]
-    return lacking + ([] if sequence.calibration.body_from_left is not None else [RAW_CALIBRATION])
+    return lacking + ([] if sequence.calibration.body == CAMERA_0 else [RAW_CALIBRATION])
 
 
 def read_truth(path: Path, sequence: Sequence) -> tuple[Array, Array]:
@@ -87,7 +88,7 @@ def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
 def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     body = sequence.calibration.body_from_left
     images = sequence.left[0].parent.parent / "timestamps.txt"
-    if sequence.format != "kitti-raw" or body is None:
+    if sequence.format != "kitti-raw" or body is None or sequence.calibration.body != CAMERA_0:
         raise InputError(f"--truth {path}: is of a drive of KITTI raw with {RAW_CALIBRATION}; the images are not")
     stamps, poses = drive_poses(path, "camera")
     if len(poses) < 2:
@@ -112,7 +113,7 @@ def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     if (np.abs(np.linalg.norm(rows[:, 4:8], axis=1) - 1.0) > UNIT).any():
         raise InputError(f"{path}: columns 5 to 8 must be a quaternion w x y z of length 1")
     body = sequence.calibration.body_from_left
-    if body is None:
+    if body is None or sequence.calibration.body != EUROC_BODY:
         raise InputError(f"{path}: is the truth of a body, but {sequence.calibration.source} has no T_BS to the camera")
     rows = rows[_matched(path, sequence.t, rows[:, 0] / 1e9)]
     turn = Rotation.from_quat(rows[:, [5, 6, 7, 4]]).as_matrix()

@@ -9,7 +9,7 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.reading.kitti import numbers, read_keys, turn
 from consistency.types import Array
-from consistency.vision.cameras import Calibration, checked
+from consistency.vision.cameras import CAMERA_0, Calibration, checked
 
 
 def read_kitti(path: Path, left: str = "", right: str = "") -> Calibration:
@@ -36,9 +36,10 @@ def _projections(
         if np.linalg.matrix_rank(P[:, :3]) < 3:
             raise InputError(f"{path}: key '{name}': the matrix of its camera is singular; must be P = K [I | t]")
     t_left, t_right = (np.linalg.solve(P[:, :3], P[:, 3]) for P in (P_left, P_right))
-    none, body = np.zeros(4), None if rectified is None else _pose(rectified, t_left)
+    none = np.zeros(4)
+    body = (None, "") if rectified is None else (_pose(rectified, t_left), CAMERA_0)
     return checked(
-        Calibration(str(path), P_left[:, :3], P_right[:, :3], none, none, np.eye(3), t_right - t_left, size, body)
+        Calibration(str(path), P_left[:, :3], P_right[:, :3], none, none, np.eye(3), t_right - t_left, size, *body)
     )
 
 
@@ -75,6 +76,6 @@ def read_kitti_raw(
     between = R[1] @ R[0].T
     return checked(
         Calibration(
-            str(path), K[0], K[1], D[0], D[1], between, T[1] - between @ T[0], sizes["S"], _pose(R[0], T[0])
+            str(path), K[0], K[1], D[0], D[1], between, T[1] - between @ T[0], sizes["S"], _pose(R[0], T[0]), CAMERA_0
         )
     )  # fmt: skip

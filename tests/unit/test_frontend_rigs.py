@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,15 @@ def test_a_drive_whose_calibrations_are_missing_has_no_truth(tmp_path: Path) -> 
     sequence = read_sequence(folder)
     assert find_truth(sequence) is None
     assert missing_of_drive(sequence) == ["calib_velo_to_cam.txt"]
+    (tmp_path / "data.csv").write_text("".join(f"{k},0,0,0,1,0,0,0\n" for k in range(5)))
+    with pytest.raises(cs.InputError, match=r"data\.csv: is the truth of a body, but .*calib_cam_to_cam.* has no T_BS"):
+        read_truth(tmp_path / "data.csv", sequence)
+    unknown = replace(sequence, calibration=replace(sequence.calibration, body=""))
+    assert missing_of_drive(unknown) == ["calib_velo_to_cam.txt", "calib_cam_to_cam.txt"]
+    with pytest.raises(
+        cs.InputError, match=r"is of a drive of KITTI raw with calib_cam_to_cam\.txt; the images are not"
+    ):
+        read_truth(folder, unknown)
     with pytest.raises(cs.InputError, match=r"--body needs calib_velo_to_cam\.txt"):
         read_truth(folder, sequence)
 

@@ -25,7 +25,6 @@ extensions = [
 ]
 root_doc = "index"
 exclude_patterns = ["_build", "examples/README.md", "gallery", "generated/gallery/*.ipynb", "generated/gallery/*.json"]
-smartquotes = False  # they would make a dash of the two of an option
 highlight_language = "none"  # an indented block is a command or what it prints
 nitpicky = True
 nitpick_ignore_regex = [

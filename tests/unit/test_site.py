@@ -124,6 +124,7 @@ def test_every_command_has_a_page_with_its_examples(tmp_path: Path, monkeypatch:
         assert "\x08" not in text
         for line in EXAMPLES.get(name, ()):
             assert f"$ consistency {line}\n" in text
+    assert "As many runs as the verdict takes, instead of `--runs`." in pages["run"]
 
 
 # --- reference ---------------------------------------------------------------------------------------

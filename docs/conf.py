@@ -21,6 +21,7 @@ extensions = [
     "myst_nb",
     "commands",
     "docstrings",
+    "figures",
     "outside",
 ]
 root_doc = "index"
@@ -56,6 +57,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "show_signature": False,
+    "capture_repr": (),  # what is printed is shown, not what an expression is
     "write_computation_times": False,
     "min_reported_time": 60,
     "remove_config_comments": True,
@@ -65,6 +67,7 @@ sphinx_gallery_conf = {
 # HTML
 html_theme = "pydata_sphinx_theme"
 html_title = project
+html_context = {"default_mode": "auto"}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_sidebars = {"tutorial": []}  # one page, no section around it

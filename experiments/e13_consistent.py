@@ -14,6 +14,7 @@ from consistency.filters.centred import Corrections
 from consistency.filters.methods.robocentric import PARKED, RobotCentredKalman, compiled
 from consistency.runs.findings import script, sibling
 from consistency.scenario import UniformLandmarks
+from consistency.terminal.progress import each
 from consistency.verdicts.curves import curves, log_rmse
 
 FINDINGS = (
@@ -119,7 +120,7 @@ def judged(study: cs.Study, baseline: float = BASELINE, layout: int = 0) -> pd.D
 def verdicts(study: cs.Study, asked: Sequence[tuple[Cell, list[str]]]) -> pd.DataFrame:
     """A row for each cell and filter."""
     rows = []
-    for cell, names in asked:
+    for cell, names in each(asked, len(asked), "worlds", "worlds"):
         results = cs.run_trials(cell.scenario(), names, study.runs, study.seed, study.jobs)
         found = cs.analyse(results, names, confidence=1.0 - FALSE_ALARM)
         rows += [(*cell, *row(found[name])) for name in names]

@@ -15,6 +15,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.runs.findings import script
+from consistency.terminal.progress import each
 from consistency.types import Array
 
 FINDINGS = ("planar-esde", "planar-iekf-slam", "planar-ocekf-slam", "planar-theory", "planar-limit")
@@ -121,7 +122,7 @@ def compared(study: cs.Study, peer: str) -> pd.DataFrame:
     A peer prints the standard error of its NEES alone. That of its RMSE is taken from the spread of our runs.
     """
     rows = []
-    for row in PEERS[peer]:
+    for row in each(PEERS[peer], len(PEERS[peer]), peer, "rows"):
         theirs = np.array([row.nees, row.position, row.heading])
         for world in worlds(row.world):
             value, spread, runs = ours(study, world, row.filter)

@@ -7,6 +7,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.runs.findings import script, sibling
+from consistency.terminal.progress import each
 from consistency.types import Array
 
 FINDINGS = ("map-ceiling",)
@@ -27,7 +28,8 @@ def main(study: cs.Study) -> list[cs.Finding]:
         cs.get_filter(CEILING)
     except cs.InputError as error:  # the other experiments need not wait for a library
         return [finding(study, False, f"not measured: {error}")]
-    rows = [row for path, reach, density in SPARSE for row in judged(study, path, reach, density)]
+    worlds = each(SPARSE, len(SPARSE), "worlds", "worlds")
+    rows = [row for path, reach, density in worlds for row in judged(study, path, reach, density)]
     columns = ["path", "range", "density", "filter", "runs", "failures", "nees", "rmse", "ratio", "low", "high"]
     table = study.tables["map_ceiling"] = pd.DataFrame(rows, columns=columns)
     ours, failures = table[table["filter"] == OURS], table[table["filter"] != OTHER]["failures"].sum()

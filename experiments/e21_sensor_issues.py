@@ -11,6 +11,7 @@ from scipy.stats import ttest_rel
 
 import consistency as cs
 from consistency.runs.findings import OURS, script
+from consistency.terminal.progress import each
 from consistency.types import Array
 from consistency.verdicts.curves import Curves, log_rmse
 
@@ -118,7 +119,7 @@ def guarded(study: cs.Study) -> cs.Finding:
 def field_of_view(study: cs.Study) -> cs.Finding:
     """The same robot with lenses from narrow to wide, with and without what a rectification leaves of them."""
     rows, heading, nees = [], {}, {}
-    for degrees in FIELDS:
+    for degrees in each(FIELDS, len(FIELDS), "fields of view", "lenses"):
         for k in (0.0, RESIDUAL):
             world = lens(degrees, k)
             for name in FILTERS:

@@ -19,6 +19,7 @@ from consistency.imaging.chain import MISMATCH, Chain, Tracks
 from consistency.imaging.filtering import LeftRightCheck
 from consistency.imaging.protocols import Stops, stand
 from consistency.runs.findings import script
+from consistency.terminal.progress import each
 from consistency.types import Array
 from consistency.vision.features import opencv
 
@@ -50,7 +51,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
         return []
     findings = []
     if any(study.wants(name) for name in FINDINGS[:4]):
-        tracks = {k1: protocol(study, k1) for k1 in (0.0, RESIDUAL)}
+        tracks = {k1: protocol(study, k1) for k1 in each((0.0, RESIDUAL), 2, "stops", "cameras")}
         tables = [by_stop(part).assign(residual=k1) for k1, part in tracks.items()]
         study.tables["images_stops"] = table = pd.concat(tables, ignore_index=True).assign(sigma=SIGMA, needed=KEPT)
         own = table[table["residual"] == RESIDUAL]
@@ -201,7 +202,7 @@ def figure_8(study: cs.Study) -> cs.Finding:
     stops = Stops(farthest=distance, nearest=distance, images=IMAGES)
     rows = []
     cameras = {f"k1 +-{k1:g}": StereoCamera.distorted(k1) for k1 in RESIDUALS} | {"glass": glass()}
-    for case, (left, camera) in enumerate(cameras.items()):
+    for case, (left, camera) in enumerate(each(cameras.items(), len(cameras), "walls", "cameras")):
         for number in range(WALLS):
             tracks = stand(Chain(), camera, stops, generator(study, 8, case, number)).kept
             means, real = track_means(tracks), track_means(tracks_of_cameras(tracks))

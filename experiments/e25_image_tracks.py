@@ -24,6 +24,7 @@ from consistency.imaging.protocols import Stops, drive, office, partition, pose_
 from consistency.imaging.selection import Spread
 from consistency.imaging.tracking import KnownProjection
 from consistency.runs.findings import OURS, script
+from consistency.terminal.progress import each
 from consistency.types import Array
 from consistency.vision.features import opencv
 
@@ -71,7 +72,7 @@ def generator(study: cs.Study, *purpose: int) -> np.random.Generator:
 def repeated(study: cs.Study, count: int, purpose: int, once: Callable[[np.random.Generator], Tracks]) -> list[Tracks]:
     """Tracks of ``count`` draws; the same with any number of workers."""
     with ThreadPoolExecutor(study.workers) as threads:
-        return list(threads.map(once, generator(study, purpose).spawn(count)))
+        return list(each(threads.map(once, generator(study, purpose).spawn(count)), count, "image sequences", "draws"))
 
 
 def wrong_camera() -> StereoCamera:
@@ -131,7 +132,7 @@ def figure_9(study: cs.Study) -> list[cs.Finding]:
     chain = Chain(selection=Spread(40, 8, 5, STRONG), stereo_first=False)
     poses = np.stack([pose_at(STEP * k) for k in range(VIEWS)])
     rows = []
-    for number, rng in enumerate(generator(study, 9).spawn(SCENES)):
+    for number, rng in enumerate(each(generator(study, 9).spawn(SCENES), SCENES, "junctions", "scenes")):
         scene = partition(rng)
         tracks = drive(chain, camera, scene, rng, VIEWS, STEP)
         names, residual = rigid_residual(tracks, poses, camera)

@@ -27,6 +27,7 @@ from consistency.characterising.writing import sensor_text
 from consistency.errors import InputError
 from consistency.runs.findings import OURS, script
 from consistency.sweeps.rig import Request, read_rig
+from consistency.terminal.progress import each
 from consistency.types import Array
 from consistency.verdicts.curves import run_means
 from consistency.vision.features import opencv
@@ -113,7 +114,7 @@ def verdicts(study: cs.Study, worlds: dict[tuple[str, str], cs.Scenario]) -> pd.
     p is that of the hypothesis that noise alone gives no greater NEES than noise and map, NaN for the latter.
     """
     rows, logs = [], dict[tuple[str, str], Array]()
-    for (model, belief), world in worlds.items():
+    for (model, belief), world in each(worlds.items(), len(worlds), "beliefs", "worlds"):
         for name in FILTERS:
             found = cs.analyse(study.results(world, [name]), [name], confidence=1.0 - LEVEL)[name]
             log_nees = np.log(run_means(study.judged(world, name)[1]))

@@ -25,6 +25,7 @@ import pandas as pd
 import consistency as cs
 from consistency.runs.findings import OURS, command_line, sibling
 from consistency.store.storage import require_free
+from consistency.terminal.progress import each
 from consistency.terminal.table import print_findings
 from consistency.types import Array
 from consistency.vision import RelativePose, StereoRig, triangulate
@@ -113,7 +114,7 @@ METHODS = {"front-end": ours, "opencv": peer}
 
 def rows_of(name: str, rig: StereoRig, motions: Sequence[Matches], seed: int) -> Iterator[dict[str, object]]:
     """Each motion under each condition by each method: error in m and degrees, NaN where it failed."""
-    for k, m in enumerate(motions):
+    for k, m in enumerate(each(motions, len(motions), name, "motions")):
         for number, condition in enumerate(CONDITIONS):
             given = spoilt(rig, m, condition, np.random.default_rng([seed, k, number]))
             for method, solve in METHODS.items():

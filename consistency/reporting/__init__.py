@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from consistency.recording import Recording
     from consistency.reporting.blocks import Document
     from consistency.sweeps.regime import Regime
+    from consistency.terminal.progress import Advance
     from consistency.verdicts.monitoring import Watched
 
 __all__ = [
@@ -61,9 +62,12 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
 
     read_manifest(Path(folder))
     require_pages(html, pdf, overwrite)
-    from consistency.reporting.build import build_report, compose
+    from consistency.reporting.build import build_report, compose, parts_of
+    from consistency.terminal.progress import progress
 
-    _write_document(compose(build_report(Path(folder))), html, pdf)
+    parts = parts_of(Path(folder))
+    with progress("report", len(parts) + sum(path is not None for path in (html, pdf)), "parts", brief=True) as advance:
+        _write_document(compose(build_report(Path(folder), advance)), html, pdf, advance=advance)
     return [path for path in (html, pdf) if path is not None]
 
 
@@ -169,7 +173,9 @@ def write_file_reports(
     return [folder / name for name in ("report.html", "report.pdf", "verdict.json")]
 
 
-def _write_document(document: Document, html: Path | None, pdf: Path | None) -> None:
+def _write_document(
+    document: Document, html: Path | None, pdf: Path | None, *, advance: Advance = lambda _: None
+) -> None:
     """The document in both formats, each file whole or not at all; None leaves one out."""
     from consistency.reporting.html import render_html
     from consistency.reporting.pdf import pdf_beside
@@ -178,8 +184,10 @@ def _write_document(document: Document, html: Path | None, pdf: Path | None) -> 
     with pdf_beside(document) if pdf is not None else nullcontext(bytes) as finished:
         if html is not None:
             contents.append((html, render_html(document).encode("utf-8")))
+            advance(1)
         if pdf is not None:
             contents.append((pdf, finished()))
+            advance(1)
     for path, content in contents:
         _write(path, content)
 

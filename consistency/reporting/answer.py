@@ -11,7 +11,7 @@ from consistency.reporting.model import Study, Track
 from consistency.reporting.wording import listed
 from consistency.types import outcome
 
-LISTED = 6  # pairs of filter and scenario that the first paragraph names one by one
+LISTED = 6  # filters that the first paragraph names one by one
 
 
 def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
@@ -57,11 +57,10 @@ def _status_sentence(status: str, pairs: list[tuple[Track, Study]], studies: int
             by_study.setdefault(study.name, []).append(track.name)
     if not by_study:
         return ""
-    count = sum(map(len, by_study.values()))
-    if count > LISTED:
-        return f"{count} are {status} ({STATUSES[status]})."
-    where = [listed(names) + (f" in {study}" if studies > 1 else "") for study, names in by_study.items()]
-    return f"{status.capitalize()} ({STATUSES[status]}): {'; '.join(where)}."
+    names = [name for found in by_study.values() for name in found]
+    if studies > 1 or len(names) > LISTED:
+        return f"{len(names)} {'is' if len(names) == 1 else 'are'} {status} ({STATUSES[status]})."
+    return f"{status.capitalize()} ({STATUSES[status]}): {listed(names)}."
 
 
 def _failure_sentence(studies: Sequence[Study]) -> str:

@@ -166,10 +166,16 @@ class Document:
     title: str
     answer: str
     chapters: tuple[Chapter, ...]
+    opening: tuple[Block, ...] = ()  # below the answer, before the contents
+
+    @property
+    def parts(self) -> tuple[tuple[Block, ...], ...]:
+        """Blocks of the opening, then of each chapter."""
+        return (self.opening, *(chapter.blocks for chapter in self.chapters))
 
     @property
     def figures(self) -> tuple[Figure, ...]:
-        return tuple(block for chapter in self.chapters for block in chapter.blocks if isinstance(block, Figure))
+        return tuple(block for part in self.parts for block in part if isinstance(block, Figure))
 
 
 def table(columns: tuple[Column, ...], rows: list[tuple[Cell, ...]], label: str, **options: str | bool) -> Table:

@@ -11,39 +11,54 @@ import numpy as np
 from consistency.diagnostics import Settings
 from consistency.errors import InputError
 from consistency.reporting.answer import answer
-from consistency.reporting.blocks import Chapter, Document
+from consistency.reporting.blocks import Block, Chapter, Document
 from consistency.reporting.clock import clock_of
 from consistency.reporting.model import Report, Study, Track
-from consistency.reporting.section import STUDY, Section
+from consistency.reporting.section import OPENING, STUDY, Section
 from consistency.reporting.sections import SECTIONS
 from consistency.runs.findings import read_findings
 from consistency.store.results import open_results
 from consistency.store.storage import read_manifest
+from consistency.terminal.progress import Advance
 from consistency.verdicts.curves import curves, nis_ratio, steps_of
 from consistency.verdicts.judge import design_of, verdict_by, with_map
 
 
-def build_report(folder: Path) -> Report:
-    """Read a folder of ``consistency run`` or ``consistency reproduce`` and judge its filters.
+def parts_of(folder: Path) -> list[Path]:
+    """Folders of results in a folder of ``consistency run``, which is one, or ``consistency reproduce``.
 
     Raises
     ------
     InputError
-        The folder holds no results, or a file in it is damaged.
+        The folder holds no results.
     """
     manifest = read_manifest(folder)
     if "studies" in manifest:
         names = manifest["studies"]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError(f"{folder / 'manifest.json'}: key 'studies' must be names of folders; write it again")
-        parts = [folder / name for name in names]
-    elif "filters" in manifest:
-        parts = [folder]
-    else:
-        raise InputError(f"{folder}: holds no filter results; write some with 'consistency run', then report those")
+        return [folder / name for name in names]
+    if "filters" in manifest:
+        return [folder]
+    raise InputError(f"{folder}: holds no filter results; write some with 'consistency run', then report those")
+
+
+def build_report(folder: Path, advance: Advance = lambda _: None) -> Report:
+    """Read a folder of ``consistency run`` or ``consistency reproduce`` and judge its filters.
+
+    ``advance`` is called with 1 after each of its parts.
+
+    Raises
+    ------
+    InputError
+        The folder holds no results, or a file in it is damaged.
+    """
+    studies: list[Study] = []
     styles: dict[str, int] = {}
-    studies = tuple(_study(part, index, styles) for index, part in enumerate(parts))
-    return Report(folder, manifest, studies, tuple(read_findings(folder)))
+    for index, part in enumerate(parts_of(folder)):
+        studies.append(_study(part, index, styles))
+        advance(1)
+    return Report(folder, read_manifest(folder), tuple(studies), tuple(read_findings(folder)))
 
 
 def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
@@ -84,13 +99,17 @@ def compose(report: Report, sections: tuple[Section[Any, Any], ...] | None = Non
         A file that a section reads is damaged.
     """
     chapters: list[Chapter] = []
+    opening: tuple[Block, ...] = ()
     for part, group in groupby(SECTIONS if sections is None else sections, key=lambda section: section.part):
         members = tuple(group)
         if part is STUDY:
             chapters += [_chapter(study, index, members) for index, study in enumerate(report.studies)]
         elif blocks := tuple(block for section in members for block in section.blocks(report)):
-            chapters.append(Chapter(part.anchor, part.title, part.link, blocks))
-    return Document(report.title, answer(report.studies, report.findings), tuple(chapters))
+            if part is OPENING:
+                opening = blocks
+            else:
+                chapters.append(Chapter(part.anchor, part.title, part.link, blocks))
+    return Document(report.title, answer(report.studies, report.findings), tuple(chapters), opening)
 
 
 def _chapter(study: Study, index: int, sections: tuple[Section[Any, Any], ...]) -> Chapter:

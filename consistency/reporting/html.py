@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from bokeh.document import Document as BokehDocument
@@ -10,7 +11,7 @@ from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from consistency.reporting.blocks import Chapter, Document
+from consistency.reporting.blocks import Block, Document
 from consistency.reporting.drawing import Figure, Panel, numbers
 from consistency.reporting.screen import Screen
 from consistency.reporting.thin import LIMIT
@@ -25,7 +26,7 @@ LEAST = 120  # points a line below which a curve is no curve
 def render_html(document: Document) -> str:
     """The whole page: style, script, data and words in one string."""
     limit = points_a_line(document)
-    drawn = [_charts(chapter, limit) for chapter in document.chapters]
+    drawn = [_charts(_panels(part), limit) for part in document.parts]
     charts = {key: markup for _, found in drawn for key, markup in found.items()}
     scripts = [script for script, found in drawn if found]
     longest = max((row[0] for row in _rows(document)), default=0)
@@ -43,13 +44,12 @@ def render_html(document: Document) -> str:
     )
 
 
-def _panels(chapter: Chapter) -> list[Panel]:
-    return [panel for block in chapter.blocks if isinstance(block, Figure) for panel in block.panels]
+def _panels(part: Sequence[Block]) -> list[Panel]:
+    return [panel for block in part if isinstance(block, Figure) for panel in block.panels]
 
 
-def _charts(chapter: Chapter, limit: int) -> tuple[Markup, dict[int, Markup]]:
+def _charts(panels: Sequence[Panel], limit: int) -> tuple[Markup, dict[int, Markup]]:
     """The script of all charts of a chapter, and the place of each panel, by its id."""
-    panels = _panels(chapter)
     if not panels:
         return Markup(), {}
     screen = Screen(limit)
@@ -65,13 +65,13 @@ def _charts(chapter: Chapter, limit: int) -> tuple[Markup, dict[int, Markup]]:
 
 def _rows(document: Document) -> list[tuple[int, int]]:
     """Length and number of columns of what is drawn."""
-    return [row for chapter in document.chapters for panel in _panels(chapter) for row in map(numbers, panel.marks)]
+    return [row for figure in document.figures for panel in figure.panels for row in map(numbers, panel.marks)]
 
 
 def points_a_line(document: Document) -> int:
     """Points that a line may have so that the file stays below its greatest size."""
     rows = _rows(document)
-    room: Any = MAXIMUM - SCRIPT - CHART * sum(len(_panels(chapter)) for chapter in document.chapters)
+    room: Any = MAXIMUM - SCRIPT - CHART * sum(len(figure.panels) for figure in document.figures)
     low, high = LEAST, LIMIT
     while low < high:
         middle = (low + high + 1) // 2

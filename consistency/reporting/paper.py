@@ -166,7 +166,7 @@ def _rows(axes: Axes, labels: Sequence[str]) -> None:
     for row in range(1, len(labels), 2):
         axes.axhspan(row - 0.5, row + 0.5, color="#f5f5f5", linewidth=0, zorder=0)
     axes.set(ylim=(len(labels) - 0.5, -0.5), yticks=range(len(labels)))
-    axes.set_yticklabels([wrapped(label, 20) for label in labels], parse_math=False)
+    axes.set_yticklabels([wrapped(label, 28) for label in labels], parse_math=False)
     axes.tick_params(axis="y", length=0, pad=7)
 
 

@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import resources
 from itertools import zip_longest
@@ -34,6 +34,7 @@ def render_pdf(document: blocks.Document) -> bytes:
         data = {
             "title": soft(document.title),
             "answer": soft(document.answer),
+            "opening": _blocks(document.opening, "opening", folder),
             "chapters": [_chapter(chapter, folder) for chapter in document.chapters],
         }
         (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
@@ -68,8 +69,12 @@ def _chapter(chapter: blocks.Chapter, folder: Path) -> dict[str, Any]:
     return {
         "title": soft(chapter.title),
         "summary": soft(chapter.summary),
-        "blocks": [_block(block, f"{chapter.anchor}-{i}", folder) for i, block in enumerate(chapter.blocks)],
+        "blocks": _blocks(chapter.blocks, chapter.anchor, folder),
     }
+
+
+def _blocks(part: Sequence[blocks.Block], name: str, folder: Path) -> list[dict[str, Any]]:
+    return [_block(block, f"{name}-{i}", folder) for i, block in enumerate(part)]
 
 
 def _block(block: blocks.Block, name: str, folder: Path) -> dict[str, Any]:
@@ -91,7 +96,7 @@ def _block(block: blocks.Block, name: str, folder: Path) -> dict[str, Any]:
         case blocks.Settings():
             content = {"cells": _settings(json.loads(block.text))}
         case blocks.Details():
-            inner = [_block(part, f"{name}-{i}", folder) for i, part in enumerate(block.blocks)]
+            inner = _blocks(block.blocks, name, folder)
             content = {"heading": soft(block.paper), "blocks": inner, "whole": block.whole}
     return {"kind": type(block).__name__} | content
 

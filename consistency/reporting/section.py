@@ -21,6 +21,7 @@ class Part:
     link: str  # in the contents
 
 
+OPENING = Part("", "", "")  # below the answer, before the contents
 STUDY = Part("study", "", "")  # stands once for each study, under its name
 FRONT_END = Part("front-end", "Stereo front-end", "Stereo front-end")
 

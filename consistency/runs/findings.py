@@ -23,6 +23,7 @@ from consistency.runs.montecarlo import run_trials
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.store.results import Results, joined
 from consistency.store.storage import manifest_of, require_free, write_folder
+from consistency.terminal.progress import quiet, say
 from consistency.terminal.table import print_findings
 from consistency.types import OURS as OURS
 from consistency.types import Finding
@@ -30,6 +31,7 @@ from consistency.verdicts.curves import Curves, curves
 from consistency.verdicts.judge import analyse
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
+WAITING = 30.0  # seconds between lines on a process that is waited for
 REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"
 
 
@@ -66,7 +68,7 @@ class Study:
             raise ValueError(f"two different scenarios are named '{world.name}'")
         missing = [name for name in filters if have is None or name not in have.filters]
         if missing:
-            print(f"{world.name}: {', '.join(missing)}", file=sys.stderr, flush=True)
+            say(f"{world.name}: {', '.join(missing)}")
             new = run_trials(world, missing, self.runs, self.seed, self.jobs)
             self.kept[world.name] = new if have is None else joined([have, new])
         return self.kept[world.name]
@@ -146,7 +148,11 @@ def _executed(path: Path, name: str) -> ModuleType:
 
 def experiment_summaries() -> dict[str, str]:
     """First line of every script's docstring."""
-    return {name: (module.__doc__ or "").strip().splitlines()[0] for name, module in experiments().items()}
+    return {name: _summary(module) for name, module in experiments().items()}
+
+
+def _summary(module: ModuleType) -> str:
+    return (module.__doc__ or "").strip().splitlines()[0]
 
 
 def reproduce(
@@ -215,7 +221,7 @@ def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[st
         if module not in futures:
             findings: list[Finding] = module.main(study)
             return findings
-        findings, tables = futures[module].result()
+        findings, tables = _waited_for(futures[module])
         study.tables |= tables
         return findings
 
@@ -224,7 +230,9 @@ def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[st
         for module in apart:
             assert pool is not None
             futures[module] = pool.submit(_contribution, module.__file__, study.runs, study.seed, study.jobs)
-        for module, ids in sorted(selection, key=lambda pair: pair[0] in futures):  # processes are waited for last
+        ordered = sorted(selection, key=lambda pair: pair[0] in futures)  # processes are waited for last
+        for number, (module, ids) in enumerate(ordered, start=1):
+            say(f"[{number} of {len(ordered)}] {Path(str(module.__file__)).stem}: {_summary(module)}")
             by_script[module] = _guarded(main, module, study, ids)
     finally:
         if pool is not None:
@@ -232,10 +240,24 @@ def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[st
     return [finding for module, ids in selection for finding in by_script[module] if finding.id in ids]
 
 
+def _waited_for(future: Future[_Contribution]) -> _Contribution:
+    """What a process leaves; a line now and then says that it still works."""
+    started = time.monotonic()
+    while True:
+        try:
+            contribution: _Contribution = future.result(timeout=WAITING)
+            return contribution
+        except TimeoutError:
+            if future.done():  # of the script itself
+                raise
+            say(f"still at it in a process of its own, {time.monotonic() - started:.0f} s")
+
+
 def _contribution(path: str, runs: int, seed: int, jobs: int) -> _Contribution:
     """Run one script by itself, in a process that knows no other's trials."""
     study = Study(runs, seed, jobs)
-    findings = _load(Path(path)).main(study)
+    with quiet():  # others write to the same terminal
+        findings = _load(Path(path)).main(study)
     if study.kept:
         raise ValueError("OWN_PROCESS is for scripts that run no filter")
     return findings, study.tables
@@ -250,7 +272,7 @@ def _guarded(
     except InputError:
         raise
     except Exception as error:
-        claim = (module.__doc__ or "").strip().splitlines()[0]
+        claim = _summary(module)
         text = dict.fromkeys(("source", "statistic", "published", "accept"), "the experiment broke before it said")
         measured = f"{type(error).__name__}: {error}"
         return [study.finding(False, "none", id=name, claim=claim, measured=measured, **text) for name in ids]

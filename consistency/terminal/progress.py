@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TypeVar
 
+T = TypeVar("T")
 Advance = Callable[[int], None]
 
 
@@ -33,6 +34,7 @@ class _Forgiving:
         return getattr(self._stream, name)
 
 
+EVERY = 5.0  # seconds between lines
 KERNELS = "kernels"  # unit of what is compiled: said even where all else is quiet
 _quiet = ContextVar("quiet", default=False)
 
@@ -53,16 +55,28 @@ def say(text: str) -> None:
         print(text, file=_Forgiving(), flush=True)
 
 
+def each(items: Iterable[T], total: int, label: str, unit: str) -> Iterator[T]:
+    """The items, ``total`` in number, with progress over them in place of that of the work on each."""
+    with progress(label, total, unit) as advance:
+        for item in items:
+            with quiet():
+                yield item
+            advance(1)
+
+
 @contextmanager
-def progress(label: str, total: int, unit: str = "runs") -> Iterator[Advance]:
-    """Yields a function to call with the number of units just done; writes to standard error."""
+def progress(label: str, total: int, unit: str = "runs", brief: bool = False) -> Iterator[Advance]:
+    """Yields a function to call with the number of units just done; writes to standard error.
+
+    ``brief``: where there is no terminal, nothing is said of what is over in a few seconds.
+    """
     if _quiet.get() and unit != KERNELS:
         yield lambda _: None
     elif sys.stderr is not None and sys.stderr.isatty():
         with _bar(label, total, unit) as advance:
             yield advance
     else:
-        yield _lines(label, total, unit)
+        yield _lines(label, total, unit, brief)
 
 
 @contextmanager
@@ -94,7 +108,7 @@ def _speed(rate: float, unit: str) -> str:
     return f"{rate:.1f} {unit}/s" if rate >= 1.0 else f"{1.0 / rate:.1f} s for one"
 
 
-def _lines(label: str, total: int, unit: str, every: float = 5.0) -> Advance:
+def _lines(label: str, total: int, unit: str, brief: bool) -> Advance:
     started = last = time.monotonic()
     done = 0
     if unit == KERNELS:  # takes half a minute, and nothing else is to be seen meanwhile
@@ -104,7 +118,7 @@ def _lines(label: str, total: int, unit: str, every: float = 5.0) -> Advance:
         nonlocal done, last
         done += count
         now = time.monotonic()
-        if done == total or now - last >= every:
+        if (done == total and not (brief and now - started < EVERY)) or now - last >= EVERY:
             last = now
             rate = done / max(now - started, 1e-9)
             if done == total:

@@ -9,10 +9,11 @@ import secrets
 from pathlib import Path
 
 import pytest
+from documents import blocks, read
 
 from consistency.cli import main
 
-PAGE = (Path(__file__).parents[2] / "docs/conventions.md").read_text(encoding="utf-8")
+PAGE = read("docs/conventions.md")
 SECTIONS = dict(part.split("\n", 1) for part in PAGE.split("\n## ")[1:])
 NEEDED = {"GTSAM Pose2": "gtsam", "GTSAM Pose3": "gtsam", "Stone Soup": "stonesoup"}
 FAULTS = {"overconfident", "conservative", "biased", "heavy-tailed", "inconsistent"}
@@ -28,9 +29,8 @@ def run_example(name: str, at: Path, monkeypatch: pytest.MonkeyPatch, *changes: 
     """The code of a section, with random numbers of its own."""
     if name in NEEDED:
         pytest.importorskip(NEEDED[name], reason=f"{NEEDED[name]} is not installed")
-    code = re.search(r"```python\n(.*?)```", SECTIONS[name], re.S)
-    assert code is not None
-    text = code.group(1)
+    (code,) = blocks("docs/conventions.md", "python", part=name)
+    text = code.text
     for old, new in (("default_rng(6021)", f"default_rng({secrets.randbits(60)})"), *changes):
         assert old in text
         text = text.replace(old, new)
@@ -80,9 +80,8 @@ def test_the_notebook_says_what_the_command_says(
     with pytest.raises(SystemExit):
         main([*commands(SECTIONS["GTSAM Pose3"])[0], "--json"])
     said = {verdict["status"] for verdict in json.loads(capsys.readouterr().out).values()}
-    code = re.search(r"```python notebook\n(.*?)```", SECTIONS["GTSAM Pose3"], re.S)
-    assert code is not None
-    (tmp_path / "look.py").write_text(code.group(1))
+    (code,) = blocks("docs/conventions.md", "python notebook", part="GTSAM Pose3")
+    (tmp_path / "look.py").write_text(code.text)
     runpy.run_path("look.py")
     assert {capsys.readouterr().out.strip()} == said
 

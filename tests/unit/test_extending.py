@@ -10,20 +10,19 @@ import sys
 from pathlib import Path
 
 import pytest
+from documents import blocks
 
 import consistency
 import consistency.filters
 
 PACKAGE = Path(consistency.__file__).parent
-DOCUMENT = PACKAGE.parent / "docs" / "extending.md"
+PAGE = "docs/extending.md"
 EFFECTS = Path("consistency/scenario/effects")
 
 
-def blocks(heading: str) -> list[str]:
+def code(heading: str) -> list[str]:
     """Code blocks of one part of the document."""
-    text = DOCUMENT.read_text(encoding="utf-8")
-    part = re.split(r"^## ", text.split(f"\n## {heading}\n")[1], flags=re.MULTILINE)[0]
-    return re.findall(r"^```\w+\n(.*?)^```", part, flags=re.MULTILINE | re.DOTALL)
+    return [block.text for block in blocks(PAGE, "python", "toml", part=heading)]
 
 
 @pytest.fixture
@@ -43,7 +42,7 @@ def python(folder: Path, code: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_bias_of_the_document_works(copy: Path) -> None:
     """One new file, one line elsewhere, a key in a scenario; and the document's own test passes."""
-    effect, line, key, test = blocks("Add a sensor effect")
+    effect, line, key, test = code("Add a sensor effect")
     assert line.count("\n") == 1
     (copy / EFFECTS / "bias.py").write_text(effect, encoding="utf-8")
     names = copy / EFFECTS / "__init__.py"
@@ -53,17 +52,17 @@ def test_the_bias_of_the_document_works(copy: Path) -> None:
     scenario = (copy / "scenarios" / "herath2007-stereo.toml").read_text(encoding="utf-8")
     (copy / "mine.toml").write_text(f"{scenario}\n{key}", encoding="utf-8")
     (copy / "test_bias.py").write_text(test, encoding="utf-8")
-    code = (
+    program = (
         "import consistency as cs, test_bias\n"
         "test_bias.test_a_bias_shifts_every_disparity()\n"
         "print(cs.__file__, cs.load_scenario('mine.toml').truth.sensor.effects)"
     )
-    done = python(copy, code)
+    done = python(copy, program)
     assert done.returncode == 0, done.stderr
     assert str(copy) in done.stdout
     assert "Bias(kind='bias', name=None, bias=(0.0, 0.0, 1.0))" in done.stdout
     names.write_text(names.read_text(encoding="utf-8").replace(line, ""), encoding="utf-8")
-    assert "'bias' is not one of" in python(copy, code).stderr  # negative control
+    assert "'bias' is not one of" in python(copy, program).stderr  # negative control
 
 
 METHODS = PACKAGE / "filters" / "methods"
@@ -72,7 +71,7 @@ METHODS = PACKAGE / "filters" / "methods"
 def test_excerpts_of_filters_are_the_code_that_runs() -> None:
     registry = (PACKAGE / "filters" / "__init__.py").read_text(encoding="utf-8")
     sources = [registry, *(path.read_text(encoding="utf-8") for path in METHODS.glob("*.py"))]
-    excerpts = blocks("Add a filter")
+    excerpts = code("Add a filter")
     assert len(excerpts) == 7
     for excerpt in excerpts:
         pieces = re.split(r"\n{3,}", excerpt.strip("\n"))
@@ -96,12 +95,12 @@ def test_a_filter_is_one_file_and_a_line_for_each_name(method: str, names: set[s
 
 
 def test_the_experiment_of_the_document_runs(tmp_path: Path) -> None:
-    (script,) = blocks("Add an experiment")
+    (script,) = code("Add an experiment")
     (tmp_path / "e13_iterated.py").write_text(script, encoding="utf-8")
-    code = "import sys, runpy; sys.argv = ['e13', '2', '0']; runpy.run_path('e13_iterated.py', run_name='__main__')"
+    program = "import sys, runpy; sys.argv = ['e13', '2', '0']; runpy.run_path('e13_iterated.py', run_name='__main__')"
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
     assert "iterated-update" in done.stdout

@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from documents import blocks
 
 import consistency as cs
 from consistency.reporting import build, pdf, write_reports
 from consistency.reporting.build import build_report
 from consistency.reporting.sections import SECTIONS, pose_errors
 
-GUIDE = Path(__file__).parents[2] / "docs" / "extending.md"
-
 
 def example(path: str) -> str:
     """The code block that follows the line which names the file ``path``."""
-    text = GUIDE.read_text(encoding="utf-8")
-    found = re.search(rf"^`{re.escape(path)}`:\n\n```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    assert found, f"docs/extending.md has no example of {path}"
-    return found.group(1)
+    (found,) = (block.text for block in blocks("docs/extending.md", "python") if block.before == f"`{path}`:")
+    return found
 
 
 @pytest.fixture

@@ -86,6 +86,24 @@ def test_long_scripts_wait_to_be_asked_for(
     assert list(measured(reproduce(only, 5, 0, 1, tmp_path / "out", long=long))) == expected
 
 
+def test_scripts_are_said_as_they_begin(
+    scripts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "WAITING", 0.2)
+    said = "import time; from consistency.terminal.progress import say; say('inside'); time.sleep(1)"
+    write(scripts, 2, ("two",), "OWN_PROCESS = True", said)
+    reproduce(["one", "two"], 5, 0, 2, tmp_path / "out")
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[:2] == ["[1 of 2] e01_script: A question.", "[2 of 2] e02_script: A question."]
+    assert lines[2].startswith("still at it in a process of its own")
+    assert "inside" not in lines
+
+
+def test_a_script_that_times_out_is_a_finding(scripts: Path, tmp_path: Path) -> None:
+    write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise TimeoutError('of its own')")
+    assert measured(reproduce(["two"], 5, 0, 2, tmp_path / "out"))["two"] == "TimeoutError: of its own"
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_script_that_breaks_is_a_finding(scripts: Path, tmp_path: Path, jobs: int) -> None:
     write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise ZeroDivisionError('no')")

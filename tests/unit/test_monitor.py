@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from documents import blocks
 from scipy import special, stats
 
 import consistency as cs
@@ -439,9 +440,8 @@ def test_the_sentence_says_what_is_judged_and_what_is_not() -> None:
 
 
 def test_the_example_of_the_manual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = (ROOT / "docs/monitor.md").read_text(encoding="utf-8")
-    (tmp_path / "example.py").write_text(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0])
+    (tmp_path / "example.py").write_text(blocks("docs/monitor.md", "python")[0].text)
     runpy.run_path(str(tmp_path / "example.py"))
     printed = capsys.readouterr().out.split()
-    assert " ".join(printed) in " ".join(text.split())
+    assert printed == blocks("docs/monitor.md", "text")[0].text.split()
     assert printed[:3] == ["alarm", "in", "step"]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from consistency.terminal.progress import KERNELS, progress
+from consistency.terminal import progress as module
+from consistency.terminal.progress import KERNELS, each, progress, say
 
 
 def test_compiling_is_announced_at_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -19,3 +20,46 @@ def test_runs_are_said_when_some_are_done(capsys: pytest.CaptureFixture[str]) ->
         assert capsys.readouterr().err == ""
         advance(2)
         assert capsys.readouterr().err.startswith("runs: 2 of 2 runs")
+
+
+def test_work_on_each_is_quiet_and_the_whole_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+    done = []
+    for item in each("abc", 3, "worlds", "worlds"):
+        say(f"inside {item}")
+        with progress("runs", 1) as advance:
+            advance(1)
+        done.append(item)
+    said = capsys.readouterr().err
+    assert done == ["a", "b", "c"]
+    assert "inside" not in said
+    assert "runs: " not in said
+    assert said.startswith("worlds: 3 of 3 worlds")
+    say("outside")
+    assert capsys.readouterr().err == "outside\n"
+
+
+def test_an_item_that_breaks_leaves_nobody_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    def breaks() -> None:
+        for _ in each("abc", 3, "worlds", "worlds"):
+            raise ValueError
+
+    with pytest.raises(ValueError):  # noqa: PT011
+        breaks()
+    say("again")
+    assert capsys.readouterr().err == "again\n"
+
+
+def test_brief_work_is_said_when_it_takes_long(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with progress("report", 2, "parts", brief=True) as advance:
+        advance(2)
+    assert capsys.readouterr().err == ""
+    clock = iter([0.0, 6.0, 7.0])
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    with progress("report", 2, "parts", brief=True) as advance:
+        advance(1)
+        advance(1)
+    assert [line.split(",")[0] for line in capsys.readouterr().err.splitlines()] == [
+        "report: 1 of 2 parts", "report: 2 of 2 parts",
+    ]  # fmt: skip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import runpy
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from documents import blocks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -603,9 +603,8 @@ def consistency(*arguments: str, capsys: pytest.CaptureFixture[str]) -> tuple[in
 
 def example(word: str) -> str:
     """The block of the manual that holds a word."""
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/files.md").read_text(), re.DOTALL)
-    (found,) = (block for block in blocks if word in block)
-    return str(found)
+    (found,) = (block.text for block in blocks("docs/files.md", "python") if word in block.text)
+    return found
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from documents import blocks
 
 import consistency as cs
 from consistency.cli import main as command
@@ -521,8 +521,7 @@ def test_a_real_sequence_from_images_to_windows(tmp_path: Path, name: str, truth
 
 def test_the_example_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    manual = (Path(__file__).parents[2] / "docs/files.md").read_text()
-    (example,) = (block for block in re.findall(r"```python\n(.*?)```", manual, re.DOTALL) if "wheels" in block)
+    (example,) = (block.text for block in blocks("docs/files.md", "python") if "wheels" in block.text)
     names: dict[str, Record] = {}
     exec(example, names)
     verdict = cs.judge(names["record"])

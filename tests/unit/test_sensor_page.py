@@ -6,13 +6,14 @@ import re
 from pathlib import Path
 
 import pytest
+from documents import blocks, read
 
 import consistency as cs
 from consistency.scenario import data_folder
 from consistency.scenario.effects import EFFECTS
 
-PAGE = (Path(__file__).parents[2] / "docs" / "sensor.md").read_text(encoding="utf-8")
-TABLES = re.findall(r"^```toml\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+PAGE = read("docs/sensor.md")
+TABLES = [block.text for block in blocks("docs/sensor.md", "toml")]
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: re.findall(r'kind = "(.*)"|sensor\.(\w+)', table)[0])
@@ -26,10 +27,10 @@ def test_a_table_switches_something_on(tmp_path: Path, table: str) -> None:
 
 
 def test_code_runs() -> None:
-    pieces = re.findall(r"^```python\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+    pieces = blocks("docs/sensor.md", "python")
     assert len(pieces) == 2
     for piece in pieces:
-        exec(piece, {})
+        exec(piece.text, {})
 
 
 def test_every_effect_and_scenario_is_there() -> None:

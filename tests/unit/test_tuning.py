@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from documents import blocks, commands
 from scipy import stats
 
 import consistency as cs
@@ -445,8 +445,8 @@ def test_a_log_is_tuned_to_a_sensor_file(capsys: pytest.CaptureFixture[str], tmp
 
 # --- the manual --------------------------------------------------------------------------------------
 
-MANUAL = (Path(__file__).parents[2] / "docs/tuning.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"^ {4}consistency (tune [^\[\n]*)$", MANUAL, re.MULTILINE)
+TYPED = [command for command in commands("docs/tuning.md") if not (command.inline or command.synopsis)]
+COMMANDS = [" ".join(command.words[1:]) for command in TYPED if command.words[1:2] == ["tune"]]
 
 
 def test_the_manual_has_commands() -> None:
@@ -473,9 +473,9 @@ def test_the_commands_of_the_manual_are_taken(
 
 
 def test_the_filterpy_filter_of_the_manual(tmp_path: Path) -> None:
-    [block] = re.findall(r"```python\n(.*?)```", MANUAL, re.DOTALL)
-    short = block.replace("runs=20", "runs=2").replace("truth__steps=50", "truth__steps=6")
-    assert short != block
+    [block] = blocks("docs/tuning.md", "python")
+    short = block.text.replace("runs=20", "runs=2").replace("truth__steps=50", "truth__steps=6")
+    assert short != block.text
     (tmp_path / "mine.py").write_text(short)
     done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

@@ -19,6 +19,7 @@ from consistency.reporting.sections import (
     maps,
     nees,
     no_truth,
+    overview,
     own_errors,
     pose_errors,
     provenance,
@@ -34,6 +35,7 @@ from consistency.reporting.sections import (
 )
 
 SECTIONS: tuple[Section[Any, Any], ...] = (
+    overview.SECTION,
     findings.SECTION,
     filters.SECTION,
     verdicts.SECTION,

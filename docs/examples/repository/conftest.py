@@ -1,0 +1,1 @@
+"""Lets the tests import the package ``cart``, which is not installed."""

@@ -1,0 +1,41 @@
+"""The file of the GitHub Action, and whether steps that use it give inputs that it has."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import yaml
+from documents import ROOT
+
+FOLDER = ROOT / ".github/actions/consistency"
+FILE: dict[str, Any] = yaml.safe_load((FOLDER / "action.yml").read_text())
+STEPS: list[dict[str, Any]] = FILE["runs"]["steps"]
+STEP_KEYS = {"name", "id", "if", "shell", "run", "uses", "with", "env", "working-directory", "continue-on-error"}
+ACTION = re.compile(r"(\.|OWNER/filter-consistency)/\.github/actions/consistency(@VERSION)?")
+
+
+def require_uses(text: str) -> list[dict[str, Any]]:
+    """The steps of a workflow, or of a part of one, that use the action; there must be one.
+
+    Raises
+    ------
+    AssertionError
+        A key or an input does not exist.
+    """
+    content = yaml.safe_load(text)
+    steps = content
+    if isinstance(content, dict):
+        assert (
+            {True, "jobs"} <= set(content) <= {"name", True, "jobs", "permissions"}
+        )  # YAML reads the key "on" as true
+        assert all("runs-on" in job for job in content["jobs"].values())
+        steps = [step for job in content["jobs"].values() for step in job["steps"]]
+    for step in steps:
+        assert set(step) <= STEP_KEYS
+        assert ("run" in step) != ("uses" in step)
+    uses = [step for step in steps if ACTION.fullmatch(step.get("uses", ""))]
+    assert uses
+    for step in uses:
+        assert set(step["with"]) <= set(FILE["inputs"])
+    return uses

@@ -1,0 +1,250 @@
+"""The GitHub Action: its file holds what GitHub demands, and its steps do what they promise in the worked repository.
+
+The steps are run by bash as the runner does: inputs become the variables that ``env:`` names.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from documents import ROOT
+
+pytest.importorskip("yaml", reason="PyYAML (the extra vision) is not installed")
+import action
+from action import FILE, STEP_KEYS, STEPS
+
+REPOSITORY = ROOT / "docs/examples/repository"
+WORKFLOWS = [*(ROOT / ".github/workflows").glob("*.yml"), *(REPOSITORY / ".github/workflows").glob("*.yml")]
+EXPRESSION = re.compile(r"\$\{\{\s*(.*?)\s*\}\}")
+
+
+# --- what GitHub demands ------------------------------------------------------------------------------
+
+
+def test_the_action_is_a_composite_one() -> None:
+    assert set(FILE) == {"name", "description", "inputs", "outputs", "runs"}
+    assert FILE["runs"]["using"] == "composite"
+    assert set(FILE["runs"]) == {"using", "steps"}
+    for name, value in FILE["inputs"].items():
+        assert re.fullmatch(r"[a-z][a-z-]*", name)
+        assert set(value) == {"description", "default"}
+        assert isinstance(value["default"], str)
+    for value in FILE["outputs"].values():
+        assert set(value) == {"description", "value"}
+
+
+@pytest.mark.parametrize("step", STEPS, ids=lambda step: step["name"])
+def test_a_step_of_the_action(step: dict[str, Any]) -> None:
+    """``shell`` is demanded of each ``run``; an expression in a script would be pasted into it."""
+    assert set(step) <= STEP_KEYS
+    assert ("run" in step) != ("uses" in step)
+    assert ("shell" in step) == ("run" in step)
+    assert not EXPRESSION.search(step.get("run", ""))
+    assert "run" in step or re.fullmatch(r"[\w./-]+@v\d+", step["uses"])
+
+
+def test_inputs_are_used_and_what_is_used_exists() -> None:
+    text = "\n".join(part.text for part in expressions(FILE))
+    assert set(re.findall(r"inputs\.([\w-]+)", text)) == set(FILE["inputs"])
+    ids = {step["id"] for step in STEPS if "id" in step}
+    assert set(re.findall(r"steps\.([\w-]+)\.", text)) <= ids
+    told = set(re.findall(r'output\("(\w+)"', (action.FOLDER / "gate.py").read_text()))
+    assert set(re.findall(r"steps\.gate\.outputs\.(\w+)", text)) == told == set(FILE["outputs"])
+    read = set(re.findall(r'(?:environ\.get|words)\("(\w+)"', (action.FOLDER / "gate.py").read_text()))
+    assert read - {"GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY"} == set(STEPS[1]["env"])
+
+
+@dataclass(frozen=True)
+class Part:
+    text: str
+
+
+def expressions(value: Any, key: str = "") -> list[Part]:
+    """What GitHub evaluates in a value: what stands in ``${{ }}``, and all of an ``if``."""
+    if isinstance(value, dict):
+        return [part for name, inner in value.items() for part in expressions(inner, str(name))]
+    if isinstance(value, list):
+        return [part for inner in value for part in expressions(inner)]
+    return [Part(str(value))] if key == "if" else [Part(found) for found in EXPRESSION.findall(str(value))]
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_workflow_gives_inputs_that_the_action_has(path: Path) -> None:
+    """Those in the documents are among the blocks of test_documents.py."""
+    text = path.read_text()
+    action.require_uses(text)
+    with pytest.raises(AssertionError):
+        action.require_uses(text.replace(" tests: ", " test: "))
+
+
+# --- what its steps do --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outcome:
+    status: int
+    summary: str
+    outputs: dict[str, str]
+    log: str
+
+
+def run_action(workspace: Path, **inputs: str) -> Outcome:
+    """The steps in order, by bash, up to the first that fails."""
+    given = {name: str(value["default"]) for name, value in FILE["inputs"].items()}
+    given |= {name.replace("_", "-"): value for name, value in inputs.items()}
+    assert set(given) == set(FILE["inputs"])
+    paths = {name: workspace.parent / name for name in ("GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY")}
+    for path in paths.values():
+        path.write_text("")
+    log, status = "", 0
+    for step in STEPS:
+        if "run" not in step or (step["name"] == "Install" and given["install"] == "false"):
+            continue
+        values = {key: evaluated(value, given) for key, value in step.get("env", {}).items()}
+        environment = os.environ | {key: str(path) for key, path in paths.items()} | values
+        environment |= {
+            "GITHUB_ACTION_PATH": str(action.FOLDER),
+            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        }
+        script = workspace.parent / "step.sh"
+        script.write_text(step["run"])
+        at = workspace / evaluated(step.get("working-directory", "."), given)
+        bash = ["bash", "--noprofile", "--norc", "-eo", "pipefail", str(script)]  # as the runner calls it
+        done = subprocess.run(bash, cwd=at, env=environment, capture_output=True, text=True, timeout=300)
+        status, log = done.returncode, log + done.stdout + done.stderr
+        if status:
+            break
+    found = re.findall(r"(\w+)<<(\w+)\n(.*?)\n\2\n", paths["GITHUB_OUTPUT"].read_text(), re.DOTALL)
+    return Outcome(status, paths["GITHUB_STEP_SUMMARY"].read_text(), {name: text for name, _, text in found}, log)
+
+
+def evaluated(text: str, inputs: dict[str, str]) -> str:
+    return EXPRESSION.sub(lambda match: inputs[match[1].removeprefix("inputs.")], text)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """A copy of the worked repository, with a change of its filter, and its trials; one for each change."""
+
+    @cache
+    def make(sigma_fix: str = "0.3") -> Path:
+        at = tmp_path_factory.mktemp("runner") / "workspace"
+        shutil.copytree(REPOSITORY, at, ignore=shutil.ignore_patterns("__pycache__", "*.csv"))
+        text = (at / "cart/ekf.py").read_text()
+        assert "SIGMA_FIX = 0.3" in text
+        (at / "cart/ekf.py").write_text(text.replace("SIGMA_FIX = 0.3", f"SIGMA_FIX = {sigma_fix}"))
+        subprocess.run([sys.executable, "simulate.py"], cwd=at, check=True)
+        return at
+
+    return make
+
+
+(USE,) = action.require_uses((REPOSITORY / ".github/workflows/consistency.yml").read_text())
+INPUTS = {name.replace("-", "_"): value for name, value in USE["with"].items()} | {"install": "false"}
+
+
+def test_an_honest_filter_passes(workspace: Callable[..., Path]) -> None:
+    """False-alarm rate 1e-3 of the estimates, but their seed is the repository's; the gates have 1e-6."""
+    done = run_action(workspace(), **INPUTS)
+    assert done.status == 0, done.log
+    assert done.summary.startswith("## Consistency: pass\n\n| what | verdict |")
+    lines = done.summary.splitlines()[4:-1]
+    assert [line.split(" | ")[1] for line in lines] == [
+        "consistent", "overconfident (expected)", "consistent", "not worse",
+    ]  # fmt: skip
+    assert all(len(re.findall(r"(?<!\\)\|", line)) == 6 for line in lines)
+    report = Path(done.outputs["report"])
+    assert (done.outputs["verdict"], report.name) == ("pass", "consistency-report")
+    assert {"gates.json", "estimates"} == {path.name for path in report.iterdir()}
+    assert (report / "estimates/report.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("fail_on", "status"), [("inconsistent", 1), ("worse", 1), ("nothing", 0)])
+def test_an_overconfident_filter_fails(workspace: Callable[..., Path], fail_on: str, status: int) -> None:
+    done = run_action(workspace("0.2"), **{**INPUTS, "fail_on": fail_on, "tests": ""})
+    assert done.status == status, done.log
+    assert done.outputs["verdict"] == "fail"
+    assert re.search(
+        r"\| estimates.csv: estimates \| overconfident \| x1\.\d+ \[1\.\d+, \d\.\d+\] \| 120 ", done.summary
+    )
+    assert "covariance too small by" in done.summary
+    assert "| worse |" in done.summary
+    assert "::error" in done.log
+
+
+def test_a_gate_that_fails_is_in_the_summary(workspace: Callable[..., Path]) -> None:
+    done = run_action(workspace("0.15"), install="false", tests="tests -k consistent")
+    assert (done.status, done.outputs["verdict"]) == (1, "fail")
+    assert "test_the_ekf_is_consistent | overconfident | x" in done.summary
+
+
+WRONG = {
+    "nothing to judge": ({}, "neither tests nor estimates are given"),
+    "no such file": ({"estimates": "nowhere.csv"}, "estimates: nowhere.csv: no such file"),
+    "no truth": ({"estimates": "estimates.csv"}, "estimates: estimates.csv: exit status 2; the log says why"),
+    "unknown fail-on": ({"tests": "tests", "fail_on": "always"}, "fail-on: must be one of inconsistent, worse, noth"),
+    "two to compare": ({"estimates": "a.csv\nb.csv", "compare_with": "old.json"}, "compare-with: needs one entry"),
+    "worse than what": ({"estimates": "estimates.csv", "fail_on": "worse"}, "worse than what?"),
+    "no such tests": ({"tests": "nowhere"}, "tests: nowhere: pytest ended with exit status 4"),
+    "no test": ({"tests": "tests -k nothing_of_that_name"}, "no test was found"),
+    "no gate": ({"tests": "test_plain.py"}, "no gate ran"),
+    "open quote": ({"tests": "'tests"}, "tests: No closing quotation"),
+    "a file for the reports": ({"tests": "tests", "report": "simulate.py"}, "is not a folder"),
+    "no such baseline": ({"estimates": "estimates.csv", "compare_with": "old.json"}, "compare-with: old.json: no such"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_inputs(workspace: Callable[..., Path], case: str) -> None:
+    """Exit 2 and one line that names the input, in the log and in the summary."""
+    inputs, expected = WRONG[case]
+    at = workspace()
+    (at / "test_plain.py").write_text("def test_plain():\n    pass\n")
+    done = run_action(at, install="false", **inputs)
+    assert done.status == 2, done.log
+    (line,) = re.findall(r"^::error title=Consistency gate::(.*)$", done.log, re.MULTILINE)
+    assert expected in line
+    assert done.outputs["verdict"] == "unusable"
+    assert done.summary.startswith("## Consistency: unusable\n")
+    assert "Traceback" not in done.log
+
+
+def test_an_input_is_never_run_by_the_shell(workspace: Callable[..., Path]) -> None:
+    at = workspace()
+    hostile = '$(touch broken) `touch broken`; touch broken #"'
+    for name in ("estimates", "compare_with", "report", "tests", "options", "fail_on"):
+        done = run_action(at, **{"install": "false", "estimates": "estimates.csv", name: hostile})
+        assert done.status == 2, name
+    assert not (at / "broken").exists()
+
+
+def test_installs_what_is_asked_for(
+    workspace: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a stand-in for pip: the version of the action itself by default."""
+    bin = tmp_path / "bin"
+    bin.mkdir()
+    fake = bin / "python"
+    fake.write_text(f'#!/bin/sh\nprintf "%s\\n" "$@" >> {tmp_path}/said\nexit 3\n')
+    fake.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(fake))
+    at = tmp_path / "empty"
+    at.mkdir()
+    assert run_action(at, tests="tests").status == 3
+    *_, source, pytest_ = (tmp_path / "said").read_text().split("\n")[:-1]
+    assert pytest_ == "pytest"
+    assert Path(source).resolve() == ROOT
+    assert run_action(at, tests="tests", package="filter-consistency==0.1.0; touch broken").status == 3
+    assert "filter-consistency==0.1.0; touch broken\npytest\n" in (tmp_path / "said").read_text()
+    assert not (at / "broken").exists()

@@ -12,10 +12,10 @@ reproduce: .venv/.done
 	$(BIN)/consistency reproduce --overwrite
 
 test: .venv/.done
-	$(BIN)/python -m pytest -n 2 -m "not slow and not browser"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser"
 
 test-all: .venv/.done
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 calibrate: .venv/.done
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py \

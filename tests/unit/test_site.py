@@ -103,6 +103,8 @@ def test_an_empty_folder_is_no_site(tmp_path: Path) -> None:
         ("scenarios/README.md", "docs/generated/scenarios", "[a](../docs/sensor.md#b)", "[a](../sensor.md#b)"),
         ("scenarios/README.md", "docs/generated/scenarios", "[a](../experiments/README.md)", "[a](experiments.md)"),
         ("CONTRIBUTING.md", "docs/generated/contributing", "[a](LICENSE)", "a"),
+        ("README.md", "docs/generated/readme", "![a](docs/images/regime.png)", "![a](../images/regime.png)"),
+        ("docs/method.md", "docs/method.md", "[a](../README.md#b)", "[a](generated/readme.md#b)"),
     ],
 )
 def test_links_lead_to_pages_of_the_site(source: str, page: str, link: str, expected: str) -> None:

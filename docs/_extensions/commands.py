@@ -26,9 +26,7 @@ INDEX = """# Command line
 
 ## Exit status
 
-{statuses}
-"""
-STATUSES = """| status | meaning |
+| status | meaning |
 | --- | --- |
 | 0 | done |
 | 1 | the verdict asked for failed (`--fail-on`, `reproduce`) |
@@ -46,10 +44,11 @@ def write_commands(app: Sphinx) -> None:
     listing = []
     for name, body in pages.items():
         body = re.sub(r"^\* .*", lambda line: OPTION.sub(r"`\g<0>`", line[0]), body, flags=re.MULTILINE)
+        body = re.sub(r"\bdocs/([\w-]+\.md)", r"[\g<0>](../../\1)", body)
         body = EXAMPLES.sub(lambda found: f"**Examples**:\n\n```console\n{plain(found[1])}```\n", body)
         write_changed(FOLDER / "commands" / f"{name}.md", f"# consistency {name}\n{body}")
         listing.append(f"- [{name}]({name}.md): {body.strip().splitlines()[0]}")
-    index = INDEX.format(listing="\n".join(listing), names="\n".join(pages), statuses=STATUSES)
+    index = INDEX.format(listing="\n".join(listing), names="\n".join(pages))
     write_changed(FOLDER / "commands" / "index.md", index)
 
 

@@ -126,6 +126,7 @@ def test_every_command_has_a_page_with_its_examples(tmp_path: Path, monkeypatch:
         assert "\x08" not in text
         for line in EXAMPLES.get(name, ()):
             assert f"$ consistency {line}\n" in text
+    assert "dask or slurm ([docs/cluster.md](../../cluster.md))" in pages["run"]
     assert "As many runs as the verdict takes, instead of `--runs`." in pages["run"]
 
 
@@ -183,7 +184,7 @@ def test_a_parameter_keeps_its_shape_in_the_description() -> None:
         Raises
         ------
         ValueError
-            A : B.
+            A : B. See docs/files.md.
 
         >>> 1
         1
@@ -192,7 +193,7 @@ def test_a_parameter_keeps_its_shape_in_the_description() -> None:
     at = lines.index("errors, P")
     assert lines[at + 1 : at + 3] == ["    (runs, n), truth minus estimate; (runs, n, n),", "    in squared units"]
     assert ": What there is: all of it" in lines
-    assert "    A : B." in lines
+    assert "    A : B. See :doc:`docs/files.md </files>`." in lines
     assert lines[lines.index(">>> 1") - 2] == "Examples"
 
 

@@ -162,6 +162,17 @@ def test_every_public_name_stands_in_the_reference() -> None:
     assert public - documented() == set()
 
 
+def test_what_a_guide_imports_stands_in_the_reference() -> None:
+    """Except for the guide to what is inside."""
+    missing = {}
+    for page in set(DOCS.glob("*.md")) - {DOCS / "extending.md", DOCS / "architecture.md"}:
+        for block in re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL):
+            for module, names in re.findall(r"^from (consistency\S*) import ([^#\n]*)", block, re.MULTILINE):
+                imported = {f"{module}.{name.strip()}" for name in names.split(",")}
+                missing |= dict.fromkeys(imported - documented(), page.name)
+    assert missing == {}
+
+
 def described(text: str, what: str = "function") -> list[str]:
     lines = inspect.cleandoc(text).split("\n")
     docstrings.describe(None, what, "name", None, None, lines)

@@ -23,6 +23,7 @@ from typing import Any
 
 import pytest
 import typer
+from document_inputs import NOT_RUN
 from documents import PAGES, PROGRAMS, ROOT, SHELL, Block, Command, blocks, commands, parsed, read, typed
 
 import consistency as cs
@@ -295,3 +296,13 @@ def test_nothing_that_looks_like_a_command_is_missed() -> None:
         seen = " ".join(command.text for command in commands(page))
         missed = [line for line in lines if line.split("#")[0].split("[")[0].rstrip("\\ ") not in seen]
         assert not missed
+
+
+# --- what is not run ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("page", "begin", "why"), NOT_RUN)
+def test_what_is_not_run_is_still_in_the_documents(page: str, begin: str, why: str) -> None:
+    found = [command.text for command in commands(page)] + [block.text for block in blocks(page, *PYTHON)]
+    assert any(text.startswith(begin) for text in found)
+    assert all((ROOT / path).exists() for path in re.findall(r"tests/\S+\.py", why))

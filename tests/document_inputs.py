@@ -41,7 +41,7 @@ NOT_RUN = [
     ("docs/files.md", "joint = marginals", "tests/oracle/test_gtsam_windows.py does the same"),
     ("docs/front-end.md", "from consistency.vision.shared", "tests/unit/test_vision_shared.py has its inputs"),
     ("docs/front-end.md", "python experiments/e11", REAL),
-    ("docs/guards.md", "consistency run", "compiles two guarded filters for a minute; tests/unit/test_guards.py runs such"),
+    ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/test_guards.py runs such"),
     ("docs/kitti07.md", "", REAL),
     ("docs/planar.md", "", f"{STUDY}; e15: {REAL}"),
     ("docs/regime.md", "consistency sweep regime --out regime --filter", "compiles two more filters for one cell"),
@@ -277,17 +277,19 @@ def names_of(page: str, folder: Path) -> dict[str, Any]:
     world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     if page == "docs/gates.md":
         from consistency.testing import assert_not_worse
+        from consistency.verdicts.comparison import write_baseline
 
         done = cs.run_trials(world, ["ekf-uvd", "ekf-xyz"], runs=60, seed=5, jobs=1)
-        done.write(folder / "done")
+        write_baseline(done, folder / "baseline.json")
         e, covariance = np.random.default_rng().normal(size=(200, 20, 3)), np.broadcast_to(np.eye(3), (200, 20, 3, 3))
         arrays = dict.fromkeys(("errors_new", "errors_old"), e) | dict.fromkeys(
             ("covariances_new", "covariances_old"), covariance
         )
         return {"assert_not_worse": assert_not_worse, "results": done, **arrays}
     if page == "docs/front-end.md":
-        names = [f"IMAGES/image_{side}/00000{k}.png" for k in (0, 1) for side in (0, 1)]
-        return {"paths": names}
+        return {"paths": [folder / f"IMAGES/image_{side}/00000{k}.png" for k in (0, 1) for side in (0, 1)]}
+    if page == "docs/long-runs.md":
+        return {"cs": cs, "scenario": cs.load_scenario("herath2007-stereo")}
     return {"cs": cs, "scenario": world, "my_filter": Wrapped()}
 
 

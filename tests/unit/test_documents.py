@@ -112,6 +112,7 @@ def findings() -> list[str]:
 @pytest.mark.parametrize("words", ["run herath2007-sterio --filter ekf-uvd --out o", "reproduce --only fig99",
     "run herath2007-stereo --filter ekf-uvdd --out o", "run herath2007-stereo --filter ekf-uvd --out o --runs many",
     "run herath2007-stereo --filter ekf-uvd --out o --run 5", "analise results", "sweep regimes --out o",
+    "run herath2007-stereo --filter ekf-uvd --out o --runs N",
     "run herath2007-stereo --filter ekf-uvd", "tune herath2007-stereo --filter ekf"])  # fmt: skip
 def test_the_command_line_does_not_take(words: str) -> None:
     """Negative control."""

@@ -30,7 +30,7 @@ STUDY = "takes from half a minute to hours even with two runs; tests of its expe
 REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
 NOT_RUN = [
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
-    ("docs/cluster.md", "consistency run", "needs a cluster; test_dask_cli.py and test_slurm.py stand in for it"),
+    ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and tests/unit/test_slurm.py stand in"),
     ("docs/consistent.md", "consistency reproduce", STUDY),
     ("docs/conventions.md", "", "tests/unit/test_conventions.py runs all of it"),
     ("docs/extending.md", "", "tests/unit/test_extending.py follows it in a copy of the package"),

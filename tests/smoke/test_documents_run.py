@@ -1,7 +1,7 @@
 """Every command and piece of code of README and docs, run in the order of its page, on small inputs and few runs.
 
 A page has an empty folder with the files that tests/document_inputs.py makes for it. What cannot be run stands there in
-``NOT_RUN``; tests/unit/test_documents.py parses that, too.
+``NOT_RUN``; tests/unit/test_documents.py parses that, too, and commands that a sentence mentions.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from consistency.cli import main
 
 pytestmark = pytest.mark.slow
 
-ELSEWHERE = {
+OF_THE_CHECKOUT = {"bash", "git", "make", "pip", "pre-commit"}  # they install, test or measure all of it
     "bash",
     "git",
     "make",
@@ -113,8 +113,8 @@ def runs(block: Block) -> bool:
 
 
 def runs_command(command: Command) -> bool:
-    ours = command.words[0] in ("consistency", "python", "pytest")
-    return ours and not command.synopsis and not inputs.not_run(command.page, command.text)
+    left_out = command.synopsis or command.words[0] in OF_THE_CHECKOUT
+    return not left_out and not inputs.not_run(command.page, command.text)
 
 
 ALL = [(name, found) for page in PAGES for name, found in parts(page) if any(map(runs, found))]
@@ -137,9 +137,9 @@ def test_it_runs(
             if command.words[0] == "consistency":
                 printed += run_command(command, capsys, monkeypatch)
             else:
-                run_process(
-                    *(["-m"] if command.words[0] == "pytest" else []), *command.words[command.words[0] == "python" :]
-                )
+                program, *words = command.words
+                assert program in ("python", "pytest"), command
+                run_process(*(["-m", "pytest"] if program == "pytest" else []), *words)
     if page in PRINTED:
         (shown,) = (block for block in found if block.language == "text" and block.text.startswith(PRINTED[page]))
         assert form(shown.text.splitlines()[0]) in map(form, printed.splitlines())

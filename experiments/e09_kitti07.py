@@ -1,9 +1,10 @@
 """What do the filters get wrong on a recorded drive, KITTI odometry 07 with drifting and slipping tracks?
 
-    python experiments/e09_kitti07.py --data DIR --out DIR [--jobs J] [--overwrite]
+    python experiments/e09_kitti07.py --data DIR --out DIR [--truth FILE] [--jobs J] [--overwrite]
 
-DIR of ``--data`` holds 0027.npz and kitti07_gt.txt (course ECE276A; KITTI's licence, CC BY-NC-SA: not shipped).
-What is in them and how it becomes a log: docs/kitti07.md.
+``--data`` is a file of tracks (.npz, course ECE276A), or a folder with one such file and one .txt of true poses:
+0027.npz and kitti07_gt.txt, or those of another drive (KITTI's licence, CC BY-NC-SA: not shipped). What is in them and
+how it becomes a log: docs/kitti07.md.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ else:
 
 FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
 
-MAIN, UNGATED, FIVE, TWIN = "kitti07", "kitti07-ungated", "kitti07-five-slots", "kitti07-white-twin"
-ORIGIN, LICENCE = "KITTI odometry 07 (raw drive 2011_09_30_0027), tracks of course ECE276A", "CC BY-NC-SA 3.0"
+MAIN, UNGATED, FIVE, TWIN = "", "-ungated", "-five-slots", "-white-twin"  # after the name of the drive
+NAMES = {"0027": "kitti07"}  # of drives, by their file; others are called as it is
+ORIGIN, LICENCE = "KITTI, tracks of course ECE276A", "CC BY-NC-SA 3.0"
 FILTERS = ("ukf-xyz", "ukf-uvd", "ekf-xyz", "ekf-uvd")  # slowest first
 SETTLED = 20  # steps: before, the covariance is nearly singular across the track (start known, no lateral noise)
 ALARM = 0.05  # chance that a consistent filter is called inconsistent, over all steps at once
@@ -55,8 +57,8 @@ TWIN_NIS = 0.10  # distance of the twin's NIS/dof from 1 that linearisation may 
 ACCEPT = {
     "consistency": f"in every filter the NEES exceeds, in some step after {SETTLED}, the bound that a consistent one "
     f"exceeds anywhere with at most {ALARM:.0%} (Bonferroni: holds however the steps depend on each other)",
-    "nis-blind": "in every filter NIS/dof lies below its 95 % interval while kitti07-consistency holds; in the twin "
-    f"with white pixel noise NIS/dof lies within {TWIN_NIS:.0%} of 1, so that the pixels are the cause",
+    "nis-blind": "in every filter NIS/dof lies below its 95 % interval while the finding on consistency holds; in the "
+    f"twin with white pixel noise NIS/dof lies within {TWIN_NIS:.0%} of 1, so that the pixels are the cause",
     "heading-floor": f"in every filter the last heading sigma is below {FLOOR} of the floor: where no landmark is seen "
     "on both sides of a step, its odometry noise is in the heading for good",
     "bounds": f"in every filter the heading error is within 2 sigma in less than {INSIDE:.0%} of the steps after "
@@ -74,12 +76,17 @@ def main(study: cs.Study) -> list[cs.Finding]:
     if not folder:
         print("kitti07: set CONSISTENCY_DATA to the folder that holds ece276a_stereo_tracks", file=sys.stderr)
         return []
-    return measure(study, logs_of(Path(folder) / "ece276a_stereo_tracks", study.seed))
+    tracks, truth = conversion.find_recording(Path(folder) / "ece276a_stereo_tracks")
+    return measure(study, logs_of(conversion.read_recording(tracks, truth), study.seed), name_of(tracks))
 
 
-def logs_of(folder: Path, seed: int) -> dict[str, Log]:
+def name_of(tracks: Path) -> str:
+    """What the drive of a file of tracks is called in findings."""
+    return NAMES.get(tracks.stem, tracks.stem)
+
+
+def logs_of(data: conversion.Recording, seed: int) -> dict[str, Log]:
     """The log, two other selections of its tracks, and its twin with white noise."""
-    data = conversion.read_recording(folder)
     trial, belief = conversion.log_of(data)
     trials = {
         MAIN: trial,
@@ -174,18 +181,19 @@ def run_all(logs: dict[str, Log], jobs: int) -> dict[str, Results]:
     if jobs < -1 or not jobs:
         raise cs.InputError(f"--jobs must be at least 1, or -1 for one worker a core, got {jobs}")
     workers = min(len(tasks), jobs if jobs > 0 else os.cpu_count() or 1)
-    print(f"kitti07: {len(tasks)} runs", file=sys.stderr, flush=True)
+    print(f"e09: {len(tasks)} runs", file=sys.stderr, flush=True)
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
         futures = [pool.submit(run_log, logs[log], [name], 1) for log, name in tasks]
         done = [(log, future.result()) for (log, _), future in zip(tasks, futures, strict=True)]
     return {name: joined([part for log, part in reversed(done) if log == name]) for name in logs}
 
 
-def measure(study: cs.Study, logs: dict[str, Log]) -> list[cs.Finding]:
+def measure(study: cs.Study, logs: dict[str, Log], drive: str) -> list[cs.Finding]:
     """Run everything, keep it in ``study`` and say what was found."""
-    study.kept |= run_all(logs, study.jobs)
-    on = {name: measured(study.kept[MAIN], name) for name in study.kept[MAIN].filters}
-    ungated, five, twin = (measured(study.kept[name], "ekf-uvd") for name in (UNGATED, FIVE, TWIN))
+    results = run_all(logs, study.jobs)
+    study.kept |= {f"{drive}{name}": each for name, each in results.items()}
+    on = {name: measured(results[MAIN], name) for name in results[MAIN].filters}
+    ungated, five, twin = (measured(results[name], "ekf-uvd") for name in (UNGATED, FIVE, TWIN))
     trial, belief = logs[MAIN].trials[0], logs[MAIN].belief
     floor, unlinked = heading_floor(trial, belief.motion.sigma_omega), len(unlinked_steps(trial))
     every, uvd, steps = list(on.values()), on["ekf-uvd"], trial.steps
@@ -195,8 +203,8 @@ def measure(study: cs.Study, logs: dict[str, Log]) -> list[cs.Finding]:
         return "; ".join(f"{name} {text.format(m=m, ratio=m.sigma_heading / floor)}" for name, m in on.items())
 
     def found(holds: bool, name: str, statistic: str, **text: str) -> cs.Finding:
-        text |= {"id": f"kitti07-{name}", "statistic": statistic, "accept": ACCEPT[name]}
-        return replace(study.finding(bool(holds), scenario=MAIN, **text), runs=1)
+        text |= {"id": f"{drive}-{name}", "statistic": statistic, "accept": ACCEPT[name]}
+        return replace(study.finding(bool(holds), scenario=drive, **text), runs=1)
 
     return [
         found(
@@ -258,21 +266,32 @@ def measure(study: cs.Study, logs: dict[str, Log]) -> list[cs.Finding]:
 def command(arguments: Sequence[str] | None = None) -> None:
     """Write OUT as `consistency reproduce` does, and the log itself as OUT/log."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, text in (("--data", "folder with 0027.npz and kitti07_gt.txt"), ("--out", "folder to write")):
-        parser.add_argument(name, type=Path, required=True, help=text)
+    parser.add_argument("--data", type=Path, required=True, help="file of tracks, or a folder with one and its truth")
+    parser.add_argument("--truth", type=Path, help="true poses [the .txt file beside the tracks]")
+    parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--jobs", type=int, default=-1, help="workers; -1 is one a core")
     parser.add_argument("--overwrite", action="store_true", help="replace an output folder of this bench")
     given = parser.parse_args(arguments)
     require_free(given.out, given.overwrite, "findings")
     study, started = cs.Study(runs=1, seed=0, jobs=given.jobs), time.monotonic()
-    logs = logs_of(given.data, study.seed)
+    tracks, truth = conversion.find_recording(given.data, given.truth)
+    data = conversion.read_recording(tracks, truth)
+    logs = logs_of(data, study.seed)
     wall = time.monotonic() - started
     manifest = manifest_of(
-        kind="log", seed=None, runs=1, wall=wall, complete=True, failures=0, origin=ORIGIN, licence=LICENCE
+        kind="log",
+        seed=None,
+        runs=1,
+        wall=wall,
+        complete=True,
+        failures=0,
+        origin=f"{ORIGIN}: {tracks.name}",
+        licence=LICENCE,
     )
-    findings = measure(study, logs)
+    findings = measure(study, logs, name_of(tracks))
     study.write(given.out, findings, time.monotonic() - started, given.overwrite)
-    write_log(given.out / "log", logs[MAIN].trials, logs[MAIN].belief, None, manifest, view=conversion.VIEW)
+    view = (data.size, (float(data.centre[0]), float(data.centre[1])))
+    write_log(given.out / "log", logs[MAIN].trials, logs[MAIN].belief, None, manifest, view=view)
     print_findings(findings)
     print(f"results in {given.out}, the log in its folder log; next: consistency report {given.out}")
 

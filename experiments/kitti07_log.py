@@ -1,4 +1,4 @@
-"""Stereo tracks of KITTI odometry 07 (course ECE276A) as a planar log; why each step is there: docs/kitti07.md.
+"""Stereo tracks of a KITTI drive (course ECE276A) as a planar log; why each step is there: docs/kitti07.md.
 
 Only :func:`planar_truth` reads the ground truth: controls, observations and where a track is cut come from the
 recording alone. Pixels are (u, v, d): right of the principal point, below it, left minus right column.
@@ -6,7 +6,6 @@ recording alone. Pixels are (u, v, d): right of the principal point, below it, l
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,12 @@ import pandas as pd
 
 from consistency.errors import InputError
 from consistency.geometry import rotation
+from consistency.reading import reading
 from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.types import Array, Trial
 from consistency.vision import tracks
+from consistency.vision.common_motion import screened
+from consistency.vision.sequence import read_table
 from consistency.vision.tracks import PIXELS
 
 SIGMA_V, SIGMA_OMEGA = 0.5, 0.05  # m/s, rad/s: white noise that the course added to the velocities
@@ -26,13 +28,13 @@ SIGMA_PX = (1.0, 3.3, 0.7)  # rms of u, v, d against the planar truth; v carries
 MAX_AGE = 12  # observations of a landmark: beyond, drift exceeds 1 px rms
 MIN_LIFE = 2  # observations: fewer tell a filter nothing
 MIN_DISPARITY = 8.0  # px, 47 m: sigma_d / d below 9 %
-GATE_PX = np.array([2.0, 2.0, 1.0])  # misfit in u, v, d from frame to frame that ends a piece
+GATE_PX = np.array([2.0, 2.0, 1.0])  # misfit in u, v, d from frame to frame where a landmark begins anew
 SLOTS = 4  # landmarks seen at once
 BANDS = 3  # image columns that the slots are spread over
-WIDTH, HEIGHT = 1226, 370  # px
-VIEW = ((WIDTH, HEIGHT), (601.8873, 183.1104))  # image and principal point of the rectified left camera, px
+SIZES = {  # px, rectified images by their focal length in px: calib_cam_to_cam.txt of the five days of KITTI raw
+    721.5377: (1242, 375), 707.0493: (1224, 370), 718.3351: (1238, 374), 707.0912: (1226, 370), 718.8560: (1241, 376),
+}  # fmt: skip
 KITTI_FROM_SENSOR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # right, down, forward <- forward, left, up
-FILES = ("0027.npz", "kitti07_gt.txt")
 
 
 @dataclass(frozen=True)
@@ -49,25 +51,48 @@ class Recording:
     axes: Array  # (3, 3), KITTI camera axes <- robot axes
     lever: Array  # (3,), camera in the robot frame, m
     poses: Array  # (T + 1, 3, 4), camera k -> camera 0, KITTI axes
+    size: tuple[int, int]  # width and height of the image, px
 
 
-def read_recording(folder: Path) -> Recording:
-    """Both files of ``folder``.
+def find_recording(at: Path, truth: Path | None = None) -> tuple[Path, Path]:
+    """The tracks (.npz) and the truth (.txt) of a folder, or of a file of tracks and the folder that it is in.
 
     Raises
     ------
     InputError
-        A file or array is missing, has another shape, or holds a value that is not finite.
+        There is none of one of them, or more than one.
     """
-    path, truth = (folder / name for name in FILES)
-    try:
-        with np.load(path) as archive:
-            data = {name: np.asarray(archive[name]) for name in archive.files}
-        rows = np.loadtxt(truth, ndmin=2)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        missing = [name for name in FILES if not (folder / name).is_file()]
-        what = f"{missing[0]} is missing" if missing else str(error).splitlines()[0]
-        raise InputError(f"--data {folder}: {what}; it must hold {' and '.join(FILES)}") from None
+    folder = at if at.is_dir() else at.parent
+    tracks_file = _only(folder, "*.npz", "tracks", "--data FILE") if at.is_dir() else at
+    return tracks_file, truth or _only(folder, "*.txt", "true poses", "--truth FILE")
+
+
+def _only(folder: Path, pattern: str, what: str, remedy: str) -> Path:
+    found = sorted(folder.glob(pattern))
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found) or "none"
+        raise InputError(f"--data {folder}: must hold one file {pattern} of {what}, holds {names}; {remedy} names it")
+    return found[0]
+
+
+def read_recording(path: Path, truth: Path) -> Recording:
+    """Tracks and true poses of a drive.
+
+    Parameters
+    ----------
+    path : archive with features, time_stamps, linear_velocity, rotational_velocity, K, b and cam_T_imu
+    truth : a line a frame from the first on, 12 numbers as KITTI's, or a time and 12; frames without are left out
+
+    Raises
+    ------
+    InputError
+        A file or array is missing, has another shape, or holds a value that is not finite; the camera is none of KITTI.
+    """
+    with reading(path, "is not an archive of tracks"), np.load(path) as archive:
+        data = {name: np.asarray(archive[name]) for name in archive.files}
+    rows = read_table(truth, None, "is not a table of finite numbers")
+    if rows.shape[1] not in (12, 13) or len(rows) < 2:
+        raise InputError(f"{truth}: must hold 12 numbers a line, or a time and 12, for two frames or more")
     frames = len(rows)
     shapes: dict[str, tuple[int, ...]] = {
         "features": (4, -1, -1), "time_stamps": (1, -1), "linear_velocity": (3, -1), "rotational_velocity": (3, -1),
@@ -75,14 +100,24 @@ def read_recording(folder: Path) -> Recording:
     }  # fmt: skip
     for name, shape in shapes.items():
         _require(path, name, data.get(name), shape, frames)
-    _require(truth, "rows", rows, (-1, 13), 2)
     return Recording(
         data["features"][:, :, :frames], data["time_stamps"][0, :frames], data["linear_velocity"][:, :frames],
         data["rotational_velocity"][:, :frames], float(data["K"][0, 0]), data["K"][:2, 2], float(data["b"]),
         data["cam_T_imu"][:3, :3],
         data["cam_T_imu"][:3, 3],  # despite its name: the camera's position in the IMU frame
-        rows[:, 1:].reshape(-1, 3, 4),
+        rows[:, -12:].reshape(-1, 3, 4),
+        image_size(float(data["K"][0, 0]), f"{path}: array 'K'"),
     )  # fmt: skip
+
+
+def image_size(f: float, where: str) -> tuple[int, int]:
+    """Width and height (px) of KITTI's rectified images of focal length ``f`` (px)."""
+    known = min(SIZES, key=lambda each: abs(each - f))
+    if abs(known - f) > 0.01:
+        raise InputError(
+            f"{where}: no rectified camera of KITTI has f = {f:g} px; they have {', '.join(map(str, SIZES))}"
+        )
+    return SIZES[known]
 
 
 def _require(path: Path, name: str, value: Any, shape: tuple[int, ...], least: int) -> None:
@@ -91,7 +126,10 @@ def _require(path: Path, name: str, value: Any, shape: tuple[int, ...], least: i
         raise InputError(f"{path}: array '{name}' is missing")
     fits = value.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, value.shape, strict=False))
     if not fits or (-1 in shape and value.shape[len(shape) - 1 - shape[::-1].index(-1)] < least):
-        raise InputError(f"{path}: array '{name}' has shape {value.shape}, not that of the recording")
+        wanted = " x ".join("any" if want == -1 else str(want) for want in shape) or "one number"
+        raise InputError(
+            f"{path}: array '{name}' has shape {value.shape}; must be {wanted}, for the {least} frames of the truth"
+        )
     if value.dtype.kind not in "fiu" or not np.isfinite(value).all():
         raise InputError(f"{path}: array '{name}' holds something that is not a finite number")
 
@@ -102,12 +140,22 @@ def log_of(data: Recording, slots: int = SLOTS, gated: bool = True) -> tuple[Tri
     Parameters
     ----------
     slots : landmarks seen at once, at most
-    gated : whether a track ends where it disagrees with the common motion
+    gated : whether a landmark begins anew where it leaves the common motion
     """
-    pieces = fresh_observations(data)
-    seen = thinned(consistent_pieces(pieces, data) if gated else pieces, slots)
-    truth = planar_truth(data)
-    trial = Trial(
+    mount = Mount(position=tuple(data.lever), rotation=roll_pitch_heading(data.axes.T @ KITTI_FROM_SENSOR))
+    sensor = BelievedSensor(model="uvd", sigma=SIGMA_PX, f=data.f, B=data.B, mount=mount)
+    belief = Belief(motion=BelievedMotion(sigma_v=SIGMA_V, sigma_omega=SIGMA_OMEGA), sensor=sensor)
+    rows = fresh_observations(data)
+    if gated:
+        [trial] = screened([trial_of(data, rows.rename(columns={"piece": "landmark"}))], belief, GATE_PX).trials
+        rows = rows_of(trial)
+    return trial_of(data, thinned(rows, slots, data.size[0])), belief
+
+
+def trial_of(data: Recording, rows: pd.DataFrame) -> Trial:
+    """All rows (step, landmark, z0, z1, z2) after step 0 as a trial."""
+    seen, truth = rows[rows["step"] >= 1].sort_values("step", kind="stable"), planar_truth(data)
+    return Trial(
         run=0,
         start=np.zeros(3),
         controls=np.column_stack([np.diff(data.stamps), data.velocity[0, 1:], data.turn_rate[2, 1:]]),
@@ -117,9 +165,13 @@ def log_of(data: Recording, slots: int = SLOTS, gated: bool = True) -> tuple[Tri
         n_landmarks=int(seen["landmark"].max()) + 1,
         truth=truth,
     )
-    mount = Mount(position=tuple(data.lever), rotation=roll_pitch_heading(data.axes.T @ KITTI_FROM_SENSOR))
-    sensor = BelievedSensor(model="uvd", sigma=SIGMA_PX, f=data.f, B=data.B, mount=mount)
-    return trial, Belief(motion=BelievedMotion(sigma_v=SIGMA_V, sigma_omega=SIGMA_OMEGA), sensor=sensor)
+
+
+def rows_of(trial: Trial) -> pd.DataFrame:
+    """Rows (piece, step, z0, z1, z2) of a trial, a piece of a track for each landmark."""
+    step = np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
+    rows = pd.DataFrame(trial.z, columns=PIXELS).assign(piece=trial.landmark, step=step)
+    return rows.sort_values(["piece", "step"], ignore_index=True)
 
 
 # --- the pose --------------------------------------------------------------------------------
@@ -183,64 +235,9 @@ def continued(track: Array, step: Array) -> Array:
     return np.concatenate([[False], (np.diff(track) == 0) & (np.diff(step) == 1)])[: len(track)]
 
 
-def consistent_pieces(rows: pd.DataFrame, data: Recording) -> pd.DataFrame:
-    """Cut pieces where they disagree with the motion that most tracks agree on (moving cars, slips)."""
-    piece, steps, pixels = rows["piece"].to_numpy(), rows["step"].to_numpy(), rows[PIXELS].to_numpy()
-    now = np.flatnonzero(np.concatenate([[False], np.diff(piece) == 0]))
-    broken = np.zeros(len(rows), dtype=bool)
-    for step in np.unique(steps[now]):
-        here = now[steps[now] == step]
-        broken[here] = ~agrees(pixels[here - 1], pixels[here], *velocity_prior(data, step), data.f, data.B)
-    starts = np.concatenate([[True], np.diff(piece) != 0]) | broken
-    return rows.assign(piece=np.cumsum(starts))
-
-
-def velocity_prior(data: Recording, step: int) -> tuple[Array, Array]:
-    """Move of the camera from step - 1 to step (shift in m, small rotation in rad; KITTI axes) and its sigma."""
-    dt = data.stamps[step] - data.stamps[step - 1]
-    turn, speed = data.turn_rate[:, step], data.velocity[:, step] + np.cross(data.turn_rate[:, step], data.lever)
-    move = np.concatenate([data.axes @ speed, data.axes @ turn]) * dt
-    return move, np.repeat([SIGMA_V, SIGMA_OMEGA], 3) * dt
-
-
-def agrees(before: Array, after: Array, mean: Array, sigma: Array, f: float, B: float) -> Array:
-    """Which pairs of pixels (n, 3) fit their common motion: ten reweighted least squares steps from the prior."""
-    points = np.column_stack([before[:, :2], np.full(len(before), f)]) * (B / before[:, 2])[:, None]
-    move, soft = mean.copy(), 0.5 * GATE_PX
-    for _ in range(10):
-        misfit, slope = _misfit_and_slope(points, after, move, f, B)
-        weight = 1 / (1 + ((misfit / soft) ** 2).sum(axis=1))
-        scaled = slope / soft[None, :, None]
-        normal = np.einsum("n,nij,nik->jk", weight, scaled, scaled) + np.diag(sigma**-2)
-        right = np.einsum("n,nij,ni->j", weight, scaled, misfit / soft) + (mean - move) / sigma**2
-        move = move + np.linalg.solve(normal, right)
-    misfit, _ = _misfit_and_slope(points, after, move, f, B)
-    return np.asarray((np.abs(misfit) <= GATE_PX).all(axis=1))
-
-
-def _misfit_and_slope(points: Array, seen: Array, move: Array, f: float, B: float) -> tuple[Array, Array]:
-    """Seen minus predicted (u, v, d), and the derivative of the prediction by (shift, rotation)."""
-    back = _rodrigues(move[3:])
-    moved = (points - move[:3]) @ back
-    x, y, depth = moved[:, 0], moved[:, 1], np.maximum(moved[:, 2], 0.5)
-    predicted = np.column_stack([x, y, np.full(len(x), B)]) * (f / depth)[:, None]
-    by_point = np.zeros((len(x), 3, 3))
-    by_point[:, 0, 0] = by_point[:, 1, 1] = f / depth
-    by_point[:, :, 2] = -predicted / depth[:, None]
-    by_turn = np.cross(moved[:, None, :], np.eye(3)[None]).transpose(0, 2, 1)
-    return seen - predicted, by_point @ np.concatenate([np.broadcast_to(-back.T, by_turn.shape), by_turn], axis=2)
-
-
-def _rodrigues(vector: Array) -> Array:
-    angle = float(np.linalg.norm(vector)) + 1e-12
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
-
-
 # --- few landmarks at once -------------------------------------------------------------------
 
 
-def thinned(rows: pd.DataFrame, slots: int = SLOTS) -> pd.DataFrame:
+def thinned(rows: pd.DataFrame, slots: int = SLOTS, width: int = 1226) -> pd.DataFrame:
     """Rows (step, landmark, z0, z1, z2) of at most ``slots`` landmarks at once, none older than MAX_AGE."""
-    return tracks.thinned(rows, tracks.Selection(slots, MAX_AGE, MIN_LIFE, BANDS, WIDTH))
+    return tracks.thinned(rows, tracks.Selection(slots, MAX_AGE, MIN_LIFE, BANDS, width))

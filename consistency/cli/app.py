@@ -126,7 +126,10 @@ def frontend(
         ),
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option("--truth", help="True poses: KITTI, EuRoC .csv or TUM; found if in IMAGES.")
+        Path | None,
+        typer.Option(
+            "--truth", help="True poses: KITTI, EuRoC .csv, TUM, or a drive of KITTI raw; found if in IMAGES."
+        ),
     ] = None,
     format: Annotated[
         str | None, typer.Option("--format", help="kitti, kitti-raw, euroc or opencv (plain) [by the folders].")
@@ -143,6 +146,9 @@ def frontend(
         typer.Option("--max-landmarks", help="Most landmarks in the log; filters are quadratic in them [200]."),
     ] = None,
     lever: Annotated[float, typer.Option("--lever", help="Metres from the robot's point forward to the camera.")] = 0.0,
+    planar: Annotated[
+        bool, typer.Option("--planar", help="Write the log even where the camera leaves the plane of a robot.")
+    ] = False,
     seed: Annotated[int, typer.Option("--seed", help="Seed of RANSAC.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
@@ -152,7 +158,7 @@ def frontend(
 
     settings = Settings(estimator=estimator, **_options(sigma_per_scale=sigma_per_scale))
     options = Options(
-        calibration, truth, format, left, right, rate, lever=lever, seed=seed, settings=settings,
+        calibration, truth, format, left, right, rate, lever=lever, planar=planar, seed=seed, settings=settings,
         **_options(max_landmarks=max_landmarks),
     )  # fmt: skip
     for line in write_frontend_log(images, out, options, overwrite).lines(out):
@@ -172,6 +178,14 @@ def run(
     ],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Recorded log folder instead of a scenario.")] = None,
+    screen: Annotated[
+        str | None,
+        typer.Option(
+            "--screen",
+            metavar="U,V,D",
+            help="Landmarks of a log begin anew that leave the common motion by more, in px.",
+        ),
+    ] = None,
     runs: Annotated[int | None, typer.Option("--runs", help="Number of Monte Carlo runs [default: 50].")] = None,
     until_decided: Annotated[
         bool, typer.Option("--until-decided", help="As many runs as the verdict takes, instead of --runs.")
@@ -210,6 +224,8 @@ def run(
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
+    if screen is not None and log is None:
+        raise InputError("--screen goes with --log: a scenario says which of its observations are spurious")
     planned = _options(max_runs=max_runs, detect=detect, false_alarm=false_alarm)
     if planned and not until_decided:
         raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
@@ -227,6 +243,11 @@ def run(
             if runs is not None or seed is not None or until_decided:
                 raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
             recorded = read_log(log)
+            if screen is not None:
+                from consistency.frontend.screening import screened_log, screening_line
+
+                recorded = screened_log(recorded, screen)
+                say(screening_line(recorded))
             resolve_filters(filters, recorded.belief)
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")

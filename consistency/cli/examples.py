@@ -11,6 +11,7 @@ EXAMPLES = {
         "run herath2007-stereo --filter ekf-uvd --filter ukf-uvd --out results",
         "run world.toml --filter ekf-uvd --until-decided --out results",
         "run --log log --filter ekf-uvd --out results",
+        "run --log log --screen 2,2,1 --filter ekf-uvd --out results",
     ),
     "analyse": (
         "analyse results --fail-on inconsistent",

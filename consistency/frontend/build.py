@@ -5,21 +5,21 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.frontend.planar_log import MIN_LIFE, log_of
-from consistency.frontend.truth import find_truth, read_truth
+from consistency.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of
+from consistency.frontend.truth import find_truth, missing_of_drive, read_truth
 from consistency.frontend.tum import covariance_text, motions_text, trajectory_text
-from consistency.store.log import write_log
+from consistency.store.log import View, write_log
 from consistency.store.storage import manifest_of, require_free, write_folder
 from consistency.types import Array
 from consistency.vision.features import opencv
 from consistency.vision.matching import is_rectified
 from consistency.vision.motion import RelativeMotion, Settings
 from consistency.vision.odometry import motion_covariances, trajectory, visual_odometry
+from consistency.vision.rig import StereoRig
 from consistency.vision.sequence import Sequence, read_sequence
 
 LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
@@ -39,6 +39,7 @@ class Options:
     rate: float | None = None  # Hz
     max_landmarks: int = LANDMARKS
     lever: float = 0.0  # m from the robot's point forward to the camera
+    planar: bool = False  # whether the log is written where the motions leave the plane, too
     seed: int = 0  # of RANSAC
     settings: Settings = field(default_factory=Settings)
 
@@ -68,7 +69,8 @@ class Summary:
     """What came of it."""
 
     frames: int
-    log: Logged | None  # None of fewer pairs than a log takes
+    log: Logged | None  # None of fewer pairs than a log takes, and where the motions leave the plane
+    plane: Plane | None  # None of fewer pairs than a log takes
     first: RelativeMotion
     distance: float  # m along the path
     inliers: float  # median of the motions
@@ -76,6 +78,7 @@ class Summary:
     timed: bool  # whether images had timestamps
     rate: float  # Hz
     truth: Path | None
+    lacking: tuple[str, ...] = ()  # files without which oxts of a drive is no truth
     faults: tuple[str, ...] = ()  # of motions that could not be measured
     doubts: tuple[str, ...] = ()  # of motions whose estimator far points dominate
 
@@ -84,8 +87,9 @@ class Summary:
         times = [] if self.timed else [f"the images have no times: {self.rate:g} Hz assumed, --rate says otherwise"]
         judge = f"consistency analyse {out}/trajectory.tum --truth {out}/truth.tum --covariance {out}/covariance.txt"
         windows = f"consistency analyse {out}/motions.tum --truth {out}/truth.tum --motions --relative 1"
+        oxts = f": that of oxts takes {' and '.join(self.lacking)} too" if self.lacking else ""
         judged = (
-            ["no truth found: --truth FILE takes one"]
+            [f"no truth found{oxts}; --truth FILE takes one"]
             if self.truth is None
             else [
                 f"truth from {self.truth}; next: {judge} --error so3",
@@ -99,9 +103,20 @@ class Summary:
             *([f"{bridges}, with the covariance of that; the first: {self.faults[0]}"] if self.faults else []),
             f"residuals: chi2/dof {self.noise_ratio:.2f}; 1 where the stated noise of the features "
             "(--sigma-per-scale) is right",
-            *(_motion_lines(self.first, out) if self.log is None else self.log.lines(out)),
+            *([self.plane.line] if self.plane is not None and not self.plane.holds else []),
+            *self._log_lines(out),
             *times,
             *judged,
+        ]
+
+    def _log_lines(self, out: Path) -> list[str]:
+        if self.log is not None:
+            return self.log.lines(out)
+        if self.plane is None:
+            return _motion_lines(self.first, out)
+        return [
+            f"no planar log of a camera that is not on a robot in the plane: trajectory and motions are in {out}; "
+            "--planar writes the log nevertheless"
         ]
 
 
@@ -117,7 +132,7 @@ def _motion_lines(motion: RelativeMotion, out: Path) -> list[str]:
 def write_frontend_log(images: Path, out: Path, options: Options, overwrite: bool = False) -> Summary:
     """Run the front-end on ``images`` and write the log folder ``out``, whole or not at all.
 
-    Two pairs make one motion and no log.
+    Two pairs make one motion and no log; nor do motions that leave the plane, unless ``options.planar``.
 
     Beside the files of a log: trajectory.tum and covariance.txt (error convention so3), motions.tum with covariances of
     the motions (likewise), truth.tum where known.
@@ -152,36 +167,33 @@ def write_frontend_log(images: Path, out: Path, options: Options, overwrite: boo
         settings=asdict(options.settings), timestamps="read" if sequence.timed else "assumed",
         bridged={str(k): m.fault for k, m in enumerate(motions) if m.fault},
     )  # fmt: skip
-    logged = None
+    logged = plane = None
     if kind == "log":
-        logged = _write_log(out, sequence, motions, truth, options, manifest, overwrite, files)
+        trial, belief = log_of(sequence, motions, truth, options.max_landmarks, options.lever)
+        plane = plane_of(motions, trial, belief)
+        manifest["plane"] = plane.fields
+    if plane is not None and (plane.holds or options.planar):
+        view = _view(sequence.rectification.rig)
+        write_log(out, [trial], belief, None, manifest, overwrite, view, files)
+        noise = belief.sensor.sigma, belief.motion.sigma_v, belief.motion.sigma_omega
+        logged = Logged(trial.n_landmarks, len(trial.z), *noise)
     else:
         write_folder(out, {}, manifest, lambda at: _write_texts(at, files), overwrite)
     chi2, dof = (sum(values) for values in zip(*((m.chi2, m.dof) for m in motions), strict=True))
     return Summary(
-        len(sequence), logged, motions[0],
-        float(sum(np.linalg.norm(m.pose.t) for m in motions)), float(np.median([m.inliers.sum() for m in motions])),
-        chi2 / dof, sequence.timed, (len(sequence) - 1) / float(sequence.t[-1] - sequence.t[0]), path,
-        tuple(m.fault for m in motions if m.fault), tuple(m.doubt for m in motions if m.doubt),
+        len(sequence), logged, plane, motions[0],
+        distance=float(sum(np.linalg.norm(m.pose.t) for m in motions)),
+        inliers=float(np.median([m.inliers.sum() for m in motions])),
+        noise_ratio=chi2 / dof, timed=sequence.timed,
+        rate=(len(sequence) - 1) / float(sequence.t[-1] - sequence.t[0]), truth=path,
+        lacking=() if path else tuple(missing_of_drive(sequence)),
+        faults=tuple(m.fault for m in motions if m.fault), doubts=tuple(m.doubt for m in motions if m.doubt),
     )  # fmt: skip
 
 
-def _write_log(
-    out: Path,
-    sequence: Sequence,
-    motions: list[RelativeMotion],
-    truth: tuple[Array, Array] | None,
-    options: Options,
-    manifest: dict[str, Any],
-    overwrite: bool,
-    files: dict[str, str],
-) -> Logged:
-    trial, belief = log_of(sequence, motions, truth, options.max_landmarks, options.lever)
-    rig = sequence.rectification.rig
-    view = (rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2])))
-    write_log(out, [trial], belief, None, manifest, overwrite, view, files)
-    noise = belief.sensor.sigma, belief.motion.sigma_v, belief.motion.sigma_omega
-    return Logged(trial.n_landmarks, len(trial.z), *noise)
+def _view(rig: StereoRig) -> View:
+    """Image size and principal point of the left camera."""
+    return rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2]))
 
 
 def _write_texts(folder: Path, files: dict[str, str]) -> None:

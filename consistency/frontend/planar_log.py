@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
 from consistency.errors import InputError
 from consistency.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
@@ -19,7 +22,67 @@ from consistency.vision.tracks import PIXELS, Selection, linked, thinned
 MAX_AGE, MIN_LIFE, BANDS = 12, 2, 3  # observations of a landmark at most and at least, columns: as docs/kitti07.md
 NEAR = 10.0  # standard deviations of its disparity that a landmark has at least: its range is nearly Gaussian
 MOST_SLOTS = 64  # landmarks at once
+LEAVES = 1.0 / (
+    NEAR * np.sqrt(MAX_AGE)
+)  # rad: as many such tilts, at random, come to 1 / NEAR within a landmark's life
 CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, forward <- forward, left, up
+
+
+@dataclass(frozen=True)
+class Plane:
+    """How well motions in space are those of a robot on a plane.
+
+    The log's sigma says how far landmarks are off when they are seen along the planar path. A landmark that is off by
+    more than a tenth of its distance, in any direction, is of no use to a filter that is of first order: that is the
+    same limit as on the range of a landmark, 1 / NEAR.
+    """
+
+    sigma: tuple[float, float, float]  # u, v, d, px
+    limit: tuple[
+        float, float, float
+    ]  # a tenth of the distance of a landmark: f / NEAR twice, and d / NEAR in the median
+    tilts: Array  # (T,), by which each motion rolls and pitches, rad
+
+    @property
+    def holds(self) -> bool:
+        return bool((np.array(self.sigma) <= self.limit).all())
+
+    @property
+    def leaving(self) -> int:
+        """Motions that tilt by more than LEAVES."""
+        return int((self.tilts > LEAVES).sum())
+
+    @property
+    def line(self) -> str:
+        """What leaves the plane, and by how much."""
+        (u, v, d), limits = self.sigma, ", ".join(f"{value:.0f}" for value in self.limit)
+        tilts = np.rad2deg(self.tilts)
+        return (
+            f"seen along a plane, landmarks are off by {u:.0f}, {v:.0f}, {d:.0f} px in u, v, d, and a tenth of their "
+            f"distance is {limits} px; {self.leaving} of {len(tilts)} motions tilt the camera by more than "
+            f"{np.rad2deg(LEAVES):.1f} deg ({np.median(tilts):.2g} in the median, {tilts.max():.2g} at most)"
+        )
+
+    @property
+    def fields(self) -> dict[str, object]:
+        """Entries of a manifest."""
+        tilts = np.rad2deg(self.tilts)
+        return {
+            "holds": self.holds, "sigma_px": self.sigma, "limit_px": self.limit, "motions": len(tilts),
+            "leaving": self.leaving, "tilt_deg": {"median": float(np.median(tilts)), "most": float(tilts.max())},
+        }  # fmt: skip
+
+
+def plane_of(motions: list[RelativeMotion], trial: Trial, belief: Belief) -> Plane:
+    """What of ``motions`` the planar log that :func:`log_of` makes of them leaves out."""
+    R, t = np.array([m.pose.R for m in motions]), np.array([m.pose.t for m in motions])
+    turn, _ = in_robot_axes(R, t, robot_axes(t), 0.0)
+    tilts = np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()[:, :2], axis=1)
+    sensor = belief.sensor
+    assert sensor.f is not None
+    u, v, d = sensor.sigma
+    wide = sensor.f / NEAR
+    return Plane((u, v, d), (wide, wide, float(np.median(trial.z[:, 2])) / NEAR), tilts)
 
 
 def log_of(

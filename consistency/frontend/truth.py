@@ -1,28 +1,43 @@
-"""True poses of the left camera from the files of datasets: KITTI, EuRoC / ASL, TUM."""
+"""True poses of the left camera from the files of datasets: KITTI odometry and raw, EuRoC / ASL, TUM."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from consistency.errors import InputError
 from consistency.reading import is_file, reading
+from consistency.reading.kitti import NANO, place_of, read_times
+from consistency.recording.kitti import BODIES, drive_poses, is_drive
 from consistency.recording.record import associate
 from consistency.recording.tum import UNIT, read_trajectory
 from consistency.types import Array
-from consistency.vision.sequence import Sequence, read_table
+from consistency.vision.cameras import CAMERA_0, EUROC_BODY
+from consistency.vision.sequence import RAW_CALIBRATION, Sequence, read_table
 
 MAX_DT = 0.01  # s between an image and its truth, as in `consistency analyse`
+PACKET_DT = 0.11  # s between an image of KITTI raw and a packet: one period, of 9.6 Hz
 PLACES = ("poses.txt", "mav0/state_groundtruth_estimate0/data.csv")
 NO_TABLE = "not a table of finite numbers"
 ROTATION = 1e-3  # largest entry of R'R - I; KITTI writes seven digits
 
 
 def find_truth(sequence: Sequence) -> Path | None:
-    """Where the layout keeps the truth, or None."""
+    """Where the layout keeps the truth, or None; the folder itself of a drive of KITTI raw with its calibrations."""
+    if sequence.format == "kitti-raw" and is_drive(sequence.folder):
+        return None if missing_of_drive(sequence) else sequence.folder
     return next((sequence.folder / place for place in PLACES if (sequence.folder / place).is_file()), None)
+
+
+def missing_of_drive(sequence: Sequence) -> list[str]:
+    """What oxts of a drive of KITTI raw lacks to be the truth of the camera; empty for other layouts."""
+    if sequence.format != "kitti-raw" or not is_drive(sequence.folder):
+        return []
+    names = [f"calib_{name}.txt" for name in BODIES["camera"]]
+    lacking = [name for name in names if place_of(sequence.folder, name) is None]
+    return lacking + ([] if sequence.calibration.body == CAMERA_0 else [RAW_CALIBRATION])
 
 
 def read_truth(path: Path, sequence: Sequence) -> tuple[Array, Array]:
@@ -30,17 +45,20 @@ def read_truth(path: Path, sequence: Sequence) -> tuple[Array, Array]:
 
     12 numbers a line are KITTI's (3 x 4 row by row, a line a frame); a .csv is EuRoC's (nanoseconds, position,
     quaternion w x y z, of the body, which T_BS ties to the camera); else TUM lines (seconds, position, quaternion
-    x y z w) of the left camera.
+    x y z w) of the left camera. A folder is a drive of KITTI raw: the poses of its inertial unit, as its calibrations
+    tie them to the camera, interpolated to the times of the images.
 
     Raises
     ------
     InputError
         The file is missing, damaged, of another length or form, or a frame has no truth within 10 ms.
     """
-    if not is_file(path):
-        raise InputError(f"--truth {path}: no such file")
+    if not is_file(path) and not is_drive(path):
+        raise InputError(f"--truth {path}: no such file, and no drive of KITTI raw")
     with reading(path, "holds no poses"):
-        if path.suffix.lower() == ".csv":
+        if path.is_dir():
+            R, t = _drive(path, sequence)
+        elif path.suffix.lower() == ".csv":
             R, t = _euroc(path, sequence)
         elif _columns(path) == 12:
             R, t = _kitti(path, len(sequence))
@@ -67,6 +85,27 @@ def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
     return U @ Vt, poses[:, :, 3]
 
 
+def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+    body = sequence.calibration.body_from_left
+    images = sequence.left[0].parent.parent / "timestamps.txt"
+    if sequence.format != "kitti-raw" or body is None or sequence.calibration.body != CAMERA_0:
+        raise InputError(f"--truth {path}: is of a drive of KITTI raw with {RAW_CALIBRATION}; the images are not")
+    stamps, poses = drive_poses(path, "camera")
+    if len(poses) < 2:
+        raise InputError(f"{path}: has {len(poses)} packets; takes two or more")
+    ends = poses[0] @ np.linalg.inv(poses[1]) @ poses[0], poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
+    poses = np.concatenate([ends[:1], poses, ends[1:]])  # driven on evenly: images do not end with the packets
+    known = np.concatenate([[2 * stamps[0] - stamps[1]], stamps, [2 * stamps[-1] - stamps[-2]]]) - stamps[0]
+    t = read_times(images) - stamps[0]
+    far = np.abs(t[:, None] - (stamps - stamps[0])).min(axis=1) > PACKET_DT / NANO
+    far |= (t < known[0]) | (t > known[-1])
+    if far.any():
+        raise InputError(f"{path}: {far.sum()} of {len(t)} frames have no packet within {PACKET_DT:g} s")
+    turn = Slerp(known, Rotation.from_matrix(poses[:, :3, :3]))(t).as_matrix()
+    place = np.column_stack([np.interp(t, known, column) for column in poses[:, :3, 3].T])
+    return turn @ body[:3, :3], place + turn @ body[:3, 3]
+
+
 def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     rows = read_table(path, ",", NO_TABLE)
     if rows.shape[1] < 8 or not np.isfinite(rows[:, :8]).all() or (np.diff(rows[:, 0]) <= 0).any():
@@ -74,7 +113,7 @@ def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     if (np.abs(np.linalg.norm(rows[:, 4:8], axis=1) - 1.0) > UNIT).any():
         raise InputError(f"{path}: columns 5 to 8 must be a quaternion w x y z of length 1")
     body = sequence.calibration.body_from_left
-    if body is None:
+    if body is None or sequence.calibration.body != EUROC_BODY:
         raise InputError(f"{path}: is the truth of a body, but {sequence.calibration.source} has no T_BS to the camera")
     rows = rows[_matched(path, sequence.t, rows[:, 0] / 1e9)]
     turn = Rotation.from_quat(rows[:, [5, 6, 7, 4]]).as_matrix()

@@ -6,7 +6,6 @@ projection, and the frames of inertial unit, velodyne and camera.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from consistency.errors import InputError
 from consistency.reading import read_text, reading
+from consistency.reading.kitti import NANO, numbers, place_of, read_keys, read_times, turn
 from consistency.recording.sheet import Lines, Sheet
 from consistency.types import Array
 
 EARTH = 6378137.0  # m, radius at the equator (WGS 84)
 POLE = 89.0  # degrees of latitude, beyond which the projection is of no use
 FIELDS = 30  # of a packet: latitude, longitude (degrees), altitude (m), roll, pitch, yaw (rad), ...
-STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
-NANO = 1e-9  # s in a nanosecond
 BODIES = {"imu": (), "velodyne": ("imu_to_velo",), "camera": ("imu_to_velo", "velo_to_cam")}  # files of calib_*.txt
 LEVEL = ("imu", "velodyne")  # bodies whose x and y are in the plane of the road
 
@@ -49,18 +47,27 @@ def read_drive(folder: Path, body: str | None = None) -> Lines:
     """
     if body not in (None, *BODIES):
         raise InputError(f"--body {body}: must be one of {', '.join(BODIES)}")
-    t = _seconds(folder / "oxts" / "timestamps.txt")
+    stamps, poses = drive_poses(folder, body or "imu")
+    poses = np.linalg.inv(poses[0]) @ poses
+    quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    t = (stamps - stamps[0]) * NANO
+    return Lines(folder, np.column_stack([t, poses[:, :3, 3], quaternion]), np.arange(1, len(t) + 1))
+
+
+def drive_poses(folder: Path, body: str) -> tuple[Array, Array]:
+    """Times of the packets in ns, (N,), and poses (N, 4, 4) of a body in a world that is east, north, up, m.
+
+    Parameters and exceptions are those of :func:`read_drive`.
+    """
+    stamps = read_times(folder / "oxts" / "timestamps.txt")
     files = sorted((folder / "oxts" / "data").glob("*.txt"))
-    if len(files) != len(t):
-        raise InputError(f"{folder / 'oxts'}: timestamps.txt has {len(t)} lines, but data {len(files)} packets")
+    if len(files) != len(stamps):
+        raise InputError(f"{folder / 'oxts'}: timestamps.txt has {len(stamps)} lines, but data {len(files)} packets")
     packets = np.array([_packet(file) for file in files])
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("ZYX", packets[:, [5, 4, 3]]).as_matrix()  # Rz(yaw) Ry(pitch) Rx(roll)
     poses[:, :3, 3] = mercator(packets[:, :3])
-    poses = poses @ np.linalg.inv(_mount(folder, body or "imu"))
-    poses = np.linalg.inv(poses[0]) @ poses
-    turn = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    return Lines(folder, np.column_stack([t, poses[:, :3, 3], turn]), np.arange(1, len(t) + 1))
+    return stamps, poses @ np.linalg.inv(_mount(folder, body))
 
 
 def drive_sheet(folder: Path, body: str | None = None) -> Sheet:
@@ -96,22 +103,6 @@ def _packet(path: Path) -> list[float]:
     return values[:6]
 
 
-def _seconds(path: Path) -> Array:
-    """Seconds since the first timestamp, (N,)."""
-    stamps = []
-    for number, line in enumerate(read_text(path, "cannot be read").splitlines(), 1):
-        if not STAMP.fullmatch(line.strip()):
-            raise InputError(f"{path}, line {number}: not a timestamp; should be like 2011-09-26 13:02:25.594360375")
-        with reading(f"{path}, line {number}", "not a timestamp"):
-            stamps.append(np.datetime64(line.strip(), "ns").astype(np.int64))
-    if not stamps:
-        raise InputError(f"{path}: is empty")
-    back = np.flatnonzero(np.diff(stamps) <= 0)
-    if len(back):
-        raise InputError(f"{path}, line {back[0] + 2}: timestamps must increase; take the synced drive")
-    return np.asarray((np.array(stamps) - stamps[0]) * NANO)
-
-
 def _mount(folder: Path, body: str) -> Array:
     """Matrix (4, 4) that takes points of the inertial unit to the body."""
     mount = np.eye(4)
@@ -122,14 +113,9 @@ def _mount(folder: Path, body: str) -> Array:
 
 def _calibration(folder: Path, name: str) -> Array:
     """Matrix (4, 4) of the lines R and T of a file of calibration."""
-    path = next((each / name for each in (folder, folder.absolute().parent) if (each / name).is_file()), None)
+    path = place_of(folder, name)
     if path is None:
         raise InputError(f"{folder}: --body needs {name}, here or in the folder above")
-    lines = dict(line.split(":", 1) for line in read_text(path, "cannot be read").splitlines() if ":" in line)
-    with reading(path, "needs lines 'R:' of 9 numbers, a rotation, and 'T:' of 3"):
-        R, T = (np.array(lines[key].split(), float) for key in "RT")
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = R.reshape(3, 3), T
-        if not (np.abs(out[:3, :3] @ out[:3, :3].T - np.eye(3)).max() < 1e-3 and np.isfinite(T).all()):
-            raise ValueError("R is no rotation")
+    rows, out = read_keys(path), np.eye(4)
+    out[:3, :3], out[:3, 3] = turn(path, rows, "R"), numbers(path, rows, "T", (3,))
     return out

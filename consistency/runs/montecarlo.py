@@ -124,14 +124,15 @@ def run_log(
 ) -> Results | StoredResults:
     """Put every run of a recorded log through every filter.
 
-    Parameters and exceptions are those of :func:`run_trials`. A resume is refused if a file of the log has changed.
+    Parameters and exceptions are those of :func:`run_trials`. A resume is refused if a file of the log has changed,
+    or how it was screened.
     """
     instances = resolve_filters(filters, log.belief)
     trials = {trial.run: trial for trial in log.trials}
     work = Work(Recorded(trials), Isolation(instances, log.belief, timeout, memory))
-    known = _known(instances) | {"log_sha256": log.sha256}
-    fields = {"seed": None, "log": log.name, "log_sha256": log.sha256, "belief": log.belief.model_dump(mode="json")}
-    with place_for(known, None if out is None else Path(out), None, resume, overwrite) as place:
+    own = {"log_sha256": log.sha256} | ({"screening": log.screening} if log.screening else {})
+    fields = {"seed": None, "log": log.name, "belief": log.belief.model_dump(mode="json")} | own
+    with place_for(_known(instances) | own, None if out is None else Path(out), None, resume, overwrite) as place:
         return Campaign(backend or Local(jobs), work, place, fields, log.landmarks).finish([sorted(trials)])
 
 

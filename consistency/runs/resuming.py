@@ -18,7 +18,7 @@ from consistency.terminal.progress import say
 PLAN = "until_decided"
 KEYS = {
     "scenario_hash": "scenario", "log_sha256": "log", "filters": "filter", "error": "error of a filter", "seed": "seed",
-    PLAN: "plan of looks",
+    "screening": "--screen", PLAN: "plan of looks",
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -63,6 +63,7 @@ class Log:
     belief: Belief
     landmarks: pd.DataFrame | None
     sha256: dict[str, str] = field(default_factory=dict)  # of the files, for the manifest of what is made of them
+    screening: dict[str, Any] | None = None  # gate and counts, where landmarks begin anew off the common motion
 
 
 def read_log(folder: str | Path) -> Log:

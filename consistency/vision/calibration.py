@@ -11,7 +11,7 @@ from consistency.errors import InputError
 from consistency.reading import read_text, reading
 from consistency.types import Array
 from consistency.vision.boofcv import read_boofcv
-from consistency.vision.cameras import Calibration, checked, distortion, sized
+from consistency.vision.cameras import EUROC_BODY, Calibration, checked, distortion, sized
 from consistency.vision.kitti import read_kitti, read_kitti_raw
 from consistency.vision.yaml_file import matrix, read_yaml
 
@@ -98,7 +98,7 @@ def read_euroc(folder: Path) -> Calibration:
     right_from_left = np.linalg.solve(right.pose, left.pose)
     R, T = right_from_left[:3, :3], right_from_left[:3, 3]
     source = f"{left.path} and {right.path}"
-    return checked(Calibration(source, left.K, right.K, left.D, right.D, R, T, left.size, left.pose))
+    return checked(Calibration(source, left.K, right.K, left.D, right.D, R, T, left.size, left.pose, EUROC_BODY))
 
 
 class _Camera(NamedTuple):

@@ -13,6 +13,7 @@ from consistency.types import Array
 from consistency.vision.yaml_file import matrix
 
 WIDEST = 30.0  # m between two cameras on one rig; calibrations are often in millimetres by mistake
+EUROC_BODY, CAMERA_0 = "body of EuRoC", "camera 0 of KITTI raw"
 COUNTS = (4, 5, 8, 12, 14)  # distortion coefficients that OpenCV knows
 
 
@@ -29,6 +30,7 @@ class Calibration:
     T: Array  # (3,), m
     image_size: tuple[int, int] | None  # width, height, px; None where the file does not say
     body_from_left: Array | None = None  # (4, 4), pose of the left camera in the body that a truth is of
+    body: str = ""  # which body that is: that of EuRoC, or camera 0 of KITTI raw
 
 
 def checked(calibration: Calibration) -> Calibration:

@@ -12,6 +12,7 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.reading import HUGE, is_file, read_text, reading
+from consistency.reading.kitti import NANO, place_of, read_times
 from consistency.types import Array
 from consistency.vision.calibration import read_calibration
 from consistency.vision.cameras import Calibration
@@ -100,8 +101,7 @@ def read_sequence(
         files, t, home = _kitti(folder), _kitti_times(folder), folder / "calib.txt"
     elif kind == "kitti-raw":
         files, t = _kitti_raw(folder)
-        places = [place / RAW_CALIBRATION for place in (folder, folder.absolute().parent)]
-        home = next((place for place in places if place.is_file()), places[1])
+        home = place_of(folder, RAW_CALIBRATION) or folder.absolute().parent / RAW_CALIBRATION
     elif kind == "euroc":
         files, t = _euroc(folder)
         home = folder
@@ -217,21 +217,9 @@ def _kitti_raw(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
     for one, two in RAW_PAIRS:
         if (folder / one).is_dir() and (folder / two).is_dir():
             files = _by_name(folder, _images(folder / one / "data"), _images(folder / two / "data"))
-            return files, _times_of_day(folder / one / "timestamps.txt")
+            stamps = read_times(folder / one / "timestamps.txt")
+            return files, (stamps - stamps[0]) * NANO
     raise InputError(f"{folder}: holds no folders {' or '.join(' and '.join(pair) for pair in RAW_PAIRS)}")
-
-
-def _times_of_day(path: Path) -> Array:
-    """Lines as ``2011-09-26 13:02:25.594360375`` in seconds from the first."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a drive of KITTI raw has the times of its images there")
-    refusal = "must hold a date and a time of day in every line"
-    lines = read_text(path, refusal).split("\n")
-    with reading(path, refusal):
-        stamps = np.array([line.strip() for line in lines if line.strip()], dtype="datetime64[ns]")
-    if np.isnat(stamps).any():
-        raise InputError(f"{path}: {refusal}")
-    return np.asarray((stamps - stamps[:1]) / np.timedelta64(1, "s"))
 
 
 def read_table(path: Path, delimiter: str | None, refusal: str) -> Array:

@@ -11,6 +11,8 @@ import pytest
 import scene
 from command import consistency
 
+from consistency.vision import RelativePose
+
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 
 
@@ -22,6 +24,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = consistency("frontend", "images", "--calibration", "images/calib.txt", "--out", "log", cwd=at)
     assert "8 stereo pairs, 0.70 m" in done.stdout
     assert "uses the images twice" in done.stdout
+    assert "tilt" not in done.stdout
+    assert json.loads((at / "log/manifest.json").read_text())["plane"]["holds"]
     return at
 
 
@@ -31,6 +35,17 @@ def test_filters_run_on_the_log_and_are_judged(folder: Path) -> None:
     verdicts = json.loads(consistency("analyse", "results", "--json", cwd=folder).stdout)
     assert set(verdicts) == {"ekf-uvd", "ukf-uvd"}
     assert "failed" not in {verdict["status"] for verdict in verdicts.values()}
+    done = consistency("run", "--log", "log", "--screen", "3,3,3", *filters[:2], "--out", "screened", cwd=folder)
+    assert re.search(r"screen: \d+ of \d+ observations that follow another", done.stderr)
+    screening = json.loads((folder / "screened/manifest.json").read_text())["screening"]
+    assert screening["gate"] == [3.0, 3.0, 3.0]
+    assert 0 <= screening["broken"] < screening["judged"] < screening["offered"]
+    again = ("run", "--log", "log", *filters[:2], "--out", "screened", "--resume")
+    assert "have another --screen" in consistency(*again, cwd=folder, status=2).stderr
+    done = consistency("run", "--log", "log", "--screen", "3,3", *filters[:2], "--out", "no", cwd=folder, status=2)
+    assert "--screen 3,3: must be 3 positive numbers for a sensor 'uvd', as 2,2,1" in done.stderr
+    done = consistency("run", "herath2007-stereo", "--screen", "3", *filters[:2], "--out", "no", cwd=folder, status=2)
+    assert "--screen goes with --log" in done.stderr
 
 
 def test_the_trajectory_is_judged(folder: Path) -> None:
@@ -93,6 +108,26 @@ def test_two_pairs_make_a_motion_and_no_log(folder: Path) -> None:
     again = consistency("frontend", "short", "--out", "one", cwd=folder, status=2)
     assert "--out one: exists already" in again.stderr
     consistency("frontend", "short", "--out", "one", "--overwrite", cwd=folder)
+
+
+def test_a_camera_that_leaves_the_plane_has_no_planar_log(folder: Path) -> None:
+    """It nods by 8 degrees at each pair; a tenth of a landmark's distance is 32 px, or 6 degrees."""
+    poses = [
+        pose.compose(RelativePose.from_vector(np.array([0.0, 0.0, 0.0, np.deg2rad(8.0) * (k % 2), 0.0, 0.0])))
+        for k, pose in enumerate(scene.drive(5))
+    ]
+    scene.write_kitti(folder / "nodding", poses, scene.texture(np.random.default_rng(0)))
+    done = consistency("frontend", "nodding", "--out", "nods", cwd=folder)
+    assert "4 of 4 motions tilt the camera by more than 1.7 deg (8 in the median, 8 at most)" in done.stdout
+    assert "no planar log of a camera that is not on a robot in the plane" in done.stdout
+    names = ("trajectory.tum", "covariance.txt", "motions.tum", "truth.tum", "manifest.json")
+    assert {path.name for path in (folder / "nods").iterdir()} == set(names)
+    plane = json.loads((folder / "nods/manifest.json").read_text())["plane"]
+    assert (plane["holds"], plane["leaving"], plane["motions"]) == (False, 4, 4)
+    assert plane["sigma_px"][1] > plane["limit_px"][1] == pytest.approx(32.0)
+    done = consistency("frontend", "nodding", "--planar", "--out", "nods", "--overwrite", cwd=folder)
+    assert "log in nods; next: consistency run" in done.stdout
+    assert (folder / "nods/sensor.toml").is_file()
 
 
 def test_images_are_no_log(folder: Path) -> None:

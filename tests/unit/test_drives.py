@@ -145,9 +145,9 @@ def test_what_is_wrong_with_a_drive_is_said(drive: Path) -> None:
     stamps.write_text("\n".join(lines))
     calibration = drive.parent / "calib_imu_to_velo.txt"
     calibration.write_text("R: 1 0 0 0 2 0 0 0 1\nT: 0 0 0\n")
-    refused(r"calib_imu_to_velo\.txt: needs lines 'R:' of 9 numbers, a rotation", body="velodyne")
+    refused(r"calib_imu_to_velo\.txt: key 'R': is no rotation", body="velodyne")
     calibration.write_text("R: 1 0 0\nT: 0 0 0\n")
-    refused(r"calib_imu_to_velo\.txt: needs lines 'R:' of 9 numbers", body="velodyne")
+    refused(r"calib_imu_to_velo\.txt: key '", body="velodyne")
     calibration.unlink()
     refused(r"--body needs calib_imu_to_velo\.txt, here or in the folder above", body="velodyne")
 

@@ -92,7 +92,7 @@ def test_kitti_colour_images_go_with_the_colour_cameras(tmp_path: Path) -> None:
         ("P0: 1 2 3\nP1: 1 2 3\n", "key 'P0': must be 12 finite numbers"),
         (f"P0: {ROWS[0]}\nPX: {ROWS[1]}\n", "key 'P1' is missing; there: P0, PX"),
         (f"P0: {ROWS[0]}\nP1: {ROWS[1].replace('350', 'nan')}", "key 'P1': must be 12 finite numbers"),
-        ("P0: one two\n", "line 1: must be 'P0:' and 12 numbers"),
+        ("P0: one two\n", "key 'P0': must be numbers, after a key and a colon"),
         (f"P0: {ROWS[1]}\nP1: {ROWS[0]}\n", "are the cameras swapped"),
         ("", "key 'P0' is missing; there: nothing"),
     ],

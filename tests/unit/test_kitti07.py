@@ -37,7 +37,7 @@ def recording(pixels: dict[int, list[tuple[float, float, float] | None]], frames
     still = np.tile(np.eye(3, 4), (frames, 1, 1)) if poses is None else poses
     zero = np.zeros((3, frames))
     return conversion.Recording(
-        features, 0.1 * np.arange(frames), zero, zero, F, CENTRE, B, KITTI, np.zeros(3), still
+        features, 0.1 * np.arange(frames), zero, zero, F, CENTRE, B, KITTI, np.zeros(3), still, (1226, 370)
     )  # fmt: skip
 
 
@@ -77,16 +77,15 @@ def test_a_gap_starts_a_new_piece_and_small_disparities_are_left_out() -> None:
 
 
 def test_a_track_that_leaves_the_common_motion_is_cut_there_and_only_there() -> None:
-    still = {track: moving(4, u=40.0 * track) for track in range(8)}
-    still[8] = [(300.0 + 10.0 * (step >= 2), 5.0, 20.0) for step in range(4)]
-    for step in range(4):  # no exact copies
-        u, v, d = still[8][step] or (0.0, 0.0, 0.0)
-        still[8][step] = (u, v + 0.01 * step, d)
-    data = recording(still, 4)
-    pieces = conversion.consistent_pieces(conversion.fresh_observations(data), data)
-    steps = pieces.groupby(["track", "piece"])["step"].apply(list)
-    assert steps.loc[8].tolist() == [[0, 1], [2, 3]]
-    assert all(steps.loc[track].tolist() == [[0, 1, 2, 3]] for track in range(8))
+    """By the screening that any log may have: the robot stands still, and the last of nine tracks jumps by 10 px."""
+    still = {track: moving(6, u=40.0 * track) for track in range(8)}
+    still[8] = [(300.0 + 10.0 * (step >= 4), 5.0 + 0.01 * step, 20.0) for step in range(6)]
+    lives = {}
+    for gated in (True, False):
+        trial, _ = conversion.log_of(recording(still, 6), slots=9, gated=gated)
+        lives[gated] = sorted(conversion.rows_of(trial).groupby("piece")["step"].apply(list))
+    assert lives[True] == sorted([[1, 2, 3], [4, 5], *[[1, 2, 3, 4, 5]] * 8])
+    assert lives[False] == [[1, 2, 3, 4, 5]] * 9
 
 
 def table(lives: dict[int, tuple[int, int, float]]) -> pd.DataFrame:
@@ -149,18 +148,66 @@ def test_unlinked_steps_and_the_floor_they_leave() -> None:
     assert experiment.heading_floor(trial, 0.05) == pytest.approx(0.05 * 0.1 * np.sqrt(3))
 
 
+ARRAYS = {
+    "features": np.full((4, 2, 3), -1.0), "time_stamps": np.arange(3.0)[None], "linear_velocity": np.zeros((3, 3)),
+    "rotational_velocity": np.zeros((3, 3)), "K": np.array([[718.856, 0, 607.2], [0, 718.856, 185.2], [0, 0, 1]]),
+    "b": np.array(0.54), "cam_T_imu": np.eye(4),
+}  # fmt: skip
+
+
+def test_any_drive_is_read_with_the_poses_of_kitti_or_times_before_them(tmp_path: Path) -> None:
+    np.savez(tmp_path / "0034.npz", **ARRAYS)
+    poses = np.arange(24.0).reshape(2, 12)
+    for columns in (poses, np.column_stack([[0.1, 0.2], poses])):
+        np.savetxt(tmp_path / "02.txt", columns)
+        for at in (tmp_path, tmp_path / "0034.npz"):
+            tracks, truth = conversion.find_recording(at)
+            data = conversion.read_recording(tracks, truth)
+            np.testing.assert_array_equal(data.poses.reshape(2, 12), poses)
+            assert data.features.shape == (4, 2, 2)  # the last frame has no truth
+            assert data.size == (1241, 376)
+            assert experiment.name_of(tracks) == "0034"
+    assert experiment.name_of(Path("0027.npz")) == "kitti07"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"time_stamps": None}, r"0034\.npz: array 'time_stamps' is missing"),
+        (
+            {"features": np.zeros((3, 2, 3))},
+            r"'features' has shape \(3, 2, 3\); must be 4 x any x any, for the 2 frames",
+        ),
+        ({"linear_velocity": np.zeros((3, 1))}, "'linear_velocity' has shape"),
+        ({"b": np.array(np.nan)}, "'b' holds something that is not a finite number"),
+        ({"K": 500.0 * np.eye(3)}, r"0034\.npz: array 'K': no rectified camera of KITTI has f = 500 px; they have 721"),
+    ],
+)
+def test_a_drive_with_other_arrays(tmp_path: Path, changes: dict[str, Array | None], said: str) -> None:
+    np.savez(tmp_path / "0034.npz", **{k: v for k, v in (ARRAYS | changes).items() if v is not None})
+    np.savetxt(tmp_path / "02.txt", np.zeros((2, 12)))
+    with pytest.raises(cs.InputError, match=said):
+        conversion.read_recording(*conversion.find_recording(tmp_path))
+
+
 def test_unusable_data_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    command = ["--data", str(tmp_path), "--out", str(tmp_path / "out")]
-    with pytest.raises(cs.InputError, match=r"0027\.npz is missing"):
-        experiment.command(command)
-    np.savez(tmp_path / "0027.npz", features=np.zeros((4, 2, 3)))
-    np.savetxt(tmp_path / "kitti07_gt.txt", np.zeros((3, 13)))
-    with pytest.raises(cs.InputError, match="'time_stamps' is missing"):
-        experiment.command(command)
+    def refused(said: str, *more: str) -> None:
+        with pytest.raises(cs.InputError, match=said) as told:
+            experiment.command(["--data", str(tmp_path), "--out", str(tmp_path / "out"), *more])
+        assert "\n" not in str(told.value)
+        assert not (tmp_path / "out").exists()
+
+    refused(r"must hold one file \*\.npz of tracks, holds none; --data FILE names it")
     (tmp_path / "0027.npz").write_bytes(b"PK not an archive")
-    with pytest.raises(cs.InputError, match="--data") as told:
-        experiment.command(command)
-    assert "\n" not in str(told.value)
+    refused(r"must hold one file \*\.txt of true poses, holds none; --truth FILE names it")
+    np.savetxt(tmp_path / "kitti07_gt.txt", np.zeros((3, 13)))
+    refused(r"0027\.npz: is not an archive of tracks")
+    np.savez(tmp_path / "0027.npz", **ARRAYS)
+    refused(r"none\.txt: ", "--truth", str(tmp_path / "none.txt"))
+    (tmp_path / "kitti07_gt.txt").write_text("0 1 2\n0 1 2\n")
+    refused(r"kitti07_gt\.txt: must hold 12 numbers a line, or a time and 12")
+    (tmp_path / "second.npz").write_bytes(b"")
+    refused(r"holds 0027\.npz, second\.npz; --data FILE")
     monkeypatch.delenv("CONSISTENCY_DATA", raising=False)
     assert experiment.main(cs.Study(runs=1)) == []
 
@@ -174,14 +221,15 @@ def recorded() -> Path:
 
 @pytest.mark.slow
 def test_the_recording_becomes_a_log_that_is_read_back(tmp_path: Path) -> None:
-    logs = experiment.logs_of(recorded(), seed=0)
-    trial, belief = logs["kitti07"].trials[0], logs["kitti07"].belief
-    assert (trial.steps, trial.n_landmarks) == (1100, 627)
+    data = conversion.read_recording(*conversion.find_recording(recorded()))
+    log = experiment.logs_of(data, seed=0)[experiment.MAIN]
+    trial, belief = log.trials[0], log.belief
+    assert (trial.steps, trial.n_landmarks) == (1100, 629)
     assert len(experiment.unlinked_steps(trial)) == 92  # the 91 slips, and step 1: nothing is seen in step 0
     assert trial.truth is not None
     path = np.hypot(*np.diff(trial.truth[:, :2], axis=0).T).sum()
     assert path == pytest.approx(692.0, abs=1.0)
-    write_log(tmp_path / "log", [trial], belief, None, manifest_of(kind="log"), view=conversion.VIEW)
+    write_log(tmp_path / "log", [trial], belief, None, manifest_of(kind="log"), view=(data.size, tuple(data.centre)))
     back = read_log(tmp_path / "log")
     np.testing.assert_array_equal(back.trials[0].z, trial.z)
     np.testing.assert_array_equal(back.trials[0].landmark, trial.landmark)
@@ -191,7 +239,7 @@ def test_the_recording_becomes_a_log_that_is_read_back(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_noise_of_the_twin_is_what_the_filter_believes() -> None:
     # with truth given, whitened noise has variance 1; 5 standard errors, so a false alarm in 1e6 a number
-    data = conversion.read_recording(recorded())
+    data = conversion.read_recording(*conversion.find_recording(recorded()))
     trial, belief = conversion.log_of(data)
     quiet, loud = (experiment.white_twin(trial, belief, np.random.default_rng(s)) for s in (0, 1))
     whitened = (quiet.z - loud.z) / belief.sensor.sigma / np.sqrt(2)

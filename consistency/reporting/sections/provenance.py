@@ -55,11 +55,12 @@ def _rounded(value: Any) -> Any:
 def facts(manifest: dict[str, Any]) -> tuple[tuple[str, str], ...]:
     """What a manifest says of its run."""
     versions = manifest.get("versions") or {}
-    wall = manifest.get("wall_time_s")
+    wall, screening = manifest.get("wall_time_s"), manifest.get("screening")
     rows = {
         "Seed": manifest.get("seed"),
         "Runs": manifest.get("runs"),
         "Scenario hash": manifest.get("scenario_hash"),
+        "Screened": screening and "{broken} of {judged} observations leave the common motion".format_map(screening),
         "Command": manifest.get("command"),
         "Git commit": manifest.get("git_commit"),
         "Wall time": None if wall is None else f"{number(float(wall), '.1f')} s",

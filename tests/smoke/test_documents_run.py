@@ -26,12 +26,6 @@ from consistency.cli import main
 pytestmark = pytest.mark.slow
 
 OF_THE_CHECKOUT = {"bash", "git", "make", "pip", "pre-commit"}  # they install, test or measure all of it
-    "bash",
-    "git",
-    "make",
-    "pip",
-    "pre-commit",
-}  # CI runs these on the whole checkout; parsed in test_documents
 SMALLER_CODE = {
     "runs=50": "runs=4", "runs=20000": "runs=20", "trials=100": "trials=6",
     "[[707.09, 0, 601.89], [0, 707.09, 183.11], [0, 0, 1]]": str(scene.K.tolist()),

@@ -26,9 +26,8 @@ def require_uses(text: str) -> list[dict[str, Any]]:
     content = yaml.safe_load(text)
     steps = content
     if isinstance(content, dict):
-        assert (
-            {True, "jobs"} <= set(content) <= {"name", True, "jobs", "permissions"}
-        )  # YAML reads the key "on" as true
+        at_the_top = {"on" if key is True else key for key in content}  # which is how YAML 1.1 reads the key "on"
+        assert {"on", "jobs"} <= at_the_top <= {"name", "on", "jobs", "permissions"}
         assert all("runs-on" in job for job in content["jobs"].values())
         steps = [step for job in content["jobs"].values() for step in job["steps"]]
     for step in steps:

@@ -33,6 +33,7 @@ class Block:
     language: str  # what the fence says, or "indented"
     text: str
     before: str  # the paragraph above it
+    part: str = ""  # the heading of the second level above it
 
     def __str__(self) -> str:
         return f"{self.page}:{self.line}"
@@ -77,9 +78,10 @@ def blocks(page: str, *languages: str, part: str = "") -> list[Block]:
             match["fenced"] if match["indented"] is None else re.sub(r"^(?: {4}|\t)", "", match["indented"], flags=re.M)
         )
         line = before.count("\n") + 1 + (match["fence"] is not None)
-        heading = re.findall(r"^## (.*)$", BLOCK.sub("", before), re.MULTILINE)
-        if (not languages or language in languages) and (not part or heading[-1:] == [part]):
-            found.append(Block(page, line, language, inside, before.strip().rpartition("\n\n")[2]))
+        heading = re.findall(r"^## (.*)$", BLOCK.sub("", before), re.MULTILINE)[-1:]
+        if (not languages or language in languages) and (not part or heading == [part]):
+            above = before.strip().rpartition("\n\n")[2]
+            found.append(Block(page, line, language, inside, above, "".join(heading)))
     return found
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -15,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from command import consistency
+from documents import blocks
 from scipy import stats
 
 import consistency as cs
@@ -164,11 +164,8 @@ def _bad_files(folder: Path) -> None:
 
 def test_the_readme_filter_runs(tmp_path: Path) -> None:
     """The README's example of a filter of one's own, with fewer runs: too few to show that it is right."""
-    example = re.search(
-        r"```python\n((?:(?!```).)*class DeadReckoning.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
-    )
-    assert example is not None
-    (tmp_path / "mine.py").write_text(example[1].replace("runs=50", "runs=4"))
+    (example,) = (block.text for block in blocks("README.md", "python") if "class DeadReckoning" in block.text)
+    (tmp_path / "mine.py").write_text(example.replace("runs=50", "runs=4"))
     done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("dead-reckoning: undecided")

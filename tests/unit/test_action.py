@@ -14,17 +14,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
+import typer
 from documents import ROOT
+
+from consistency.cli.app import app
+from consistency.runs.findings import sibling
 
 pytest.importorskip("yaml", reason="PyYAML (the extra vision) is not installed")
 import action
 from action import FILE, STEP_KEYS, STEPS
 
 REPOSITORY = ROOT / "docs/examples/repository"
-WORKFLOWS = [*(ROOT / ".github/workflows").glob("*.yml"), *(REPOSITORY / ".github/workflows").glob("*.yml")]
+WORKFLOWS = [ROOT / ".github/workflows/ci.yml", REPOSITORY / ".github/workflows/consistency.yml"]
 EXPRESSION = re.compile(r"\$\{\{\s*(.*?)\s*\}\}")
 
 
@@ -163,6 +168,7 @@ def test_an_honest_filter_passes(workspace: Callable[..., Path]) -> None:
         "consistent", "overconfident (expected)", "consistent", "not worse",
     ]  # fmt: skip
     assert all(len(re.findall(r"(?<!\\)\|", line)) == 6 for line in lines)
+    assert all(re.fullmatch(r"x[12]\.\d+ \[\d.*\]", line.split(" | ")[2]) for line in lines[:3])
     report = Path(done.outputs["report"])
     assert (done.outputs["verdict"], report.name) == ("pass", "consistency-report")
     assert {"gates.json", "estimates"} == {path.name for path in report.iterdir()}
@@ -218,6 +224,55 @@ def test_wrong_inputs(workspace: Callable[..., Path], case: str) -> None:
     assert done.outputs["verdict"] == "unusable"
     assert done.summary.startswith("## Consistency: unusable\n")
     assert "Traceback" not in done.log
+
+
+@pytest.fixture
+def gate() -> ModuleType:
+    return sibling(str(action.FOLDER / "action.yml"), "gate")
+
+
+@pytest.mark.parametrize(
+    ("tests", "consistent", "no_worse", "fail_on", "status", "verdict"),
+    [
+        (True, True, True, "inconsistent", 0, "pass"), (False, True, True, "inconsistent", 1, "fail"),
+        (True, False, True, "inconsistent", 1, "fail"), (True, True, False, "inconsistent", 1, "fail"),
+        (True, False, True, "worse", 0, "pass"), (False, True, True, "worse", 1, "fail"),
+        (True, True, False, "worse", 1, "fail"), (False, False, False, "nothing", 0, "fail"),
+    ],
+)  # fmt: skip
+def test_what_fails_the_job(
+    gate: ModuleType, tests: bool, consistent: bool, no_worse: bool, fail_on: str, status: int, verdict: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    for name, good in (("run_tests", tests), ("judge", consistent), ("compare", no_worse)):
+        monkeypatch.setattr(gate, name, lambda *given, good=good: (good, [gate.Row("what", "verdict", "", "1", "why")]))
+    for name in ("old.json", "est.csv"):
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    given = {"TESTS": "tests", "ESTIMATES": " est.csv \n\n", "COMPARE_WITH": "old.json", "FAIL_ON": fail_on}
+    for name, value in {**given, "GITHUB_OUTPUT": "out.txt", "GITHUB_STEP_SUMMARY": "summary.md"}.items():
+        monkeypatch.setenv(name, value)
+    assert gate.main() == status
+    assert f"\n{verdict}\n" in (tmp_path / "out.txt").read_text()
+    assert (tmp_path / "summary.md").read_text().count("| what | verdict |") == 1 + 3
+
+
+def test_a_cell_of_the_summary_cannot_break_the_table(gate: ModuleType) -> None:
+    row = gate.Row("test[a|b]", "failed", "", "1", "<img src=x>\nand `code` & more")
+    line = gate.markdown("fail", [row]).splitlines()[4]
+    assert line == "| test[a\\|b] | failed |  | 1 | &lt;img src=x> and \\`code\\` &amp; more |"
+
+
+def test_options_that_compare_lacks_are_left_out(gate: ModuleType) -> None:
+    options = ["--truth", "t.csv", "--detect", "2", "--tolerance=1.1", "--error", "so2"]
+    assert gate.shared(options) == ["--truth", "t.csv", "--error", "so2"]
+    lacking = {option for option in options_of("analyse") - options_of("compare") if option in gate.OF_ANALYSE}
+    assert lacking == set(gate.OF_ANALYSE)
+
+
+def options_of(name: str) -> set[str]:
+    command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
+    return {option for parameter in command.params for option in parameter.opts}
 
 
 def test_an_input_is_never_run_by_the_shell(workspace: Callable[..., Path]) -> None:

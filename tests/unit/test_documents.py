@@ -23,6 +23,7 @@ from typing import Any
 
 import pytest
 import typer
+from document_inputs import NOT_RUN
 from documents import PAGES, PROGRAMS, ROOT, SHELL, Block, Command, blocks, commands, parsed, read, typed
 
 import consistency as cs
@@ -111,6 +112,7 @@ def findings() -> list[str]:
 @pytest.mark.parametrize("words", ["run herath2007-sterio --filter ekf-uvd --out o", "reproduce --only fig99",
     "run herath2007-stereo --filter ekf-uvdd --out o", "run herath2007-stereo --filter ekf-uvd --out o --runs many",
     "run herath2007-stereo --filter ekf-uvd --out o --run 5", "analise results", "sweep regimes --out o",
+    "run herath2007-stereo --filter ekf-uvd --out o --runs N",
     "run herath2007-stereo --filter ekf-uvd", "tune herath2007-stereo --filter ekf"])  # fmt: skip
 def test_the_command_line_does_not_take(words: str) -> None:
     """Negative control."""
@@ -295,3 +297,13 @@ def test_nothing_that_looks_like_a_command_is_missed() -> None:
         seen = " ".join(command.text for command in commands(page))
         missed = [line for line in lines if line.split("#")[0].split("[")[0].rstrip("\\ ") not in seen]
         assert not missed
+
+
+# --- what is not run ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("page", "begin", "why"), NOT_RUN)
+def test_what_is_not_run_is_still_in_the_documents(page: str, begin: str, why: str) -> None:
+    found = [command.text for command in commands(page)] + [block.text for block in blocks(page, *PYTHON)]
+    assert any(text.startswith(begin) for text in found)
+    assert all((ROOT / path).exists() for path in re.findall(r"tests/\S+\.py", why))

@@ -131,15 +131,16 @@ def judge(given: Inputs, estimates: str) -> tuple[bool, list[Row]]:
     return status == 0, rows
 
 
+def shared(options: list[str]) -> list[str]:
+    """Those of the options of ``analyse`` that ``compare`` has, too."""
+    pairs = zip(["", *options], options, strict=False)
+    return [word for last, word in pairs if last not in OF_ANALYSE and word.split("=")[0] not in OF_ANALYSE]
+
+
 def compare(given: Inputs, estimates: str) -> tuple[bool, list[Row]]:
     """Whether they are no worse than the baseline, and a row for each filter."""
-    before = ["", *given.options]
-    options = [
-        word
-        for last, word in zip(before, given.options, strict=False)
-        if last not in OF_ANALYSE and word.split("=")[0] not in OF_ANALYSE
-    ]
-    words = ["consistency", "compare", *options, "--json", "--fail-on", "worse", "--", estimates, given.compare_with]
+    options = ["--json", "--fail-on", "worse", *shared(given.options)]
+    words = ["consistency", "compare", *options, "--", estimates, given.compare_with]
     status, said = run(*words)
     if status not in (0, 1):
         raise Unusable(f"compare-with: {given.compare_with}: exit status {status}; the log says why")

@@ -1,0 +1,308 @@
+"""What the commands and the code of the documents find in their folder, and which of them are not run here."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from documents import ROOT
+from scipy.spatial.transform import Rotation
+
+import consistency as cs
+from consistency.runs.montecarlo import simulate_log
+from consistency.types import Array
+
+RNG = np.random.default_rng(20070)  # what is judged right or wrong is not asserted
+DT, STEPS, RUNS = 0.5, 120, 12
+SIGMA = np.array([0.02, 0.02, 0.02, 0.004, 0.004, 0.004])  # m, rad
+T = DT * np.arange(STEPS)
+PLACE = np.column_stack([0.3 * T, np.sin(0.2 * T), 0.02 * T])
+TURN = Rotation.from_rotvec(np.outer(T, [0, 0, 0.05]))
+P = np.broadcast_to(np.diag(SIGMA**2).ravel(), (STEPS, 36))
+DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
+
+# Commands and code that are only parsed: page, what they begin with, and why.
+STUDY = "takes from half a minute to hours even with two runs; tests of its experiment run its parts"
+REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
+NOT_RUN = [
+    ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
+    ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and tests/unit/test_slurm.py stand in"),
+    ("docs/consistent.md", "consistency reproduce", STUDY),
+    ("docs/conventions.md", "", "tests/unit/test_conventions.py runs all of it"),
+    ("docs/extending.md", "", "tests/unit/test_extending.py follows it in a copy of the package"),
+    ("docs/files.md", "consistency analyse drive.bag", "tests/unit/test_bags.py writes and judges such bags"),
+    ("docs/files.md", "consistency analyse drive --truth-topic", "tests/unit/test_bags.py"),
+    ("docs/files.md", "consistency analyse drives --truth-topic", "tests/unit/test_bags.py"),
+    ("docs/files.md", "consistency analyse keyframes.csv", "tests/unit/test_relative.py has cross-covariances"),
+    ("docs/files.md", "consistency analyse est.tum", "tests/oracle/test_gtsam_windows.py has such marginals"),
+    ("docs/files.md", "joint = marginals", "tests/oracle/test_gtsam_windows.py does the same"),
+    ("docs/front-end.md", "from consistency.vision.shared", "tests/unit/test_vision_shared.py has its inputs"),
+    ("docs/front-end.md", "python experiments/e11", REAL),
+    ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/test_guards.py runs such"),
+    ("docs/kitti07.md", "", REAL),
+    ("docs/planar.md", "", f"{STUDY}; e15: {REAL}"),
+    ("docs/regime.md", "consistency sweep regime --out regime --filter", "compiles two more filters for one cell"),
+    ("docs/sensor.md", "consistency reproduce", STUDY),
+    ("docs/static-limit.md", "consistency reproduce", STUDY),
+    ("docs/tuning.md", "import numpy", "tests/unit/test_tuning.py runs it with two runs of six steps"),
+    ("docs/tuning.md", "consistency tune --log OUT", REAL),
+    ("docs/tuning.md", "python experiments/e15", REAL),
+]  # fmt: skip
+
+
+def not_run(page: str, text: str) -> bool:
+    return any(page == where and text.startswith(begin) for where, begin, _ in NOT_RUN)
+
+
+# --- files -------------------------------------------------------------------------------------------------
+
+
+def write_rows(at: Path, *columns: Array) -> None:
+    at.parent.mkdir(exist_ok=True, parents=True)
+    np.savetxt(at, np.column_stack([T, *columns]), fmt="%.12g")
+
+
+def poses(place: Array, turn: Rotation) -> Array:
+    return np.column_stack([place, turn.as_quat()])
+
+
+def errors() -> Array:
+    return SIGMA * RNG.normal(size=(STEPS, 6))
+
+
+def estimated() -> Array:
+    e = errors()
+    return poses(PLACE - e[:, :3], Rotation.from_rotvec(-e[:, 3:]) * TURN)
+
+
+def trajectories(folder: Path) -> None:
+    """est, truth and P as folders of RUNS files, and est.txt, truth.txt, P.txt of one run."""
+    for name in ["", *(f"/{k:02d}" for k in range(RUNS))]:
+        write_rows(folder / f"truth{name}.txt", poses(PLACE, TURN))
+        write_rows(folder / f"est{name}.txt", estimated())
+        write_rows(folder / f"P{name}.txt", P)
+
+
+def inline(folder: Path) -> None:
+    """The covariance in the line of its pose: est.txt, and the folders est, NEW and OLD; TRUTH as truth."""
+    trajectories(folder)
+    for name in ("est.txt", *(f"{of}/{k:02d}.txt" for of in ("est", "NEW", "OLD") for k in range(RUNS))):
+        write_rows(folder / name, estimated(), P)
+    shutil.copytree(folder / "truth", folder / "TRUTH")
+
+
+def motions(folder: Path) -> None:
+    """motions.tum, each line a motion with its covariance, and truth.tum."""
+    write_rows(folder / "truth.tum", poses(PLACE, TURN))
+    before = TURN[:-1].inv()
+    e = errors()[1:]
+    moved = poses(before.apply(np.diff(PLACE, axis=0)) - e[:, :3], Rotation.from_rotvec(-e[:, 3:]) * before * TURN[1:])
+    write_rows(folder / "motions.tum", np.vstack([[0, 0, 0, 0, 0, 0, 1], moved]), P)
+
+
+def archive(at: Path) -> None:
+    """Errors of position and velocity, (60, 100, 2)."""
+    e, covariance = RNG.normal(size=(60, 100, 2)), np.broadcast_to(np.eye(2), (60, 100, 2, 2))
+    np.savez(at, truth=e, estimates=np.zeros_like(e), covariances=covariance)
+
+
+def table(at: Path, rows: list[dict[str, float]]) -> None:
+    at.parent.mkdir(exist_ok=True, parents=True)
+    with at.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def planar(folder: Path) -> None:
+    """poses.csv and truth.csv: x, y, heading of 30 runs."""
+    rng, sigma = RNG, np.array([0.1, 0.1, 0.02])
+    variances = dict(zip(("P_xx", "P_yy", "P_hh"), sigma**2, strict=True)) | dict.fromkeys(
+        ("P_xy", "P_xh", "P_yh"), 0.0
+    )
+    keys = [{"run": run, "step": step, "t": 0.1 * step} for run in range(30) for step in range(1, 21)]
+    names = ("x", "y", "heading")
+    own = [key | dict(zip(names, sigma * rng.normal(size=3), strict=True)) | variances for key in keys]
+    table(folder / "poses.csv", own)
+    table(folder / "truth.csv", [key | dict.fromkeys(names, 0.0) for key in keys])
+
+
+def kitti(folder: Path) -> None:
+    """A drive as truth, and estimates at the first pose all the time."""
+    import drives
+
+    (folder / DAY).mkdir()
+    drives.write_drive(folder / DAY / DRIVE)
+    stay = poses(np.zeros((STEPS, 3)), Rotation.identity(STEPS))
+    for name in ("est.txt", f"est/{DRIVE}.txt"):
+        at = folder / name
+        at.parent.mkdir(exist_ok=True)
+        np.savetxt(at, np.column_stack([0.103 * np.arange(50), stay[:50], P[:50]]), fmt="%.12g")
+    zero = dict.fromkeys(("x", "y", "heading", "P_xy", "P_xh", "P_yh"), 0.0) | dict.fromkeys(
+        ("P_xx", "P_yy", "P_hh"), 1.0
+    )
+    table(folder / "est.csv", [{"t": 0.103 * k, **zero} for k in range(50)])
+
+
+def openvins(folder: Path) -> None:
+    import drives
+
+    drives.write_states(folder)
+    triangle = np.eye(3)[np.triu_indices(3)] * 1e-4
+    both = np.broadcast_to(np.concatenate([triangle, triangle]), (STEPS, 12))
+    write_rows(folder / "stamped_traj_estimate.txt", estimated(), both)
+    write_rows(folder / "stamped_groundtruth.txt", poses(PLACE, TURN))
+
+
+def innovations(folder: Path) -> None:
+    import flight
+
+    nis = (RNG.normal(size=(300, 2)) ** 2).sum(axis=1)
+    table(folder / "innovations.csv", [{"t": k / 10, "nis": each, "nis_dof": 2} for k, each in enumerate(nis)])
+    log = flight.Flight()
+    for k, each in enumerate(RNG.normal(size=300)):
+        log.both(1_000_000 + 100_000 * k, {"baro_vpos": (each, 1.0)})
+    log.write(folder / "flight.ulg")
+
+
+def images(folder: Path) -> None:
+    """IMAGES: a KITTI sequence of a wall; RESTING: the same pair again and again; FILE: their calibration."""
+    import cv2
+    import scene
+
+    wall = scene.texture(RNG)
+    scene.write_kitti(folder / "IMAGES", scene.drive(12), wall)
+    shutil.copytree(folder / "IMAGES", folder / "RESTING")
+    for side, image in zip(("image_0", "image_1"), scene.pair(scene.drive(1)[0], wall), strict=True):
+        for path in (folder / "RESTING" / side).iterdir():
+            noisy = image + RNG.normal(0, 2, image.shape)
+            assert cv2.imwrite(str(path), np.clip(noisy, 0, 255).astype(np.uint8))
+    (folder / "RESTING/poses.txt").unlink()
+    shutil.copy(folder / "IMAGES/calib.txt", folder / "FILE")
+
+
+def boards(folder: Path, square: float = 0.024) -> None:
+    """BOARDS: pairs left1, right1, ... of a chessboard of 9 x 6 inner corners in several poses."""
+    import cv2
+
+    cells = np.kron(np.indices((7, 10)).sum(axis=0) % 2, np.ones((60, 60)))
+    texture = np.pad(255 * (1 - cells), 60, constant_values=255).astype(np.uint8)
+    K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    pixel = square / 60
+    texel = np.array([[pixel, 0, -6 * square], [0, pixel, -4.5 * square], [0, 0, 1]])  # of the texture, on the board
+    (folder / "BOARDS").mkdir()
+    rng = RNG
+    for k in range(1, 13):
+        turn = Rotation.from_rotvec(rng.uniform(-0.4, 0.4, 3)).as_matrix()
+        at = np.array([*rng.uniform(-0.06, 0.06, 2), rng.uniform(0.35, 0.6)])
+        for side, x in (("left", 0.0), ("right", 0.06)):
+            H = K @ np.column_stack([turn[:, 0], turn[:, 1], at - [x, 0, 0]]) @ texel
+            view = cv2.warpPerspective(texture, H, (640, 480), flags=cv2.INTER_AREA, borderValue=128)
+            view = cv2.GaussianBlur(view, (0, 0), 0.7) + rng.normal(0, 2, view.shape)
+            assert cv2.imwrite(str(folder / f"BOARDS/{side}{k}.png"), np.clip(view, 0, 255).astype(np.uint8))
+
+
+def log(name: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        simulate_log(cs.load_scenario("herath2007-stereo"), 4, 11, folder / name)
+        shutil.copy(folder / name / "sensor.toml", folder / "sensor.toml")
+
+    return write
+
+
+def results(*names: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=60)
+        done = cs.run_trials(world, ["ekf-uvd", "ukf-uvd"], runs=20, seed=5, jobs=1)
+        for name in names:
+            done.write(folder / name)
+
+    return write
+
+
+def repository(folder: Path) -> None:
+    shutil.copytree(ROOT / "docs/examples/repository", folder, dirs_exist_ok=True)
+
+
+def of_readme(folder: Path) -> None:
+    for prepare in (inline, motions, innovations, images, boards, log("LOG")):
+        prepare(folder)
+    archive(folder / "new.npz")
+    (folder / "sensor.toml").unlink()
+
+
+PREPARE: dict[str, list[Callable[[Path], None]]] = {
+    "README.md": [of_readme],
+    "docs/characterise.md": [log("drive"), images, boards],
+    "docs/examples/repository/README.md": [repository],
+    "docs/files.md": [inline],
+    "docs/files.md TUM trajectories": [trajectories],
+    "docs/files.md Another world frame: `--align`": [trajectories],
+    "docs/files.md Tables: .csv and .parquet": [planar],
+    "docs/files.md OpenVINS": [openvins],
+    "docs/files.md KITTI": [kitti],
+    "docs/files.md Relative poses": [motions],
+    "docs/front-end.md": [images],
+    "docs/monitor.md": [innovations],
+    "docs/referee.md": [results("results", "DIR", "NEW")],
+    "docs/regime.md": [log("log")],
+}  # of a page, or of a part of it that has a folder of its own
+
+# --- names that the reader brings --------------------------------------------------------------------------
+
+TESTED = """
+import numpy as np, pytest
+from consistency.testing import assert_consistent, assert_not_worse
+
+my_filter, axes = None, {axes}
+
+
+def simulate(filter, runs):
+    covariance = np.broadcast_to(np.eye(axes), (runs, 20, axes, axes))
+    return np.random.default_rng(20070).normal(size=(runs, 20, axes)), covariance
+
+
+def simulate_my_filter(runs):
+    return simulate(my_filter, runs)
+
+
+"""
+
+
+def names_of(page: str, folder: Path) -> dict[str, Any]:
+    """Variables that the code of a page does not make itself."""
+    world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
+    if page == "docs/gates.md":
+        from consistency.testing import assert_not_worse
+        from consistency.verdicts.comparison import write_baseline
+
+        done = cs.run_trials(world, ["ekf-uvd", "ekf-xyz"], runs=60, seed=5, jobs=1)
+        write_baseline(done, folder / "baseline.json")
+        e, covariance = RNG.normal(size=(200, 20, 3)), np.broadcast_to(np.eye(3), (200, 20, 3, 3))
+        arrays = dict.fromkeys(("errors_new", "errors_old"), e) | dict.fromkeys(
+            ("covariances_new", "covariances_old"), covariance
+        )
+        return {"assert_not_worse": assert_not_worse, "results": done, **arrays}
+    if page == "docs/front-end.md":
+        return {"paths": [folder / f"IMAGES/image_{side}/00000{k}.png" for k in (0, 1) for side in (0, 1)]}
+    if page == "docs/long-runs.md":
+        return {"cs": cs, "scenario": cs.load_scenario("herath2007-stereo")}
+    return {"cs": cs, "scenario": world, "my_filter": Wrapped()}
+
+
+class Wrapped:
+    """A filter of the reader's own."""
+
+    name, sensors = "mine", ("uvd",)
+
+    def __init__(self) -> None:
+        self.inner = cs.get_filter("ekf-uvd")
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("init", "predict", "update", "pose"):
+            return getattr(self.inner, name)
+        raise AttributeError(name)

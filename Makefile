@@ -37,7 +37,7 @@ regime: .venv/.done
 	cp reports/regime/map.json reports/reference/regime.json
 
 docs: .venv/.done
-	$(BIN)/python -m sphinx -q -W --keep-going -d docs/_build/doctrees docs docs/_build/html
+	$(BIN)/python -m sphinx -q -E -W --keep-going -d docs/_build/doctrees docs docs/_build/html
 	$(BIN)/python docs/check.py docs/_build/html
 
 tutorial: .venv/.done

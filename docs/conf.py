@@ -21,16 +21,20 @@ extensions = [
     "myst_nb",
     "commands",
     "docstrings",
+    "figures",
     "outside",
 ]
 root_doc = "index"
 exclude_patterns = ["_build", "examples/README.md", "gallery", "generated/gallery/*.ipynb", "generated/gallery/*.json"]
-smartquotes = False  # they would make a dash of the two of an option
 highlight_language = "none"  # an indented block is a command or what it prints
 nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!consistency[.:]).*"),  # types and modules of others, or an alias of arrays
-    (r"py:class", r"consistency\..*"),  # types in signatures whose page is that of a name that uses them
+    (
+        r"py:class",
+        r"consistency\..*\.(Backend|Curves|DisparityGrowth|Group|Lens|Moments|Observations|Parts|Space|Sweep|Tables)",
+    ),  # in signatures, not public
+    (r"py:class", r"consistency\.imaging\.\w+\.(Correspondence|Filter|Selection|Tracking)"),  # stages of the chain
 ]
 
 # pages
@@ -57,6 +61,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "show_signature": False,
+    "capture_repr": (),  # what is printed is shown, not what an expression is
     "write_computation_times": False,
     "min_reported_time": 60,
     "remove_config_comments": True,
@@ -66,6 +71,7 @@ sphinx_gallery_conf = {
 # HTML
 html_theme = "pydata_sphinx_theme"
 html_title = project
+html_context = {"default_mode": "auto"}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_sidebars = {"tutorial": []}  # one page, no section around it

@@ -135,7 +135,7 @@ def challenge(
     Parameters
     ----------
     base : the scenario whose values are the plain ones; None for the first of :data:`BASES` that fits the filter
-    within : bounds of dimensions, see :func:`consistency.challenging.worlds.space_of`
+    within : bounds of dimensions, see ``consistency.challenging.worlds.space_of``
 
     Raises
     ------

@@ -86,8 +86,8 @@ class Settings:
     """
 
     false_alarm: float = 0.05  # chance to find a fault in a right filter, all questions together
-    detect: float = 1.5  # a consistent filter is shown to have a ratio of true to stated covariance inside
-    power: float = 0.95  # [1 / detect, detect]; one at either end is not called so with this probability or more
+    detect: float = 1.5  # consistent: the ratio of true to stated covariance is shown to be in [1 / detect, detect]
+    power: float = 0.95  # a filter at either end is not called consistent, with this probability or more
     tolerance: float | None = None  # a ratio shown to lie in [1 / tolerance, tolerance] is no fault
     allow: str | None = None  # "conservative": a covariance that is too large is no fault
     method: str = "max"  # of the band over all steps: "max" or "bonferroni"

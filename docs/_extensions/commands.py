@@ -10,6 +10,7 @@ from outside import FOLDER, write_changed
 from sphinx.application import Sphinx
 
 GENERATOR = [sys.executable, "-m", "typer", "consistency.cli", "utils", "docs", "--name", "consistency"]
+OPTION = re.compile(r"(?<![`\w\-\[])--[a-z][a-z-]*")  # in a sentence, where two hyphens would become a dash
 EXAMPLES = re.compile(r"\x08?\n?Examples:\n((?:  .*\n)+)")
 INDEX = """# Command line
 
@@ -25,9 +26,7 @@ INDEX = """# Command line
 
 ## Exit status
 
-{statuses}
-"""
-STATUSES = """| status | meaning |
+| status | meaning |
 | --- | --- |
 | 0 | done |
 | 1 | the verdict asked for failed (`--fail-on`, `reproduce`) |
@@ -44,10 +43,12 @@ def write_commands(app: Sphinx) -> None:
     pages = dict(zip(parts[::2], parts[1::2], strict=True))
     listing = []
     for name, body in pages.items():
+        body = re.sub(r"^\* .*", lambda line: OPTION.sub(r"`\g<0>`", line[0]), body, flags=re.MULTILINE)
+        body = re.sub(r"\bdocs/([\w-]+\.md)", r"[\g<0>](../../\1)", body)
         body = EXAMPLES.sub(lambda found: f"**Examples**:\n\n```console\n{plain(found[1])}```\n", body)
         write_changed(FOLDER / "commands" / f"{name}.md", f"# consistency {name}\n{body}")
         listing.append(f"- [{name}]({name}.md): {body.strip().splitlines()[0]}")
-    index = INDEX.format(listing="\n".join(listing), names="\n".join(pages), statuses=STATUSES)
+    index = INDEX.format(listing="\n".join(listing), names="\n".join(pages))
     write_changed(FOLDER / "commands" / "index.md", index)
 
 

@@ -2,6 +2,7 @@
 
 - ``name : (runs, n), what it is`` describes a parameter; napoleon would take it for the name of a type.
 - A doctest below the last section is an example.
+- A page that is named becomes a link to it.
 - The comment behind a field is its description, without the colon of ``#:``. A colon in it is one of a sentence;
   napoleon would take what is before it for a type.
 """
@@ -16,6 +17,7 @@ from sphinx.pycode import parser
 
 NAMES = ("Parameters", "Other Parameters", "Attributes")
 RESULTS = ("Returns", "Yields")
+PAGE = re.compile(r"\bdocs/([\w-]+)\.md")
 FIELDS = ("attribute", "data", "property")
 RULE = re.compile(r"-{3,}\s*$")
 
@@ -35,7 +37,7 @@ def describe(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: l
             lines_out += [line if line.startswith(" ") else f": {line}"]
         else:
             lines_out.append(line)
-    lines[:] = lines_out
+    lines[:] = [PAGE.sub(r":doc:`\g<0> </\1>`", line) for line in lines_out]
 
 
 def hide(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:

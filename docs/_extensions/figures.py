@@ -6,7 +6,10 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from sphinx.application import Sphinx
 from sphinx_gallery.scrapers import figure_rst
+
+from consistency.terminal.progress import quiet
 
 LOOK = {
     "axes.linewidth": 0.7,
@@ -40,3 +43,11 @@ def figure_scraper(block: Any, block_vars: dict[str, Any], gallery_conf: dict[st
     path = next(block_vars["image_path_iterator"])
     save(figure, path)
     return str(figure_rst([path], gallery_conf["src_dir"]))
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Run the scripts without progress among their outputs."""
+    silence = quiet()
+    silence.__enter__()
+    app.connect("build-finished", lambda *_: silence.__exit__(None, None, None))
+    return {"parallel_read_safe": True}

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 FOLDER = DOCS / "generated"
 PAGES = {
-    "README.md": "index",
+    "README.md": "generated/readme",
     "CHANGELOG.md": "generated/changelog",
     "CONTRIBUTING.md": "generated/contributing",
     "benchmarks/README.md": "generated/benchmarks",

@@ -103,6 +103,8 @@ def test_an_empty_folder_is_no_site(tmp_path: Path) -> None:
         ("scenarios/README.md", "docs/generated/scenarios", "[a](../docs/sensor.md#b)", "[a](../sensor.md#b)"),
         ("scenarios/README.md", "docs/generated/scenarios", "[a](../experiments/README.md)", "[a](experiments.md)"),
         ("CONTRIBUTING.md", "docs/generated/contributing", "[a](LICENSE)", "a"),
+        ("README.md", "docs/generated/readme", "![a](docs/images/regime.png)", "![a](../images/regime.png)"),
+        ("docs/method.md", "docs/method.md", "[a](../README.md#b)", "[a](generated/readme.md#b)"),
     ],
 )
 def test_links_lead_to_pages_of_the_site(source: str, page: str, link: str, expected: str) -> None:
@@ -124,6 +126,8 @@ def test_every_command_has_a_page_with_its_examples(tmp_path: Path, monkeypatch:
         assert "\x08" not in text
         for line in EXAMPLES.get(name, ()):
             assert f"$ consistency {line}\n" in text
+    assert "dask or slurm ([docs/cluster.md](../../cluster.md))" in pages["run"]
+    assert "As many runs as the verdict takes, instead of `--runs`." in pages["run"]
 
 
 # --- reference ---------------------------------------------------------------------------------------
@@ -158,6 +162,17 @@ def test_every_public_name_stands_in_the_reference() -> None:
     assert public - documented() == set()
 
 
+def test_what_a_guide_imports_stands_in_the_reference() -> None:
+    """Except for the guide to what is inside."""
+    missing = {}
+    for page in set(DOCS.glob("*.md")) - {DOCS / "extending.md", DOCS / "architecture.md"}:
+        for block in re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL):
+            for module, names in re.findall(r"^from (consistency\S*) import ([^#\n]*)", block, re.MULTILINE):
+                imported = {f"{module}.{name.strip()}" for name in names.split(",")}
+                missing |= dict.fromkeys(imported - documented(), page.name)
+    assert missing == {}
+
+
 def described(text: str, what: str = "function") -> list[str]:
     lines = inspect.cleandoc(text).split("\n")
     docstrings.describe(None, what, "name", None, None, lines)
@@ -180,7 +195,7 @@ def test_a_parameter_keeps_its_shape_in_the_description() -> None:
         Raises
         ------
         ValueError
-            A : B.
+            A : B. See docs/files.md.
 
         >>> 1
         1
@@ -189,7 +204,7 @@ def test_a_parameter_keeps_its_shape_in_the_description() -> None:
     at = lines.index("errors, P")
     assert lines[at + 1 : at + 3] == ["    (runs, n), truth minus estimate; (runs, n, n),", "    in squared units"]
     assert ": What there is: all of it" in lines
-    assert "    A : B." in lines
+    assert "    A : B. See :doc:`docs/files.md </files>`." in lines
     assert lines[lines.index(">>> 1") - 2] == "Examples"
 
 

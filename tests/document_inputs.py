@@ -245,6 +245,7 @@ PREPARE: dict[str, list[Callable[[Path], None]]] = {
     "docs/files.md Tables: .csv and .parquet": [planar],
     "docs/files.md OpenVINS": [openvins],
     "docs/files.md KITTI": [kitti],
+    "docs/files.md Logs": [log("LOG")],
     "docs/files.md Relative poses": [motions],
     "docs/front-end.md": [images],
     "docs/monitor.md": [innovations],

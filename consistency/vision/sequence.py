@@ -121,9 +121,15 @@ def read_sequence(
     return Sequence(folder, kind, *files, times, t is not None, cameras, rectification)
 
 
-def read_image(path: Path, size: tuple[int, int] | None = None) -> Array:
-    """An image as 8-bit grey (h, w); with ``size`` (width, height) it must have it."""
-    cv2 = opencv()
+def read_image(path: str | Path, size: tuple[int, int] | None = None) -> Array:
+    """An image as 8-bit grey (h, w); with ``size`` (width, height) it must have it.
+
+    Raises
+    ------
+    InputError
+        There is no such file, it is no image, or it has another size.
+    """
+    cv2, path = opencv(), Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such image")
     try:

@@ -16,7 +16,7 @@ from consistency.geometry import rotation
 from consistency.vision.calibration import read_calibration
 from consistency.vision.kitti import read_kitti
 from consistency.vision.rectification import rectify
-from consistency.vision.sequence import read_sequence
+from consistency.vision.sequence import read_image, read_sequence
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 
@@ -389,3 +389,14 @@ def test_unusable_truth(kitti: Path, text: str, said: str) -> None:
 
 def test_the_scene_is_what_it_says(kitti: Path) -> None:
     assert read_sequence(kitti).rectification.rig.t[0] == pytest.approx(BASELINE)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_an_image_is_read_by_its_path(tmp_path: Path, kind: Callable[[Path], str | Path]) -> None:
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    assert cv2.imwrite(str(tmp_path / "image.png"), grey)
+    np.testing.assert_array_equal(read_image(kind(tmp_path / "image.png"), (4, 3)), grey)
+    with pytest.raises(cs.InputError, match="has 4 x 3 px, other images 3 x 4 px"):
+        read_image(kind(tmp_path / "image.png"), (3, 4))
+    with pytest.raises(cs.InputError, match="no such image"):
+        read_image(kind(tmp_path / "none.png"))

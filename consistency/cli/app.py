@@ -18,7 +18,7 @@ UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps i
 Abort: Any = typer.Abort
 
 app = typer.Typer(
-    help="Does a stereo-SLAM filter tell the truth about its own uncertainty?",
+    help="Does your estimator tell the truth about its own uncertainty?",
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

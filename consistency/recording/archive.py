@@ -10,6 +10,9 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, planar_error
 from consistency.reading import is_file, reading, require_room
+from consistency.recording.hints import hints, turns
+from consistency.recording.interpolation import Manifold
+from consistency.recording.poses import Poses
 from consistency.recording.record import Recording, Track, assemble, symmetric
 from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places, are_dof, bounded
@@ -46,6 +49,7 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
     covariances = _array(path, arrays, "covariances", 4)
     if kind == NEEDED[0]:
         error, error_kind = _array(path, arrays, "errors", 3), ""
+        estimates, truth = np.zeros_like(error), error
     else:
         estimates, truth = (_array(path, arrays, key, 3) for key in ("estimates", "truth"))
         if estimates.shape != truth.shape:
@@ -63,18 +67,29 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
         raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {(runs, steps, n, n)}")
     lengths = run_lengths(path, arrays, runs, steps)
     nis, dof = _nis(path, arrays, (runs, steps))
-    tracks = []
+    tracks, poses = [], []
     for run, length in enumerate(lengths):
-        place = [f"{path}, run {run}, step {k + 1}" for k in range(length)]
+        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
         P = symmetric(covariances[run, :length], place.__getitem__)
+        given = error_kind or "vector"
+        poses.append(_poses(place, estimates[run, :length], P, truth[run, :length], given))
         cut = (None if values is None else values[run, :length] for values in (nis, dof))
         tracks.append(Track(run, np.arange(length), place, error[run, :length], P, *cut))
+    axes = _axes(path, arrays, n)
     notes = [f"error convention {error_kind}: {PLANAR[error_kind]}"] if error_kind else []
-    return [
-        assemble(
-            path.stem, tracks, step_times(path, arrays, steps), _axes(path, arrays, n), str(path), error_kind, notes
-        )
-    ]
+    notes += hints(path.stem, axes, poses)
+    if error_kind in ("", "vector"):
+        remedy = "add --error so2, if these are x, y, heading" if error_kind and n == 3 else "wrap it to [-pi, pi]"
+        notes += turns(path.stem, axes, error, covariances, remedy)
+    return [assemble(path.stem, tracks, step_times(path, arrays, steps), axes, str(path), error_kind, notes)]
+
+
+def _poses(place: Places, estimate: Array, covariance: Array, truth: Array, convention: str) -> Poses:
+    """Estimates (T, n) of one run beside their truth, NaN where it is not known."""
+    t, known = np.arange(len(estimate), dtype=float), np.isfinite(truth).all(axis=-1)
+    manifold: Manifold = "vector" if convention == "vector" else "planar"
+    stated = np.ones(len(t), bool)
+    return Poses(place, t, estimate, covariance, stated, t[known], truth[known], manifold, convention, 0.0)
 
 
 def _relative(

@@ -24,6 +24,8 @@ DEGREE = np.pi / 180.0
 MILLI = 1e-3
 TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
 
+NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
+
 Change = Callable[[Poses], Poses]
 
 
@@ -57,6 +59,21 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
     of = "" if worst == 0 else f" of {axes[worst - 1]} by itself"
     size = f"{10.0 ** abs(off[worst]):.2g} times too {'large' if off[worst] > 0 else 'small'}"
     return [f"{name}: the NEES{of} is {size}, but about right if {guesses[best].text}"]
+
+
+def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
+    """Components of errors (runs, steps, n) that are angles: where they are far off, it is by whole turns."""
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        far = (np.abs(error) > np.pi) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < SHARP)
+        home = np.abs(wrap(error)) <= NEAR * sigma
+    found = []
+    for k, axis in enumerate(axes):
+        jumps = int(far[..., k].sum())
+        if jumps >= LEAST and home[..., k][far[..., k]].all():
+            steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
+            found.append(f"{name}: the error of {axis} is off by 2 pi in {steps}, as that of an angle; {remedy}")
+    return found
 
 
 def decades(runs: Sequence[Poses]) -> Array:

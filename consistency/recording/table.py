@@ -152,7 +152,9 @@ def _recording(
         shift, clocks = 0.0, list[str]()
         if relative is not None:
             shift = time_offset if isinstance(time_offset, float) else 0.0
-        elif key == "t" or align is not None:
+        elif key == "step" and align is None:
+            clocks = hints(name, axes, _poses(sheet, samples, runs, keys, estimate, covariance, convention, 0.0))
+        else:
             reach = _default_dt(max_dt) if key == "t" else 0.0
             poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, reach)
             shift, clocks, moved = clocks_and_frames(name, poses, time_offset, align, range(len(axes)))

@@ -182,9 +182,9 @@ def _line(chart: Any, mark: Line, _: Panel, limit: int) -> Any:
     if mark.bound is not None:
         edge: dict[str, Any] = {
             "line_color": mark.look.colour,
-            "line_width": 0.9,
+            "line_width": 1.3,
             "line_dash": [5, 4],
-            "line_alpha": 0.7,
+            "line_alpha": 1.0,
         }
         edges = [chart.add_glyph(source, glyphs.Line(x="x", y=side, **edge)) for side in ("bound", "below")]
     stroke = _stroke(mark.look)

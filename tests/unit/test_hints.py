@@ -15,7 +15,7 @@ from consistency.geometry import wrap
 from consistency.geometry.conventions import planar_error, spatial_error
 from consistency.recording import read_recordings
 from consistency.recording.frames import Frame, carried, fitted_frame, moved
-from consistency.recording.hints import decades, hints
+from consistency.recording.hints import decades, hints, turns
 from consistency.recording.poses import Poses
 from consistency.recording.sheet import Places
 from consistency.types import Array
@@ -246,3 +246,79 @@ def test_the_hint_is_a_note_of_what_was_read(tmp_path: Path, rng: np.random.Gene
     wrong = read_recordings(*files, covariance_order="rotation-translation")[0].notes
     assert any("in the other order (--covariance-order)" in note for note in wrong)
     assert not any("about right if" in note for note in read_recordings(*files)[0].notes)
+
+
+def trials(rng: np.random.Generator, runs: int = 20, steps: int = 40) -> tuple[Array, Array, Array]:
+    """Truth and estimates (runs, steps, 3) of planar poses that turn past pi, and right covariances."""
+    sigma = np.array([0.2, 0.3, 0.02])
+    truth = np.cumsum(rng.normal(size=(runs, steps, 3)) * [0.1, 0.1, 0.2], axis=1) + np.array([0, 0, 3.0])
+    return truth, truth - sigma * rng.normal(size=truth.shape), np.broadcast_to(np.diag(sigma**2), (*truth.shape, 3))
+
+
+def write_steps(path: Path, pose: Array, P: Array) -> Path:
+    """A table with runs and steps, and no times."""
+    pairs = [("xx", 0, 0), ("xy", 0, 1), ("xh", 0, 2), ("yy", 1, 1), ("yh", 1, 2), ("hh", 2, 2)]
+    lines = ["run,step,x,y,heading," + ",".join(f"P_{name}" for name, *_ in pairs)]
+    for run, step in np.ndindex(pose.shape[:2]):
+        numbers = [*pose[run, step], *(P[run, step, i, j] for _, i, j in pairs)]
+        lines.append(f"{run},{step + 1}," + ",".join(f"{value:.12g}" for value in numbers))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda pose, P: (pose, P), None),
+        (lambda pose, P: (pose * [1, 1, DEGREES], P), "the headings of the estimates are in degrees"),
+        (lambda pose, P: (pose * [1e3, 1e3, 1], P), "the positions of the estimates are in millimetres"),
+        (lambda pose, P: (pose, np.linalg.inv(P)), "it is an information matrix; invert it"),
+    ],
+)
+def test_files_that_know_steps_and_no_times_get_hints(
+    change: Callable[[Array, Array], tuple[Array, Array]], said: str | None, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    truth, right, P = trials(rng)
+    estimates, stated = change(right, P)
+    write_steps(tmp_path / "truth.csv", truth, P)
+    write_steps(tmp_path / "est.csv", estimates, stated)
+    np.savez(tmp_path / "est.npz", truth=truth, estimates=estimates, covariances=stated)
+    (table,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
+    (archive,) = read_recordings(tmp_path / "est.npz", convention="so2")
+    for record in (table, archive):
+        hints_given = [note for note in record.notes if "about right if" in note]
+        assert [note.partition("about right if ")[2] for note in hints_given] == ([] if said is None else [said])
+
+
+def test_errors_alone_get_the_hints_of_covariances(tmp_path: Path, rng: np.random.Generator) -> None:
+    truth, estimates, P = trials(rng)
+    np.savez(tmp_path / "errors.npz", errors=truth - estimates, covariances=np.linalg.inv(P))
+    (record,) = read_recordings(tmp_path / "errors.npz")
+    assert any(note.endswith("it is an information matrix; invert it") for note in record.notes)
+
+
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_an_angle_whose_errors_jump_by_a_turn_is_named(wrapped: bool, tmp_path: Path, rng: np.random.Generator) -> None:
+    truth, estimates, P = trials(rng)
+    if wrapped:
+        truth, estimates = (np.dstack([pose[..., :2], wrap(pose[..., 2])]) for pose in (truth, estimates))
+    np.savez(tmp_path / "poses.npz", truth=truth, estimates=estimates, covariances=P)
+    np.savez(tmp_path / "errors.npz", errors=truth - estimates, covariances=P, axes=["x", "y", "yaw"])
+    jumps = int((np.abs(truth - estimates)[..., 2] > np.pi).sum())
+    for name, axis, remedy in (
+        ("poses", "e3", "add --error so2, if these are x, y, heading"),
+        ("errors", "yaw", "wrap it to [-pi, pi]"),
+    ):
+        (record,) = read_recordings(tmp_path / f"{name}.npz")
+        said = f"{name}: the error of {axis} is off by 2 pi in {jumps} of 800 steps, as that of an angle; {remedy}"
+        assert [note for note in record.notes if "2 pi" in note] == ([said] if wrapped else [])
+    assert jumps == 0 or wrapped
+    assert jumps > 2 or not wrapped
+    (judged,) = read_recordings(tmp_path / "poses.npz", convention="so2")
+    assert not any("2 pi" in note for note in judged.notes)
+
+
+def test_errors_that_are_far_off_by_themselves_are_no_angle(rng: np.random.Generator) -> None:
+    error = 6.0 + 0.3 * rng.normal(size=(10, 40, 1))
+    assert turns("name", ["e1"], error, np.full((10, 40, 1, 1), 0.01**2), "wrap it") == []
+    assert turns("name", ["e1"], error, np.full((10, 40, 1, 1), 0.5**2), "wrap it") == []

@@ -45,11 +45,13 @@ def judgement(study: Judged) -> list[Block]:
 
 
 def _table(study: Judged) -> Table:
-    rows = [_cells(track) for track in study.tracks]
+    every = [_cells(track) for track in study.tracks]
+    shown = [i for i in range(len(every[0])) if any(cells[i] != "–" for cells in every)] if every else []
+    heads = tuple(columns(study)[i] for i in shown)
+    rows = [tuple(cells[i] for i in shown) for cells in every]
     text = caption(study)
-    return table(
-        columns(study), rows, f"Verdicts of {study.name}", caption=text, paper=f"{study.name}: {text}", style="narrow"
-    )
+    label, paper = f"Verdicts of {study.name}", f"{study.name}: {text}"
+    return table(heads, rows, label, caption=text, paper=paper, style="narrow", apart=True)
 
 
 def _cells(track: Estimator) -> tuple[Cell, ...]:

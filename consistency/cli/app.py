@@ -301,7 +301,7 @@ def analyse(
         typer.Option("--innovations", help="'optimal': of an optimal gain without a gate, so that they are judged."),
     ] = None,
     confidence: Annotated[
-        float | None, typer.Option("--confidence", help="The same as --false-alarm, which is 1 less it.")
+        float | None, typer.Option("--confidence", help="1 less the --false-alarm, in its place.")
     ] = None,
     report: Annotated[
         Path | None, typer.Option("--report", help="Folder for an HTML and a PDF page on files of another estimator.")

@@ -176,4 +176,6 @@ def _with_frame(recordings: list[Recording], truth: Path | None, body: str | Non
 def _refuse(path: Path, options: dict[str, object], names: Sequence[str]) -> None:
     for name in names:
         if options[name] is not None:
-            raise InputError(f"--{name}: does not go with {path}")
+            kept = path.suffix.lower() == ".npz" and name in ("truth", "axes")
+            instead = f", an archive; it has a key '{name}' in its place" if kept else ""
+            raise InputError(f"--{name}: does not go with {path}{instead}")

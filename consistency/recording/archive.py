@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -140,7 +141,19 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
         if len(set(archive.files)) < len(archive.files):
             raise ValueError("a key is there twice")
         require_room(path, sum(member.file_size for member in archive.zip.infolist()))
-        return {key: archive[key] for key in archive.files}
+        return {key: _numbers(path, archive, key) for key in archive.files}
+
+
+def _numbers(path: Path, archive: Any, key: str) -> Array:
+    """One array of an archive; what only Python could read is refused."""
+    try:
+        array: Array = archive[key]
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            what = "holds Python objects, as of runs of different lengths; pad them with NaN and add 'lengths'"
+            raise InputError(f"{path}: key '{key}' {what}") from None
+        raise
+    return array
 
 
 def _array(path: Path, arrays: dict[str, Array], key: str, dimensions: int) -> Array:

@@ -881,7 +881,12 @@ BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
     "npz truth": (
         npz(errors=ERRORS, covariances=MATRICES),
         ("a.npz", "--truth", "t.csv"),
-        "--truth: does not go with a.npz",
+        "--truth: does not go with a.npz, an archive; it has a key 'truth' in its place",
+    ),
+    "npz ragged": (
+        npz(errors=np.array([ERRORS[0], ERRORS[1, :2]], dtype=object), covariances=MATRICES),
+        ("a.npz",),
+        "a.npz: key 'errors' holds Python objects, as of runs of different lengths; pad them with NaN",
     ),
     "not an npz": (lambda at: (at / "a.npz").write_text("no"), ("a.npz",), "a.npz: is not a NumPy archive"),
 }

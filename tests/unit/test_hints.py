@@ -322,3 +322,12 @@ def test_errors_that_are_far_off_by_themselves_are_no_angle(rng: np.random.Gener
     error = 6.0 + 0.3 * rng.normal(size=(10, 40, 1))
     assert turns("name", ["e1"], error, np.full((10, 40, 1, 1), 0.01**2), "wrap it") == []
     assert turns("name", ["e1"], error, np.full((10, 40, 1, 1), 0.5**2), "wrap it") == []
+
+
+def test_steps_are_no_clock(tmp_path: Path, rng: np.random.Generator) -> None:
+    truth, estimates, P = trials(rng)
+    along = np.arange(40)[:, None] * [2.0, 1.0, 0.0]
+    write_steps(tmp_path / "truth.csv", truth + along, P)
+    write_steps(tmp_path / "late.csv", np.roll(estimates + along, 1, axis=1)[:, 1:], P[:, 1:])
+    (record,) = read_recordings(tmp_path / "late.csv", tmp_path / "truth.csv")
+    assert not any("offset" in note or "clock" in note for note in record.notes), record.notes

@@ -14,7 +14,7 @@ from scipy import stats
 import consistency as cs
 from consistency import cli
 from consistency.recording import read_recordings
-from consistency.reporting.blocks import Text
+from consistency.reporting.blocks import Table, Text
 from consistency.reporting.drawing import Figure, Line
 from consistency.reporting.files import clock_of, compose_files, observed_coverage, record_figures, shown_run, unit_of
 from consistency.verdicts.judge import analyse_recordings
@@ -63,6 +63,14 @@ def test_the_verdict_stands_on_top_and_the_pictures_first(archive: Path) -> None
     assert made.answer == f"mine is {sentence}."
     assert [block.title for block in made.chapters[0].blocks] == ["Errors and stated bounds", "NEES", "Coverage"]
     assert [chapter.anchor for chapter in made.chapters] == ["estimator-0", "verdicts", "provenance"]
+
+
+def test_what_the_files_do_not_tell_has_no_column(archive: Path) -> None:
+    (shown,) = [block for block in document(archive).chapters[1].blocks if isinstance(block, Table)][:1]
+    heads = [column.head for column in shown.columns]
+    assert {"Filter", "Verdict", "Mean ANEES", "RMSE position (m)", "Failed runs"} <= set(heads)
+    assert "NIS / dof" not in heads
+    assert [len(row) for _, rows in shown.groups for row in rows] == [len(heads)]
 
 
 def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive: Path) -> None:

@@ -22,9 +22,8 @@ from consistency.vision.tracks import PIXELS, Selection, linked, thinned
 MAX_AGE, MIN_LIFE, BANDS = 12, 2, 3  # observations of a landmark at most and at least, columns: as docs/kitti07.md
 NEAR = 10.0  # standard deviations of its disparity that a landmark has at least: its range is nearly Gaussian
 MOST_SLOTS = 64  # landmarks at once
-LEAVES = 1.0 / (
-    NEAR * np.sqrt(MAX_AGE)
-)  # rad: as many such tilts, at random, come to 1 / NEAR within a landmark's life
+# rad: as many such tilts, at random, come to 1 / NEAR within a landmark's life
+LEAVES = 1.0 / (NEAR * np.sqrt(MAX_AGE))
 CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, forward <- forward, left, up
 
 
@@ -38,9 +37,7 @@ class Plane:
     """
 
     sigma: tuple[float, float, float]  # u, v, d, px
-    limit: tuple[
-        float, float, float
-    ]  # a tenth of the distance of a landmark: f / NEAR twice, and d / NEAR in the median
+    limit: tuple[float, float, float]  # px, a tenth of a landmark's distance: f / NEAR twice, the median d / NEAR
     tilts: Array  # (T,), by which each motion rolls and pitches, rad
 
     @property

@@ -114,9 +114,7 @@ def log_of(data: Factors) -> tuple[Trial, Belief]:
         n_landmarks=int(landmark.max()) + 1,
         truth=true,
     )
-    turn = axes @ CAMERA
-    roll, heading = np.arctan2(turn[2, 1], turn[2, 2]), np.arctan2(turn[1, 0], turn[0, 0])
-    mount = Mount(rotation=(float(roll), float(-np.arcsin(turn[2, 0])), float(heading)))
+    mount = Mount(rotation=conversion.roll_pitch_heading(axes @ CAMERA))
     sensor = BelievedSensor(model="uvd", sigma=SIGMA_PX, f=float(f), B=float(B), mount=mount)
     return trial, Belief(motion=BelievedMotion(sigma_v=SIGMA_V, sigma_omega=SIGMA_OMEGA), sensor=sensor)
 

@@ -68,18 +68,18 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
         raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {(runs, steps, n, n)}")
     lengths = run_lengths(path, arrays, runs, steps)
     nis, dof = _nis(path, arrays, (runs, steps))
+    given = error_kind or "vector"
     tracks, poses = [], []
     for run, length in enumerate(lengths):
         place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
         P = symmetric(covariances[run, :length], place.__getitem__)
-        given = error_kind or "vector"
         poses.append(_poses(place, estimates[run, :length], P, truth[run, :length], given))
         cut = (None if values is None else values[run, :length] for values in (nis, dof))
         tracks.append(Track(run, np.arange(length), place, error[run, :length], P, *cut))
     axes = _axes(path, arrays, n)
     notes = [f"error convention {error_kind}: {PLANAR[error_kind]}"] if error_kind else []
     notes += hints(path.stem, axes, poses)
-    if error_kind in ("", "vector"):
+    if given == "vector":
         remedy = "add --error so2, if these are x, y, heading" if error_kind and n == 3 else "wrap it to [-pi, pi]"
         notes += turns(path.stem, axes, error, covariances, remedy)
     return [assemble(path.stem, tracks, step_times(path, arrays, steps), axes, str(path), error_kind, notes)]

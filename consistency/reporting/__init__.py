@@ -60,13 +60,13 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     """
     from consistency.store.storage import read_manifest
 
-    read_manifest(Path(folder))
+    manifest = read_manifest(Path(folder))
     require_pages(html, pdf, overwrite)
-    from consistency.reporting.build import build_report, compose, parts_of
+    from consistency.reporting.build import build_report, compose, folders_of
     from consistency.terminal.progress import progress
 
-    parts = parts_of(Path(folder))
-    with progress("report", len(parts) + sum(path is not None for path in (html, pdf)), "parts", brief=True) as advance:
+    parts = len(folders_of(Path(folder), manifest)) + sum(path is not None for path in (html, pdf))
+    with progress("report", parts, "parts", brief=True) as advance:
         _write_document(compose(build_report(Path(folder), advance)), html, pdf, advance=advance)
     return [path for path in (html, pdf) if path is not None]
 

@@ -51,13 +51,9 @@ def _count_sentence(studies: Sequence[Study], tracks: Sequence[Track]) -> str:
 
 
 def _status_sentence(status: str, pairs: list[tuple[Track, Study]], studies: int) -> str:
-    by_study: dict[str, list[str]] = {}
-    for track, study in pairs:
-        if track.verdict.status == status:
-            by_study.setdefault(study.name, []).append(track.name)
-    if not by_study:
+    names = [track.name for track, _ in pairs if track.verdict.status == status]
+    if not names:
         return ""
-    names = [name for found in by_study.values() for name in found]
     if studies > 1 or len(names) > LISTED:
         return f"{len(names)} {'is' if len(names) == 1 else 'are'} {status} ({STATUSES[status]})."
     return f"{status.capitalize()} ({STATUSES[status]}): {listed(names)}."

@@ -24,7 +24,7 @@ from consistency.verdicts.curves import curves, nis_ratio, steps_of
 from consistency.verdicts.judge import design_of, verdict_by, with_map
 
 
-def parts_of(folder: Path) -> list[Path]:
+def folders_of(folder: Path, manifest: dict[str, Any]) -> list[Path]:
     """Folders of results in a folder of ``consistency run``, which is one, or ``consistency reproduce``.
 
     Raises
@@ -32,7 +32,6 @@ def parts_of(folder: Path) -> list[Path]:
     InputError
         The folder holds no results.
     """
-    manifest = read_manifest(folder)
     if "studies" in manifest:
         names = manifest["studies"]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -53,12 +52,12 @@ def build_report(folder: Path, advance: Advance = lambda _: None) -> Report:
     InputError
         The folder holds no results, or a file in it is damaged.
     """
-    studies: list[Study] = []
+    manifest, studies = read_manifest(folder), list[Study]()
     styles: dict[str, int] = {}
-    for index, part in enumerate(parts_of(folder)):
+    for index, part in enumerate(folders_of(folder, manifest)):
         studies.append(_study(part, index, styles))
         advance(1)
-    return Report(folder, read_manifest(folder), tuple(studies), tuple(read_findings(folder)))
+    return Report(folder, manifest, tuple(studies), tuple(read_findings(folder)))
 
 
 def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:

@@ -19,7 +19,7 @@ from consistency.gating.watch import DEFAULTS, Entry, Watch, watching
 
 NAME = "consistency-gates"
 MARKER = (
-    "consistency(dof=3, detect=1.5, false_alarm=0.001, power=0.95, tolerance=None, allow=None): "
+    "consistency(dof=3, detect=1.5, false_alarm=0.001, power=0.95, tolerance=None, allow=None, lost=None): "
     "what the gates of a test ask; plans the number of runs that the fixture consistency_runs gives"
 )
 
@@ -110,7 +110,7 @@ class Gates:
         terms = DEFAULTS | options
         if self.budget is not None and "false_alarm" not in options:  # enough whatever else will run
             terms["false_alarm"] = in_place_rate(self.budget, self.collected)
-        return gate_runs(terms["dof"], terms["detect"], terms["false_alarm"], terms["power"], terms["allow"])
+        return gate_runs(**{key: value for key, value in terms.items() if key != "tolerance"})
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:

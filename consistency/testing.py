@@ -53,6 +53,7 @@ def assert_consistent(
     power: float | None = None,
     tolerance: float | None = None,
     allow: str | None = None,
+    lost: float | None = None,
     axes: Sequence[str] | None = None,
     subsets: Mapping[str, Sequence[int]] | None = None,
     method: str = "max",
@@ -80,6 +81,8 @@ def assert_consistent(
     power : chance that it does not (0.95)
     tolerance : a ratio shown to lie in [1 / tolerance, tolerance] is no fault; nothing is tolerated by default
     allow : "conservative" accepts a covariance that is too large
+    lost : share of lost runs that must not pass: of runs that failed, or whose mean NEES is beyond
+        :func:`consistency.diagnostics.lost_bound` at ``false_alarm`` over their number. Nothing is asked by default
     axes : names of the n components
     subsets : further groups of components to look at, name -> indices
     method : of the band over all steps, see :func:`consistency.diagnostics.simultaneous_band`
@@ -97,13 +100,13 @@ def assert_consistent(
     ConsistencyError
         A fault at the stated false-alarm rate, however few the runs; or failed runs in results.
     InsufficientTrials
-        No fault, and too few runs to show that the ratio is inside; :func:`consistency.diagnostics.gate_runs` are
-        enough for nearly every right filter.
+        No fault, and too few runs to show that the ratio is inside, or that few runs are lost;
+        :func:`consistency.diagnostics.gate_runs` are enough for nearly every right filter.
     ValueError
         Input that cannot be judged, named by run (from 0) and step (from 1); options that do not fit.
     """
     __tracebackhide__ = True
-    demand = terms(false_alarm, detect, power, allow, tolerance)
+    demand = terms(false_alarm, detect, power, allow, tolerance, lost)
     arrays: dict[str, Any] = {
         "covariances": covariances, "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
         "innovations": innovations, "innovation_covariances": innovation_covariances, "axes": axes,
@@ -124,7 +127,7 @@ def assert_consistent(
         return _Look(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
-        return gate_runs(candidate.planned_dof, demand.detect, rate, demand.power, demand.allow)
+        return gate_runs(candidate.planned_dof, demand.detect, rate, demand.power, demand.allow, demand.lost)
 
     result = _settle("assert_consistent", candidate, demand, look, needed)
     assert result.verdict is not None
@@ -271,8 +274,9 @@ def _deciding(result: _Look, runs: int) -> int:
     """Runs that would probably decide, more than there are; 0 for a comparison, which says so itself."""
     if result.verdict is None:
         return 0
-    shown = result.verdict.equivalence
-    return max(runs + 1, (shown.runs or 0) if shown is not None else 0)
+    shown, lost = result.verdict.equivalence, result.verdict.lost
+    deciding = (shown.runs or 0) if shown is not None and not shown.shown else 0
+    return max(runs + 1, deciding, (lost.needed or 0) if lost is not None else 0)
 
 
 def _entry(
@@ -290,7 +294,8 @@ def _entry(
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
         runs=candidate.runs, needed=least, dof=candidate.planned_dof, detect=demand.detect, power=demand.power,
-        allow=demand.allow, late={} if late is None else _summary(late), statistics=statistics, **fields,
+        allow=demand.allow, lost=demand.lost, late={} if late is None else _summary(late), statistics=statistics,
+        **fields,
     )  # fmt: skip
 
 

@@ -49,6 +49,7 @@ SlurmOptions = Annotated[
         "--slurm", metavar="KEY=VALUE", help="For slurm: partition=short, time=60 (minutes); may be repeated."
     ),
 ]
+LOST_HELP = "share of lost runs that must be excluded"
 DETECT_HELP = "ratio of true to stated covariance that must be found"
 FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC)}  # a disk, a quota, a limit
 SCENARIO = "Built-in name (see 'list') or path of a .toml file."
@@ -195,6 +196,7 @@ def run(
     false_alarm: Annotated[
         float | None, typer.Option("--false-alarm", help="For --until-decided: chance to fail a right filter [0.05].")
     ] = None,
+    lost: Annotated[float | None, typer.Option("--lost", help=f"For --until-decided: {LOST_HELP}.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the noise [default: 0].")] = None,
     jobs: Jobs = -1,
     timeout: Annotated[
@@ -226,7 +228,7 @@ def run(
         raise InputError("give either a SCENARIO or --log DIR")
     if screen is not None and log is None:
         raise InputError("--screen goes with --log: a scenario says which of its observations are spurious")
-    planned = _options(max_runs=max_runs, detect=detect, false_alarm=false_alarm)
+    planned = _options(max_runs=max_runs, detect=detect, false_alarm=false_alarm, lost=lost)
     if planned and not until_decided:
         raise InputError(f"--{next(iter(planned)).replace('_', '-')} goes with --until-decided")
     if until_decided and runs is not None:
@@ -296,6 +298,10 @@ def analyse(
         float | None,
         typer.Option("--tolerance", help="A covariance ratio shown inside [1/R, R] is no fault.", metavar="R"),
     ] = None,
+    lost: Annotated[
+        float | None,
+        typer.Option("--lost", help="Consistent is also a share of lost runs shown to be this at most.", metavar="P"),
+    ] = None,
     innovations: Annotated[
         str | None,
         typer.Option("--innovations", help="'optimal': of an optimal gain without a gate, so that they are judged."),
@@ -322,7 +328,7 @@ def analyse(
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
     if innovations not in (None, "optimal"):
         raise InputError(f"--innovations must be 'optimal', got '{innovations}'")
-    changes = _options(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance)
+    changes = _options(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance, lost=lost)
     settings = settings_of(**changes) if changes else None
     written: list[Path] = []
     if overwrite and report is None:
@@ -381,6 +387,7 @@ def plan(
     allow: Annotated[
         str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
     ] = None,
+    lost: Annotated[float | None, typer.Option("--lost", help=f"{LOST_HELP.capitalize()}.", metavar="P")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
@@ -401,9 +408,9 @@ def plan(
     if like is not None:
         pilots = pilots_of(open_results(like), filters)
     elif scenario is not None:
-        plan_runs(dof, detect, false_alarm, power, allow)  # refuse before the work
+        plan_runs(dof, detect, false_alarm, power, allow, lost=lost)  # refuse before the work
         pilots = pilots_of(run_trials(load_scenario(scenario), filters or [], pilot_runs, seed), filters)
-    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots)
+    planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost)
     if as_json:
         print(json.dumps(planned, indent=2))
     else:

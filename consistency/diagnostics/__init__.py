@@ -15,11 +15,20 @@ from consistency.diagnostics.equivalence import equivalence
 from consistency.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
 from consistency.diagnostics.landmarks import map_score
+from consistency.diagnostics.lost import lost_bound
 from consistency.diagnostics.monitor import Alarm, Monitor
 from consistency.diagnostics.nees import anees, nees
 from consistency.diagnostics.normality import Normality, normality
 from consistency.diagnostics.outliers import Outlier, outliers
-from consistency.diagnostics.planning import PilotPlan, detectable_ratio, gate_runs, pilot_plan, power_of, required_runs
+from consistency.diagnostics.planning import (
+    PilotPlan,
+    detectable_ratio,
+    gate_runs,
+    lost_runs,
+    pilot_plan,
+    power_of,
+    required_runs,
+)
 from consistency.diagnostics.questions import answers
 from consistency.diagnostics.records import (
     Answer,
@@ -85,6 +94,8 @@ __all__ = [
     "judge",
     "largest_direction",
     "look",
+    "lost_bound",
+    "lost_runs",
     "map_score",
     "mean_shape",
     "mean_test",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.diagnostics.wording import p_text, plain, plural, question_text, short
+from consistency.diagnostics.wording import p_text, percent, plain, plural, question_text, short
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
@@ -24,7 +24,8 @@ def flat(v: Verdict) -> dict[str, Any]:
         "failures": [[f.run, f.step, f.reason] for f in v.failures],
         "answers": [vars(a) for a in v.answers], "p_value": v.p_value, "left_out_steps": list(v.left_out_steps),
     }  # fmt: skip
-    for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy, _map, _joint, _rejection):
+    of_errors = (_scale, _lost, _location, _axes, _bias, _shape, _tails)
+    for part in (*of_errors, _innovations, _accuracy, _map, _joint, _rejection):
         s |= part(v)
     if v.convention is not None or v.notes:
         s |= {"convention": v.convention, "align": v.align, "notes": list(v.notes)}
@@ -42,6 +43,17 @@ def _scale(v: Verdict) -> dict[str, Any]:
         "ratio": s.inflation.value, "ratio_interval": tuple(s.inflation[1:]), "detectable": s.detectable,
         "median_run": s.median_run, "worst_run": s.worst_run, "share_inside": s.share_inside,
         "equivalence": _equivalence(s.equivalence), "within": _within(s.within),
+    }  # fmt: skip
+
+
+def _lost(v: Verdict) -> dict[str, Any]:
+    if (lost := v.lost) is None:
+        return {}
+    return {
+        "lost": {
+            "asked": v.settings.lost, "count": lost.count, "runs": lost.runs, "bound": lost.bound, "upper": lost.upper,
+            "level": lost.level, "needed": lost.needed,
+        }
     }  # fmt: skip
 
 
@@ -76,6 +88,8 @@ def _axes(v: Verdict) -> dict[str, Any]:
         "of_axes": {key: tuple(interval) for key, interval in a.inflation.items()},
         "impossible": [list(pair) for pair in v.impossible],
     }  # fmt: skip
+    if (worst := v.worst_axis) is not None:
+        s |= {"worst_axis": worst[0], "worst_axis_ratio": tuple(worst[1])}
     if a.largest is not None:
         s |= {"largest": tuple(a.largest), "largest_direction": a.direction}
     return s
@@ -86,7 +100,7 @@ def _bias(v: Verdict) -> dict[str, Any]:
         return {}
     s: dict[str, Any] = {"bias": {axis: tuple(interval) for axis, interval in b.by_axis.items()}, "bias_step": b.step}
     if b.inflation_without is not None:
-        s |= {"ratio_without_bias": tuple(b.inflation_without), "bias_axis": b.axis}
+        s |= {"ratio_without_bias": tuple(b.inflation_without), "bias_axis": b.axis, "bias_in_step": b.size}
     return s
 
 
@@ -94,7 +108,9 @@ def _shape(v: Verdict) -> dict[str, Any]:
     if (s := v.shape) is None:
         return {}
     correlation = [*(s.pair or (None, None)), s.actual, s.stated]
-    return {"shape": s.matrix, "shape_step": s.step, "correlation": correlation}
+    return {
+        "shape": s.matrix, "shape_step": s.step, "correlation": correlation, "correlation_wrong_sign": s.wrong_sign,
+    }  # fmt: skip
 
 
 def _tails(v: Verdict) -> dict[str, Any]:
@@ -172,10 +188,14 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {short(low)} to {short(high)} accepted)"))
         value, low, high = s.inflation
         rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], truth over stated"))
+        if (worst := v.worst_axis) is not None:
+            rows.append(("worst axis", f"{worst[0]} {plain(worst[1])}"))
         if s.within is not None:
             rows.append(("within the log", f"{plain(s.within.ratio)}, if errors decorrelate as within it"))
         ends = f"[{short(1 / shown.factor)}, {short(shown.factor)}]"
         rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)})"))
+        if v.lost is not None:
+            rows.append((f"lost {v.unit}s", f"{v.lost.count} of {v.lost.runs}, at most {percent(v.lost.upper)} of all"))
     if v.accuracy is not None and v.axes is not None:
         inside = (f"{axis} {100 * c:.1f} %" for axis, c in zip(v.axes.names, v.accuracy.coverage, strict=True))
         rows.append(("2-sigma coverage", ", ".join(inside)))

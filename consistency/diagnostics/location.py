@@ -14,7 +14,7 @@ from consistency.diagnostics.blocks import blocks, by_runs
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
 from consistency.diagnostics.nees import anees
-from consistency.diagnostics.questions import BIAS, SCALE, STEP
+from consistency.diagnostics.questions import BIAS, SCALE, SHAPE, STEP
 from consistency.diagnostics.records import (
     Accuracy,
     Answer,
@@ -33,6 +33,8 @@ from consistency.diagnostics.whitening import mean_of_runs, standardise
 from consistency.types import Array, Indices
 
 FEWEST = 8  # runs; with fewer the axes are not told apart
+SIGN = 2.0  # standard errors from 0, of steps that are all one and the same, at which a correlation has a sign
+VISIBLE = 0.05  # a stated correlation that is worth a word
 SURE = 0.04  # false-alarm rate of naming an axis, or a beginning, that does not stand out
 
 Answers = Mapping[str, Answer]
@@ -140,9 +142,9 @@ def bias_of(sample: Sample, tests: Tests, location: Location, answers: Answers) 
         test = hotelling(of_runs, INTERVAL)
         by_axis = {a: Interval(test.mean[i], *test.interval[i]) for i, a in enumerate(errors.names)}
     if not _any(answers, BIAS):
-        return Bias(by_axis, tests.bias_step, None, None)
+        return Bias(by_axis, tests.bias_step, None, None, None)
     without = ratio_interval(sample.centred_means(late), sample.dof, INTERVAL)
-    return Bias(by_axis, tests.bias_step, _axis_in_step(sample, tests.bias_step), without)
+    return Bias(by_axis, tests.bias_step, *_axis_in_step(sample, tests.bias_step), without)
 
 
 def _standard_means(error: Array, covariance: Symmetric, counted: Array) -> Array:
@@ -150,23 +152,30 @@ def _standard_means(error: Array, covariance: Symmetric, counted: Array) -> Arra
     return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
 
 
-def _axis_in_step(sample: Sample, step: int | None) -> str | None:
+def _axis_in_step(sample: Sample, step: int | None) -> tuple[str | None, float | None]:
+    """The component whose mean stands out most in a step, and that mean in stated standard deviations."""
     if step is None:
-        return None
+        return None, None
     errors = _errors(sample)
     at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
-    return errors.names[int(np.argmax(np.abs(at.mean(axis=0)) / at.std(axis=0, ddof=1).clip(1e-300)))]
+    mean = at.mean(axis=0)
+    chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(1e-300)))
+    return errors.names[chief], float(mean[chief])
 
 
-def shape_of(sample: Sample, tests: Tests, answers: Answers) -> Shape | None:
+def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float) -> Shape | None:
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
     if tests.matrix is None or sample.dof == 1:
         return None
     errors = _errors(sample)
     in_step = not _any(answers, ("shape",)) and tests.shape_step is not None
     here = slice(tests.shape_step - 1, tests.shape_step) if in_step and tests.shape_step else slice(None)
-    pair, actual, stated = _correlation(errors.error[:, here], errors.covariance[:, here], sample.counted[:, here])
-    return Shape(tests.matrix, tests.shape_step, pair, actual, stated)
+    counted = sample.counted[:, here]
+    pair, actual, stated = _correlation(errors.error[:, here], errors.covariance[:, here], counted)
+    known = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
+    wrong_sign = _any(answers, SHAPE) and actual * stated < 0.0 and abs(actual) > known and abs(stated) > VISIBLE
+    right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in errors.names)
+    return Shape(tests.matrix, tests.shape_step, pair, actual, stated, wrong_sign, wrong_sign and right)
 
 
 def tails_of(tests: Tests, run_numbers: Indices | None) -> Tails:

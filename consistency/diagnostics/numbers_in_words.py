@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from consistency.diagnostics.records import Interval
+from consistency.diagnostics.records import TINY, Interval
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
-TINY = 1e-12  # ratio of an error that is rounding
 
 
 def short(value: float) -> str:
@@ -50,3 +49,8 @@ def p_text(p: float) -> str:
 def plural(count: int, noun: str) -> str:
     """1 run, 2 runs."""
     return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def percent(share: float, digits: int = 2) -> str:
+    """5.8 %, of a share."""
+    return f"{100.0 * share:.{digits}g} %" if share < 0.995 else "100 %"

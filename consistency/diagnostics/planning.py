@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from consistency.diagnostics.questions import MAIN, SHARES
 from consistency.diagnostics.scale import FEW, scale_test
@@ -51,13 +51,47 @@ def required_runs(
     return high
 
 
-def gate_runs(dof: int, detect: float, false_alarm: float = 0.05, power: float = 0.95, allow: str | None = None) -> int:
+def gate_runs(
+    dof: int,
+    detect: float,
+    false_alarm: float = 0.05,
+    power: float = 0.95,
+    allow: str | None = None,
+    lost: float | None = None,
+) -> int:
     """Runs with which a verdict (:func:`judge`) finds a covariance wrong by ``detect`` in all steps with ``power``.
 
-    As :func:`required_runs` with the half of ``false_alarm`` that a verdict gives to the mean NEES. Raises as that.
+    As :func:`required_runs` with the half of ``false_alarm`` that a verdict gives to the mean NEES, and at least
+    :func:`lost_runs` where a share ``lost`` of lost runs is to be excluded. Raises as those.
     """
     _require(dof, false_alarm, power)
-    return required_runs(dof, detect, SHARES[MAIN] * false_alarm, power, two_sided=allow is None)
+    runs = required_runs(dof, detect, SHARES[MAIN] * false_alarm, power, two_sided=allow is None)
+    return runs if lost is None else max(runs, lost_runs(lost, power))
+
+
+def share_limit(lost: int, runs: int, confidence: float = 0.95) -> float:
+    """Upper limit of the share of lost runs, where ``lost`` of ``runs`` are (Clopper & Pearson 1934)."""
+    return float(special.betaincinv(lost + 1, runs - lost, confidence)) if lost < runs else 1.0
+
+
+def lost_runs(share: float, power: float = 0.95, lost: int = 0) -> int:
+    """Runs with ``lost`` lost ones among them whose Clopper-Pearson limit is ``share`` at most: 59 for 0.05 and none.
+
+    Raises
+    ------
+    ValueError
+        A number outside (0, 1), or a share so small that over 10 million runs are needed.
+    """
+    for name, value in (("lost", share), ("power", power)):
+        if not 0.0 < value < 1.0:
+            raise ValueError(f"{name} must lie between 0 and 1, got {value}")
+    if share_limit(lost, LARGEST, power) > share:
+        raise ValueError(f"lost of {share} needs more than {LARGEST} runs; ask for a larger share")
+    low, high = lost, LARGEST
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if share_limit(lost, middle, power) <= share else (middle, high)
+    return high
 
 
 @dataclass(frozen=True)
@@ -78,6 +112,7 @@ def pilot_plan(
     false_alarm: float = 0.05,
     power: float = 0.95,
     allow: str | None = None,
+    lost: float | None = None,
 ) -> PilotPlan:
     """Runs that :func:`judge` takes where steps depend on each other as in a pilot, and not completely.
 
@@ -89,11 +124,12 @@ def pilot_plan(
     ----------
     means : (runs,), mean NEES of each run over ``dof``; at least 20
     steps : of a run
+    lost : share of lost runs that is to be excluded
 
     Raises
     ------
     ValueError
-        As :func:`required_runs`; too few runs.
+        As :func:`required_runs` and :func:`lost_runs`; too few runs.
     """
     _require(dof, false_alarm, power)
     if len(means) < FEW:
@@ -102,7 +138,8 @@ def pilot_plan(
     share = SHARES[MAIN] * false_alarm
     least = required_runs(test.effective_dof, detect, share, power, two_sided=allow is None)
     runs = min(int(np.ceil(MARGIN * least)), gate_runs(dof, detect, false_alarm, power, allow))
-    return PilotPlan(len(means), test.effective_dof, float(np.sqrt(2.0 / test.spread)), max(runs, FEW))
+    runs = max(runs, FEW) if lost is None else max(runs, FEW, lost_runs(lost, power))
+    return PilotPlan(len(means), test.effective_dof, float(np.sqrt(2.0 / test.spread)), runs)
 
 
 def power_of(dof: float, runs: int, ratio: float, false_alarm: float = 0.05, two_sided: bool = True) -> float:

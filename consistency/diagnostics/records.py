@@ -6,8 +6,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.types import Array, Failure, Indices
+
+TINY = 1e-12  # ratio of an error that is rounding
 
 # status -> what it means; the order is that of reports
 STATUSES = {
@@ -92,6 +96,7 @@ class Settings:
     allow: str | None = None  # "conservative": a covariance that is too large is no fault
     method: str = "max"  # of the band over all steps: "max" or "bonferroni"
     subsets: Mapping[str, Sequence[int]] | None = None  # further groups of components to look at, name -> indices
+    lost: float | None = None  # consistent: the share of lost runs is shown to be this at most
 
     def __post_init__(self) -> None:
         for name in ("false_alarm", "power"):
@@ -101,6 +106,8 @@ class Settings:
             value = getattr(self, name)
             if value is not None and not (0.0 < value < float("inf") and value != 1.0):
                 raise ValueError(f"{name} must be a positive ratio of true to stated covariance, not 1; got {value}")
+        if self.lost is not None and not 0.0 < self.lost < 1.0:
+            raise ValueError(f"lost must lie between 0 and 1, got {self.lost}")
         if self.allow not in (None, "conservative"):
             raise ValueError(f"allow must be 'conservative' or None, got '{self.allow}'")
         if self.method not in ("max", "bonferroni"):
@@ -199,12 +206,25 @@ class Axes:
 
 
 @dataclass(frozen=True)
+class Lost:
+    """Runs that failed, or whose mean NEES is beyond what a right run has."""
+
+    count: int
+    runs: int  # that failed or have a NEES
+    bound: float  # mean NEES beyond which a run is lost
+    upper: float  # limit of the share of lost runs
+    level: float  # confidence of the limit
+    needed: int | None = None  # runs that show the share asked for, if no further run is lost; None without one
+
+
+@dataclass(frozen=True)
 class Bias:
     """Mean of the error."""
 
     by_axis: Mapping[str, Interval]  # in stated standard deviations
     step: int | None  # where it is clearest, 1..T
     axis: str | None  # the one that carries it in that step
+    size: float | None  # its mean there, in stated standard deviations
     inflation_without: Interval | None  # of the errors less their mean; where a bias was found
 
 
@@ -217,6 +237,8 @@ class Shape:
     pair: tuple[int, int] | None  # components that correlate least as stated
     actual: float  # their correlation
     stated: float
+    wrong_sign: bool = False  # of the correlation, beyond doubt
+    alone: bool = False  # and no component is wrong by itself, so that a fault of the scale is its
 
 
 @dataclass(frozen=True)
@@ -342,6 +364,7 @@ class Verdict:
     joint: JointScore | None = None  # of the verdict on a map
     rejection: RejectionScore | None = None  # of a filter with a guard
     unit: str = "run"  # what a run is called, as in :class:`Evidence`
+    lost: Lost | None = None  # where there is a NEES
 
     @property
     def in_world(self) -> Verdict:
@@ -360,6 +383,19 @@ class Verdict:
     def places(self) -> str:
         """What stands in the place of steps."""
         return "steps" if self.landmarks is None else "landmarks"
+
+    @property
+    def worst_axis(self) -> tuple[str, Interval] | None:
+        """Component whose ratio is farthest from 1, of a verdict on the scale to its side; None of a single one."""
+        if self.axes is None or len(self.axes.names) < 2:
+            return None
+        logs = {a: np.log(max(i.value, TINY)) for a, i in self.axes.inflation.items() if a in self.axes.names}
+        side = {"overconfident": 1.0, "conservative": -1.0}.get(self.status, 1.0 if self.settings.one_sided else 0.0)
+        known = [axis for axis, log in logs.items() if np.isfinite(log)]
+        if not known:
+            return None
+        worst = max(known, key=lambda axis: side * logs[axis] if side else abs(logs[axis]))
+        return worst, self.axes.inflation[worst]
 
     @property
     def faults(self) -> tuple[str, ...]:

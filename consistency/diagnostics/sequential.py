@@ -30,6 +30,7 @@ class Design:
     false_alarm: float = 0.05  # of all looks together
     power: float = 0.95
     max_runs: int | None = None  # what is open then is undecided
+    lost: float | None = None  # see :class:`Settings`
 
     def __post_init__(self) -> None:
         if self.max_runs is not None and self.max_runs < 1:
@@ -41,7 +42,7 @@ class Design:
     @property
     def settings(self) -> Settings:
         """What each look is asked."""
-        return Settings(self.false_alarm, self.detect, self.power)
+        return Settings(self.false_alarm, self.detect, self.power, lost=self.lost)
 
     def inspections(self) -> Iterator[tuple[int, float | None]]:
         """Runs after which to look, and what the look may cost; None where only the scale is looked at."""
@@ -105,7 +106,12 @@ def follow(design: Design, evidence_of: Callable[[int], Evidence], limit: int | 
 
 
 def sequential_design(
-    dof: int, detect: float = 1.5, false_alarm: float = 0.05, power: float = 0.95, max_runs: int | None = None
+    dof: int,
+    detect: float = 1.5,
+    false_alarm: float = 0.05,
+    power: float = 0.95,
+    max_runs: int | None = None,
+    lost: float | None = None,
 ) -> Design:
     """A :class:`Design`.
 
@@ -114,4 +120,4 @@ def sequential_design(
     ValueError
         A value out of its range.
     """
-    return Design(dof, detect, false_alarm, power, max_runs)
+    return Design(dof, detect, false_alarm, power, max_runs, lost)

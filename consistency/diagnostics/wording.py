@@ -11,12 +11,13 @@ from consistency.diagnostics.faults_in_words import (
     joint_text,
     scale_text,
     shape_text,
+    tails_text,
 )
-from consistency.diagnostics.numbers_in_words import UNCERTAIN, off_by, p_text, plain, plural, short
+from consistency.diagnostics.numbers_in_words import UNCERTAIN, off_by, p_text, percent, plain, plural, short
 from consistency.diagnostics.questions import BIAS, JOINT, JOINT_DISTRIBUTION, SCALE, SHAPE
 from consistency.diagnostics.records import Equivalence, Verdict
 
-__all__ = ["UNCERTAIN", "off_by", "p_text", "plain", "plural", "question_text", "reasons", "short"]
+__all__ = ["UNCERTAIN", "off_by", "p_text", "percent", "plain", "plural", "question_text", "reasons", "short"]
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 MUCH = 100_000  # runs; more are no advice
@@ -43,7 +44,7 @@ def reasons(v: Verdict) -> list[str]:
         lines.append(_nis(v))
     if v.answers:
         lines.append(_questions(v, faults))
-    return [f"{v.status}{_since(v, faults)}: {lines[0]}", *lines[1:]]
+    return [f"{v.status}: {lines[0]}", *lines[1:]]
 
 
 # --- the sentence ------------------------------------------------------------------------------------
@@ -70,13 +71,6 @@ def _failures(v: Verdict) -> list[str]:
     return lines
 
 
-def _since(v: Verdict, faults: Faults) -> str:
-    since = v.location.since if v.location is not None else None
-    if not faults or since is None or v.status in ("biased", "heavy-tailed"):  # it is that of the scale
-        return ""
-    return f" since step {since}"
-
-
 def _sentence(v: Verdict, faults: Faults) -> str:
     if not faults:
         return _no_fault(v)
@@ -89,15 +83,10 @@ def _sentence(v: Verdict, faults: Faults) -> str:
     elif v.status != "biased":
         parts += [scale_text(v, faults)] if any(q in faults for q in SCALE) else []
         parts += [shape_text(v, faults)] if any(q in faults for q in SHAPE) else []
-    if "outliers" in faults:
-        assert v.tails is not None
-        where = f"{v.unit} {v.tails.run} lies {short(v.tails.distance)} sigma from the other {v.unit}s"
-        where += f" in {v.place(v.tails.step)}" * (v.steps > 1)
-        parts.insert(0 if v.status == "heavy-tailed" else len(parts), f"heavy tails: {where}")
-    elif v.status == "heavy-tailed":
-        parts.insert(0, f"heavy tails: the {v.unit}s differ more than Gaussian errors would")
+    if "outliers" in faults or v.status == "heavy-tailed":
+        parts.insert(0 if v.status == "heavy-tailed" else len(parts), tails_text(v, faults))
     if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
-        parts.append(joint_text(v.joint))
+        parts.append(joint_text(v, v.joint))
     if JOINT_DISTRIBUTION in faults and len(faults) == 1:
         parts.append("the NEES of pose and map together does not follow the chi-square distribution")
     if "distribution" in faults and len(faults) == 1:
@@ -108,7 +97,7 @@ def _sentence(v: Verdict, faults: Faults) -> str:
         parts.append("innovations correlated over steps")
     if any(q in faults for q in SCALE) and v.status != "heavy-tailed" and _no_bias(v):
         parts.append("no bias found")
-    return "; ".join(parts)
+    return "; ".join(part for part in parts if part)
 
 
 def _no_bias(v: Verdict) -> bool:
@@ -117,17 +106,44 @@ def _no_bias(v: Verdict) -> bool:
 
 
 def _no_fault(v: Verdict) -> str:
+    """Whether the ratio is shown to be right, with that of the worst axis; and what share of lost runs stays open."""
     assert v.scale is not None
-    shown, inflation = v.scale.equivalence, v.scale.inflation
+    shown, runs = v.scale.equivalence, plural(v.runs, v.unit)
     tolerated = [a.question for a in v.answers if a.tolerated]
     none = "no fault beyond the tolerance" if tolerated else "no fault found"
-    size = f"covariance ratio {plain(inflation)}"
+    size, axis, lost = f"covariance ratio {plain(v.scale.inflation)}", _worst_axis(v), _lost(v)
     if shown.shown:
-        return f"{none} in {plural(v.runs, v.unit)}, and the {size} is shown to be {_within(v, shown)}"
-    advice = ""
+        return f"{none} in {runs}, and the {size} is shown to be {_within(v, shown)}{axis}{lost}"
+    advice, asked = "", 0 if v.lost is None or v.settings.lost is None else v.lost.needed or 0
     if shown.runs is not None and shown.runs <= MUCH:
-        advice = f"; {max(shown.runs, v.runs + 1)} such {v.unit}s would probably decide"
-    return f"{none}, but {plural(v.runs, v.unit)} {_do(v.runs)} not show the {size} to be {_within(v, shown)}{advice}"
+        advice = f"; {max(shown.runs, v.runs + 1, asked)} such {v.unit}s would probably decide"
+    return f"{none}, but {runs} {_do(v.runs)} not show the {size} to be {_within(v, shown)}{axis}{advice}"
+
+
+def _worst_axis(v: Verdict) -> str:
+    worst = v.worst_axis
+    return "" if worst is None else f" (worst axis: {worst[0]} {plain(worst[1])})"
+
+
+def _lost(v: Verdict) -> str:
+    """Lost runs, and the share of them that is shown or not excluded."""
+    if (lost := v.lost) is None:
+        return ""
+    asked, unit, runs = v.settings.lost, v.unit, plural(v.runs, v.unit)
+    some = f"{plural(lost.count, unit)} of {lost.runs} {_is(lost.count)} lost" if lost.count else ""
+    if asked is not None and lost.upper <= asked:
+        return f"; lost {unit}s are shown to be at most {percent(asked)} of all ({some or f'none of {lost.runs} is'})"
+    found = f"; {some}, and" if some else ";" if asked is None else ", but"
+    upper = percent(lost.upper, 2 if asked is None else 3)
+    text = f"{found} lost {unit}s of up to {upper} cannot be excluded with {runs}"
+    if asked is None:
+        return text
+    more = "" if lost.needed is None else f"; {lost.needed} {unit}s would, if no further one is lost"
+    return f"{text}, and {percent(asked)} is asked for{more}"
+
+
+def _is(count: int) -> str:
+    return "is" if count == 1 else "are"
 
 
 def _within(v: Verdict, shown: Equivalence) -> str:
@@ -157,6 +173,13 @@ def _level(v: Verdict) -> list[str]:
         text += f" of {s.judged_steps}"
     tolerated = [a.question for a in v.answers if a.tolerated]
     lines = [text]
+    if v.faults and (worst := v.worst_axis) is not None:
+        lines.append(f"covariance ratio of the worst axis: {worst[0]} {plain(worst[1])}; of all {plain(s.inflation)}")
+    if v.lost is not None and (v.lost.count or v.settings.lost is not None):
+        lines.append(
+            f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "
+            f"at most {percent(v.lost.upper)} of all at a confidence of {v.lost.level:g}"
+        )
     if tolerated:
         lines.append(
             f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"

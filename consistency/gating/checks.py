@@ -56,7 +56,7 @@ class Candidate:
     def judge(self, false_alarm: float, terms: Terms) -> Verdict:
         """See :func:`consistency.diagnostics.judge`."""
         settings = Settings(
-            false_alarm, terms.detect, terms.power, terms.tolerance, terms.allow, self.method, self.subsets
+            false_alarm, terms.detect, terms.power, terms.tolerance, terms.allow, self.method, self.subsets, terms.lost
         )
         return judge(self.evidence, settings)
 

@@ -11,7 +11,7 @@ from consistency.gating.budget import in_place_rate
 
 # of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose
 DEFAULTS: dict[str, Any] = {
-    "dof": 3, "detect": 1.5, "false_alarm": 1e-3, "power": 0.95, "tolerance": None, "allow": None,
+    "dof": 3, "detect": 1.5, "false_alarm": 1e-3, "power": 0.95, "tolerance": None, "allow": None, "lost": None,
 }  # fmt: skip
 
 
@@ -44,6 +44,7 @@ class Entry:
     distance: float | None = None  # of a comparison
     standard_error: float | None = None
     spread: dict[str, float] = field(default_factory=dict)  # what else plans the runs of a comparison
+    lost: float | None = None  # share of lost runs that must not pass
     late: dict[str, Any] = field(default_factory=dict)  # what changes here if the end of the session finds the fault
     statistics: dict[str, Any] = field(default_factory=dict)  # all of the verdict
     test: str = ""
@@ -61,6 +62,7 @@ class Terms:
     tolerance: float | None = None
     budget: float | None = None  # of the whole session; ``false_alarm`` is then provisional
     may_fail: bool = True  # in place
+    lost: float | None = None  # share of lost runs that must be excluded
 
     @property
     def planned(self) -> float:
@@ -103,6 +105,7 @@ def terms(
     power: float | None,
     allow: str | None,
     tolerance: float | None = None,
+    lost: float | None = None,
 ) -> Terms:
     """Arguments first, then the marker of the running test, then the session's budget, then the defaults.
 
@@ -114,6 +117,7 @@ def terms(
     watch = current()
     given: dict[str, Any] = {
         "false_alarm": false_alarm, "detect": detect, "power": power, "allow": allow, "tolerance": tolerance,
+        "lost": lost,
     }  # fmt: skip
     choices: dict[str, Any] = dict(watch.marked) | {key: value for key, value in given.items() if value is not None}
     options = DEFAULTS | choices
@@ -131,9 +135,12 @@ def terms(
     wide = options["tolerance"]
     if wide is not None and (not 0.0 < wide < float("inf") or wide == 1.0):
         raise ValueError(f"tolerance must be a positive ratio of true to stated covariance, not 1; got {wide}")
+    if options["lost"] is not None and not 0.0 < options["lost"] < 1.0:
+        raise ValueError(f"lost must lie between 0 and 1, got {options['lost']}")
     rest = float(options["detect"]), float(options["power"]), options["allow"], wide
     if watch.budget is None or "false_alarm" in choices:
-        return Terms(float(options["false_alarm"]), *rest)
+        return Terms(float(options["false_alarm"]), *rest, lost=options["lost"])
     rate = in_place_rate(watch.budget, watch.tests, watch.budgeted)
     watch.budgeted += 1
-    return Terms(rate or in_place_rate(watch.budget, watch.tests), *rest, budget=watch.budget, may_fail=rate > 0)
+    provisional = rate or in_place_rate(watch.budget, watch.tests)
+    return Terms(provisional, *rest, budget=watch.budget, may_fail=rate > 0, lost=options["lost"])

@@ -17,7 +17,9 @@ def plan_command(dof: int, terms: Terms) -> str:
     """The command that plans the same number of runs."""
     return (
         f"consistency plan --dof {dof} --detect {terms.detect!r} --false-alarm {terms.false_alarm!r} "
-        f"--power {terms.power!r}" + (f" --allow {terms.allow}" if terms.allow else "")
+        f"--power {terms.power!r}"
+        + (f" --allow {terms.allow}" if terms.allow else "")
+        + (f" --lost {terms.lost!r}" if terms.lost is not None else "")
     )
 
 

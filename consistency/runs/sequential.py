@@ -31,6 +31,7 @@ def run_until_decided(
     false_alarm: float = 0.05,
     power: float = 0.95,
     max_runs: int | None = None,
+    lost: float | None = None,
     seed: int = 0,
     jobs: int = -1,
     timeout: float | None = None,
@@ -45,7 +46,7 @@ def run_until_decided(
     """Simulate and judge at the inspections of a :class:`Design` until every filter is decided.
 
     A filter is decided at the first inspection that finds a fault, or shows the ratio of true to stated covariance to
-    lie in [1 / detect, detect]; what is said then stands, however many runs other filters take. With ``max_runs``
+    lie in [1 / detect, detect], and the share of lost runs to be ``lost`` at most where that is given; what is said then stands, however many runs other filters take. With ``max_runs``
     what is open after so many runs ends undecided. Which runs are drawn does not depend on the looks.
 
     Parameters
@@ -67,6 +68,7 @@ def run_until_decided(
     plan: dict[str, Any] = {
         "dof": len(POSE), "detect": detect, "false_alarm": false_alarm, "power": power, "max_runs": max_runs,
     }  # fmt: skip
+    plan |= {} if lost is None else {"lost": lost}
     design, decided = plan_of(plan), dict[str, Verdict]()
     with studied(
         scenario, filters, seed, backend or Local(jobs), timeout, memory,

@@ -16,7 +16,8 @@ from rich.table import Table as RichTable
 from consistency.diagnostics import Interval, MapScore, Verdict
 from consistency.diagnostics.export import map_text, rejection_text
 from consistency.diagnostics.monitor import CAVEAT, accepted_scales
-from consistency.diagnostics.wording import short
+from consistency.diagnostics.wording import percent, short
+from consistency.diagnostics.wording import plain as ratio_text
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 from consistency.store.storage import plain
 from consistency.types import Finding, outcome
@@ -89,6 +90,10 @@ def _below(verdicts: dict[str, Verdict]) -> list[str]:
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
+    if axes := {name: v.worst_axis for name, v in verdicts.items() if v.worst_axis is not None}:
+        lines.append(
+            f"ratio of the worst axis: {'; '.join(f'{n} {axis} {ratio_text(i)}' for n, (axis, i) in axes.items())}"
+        )
     maps = {name: v.map for name, v in verdicts.items() if v.map is not None and v.map.landmarks}
     if maps:
         judged = "" if any(m.verdict is not None for m in maps.values()) else ", not judged"
@@ -139,6 +144,8 @@ def print_plan(planned: dict[str, Any]) -> None:
         f"{p['runs']} runs: a verdict at false alarm {p['false_alarm']:g} then finds a covariance too {side} by "
         f"x{factor:.3g} with power {p['power']:g}"
     )
+    if "lost" in p:
+        print(f"{p['lost_runs']} runs, none of them lost, show that at most {percent(p['lost'])} of all are")
     print(
         f"{p['one_step']} runs would do for a single chi-square test of one step, at the same rates; "
         f"--until-decided asks everything after {', '.join(map(str, p['looks']))}, ... runs and stops when it is clear"

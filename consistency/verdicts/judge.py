@@ -18,6 +18,7 @@ from consistency.diagnostics import (
     follow,
     gate_runs,
     judge,
+    lost_runs,
     map_score,
     pilot_plan,
     rejection_score,
@@ -314,6 +315,7 @@ def plan(
     power: float,
     allow: str | None = None,
     pilots: Mapping[str, Curves] | None = None,
+    lost: float | None = None,
 ) -> dict[str, Any]:
     """Runs that a verdict takes (``runs``), those of one chi-square test (``one_step``), and the first looks.
 
@@ -321,6 +323,7 @@ def plan(
     ----------
     pilots : a few runs of each filter; ``like`` then has the runs that filters take whose steps depend on each other
         as theirs do
+    lost : share of lost runs that is to be excluded
 
     Raises
     ------
@@ -332,15 +335,16 @@ def plan(
     if pilots is not None and dof != len(POSE):
         raise InputError(f"--dof {dof}: results of the bench have {len(POSE)} dimensions; leave it out")
     try:
-        runs = gate_runs(dof, detect, false_alarm, power, allow)
+        runs = gate_runs(dof, detect, false_alarm, power, allow, lost)
         looks = list(itertools.takewhile(lambda n: n < runs, (n for n, spent in Design(dof).inspections() if spent)))
         planned: dict[str, Any] = {
             "dof": dof, "detect": detect, "false_alarm": false_alarm, "power": power, "allow": allow, "runs": runs,
             "one_step": required_runs(dof, detect, false_alarm, power, two_sided=allow is None), "looks": looks,
         }  # fmt: skip
+        planned |= {} if lost is None else {"lost": lost, "lost_runs": lost_runs(lost, power)}
         if pilots is not None:
             planned["like"] = {
-                name: vars(pilot_plan(_pilot_means(c), dof, c.t.size, detect, false_alarm, power, allow))
+                name: vars(pilot_plan(_pilot_means(c), dof, c.t.size, detect, false_alarm, power, allow, lost))
                 for name, c in pilots.items()
             }
         return planned

@@ -46,8 +46,9 @@ def run_until_decided(
     """Simulate and judge at the inspections of a :class:`Design` until every filter is decided.
 
     A filter is decided at the first inspection that finds a fault, or shows the ratio of true to stated covariance to
-    lie in [1 / detect, detect], and the share of lost runs to be ``lost`` at most where that is given; what is said then stands, however many runs other filters take. With ``max_runs``
-    what is open after so many runs ends undecided. Which runs are drawn does not depend on the looks.
+    lie in [1 / detect, detect] and, where ``lost`` is given, the share of lost runs to be that at most; what is said
+    then stands, however many runs other filters take. With ``max_runs`` what is open after so many runs ends undecided.
+    Which runs are drawn does not depend on the looks.
 
     Parameters
     ----------

@@ -90,10 +90,9 @@ def _below(verdicts: dict[str, Verdict]) -> list[str]:
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
-    if axes := {name: v.worst_axis for name, v in verdicts.items() if v.worst_axis is not None}:
-        lines.append(
-            f"ratio of the worst axis: {'; '.join(f'{n} {axis} {ratio_text(i)}' for n, (axis, i) in axes.items())}"
-        )
+    if worst := [(name, *v.worst_axis) for name, v in verdicts.items() if v.worst_axis is not None]:
+        texts = "; ".join(f"{name} {axis} {ratio_text(ratio)}" for name, axis, ratio in worst)
+        lines.append(f"ratio of the worst axis: {texts}")
     maps = {name: v.map for name, v in verdicts.items() if v.map is not None and v.map.landmarks}
     if maps:
         judged = "" if any(m.verdict is not None for m in maps.values()) else ", not judged"

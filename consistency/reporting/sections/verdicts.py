@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from consistency.diagnostics.wording import UNCERTAIN, plural, short
+from consistency.diagnostics.wording import UNCERTAIN, plain, plural, short
 from consistency.reporting.blocks import Block, Cell, Column, Heading, Name, Reason, Reasons, Status, Table, Text, table
 from consistency.reporting.model import Estimator, Judged, Report
 from consistency.reporting.section import Part, Section
@@ -73,6 +73,7 @@ def columns(study: Judged) -> tuple[Column, ...]:
         Column("Mean ANEES", "Mean\nANEES", number=True),
         Column("Covariance to multiply by", "Covariance to\nmultiply by", number=True),
         Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True),
+        Column("Worst axis", "Worst\naxis", number=True),
         Column("Mainly", number=True),
         Column("Since step", "Since\nstep", number=True),
         Column("RMSE position (m)", "RMSE\n(m)", number=True),
@@ -92,6 +93,7 @@ def row(track: Estimator) -> tuple[str, ...]:
         "–" if v.scale is None else brief(v.scale.mean_anees),
         inflation(track),
         shown_inside(track),
+        worst_axis(track),
         (location.subset if location is not None else None) or "–",
         "–" if since is None else str(since),
         number(None if accuracy is None else accuracy.rmse_position, ".3f"),
@@ -120,6 +122,12 @@ def inflation(track: Estimator) -> str:
     ratio, low, high = scale.inflation
     known = np.isfinite(high) and high < UNCERTAIN * low
     return f"×{brief(ratio)} [{f'{brief(low)}, {brief(high)}' if known else 'unknown'}]"
+
+
+def worst_axis(track: Estimator) -> str:
+    """Axis whose ratio of true to stated covariance is farthest from 1, and that ratio."""
+    worst = track.verdict.worst_axis
+    return "–" if worst is None else f"{worst[0]} {plain(worst[1])}"
 
 
 def shown_inside(track: Estimator) -> str:

@@ -248,6 +248,8 @@ def _without_truth(v: Verdict, faults: Faults) -> str:
     if not faults and shown is not None:
         is_shown = "is shown to be" if shown.shown else "is not shown to be"
         parts.append(f"their NIS {is_shown} {_within(v, shown)} times its degrees of freedom")
+        if v.settings.lost is not None:
+            parts.append("they cannot show what share of runs is lost")
     return "; ".join(parts)
 
 

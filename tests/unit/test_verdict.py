@@ -74,7 +74,8 @@ def test_calibrated_is_consistent() -> None:
     assert verdict.consistent
     assert verdict.faults == ()
     assert verdict.reasons[0].startswith("consistent: no fault found in 50 runs, and the covariance ratio ")
-    assert verdict.reasons[0].endswith("] is shown to be between 0.67 and 1.50")
+    assert "] is shown to be between 0.67 and 1.50 (worst axis: axis " in verdict.reasons[0]
+    assert verdict.reasons[0].endswith("; lost runs of up to 5.8 % cannot be excluded with 50 runs")
     assert verdict.first_step is None
     assert verdict.subset is None
     assert verdict.statistics["first_outside"] is None
@@ -120,7 +121,7 @@ def test_biased_is_caught() -> None:
     verdict = make(bias=1.5).verdict()
     assert verdict.status == "biased"
     assert {"scale", "bias"} <= set(verdict.faults)
-    assert verdict.reasons[0].startswith("biased: axis 0 +1.")
+    assert verdict.reasons[0].startswith("biased: mean error +1.")
     assert "too small" not in verdict.reasons[0]
     assert verdict.bias is not None
     assert verdict.bias.inflation_without is not None
@@ -130,7 +131,7 @@ def test_biased_is_caught() -> None:
 def test_a_bias_does_not_hide_a_covariance_too_small() -> None:
     verdict = make(scale=3.0, bias=1.5).verdict()
     assert verdict.status == "overconfident"
-    assert "biased: axis 0 +" in verdict.reasons[0]
+    assert "mean error +" in verdict.reasons[0]
     assert "covariance about the mean too small by x" in verdict.reasons[0]
 
 

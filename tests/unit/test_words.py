@@ -378,7 +378,10 @@ def test_the_flaws_are_seen() -> None:
         must_grow: "conservative: covariance too large by x2.0 in 3 of 9 steps, and too small by up to x1.2 in 1",
         said_twice: "biased: biased in step 3",
     }
-    good = "overconfident: mean error -0.50 sigma [-0.60, -0.40] in axis 1; 10 runs; covariance too small by x1.20 [1.10, 1.30] of 1 run"
+    good = (
+        "overconfident: mean error -0.50 sigma [-0.60, -0.40] in axis 1; 10 runs; covariance too small by x1.20 "
+        "[1.10, 1.30] of 1 run"
+    )
     for flaw in FLAWS:
         assert flaw(bad[flaw])
         assert not flaw(good)

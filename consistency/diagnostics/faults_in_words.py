@@ -43,10 +43,12 @@ def scale_text(v: Verdict, faults: Faults) -> str:
     text = f"covariance{about} {off_by(inflation)}"
     if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
         size = _factor(inflation.value)
-        text = f"covariance{about} {_side(inflation.value - 1.0)} by x{size} in the mean, which a few {v.unit}s make"
+        text = f"covariance{about} {_side(inflation.value - 1.0)} by x{size}{_since(v)} in the mean, which a few "
+        text += f"{v.unit}s make"
     elif inflation.holds(1.0) and v.runs > 1:
-        text += f", an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
-    text += _since(v)
+        text += f"{_since(v)}, an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
+    else:
+        text += _since(v)
     if where.subset:
         text += f", mainly {where.subset}"
     if where.lasting and where.since is None and where.first_step is not None and where.first_step > _first(v.scale):

@@ -156,7 +156,7 @@ def judge(record: Record, *, optimal_gain: bool = False, **settings: Any) -> Jud
     Parameters
     ----------
     optimal_gain : the filter declares one and gates nothing away, so that its innovations are judged
-    settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow`` of
+    settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow``, ``lost`` of
         :class:`consistency.diagnostics.Settings`
 
     Raises

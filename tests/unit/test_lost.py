@@ -211,6 +211,7 @@ def test_until_decided_goes_on_until_the_share_is_excluded() -> None:
     early = look(Design(3, lost=0.05), Evidence("f", nees=nees[:48], dof=3), 0.1)
     assert early.lost is not None
     assert early.lost.upper > 0.05
+    assert early.lost.bound == pytest.approx(float(lost_bound(3, 0.05 / (48 * 49))))
     needed = early.lost.needed
     assert needed is not None
     assert lost_evidence(np.zeros(needed, bool), 0.05)[-1] >= 20.0 > lost_evidence(np.zeros(needed - 1, bool), 0.05)[-1]

@@ -7,6 +7,7 @@ are seen from a body which turns in space alike in all runs. ``calibration.py`` 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from consistency.types import Array
 
 RATES = (0.05, 1e-3)  # of commands and of gates
 GATES, DRAWS = 2000, 40_000
-QUICK_GATES, QUICK_DRAWS = 100, 1000
+LONG_GATES, CHEAP = 400, 10_000  # gates of more values of the NIS than that
+QUICK_GATES, QUICK_DRAWS = 60, 500
 ALARM, WHITENESS, IN_STEP, SHAPE = "false alarm", "innovation whiteness", STEP, "shape"
 # degrees of freedom of the NIS: runs and steps
 NIS = {
@@ -28,7 +30,7 @@ NIS = {
     (1, 6): ((20, 20), (50, 1000)),
     (1, 2, 3, 4, 5, 6): ((20, 20), (50, 1000), (50, 5000)),
 }
-QUICK_NIS = {(1,): ((20, 20), (50, 1000)), (1, 6): ((20, 20),)}
+QUICK_NIS = {(1,): ((20, 20), (50, 1000))}
 GAP_STEPS, GAP_RUNS = 100, (21, 50)
 GAPS = {
     "10 % missing": "one error in all steps of a run, 10 % of the NEES missing at random",
@@ -37,6 +39,7 @@ GAPS = {
     "few go on": "one error in all steps of a run, 10 % missing at random; all but 10 runs end half-way",
 }
 COMPONENTS = {2: (21, 50, 100), 3: (21, 50, 100), 6: (50, 100), 9: (50, 100)}  # and runs
+QUICK_GAPS = ("10 % missing",)
 SHAPES = {
     "independent": "10 independent steps",
     "slow": "one error in all steps",
@@ -68,27 +71,36 @@ ABOUT = {
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
     """Rows of the calibration table."""
-    gates, draws = (QUICK_GATES, QUICK_DRAWS) if quick else (GATES, DRAWS)
-    table = []
+    return [*_nis_rows(quick, seed), *_gap_rows(quick, seed), *_shape_rows(quick, seed)]
+
+
+def _nis_rows(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
     for dof, sizes in (QUICK_NIS if quick else NIS).items():
         for runs, steps in sizes:
             rng = np.random.default_rng((seed, 91, *dof, runs, steps))
+            gates = QUICK_GATES if quick else GATES if runs * steps <= CHEAP else LONG_GATES
             verdicts = [_of_innovations(rng, dof, runs, steps) for _ in range(gates)]
-            table += _of_gates(_nis_world(dof, steps), WHITENESS, runs, verdicts)
-    for k, world in enumerate(GAPS):
-        for runs in GAP_RUNS:
+            yield from _of_gates(_nis_world(dof, steps), WHITENESS, runs, verdicts)
+
+
+def _gap_rows(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
+    for k, world in enumerate(QUICK_GAPS if quick else GAPS):
+        for runs in GAP_RUNS[-1:] if quick else GAP_RUNS:
             rng = np.random.default_rng((seed, 92, k, runs))
-            table += _of_gates(world, IN_STEP, runs, [_of_gaps(rng, world, runs) for _ in range(gates)])
-    share = RATES[0] * SHARES[SHAPE]
+            verdicts = [_of_gaps(rng, world, runs) for _ in range(QUICK_GATES if quick else GATES)]
+            yield from _of_gates(world, IN_STEP, runs, verdicts)
+
+
+def _shape_rows(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
     for k, name in enumerate(SHAPES):
         for n, numbers in COMPONENTS.items():
             if name == "turning" and n != 3:
                 continue
             for runs in numbers[-1:] if quick else numbers:
                 rng = np.random.default_rng((seed, 93, k, n, runs))
-                p = np.array([mean_shape(whitened(rng, name, runs, n))[1] for _ in range(draws)])
-                table.append(_row(_shape_world(name, n), SHAPE, runs, share, p))
-    return table
+                draws = range(QUICK_DRAWS if quick else DRAWS)
+                p = np.array([mean_shape(whitened(rng, name, runs, n))[1] for _ in draws])
+                yield _row(_shape_world(name, n), SHAPE, runs, RATES[0] * SHARES[SHAPE], p)
 
 
 def _of_gates(world: str, question: str, runs: int, verdicts: list[Verdict]) -> list[dict[str, Any]]:

@@ -81,8 +81,8 @@ def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
     """Whiteness of the NIS alone, where no innovations are kept, shapes (runs, steps).
 
     The cube root of the NIS is nearly Gaussian (Wilson & Hilferty 1931). It is standardised by its exact mean and
-    standard deviation, because the autocorrelations are those about a mean of 0; those of Wilson and Hilferty are 2 %
-    of a standard deviation off with one degree of freedom, which many steps take for correlation. What mean is left
+    standard deviation, because autocorrelations are about a mean of 0; the mean of Wilson and Hilferty is 5 % of a
+    standard deviation off with one degree of freedom, which over many steps looks like correlation. What mean is left
     is removed, so that white innovations that are not Gaussian do not count as correlated.
 
     Correlated innovations show in their squares, with the correlation squared.
@@ -108,7 +108,7 @@ def cube_root_moments(dof: Array) -> tuple[Array, Array]:
 
 
 def _cube_root(overall: float, mean: Array, deviation: Array, nis: Array, dof: Array) -> Array:
-    """Cube root of NIS / ``overall`` (runs, steps), standardised by the moments (dof + 1,) of its degrees of freedom."""
+    """Cube root of NIS / ``overall`` (runs, steps), standardised by the moments (dof + 1,) of each dof."""
     counted = np.isfinite(nis) & (dof > 0)
     n = np.where(counted, dof, 0).astype(int)
     with np.errstate(divide="ignore", invalid="ignore"):

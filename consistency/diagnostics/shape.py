@@ -93,7 +93,7 @@ def products_test(products: Array) -> float:
       the correlations between the numbers over the runs. Chance makes these eigenvalues differ more than they do,
       which errs on the safe side.
 
-    NaN where a number is the same in all runs.
+    NaN where a number is 0 in all runs, as with a component that has no error.
     """
     runs, size = products.shape
     if size <= ALL_AT_ONCE:

@@ -112,9 +112,9 @@ def test_the_correlation_of_few_shared_runs_is_not_used(fresh: np.random.Generat
 
 def test_opposite_and_equal_neighbours(fresh: np.random.Generator) -> None:
     """A negative correlation counts as none, and one of 1 is not lost in rounding."""
-    x = fresh.chisquare(3, 40)
-    opposite = 1.2 * np.stack([x, x.max() - x], axis=1)
-    assert simultaneous_band(opposite, 3).p_value == pytest.approx(min(1.0, two_steps(opposite, 0.0)))
+    x = 1.2 * stats.chi2.ppf((np.arange(40) + 0.5) / 40, 3)
+    for pair, rho in ((np.stack([x, x[::-1]], axis=1), 0.0), (np.stack([x, x], axis=1), 1.0)):
+        assert simultaneous_band(pair, 3).p_value == pytest.approx(two_steps(pair, rho), rel=1e-6)
     equal = np.repeat(1.3 * fresh.chisquare(3, (40, 1)), 300, axis=1) * fresh.uniform(0.999999, 1.0, 300)
     assert 0.0 <= simultaneous_band(equal, 3).p_value <= 1.0
 

@@ -139,10 +139,10 @@ def _of_gaps(rng: np.random.Generator, world: str, runs: int) -> Verdict:
 def whitened(rng: np.random.Generator, name: str, runs: int, n: int) -> Array:
     """Whitened errors (runs, steps, n) of a right filter; those of slow errors once instead of in all steps."""
     if name == "slow":
-        return rng.standard_normal((runs, 1, n))
+        return np.asarray(rng.standard_normal((runs, 1, n)))
     if name == "turning":
         turn = Rotation.from_rotvec(_wandering(10)).as_matrix()
-        return np.einsum("kij,rj->rki", turn, rng.standard_normal((runs, n)))
+        return np.asarray(np.einsum("kij,rj->rki", turn, rng.standard_normal((runs, n))))
     w = rng.standard_normal((runs, 10, n))
     if name == "ragged":
         w[np.arange(10) >= rng.integers(1, 11, (runs, 1))] = np.nan

@@ -97,4 +97,4 @@ def _slopes_of(nees: Array) -> Array:
     scale = np.sqrt((a * a).sum(axis=0) * (b * b).sum(axis=0))
     rho = np.where((scale > 0) & (shared >= FEW), (a * b).sum(axis=0) / np.where(scale > 0, scale, 1.0), 0.0)
     rho = np.clip(rho * shared / np.sqrt(alive[:-1] * alive[1:]), 0.0, 1.0)
-    return np.sqrt((1.0 - rho) / (1.0 + rho))
+    return np.asarray(np.sqrt((1.0 - rho) / (1.0 + rho)))

@@ -112,7 +112,7 @@ def _cube_root(overall: float, mean: Array, deviation: Array, nis: Array, dof: A
     counted = np.isfinite(nis) & (dof > 0)
     n = np.where(counted, dof, 0).astype(int)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return (np.cbrt(nis / (n * overall)) - mean[n]) / deviation[n]
+        return np.asarray((np.cbrt(nis / (n * overall)) - mean[n]) / deviation[n])
 
 
 def _portmanteau(u: Array, lags: int) -> Whiteness:

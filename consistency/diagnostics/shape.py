@@ -107,7 +107,7 @@ def products_test(products: Array) -> float:
     u = gap / length
     weights = np.linalg.eigvalsh(u @ u.T if runs < size else u.T @ u)
     scores = float(np.square(special.ndtri(tail)).sum())
-    return min(1.0, 2.0 * min(2.0 * size * float(tail.min()), weighted_chi_square_tail(scores, weights)))
+    return float(min(1.0, 2.0 * min(2.0 * size * float(tail.min()), weighted_chi_square_tail(scores, weights))))
 
 
 def weighted_chi_square_tail(value: float, weights: Array) -> float:

@@ -152,4 +152,5 @@ def whitened(rng: np.random.Generator, name: str, runs: int, n: int) -> Array:
 def _wandering(steps: int) -> Array:
     """Rotation vectors (steps, 3) of a body that turns about an axis which moves, the same at every call."""
     k = np.arange(steps)[:, None]
-    return 0.4 * k * np.stack([np.cos(0.2 * k[:, 0]), np.sin(0.2 * k[:, 0]), 0.5 * np.ones(steps)], axis=-1)
+    axis = np.stack([np.cos(0.2 * k[:, 0]), np.sin(0.2 * k[:, 0]), 0.5 * np.ones(steps)], axis=-1)
+    return np.asarray(0.4 * k * axis)

@@ -5,7 +5,8 @@ shows, and the table of docs/referee.md. ``make calibrate-quick`` measures fewer
 numbers, writes nothing, and fails where a promise is broken: by chance less than once in 5,000 runs.
 
 Worlds are in ``calibration_worlds.py`` and promises in ``calibration_cases.py``; ``calibration_monitor.py`` and
-``calibration_compare.py`` have those on the monitor and on comparisons.
+``calibration_compare.py`` have those on the monitor and on comparisons, ``calibration_questions.py`` those on questions
+that are hard to keep a rate with.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ MODULES = (
     "calibration_compare",
     "calibration_map",
     "calibration_lost",
+    "calibration_questions",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

@@ -40,7 +40,9 @@ def simultaneous_band(
     that move together are counted once: P(max > c) <= sum P(z_k > c) - sum P(z_k > c, z_k+1 > c) (Hunter
     1976; Worsley 1982), with the second term from the bivariate normal with the correlation of the NEES in
     neighbouring steps over the runs, in Owen's (1956) T function: 2 Q(c) + 4 sum T(c, a_k), a_k^2 =
-    (1 - rho_k) / (1 + rho_k).
+    (1 - rho_k) / (1 + rho_k). Where runs have gaps or end early, step averages are over different runs, and correlate
+    less than the NEES of a run that has both steps: rho_k is that times s / sqrt(N_k N_k+1), where s of the N_k and
+    N_k+1 runs are in both.
 
     Parameters
     ----------
@@ -86,11 +88,13 @@ def _slopes(nees: Array, judged: Indices) -> Array:
 
 
 def _slopes_of(nees: Array) -> Array:
-    both = np.isfinite(nees[:, 1:]) & np.isfinite(nees[:, :-1])
-    count = np.maximum(both.sum(axis=0), 1)
+    present = np.isfinite(nees)
+    both = present[:, 1:] & present[:, :-1]
+    shared, alive = both.sum(axis=0), present.sum(axis=0)
+    count = np.maximum(shared, 1)
     a, b = (np.where(both, part, 0.0) for part in (nees[:, :-1], nees[:, 1:]))
     a, b = (np.where(both, part - part.sum(axis=0) / count, 0.0) for part in (a, b))
     scale = np.sqrt((a * a).sum(axis=0) * (b * b).sum(axis=0))
-    rho = np.where((scale > 0) & (count >= FEW), (a * b).sum(axis=0) / np.where(scale > 0, scale, 1.0), 0.0)
-    rho = np.clip(rho, 0.0, 1.0)
-    return np.sqrt((1.0 - rho) / (1.0 + rho))
+    rho = np.where((scale > 0) & (shared >= FEW), (a * b).sum(axis=0) / np.where(scale > 0, scale, 1.0), 0.0)
+    rho = np.clip(rho * shared / np.sqrt(alive[:-1] * alive[1:]), 0.0, 1.0)
+    return np.asarray(np.sqrt((1.0 - rho) / (1.0 + rho)))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from consistency.diagnostics.blocks import blocks
 from consistency.diagnostics.whitening import all_finite
@@ -57,7 +57,7 @@ def t_squared(whitened: Array, known: Moments | None = None) -> tuple[Array, Arr
         m, scatter = mean[good], S[good]
         t2 = N[good] * np.einsum("ki,ki->k", m, np.linalg.solve(scatter, m[..., None])[..., 0])
         statistic[good] = t2
-        p_value[good] = stats.f.sf(t2 * (N[good] - n) / (n * (N[good] - 1)), n, N[good] - n)
+        p_value[good] = special.fdtrc(n, N[good] - n, t2 * (N[good] - n) / (n * (N[good] - 1)))
     return statistic, p_value
 
 

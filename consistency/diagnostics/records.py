@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from consistency.diagnostics.ends import EarlyEnds
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.types import Array, Failure, Indices
 
@@ -342,6 +343,7 @@ class Verdict:
     joint: JointScore | None = None  # of the verdict on a map
     rejection: RejectionScore | None = None  # of a filter with a guard
     unit: str = "run"  # what a run is called, as in :class:`Evidence`
+    ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
 
     @property
     def in_world(self) -> Verdict:

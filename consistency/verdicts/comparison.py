@@ -117,7 +117,7 @@ def baseline_of_files(recordings: Sequence[Recording], name: str, truth: Path | 
     for r in recordings:
         if r.nees is None:
             raise InputError(f"{name}: has no truth of {r.name}; give it with --truth, as only a NEES can be compared")
-        of = evidence_of_windows(r) if r.independent else r
+        of = evidence_of_windows(r) if r.independent and not r.unshown else r
         assert of.nees is not None
         numbers = of.run_numbers if isinstance(of, Evidence) else r.runs
         filters[r.name] = summary(of.nees, r.dof, of.error, of.covariance, numbers)

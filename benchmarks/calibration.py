@@ -41,6 +41,7 @@ MODULES = (
     "calibration_monitor",
     "calibration_compare",
     "calibration_map",
+    "calibration_windows",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

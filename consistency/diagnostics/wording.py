@@ -301,8 +301,8 @@ def _early_ends(v: Verdict) -> list[str]:
         return []
     return [
         f"{plural(v.ends.runs, v.unit)} that end early have a larger NEES in their last step than "
-        f"{100 * v.ends.above:.0f} % of the {v.unit}s that go on (p {p_text(v.ends.p_value)}): if they end because they "
-        "are lost, no rate holds; write a row of NaN where a filter breaks down, so that it counts as failed"
+        f"{100 * v.ends.above:.0f} % of the {v.unit}s that go on (p {p_text(v.ends.p_value)}): if they end because "
+        "they are lost, no rate holds; write a row of NaN where a filter breaks down, so that it counts as failed"
     ]
 
 

@@ -1,7 +1,7 @@
 """Windows of a log that are declared to be independent: is a fault said without a doubt where they are not?
 
-Signs of the errors are independent and their sizes are not: chi-square values whose normal scores are AR(1). Each window
-by itself is right. Windows are judged as ``consistency analyse --relative 1 --windows independent`` judges them.
+Signs of the errors are independent and their sizes are not: chi-square values whose normal scores are AR(1). Each
+window by itself is right. Windows are judged as ``consistency analyse --relative 1 --windows independent`` judges them.
 ``calibration.py`` puts the rows into its table.
 """
 
@@ -25,7 +25,7 @@ FEW = (20, 60, 200, 1000)  # windows of those
 UNDOUBTED, DOUBTED = "windows, fault without a doubt", "windows, doubted"
 ABOUT = {
     **{
-        f"sizes AR({rho:g})": f"windows of a log with {DOF} components whose sizes go on as AR({rho:g}); runs are windows"
+        f"sizes AR({rho:g})": f"windows whose sizes go on as AR({rho:g}), n = {DOF}; runs are windows"
         for rho in MEMORIES
     },
     **{f"independent windows, n = {n}": f"windows of a log with {n} components; runs are windows" for n in (1, 3)},
@@ -80,7 +80,8 @@ def _row(world: str, question: str, runs: int, stated: float, gates: int, found:
 def main() -> None:
     """Print the rows."""
     for row in rows(quick=False, seed=20070101):
-        print(f"{row['question']}, {row['world']}, {row['runs']}: {100 * row['found'] / row['gates']:.2f} %", flush=True)
+        share = 100 * row["found"] / row["gates"]
+        print(f"{row['question']}, {row['world']}, {row['runs']}: {share:.2f} %", flush=True)
 
 
 if __name__ == "__main__":

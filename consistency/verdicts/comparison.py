@@ -63,6 +63,11 @@ class Compared:
         text += f": {c.runs} runs, {way}, p {c.p_value:.2g}"
         if c.distance == c.standard_error == 0.0:
             text += "; every run is the same in both"
+        elif c.worse and c.conservative:
+            text += (
+                f"; its covariance is farther too large, unless rare runs with a large NEES are missing here: up to "
+                f"{100.0 * c.unseen:.2g} % of all runs may be of a kind that {c.runs} do not show"
+            )
         elif not c.worse and c.at_most < np.log(DETECT):
             text += f"; farther off by x{np.exp(max(c.at_most, 0.0)):.3g} at most"
         elif not c.worse:

@@ -63,7 +63,12 @@ class Comparison:
     at_most: float = float("inf")  # upper limit of the distance with confidence 1 - false_alarm
     sum_error: float = 0.0  # standard error of log ratio_a + log ratio_b
     reference: float = 0.0  # lower limit of abs(log ratio_b) with confidence 1 - false_alarm
-    conservative: bool = False  # the p value is of an a that is farther off because its covariance is too large
+    side: float = 0.0  # -1 where the p value is of an a that is farther off because its covariance is too large, or 1
+
+    @property
+    def conservative(self) -> bool:
+        """The p value is of an a that is farther off because its covariance is too large."""
+        return self.side < 0.0
 
     @property
     def unseen(self) -> float:
@@ -194,7 +199,7 @@ def _comparison(
     return Comparison(
         runs=runs, paired=paired, differences=differences, distance=abs(log_a) - abs(log_b), standard_error=gap.error,
         p_value=min(1.0, 2.0 * min(above, below)), false_alarm=false_alarm, at_most=_at_most(gap, total, tail),
-        sum_error=total.error, reference=max(0.0, abs(log_b) - width), conservative=below < above,
+        sum_error=total.error, reference=max(0.0, abs(log_b) - width), side=-1.0 if below < above else 1.0,
     )  # fmt: skip
 
 

@@ -44,6 +44,7 @@ MODULES = (
     "calibration_map",
     "calibration_lost",
     "calibration_questions",
+    "calibration_windows",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

@@ -10,8 +10,10 @@ from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
 from consistency.diagnostics.direction import Largest, largest_direction
 from consistency.diagnostics.distribution import Pit, pit
+from consistency.diagnostics.ends import EarlyEnds, early_ends
 from consistency.diagnostics.eprocess import EProcess, e_process, ever
 from consistency.diagnostics.equivalence import equivalence
+from consistency.diagnostics.independence import Independence, independence
 from consistency.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import anees_interval, chi2_mean_interval
 from consistency.diagnostics.landmarks import map_score
@@ -56,9 +58,11 @@ __all__ = [
     "Design",
     "Difference",
     "EProcess",
+    "EarlyEnds",
     "Equivalence",
     "Evidence",
     "Hotelling",
+    "Independence",
     "Interval",
     "JointNees",
     "Largest",
@@ -85,12 +89,14 @@ __all__ = [
     "coverage_interval",
     "detectable_ratio",
     "e_process",
+    "early_ends",
     "equivalence",
     "ever",
     "follow",
     "gate_runs",
     "hotelling",
     "identity_statistic",
+    "independence",
     "judge",
     "largest_direction",
     "look",

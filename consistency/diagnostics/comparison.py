@@ -63,6 +63,17 @@ class Comparison:
     at_most: float = float("inf")  # upper limit of the distance with confidence 1 - false_alarm
     sum_error: float = 0.0  # standard error of log ratio_a + log ratio_b
     reference: float = 0.0  # lower limit of abs(log ratio_b) with confidence 1 - false_alarm
+    side: float = 0.0  # -1 where the p value is of an a that is farther off because its covariance is too large, or 1
+
+    @property
+    def conservative(self) -> bool:
+        """The p value is of an a that is farther off because its covariance is too large."""
+        return self.side < 0.0
+
+    @property
+    def unseen(self) -> float:
+        """Largest share of runs, 95 %, that may be of a kind of which not one is among these."""
+        return float(1.0 - 0.05 ** (1.0 / self.runs))
 
     @property
     def worse(self) -> bool:
@@ -133,6 +144,10 @@ def compare(
     ``false_alarm`` at most wherever the ratios are, and half of it where both filters err to the same side. The
     one-sided tests are those of ``consistency.diagnostics.contrast``.
 
+    What is compared are expectations. No test of these holds for every law of heavy tails (Bahadur & Savage 1956): rare
+    runs with a large NEES that are not among these make a covariance look larger than it is. So that ``a`` is worse
+    because it is ``conservative`` holds for run means without such tails only.
+
     Parameters
     ----------
     axes : names of the components
@@ -184,7 +199,7 @@ def _comparison(
     return Comparison(
         runs=runs, paired=paired, differences=differences, distance=abs(log_a) - abs(log_b), standard_error=gap.error,
         p_value=min(1.0, 2.0 * min(above, below)), false_alarm=false_alarm, at_most=_at_most(gap, total, tail),
-        sum_error=total.error, reference=max(0.0, abs(log_b) - width),
+        sum_error=total.error, reference=max(0.0, abs(log_b) - width), side=-1.0 if below < above else 1.0,
     )  # fmt: skip
 
 

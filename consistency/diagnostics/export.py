@@ -27,6 +27,8 @@ def flat(v: Verdict) -> dict[str, Any]:
     of_errors = (_scale, _lost, _location, _axes, _bias, _shape, _tails)
     for part in (*of_errors, _innovations, _accuracy, _map, _joint, _rejection):
         s |= part(v)
+    if v.ends is not None:
+        s["early_ends"] = vars(v.ends) | {"lost": v.ends.lost}
     if v.convention is not None or v.notes:
         s |= {"convention": v.convention, "align": v.align, "notes": list(v.notes)}
     if v.world is not None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from consistency.diagnostics.ends import EarlyEnds
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.types import Array, Failure, Indices
 
@@ -365,6 +366,7 @@ class Verdict:
     rejection: RejectionScore | None = None  # of a filter with a guard
     unit: str = "run"  # what a run is called, as in :class:`Evidence`
     lost: Lost | None = None  # where there is a NEES
+    ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
 
     @property
     def in_world(self) -> Verdict:

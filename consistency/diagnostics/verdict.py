@@ -10,6 +10,7 @@ import numpy as np
 from consistency.diagnostics import wording
 from consistency.diagnostics.asking import Tests, ask
 from consistency.diagnostics.band import simultaneous_band
+from consistency.diagnostics.ends import early_ends
 from consistency.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.diagnostics.headline import at_share, status_of
 from consistency.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
@@ -93,6 +94,9 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
         innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
         unit=evidence.unit,
     )  # fmt: skip
+    if sample is not None and evidence.landmarks is None:
+        ends = early_ends(sample.nees)
+        verdict = replace(verdict, ends=ends if ends.runs else None)
     if sample is not None and tests is not None:
         shown = _equivalence(sample, both_sides, look, evidence.reduced)
         lost = lost_of(evidence, sample.nees, sample.dof, settings, any_time=look is not None)

@@ -32,7 +32,7 @@ def reasons(v: Verdict) -> list[str]:
     lines: list[str] = []
     if judged:
         assert v.scale is not None
-        lines = [_sentence(v, faults), *_level(v), *_within_one(v), *_together(v), *_coverage(v)]
+        lines = [_sentence(v, faults), *_early_ends(v), *_level(v), *_within_one(v), *_together(v), *_coverage(v)]
     elif v.scale is not None:
         lines = ["no step has a covariance of full rank to judge"]
     elif v.innovations is not None and v.innovations.dof:
@@ -185,6 +185,17 @@ def _level(v: Verdict) -> list[str]:
             f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"
         )
     return lines
+
+
+def _early_ends(v: Verdict) -> list[str]:
+    """That runs seem to end because the filter is lost."""
+    if v.ends is None or not v.ends.lost:
+        return []
+    return [
+        f"{plural(v.ends.runs, v.unit)} that end early have a larger NEES in their last step than "
+        f"{100 * v.ends.above:.0f} % of the {v.unit}s that go on (p {p_text(v.ends.p_value)}): if they end because "
+        "they are lost, no rate holds; write a row of NaN where a filter breaks down, so that it counts as failed"
+    ]
 
 
 def _within_one(v: Verdict) -> list[str]:

@@ -47,6 +47,7 @@ class Recording:
     face: str = ""  # what the verdict has to say of that
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
     spoilt: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
+    unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
 
     @property
     def left_out_steps(self) -> list[int]:

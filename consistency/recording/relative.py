@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from consistency.diagnostics.independence import ENOUGH, Independence, independence
 from consistency.diagnostics.whitening import whiten
+from consistency.diagnostics.wording import p_text
 from consistency.errors import InputError
 from consistency.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
 from consistency.recording.record import Recording, Track, assemble, common_times, count
@@ -24,8 +26,6 @@ MARGINAL = (
     "covariances of two poses do not tell that of the motion between them; give their cross-covariances, or motions "
     "with --motions (docs/files.md, Relative poses)"
 )
-FEWEST = 20  # neighbouring windows that are compared
-CLEAR = 3.3  # standard errors: one right log in a thousand goes beyond
 BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
 
 
@@ -164,8 +164,14 @@ def relative_recording(
         for one, column in zip(found, columns, strict=True)
     ]
     notes = _notes(name, found, axes, stretches[0].convention, relative)
+    of = _independence(found)
+    notes += _doubt(name, of, relative) if relative.independent else []
     record = assemble(name, tracks, t, tuple(axes[i] for i in part), file, KIND, notes)
-    return replace(record, window=relative.text, independent=relative.independent)
+    if not relative.independent:
+        return replace(record, window=relative.text)
+    face = f"the {_whose(relative)} do not seem to be independent, on which this rests" if of.doubtful else ""
+    unshown = _too_few(of, relative)
+    return replace(record, window=relative.text, independent=True, face=face, unshown=unshown)
 
 
 def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention: str, relative: Relative) -> list[str]:
@@ -182,7 +188,6 @@ def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention:
         notes.append(
             f"{name}: errors of different {_whose(relative)} are declared to be independent: each window is a run"
         )
-        notes += _doubt(name, found, relative)
     else:
         notes.append(
             f"{name}: windows are steps of their run, as their errors may depend on each other; where they do not, "
@@ -211,26 +216,34 @@ def _widest(found: Sequence[Windows]) -> float:
     return float(np.median(np.sqrt(np.maximum(np.linalg.eigvalsh(angles)[:, -1], 0.0)))) if len(angles) else 0.0
 
 
-def _doubt(name: str, found: Sequence[Windows], relative: Relative) -> list[str]:
-    """That neighbouring windows go together, though they are declared to be independent.
+def _independence(found: Sequence[Windows]) -> Independence:
+    return independence(np.concatenate([whiten(one.error, one.covariance) for one in found]))
 
-    Sum of w_k . w_k+1 over the square root of the sum of (w_k . w_k+1)^2, of whitened errors w, is standard normal
-    where they are independent with mean zero.
-    """
-    products = [np.empty(0)]
-    for one in found:
-        w = whiten(one.error, one.covariance)
-        products.append((w[:-1] * w[1:]).sum(axis=1))
-    both = np.concatenate(products)
-    both = both[np.isfinite(both)]
-    if len(both) < FEWEST or not both.any():
+
+def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:
+    """That windows go together, or against each other, though they are declared to be independent."""
+    if not of.doubtful:
         return []
-    score = float(both.sum() / np.sqrt(np.square(both).sum()))
-    if abs(score) < CLEAR:
-        return []
-    way = "go the same way" if score > 0 else "go opposite ways"
-    cause = "a bias, or noise that lasts longer than a window" if score > 0 else "noise of the pose that they share"
+    if of.of_sizes:
+        way = "are of like size" if of.alike else "are of unlike size"
+        cause = "conditions that last longer than a window" if of.alike else "what takes turns from window to window"
+    else:
+        way = "go the same way" if of.alike else "go opposite ways"
+        cause = "a bias, or noise that lasts longer than a window" if of.alike else "noise of the pose that they share"
     return [
-        f"{name}: errors of neighbouring windows {way} ({score:+.1f} standard errors), so that they do not seem to be "
+        f"{name}: errors of neighbouring windows {way} (p {p_text(of.p_value)}), so that they do not seem to be "
         f"independent: {cause} may be behind it, and the verdict holds for independent {_whose(relative)} only"
     ]
+
+
+def _too_few(of: Independence, relative: Relative) -> str:
+    """Why windows that are only declared to be independent decide nothing; "" where they are enough.
+
+    Independent motions are another matter: their covariance over a window rests on it, and is judged with it.
+    """
+    if relative.motions or of.pieces >= ENOUGH:
+        return ""
+    return (
+        f"{count(of.pieces, 'window')} {'is' if of.pieces == 1 else 'are'} too few windows to show independence, which "
+        f"takes {ENOUGH}; without --windows independent they are steps of their run, however they depend on each other"
+    )

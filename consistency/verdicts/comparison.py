@@ -63,6 +63,11 @@ class Compared:
         text += f": {c.runs} runs, {way}, p {c.p_value:.2g}"
         if c.distance == c.standard_error == 0.0:
             text += "; every run is the same in both"
+        elif c.worse and c.conservative:
+            text += (
+                f"; its covariance is farther too large, unless rare runs with a large NEES are missing here: up to "
+                f"{100.0 * c.unseen:.2g} % of all runs may be of a kind that {c.runs} do not show"
+            )
         elif not c.worse and c.at_most < np.log(DETECT):
             text += f"; farther off by x{np.exp(max(c.at_most, 0.0)):.3g} at most"
         elif not c.worse:
@@ -117,7 +122,7 @@ def baseline_of_files(recordings: Sequence[Recording], name: str, truth: Path | 
     for r in recordings:
         if r.nees is None:
             raise InputError(f"{name}: has no truth of {r.name}; give it with --truth, as only a NEES can be compared")
-        of = evidence_of_windows(r) if r.independent else r
+        of = evidence_of_windows(r) if r.independent and not r.unshown else r
         assert of.nees is not None
         numbers = of.run_numbers if isinstance(of, Evidence) else r.runs
         filters[r.name] = summary(of.nees, r.dof, of.error, of.covariance, numbers)

@@ -25,8 +25,10 @@ from consistency.diagnostics import (
     required_runs,
     sequential_design,
 )
+from consistency.diagnostics.questions import SHARES
 from consistency.diagnostics.scale import FEW
 from consistency.diagnostics.symmetric import Symmetric
+from consistency.diagnostics.wording import plain
 from consistency.errors import InputError
 from consistency.recording import Recording
 from consistency.store.results import POSE, Tables
@@ -262,7 +264,7 @@ def analyse_recordings(
                 name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
                 failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, spoilt=r.spoilt,
             )  # fmt: skip
-        verdict = judge(evidence, settings)
+        verdict = _unshown(judge(evidence, settings), r.unshown)
         first, *rest = verdict.reasons
         verdicts[name] = replace(
             verdict,
@@ -273,6 +275,16 @@ def analyse_recordings(
             left_out_steps=tuple(r.left_out_steps),
         )
     return verdicts
+
+
+def _unshown(verdict: Verdict, why: str) -> Verdict:
+    """Undecided, for that reason; as it was without one, or where a window failed."""
+    if not why or verdict.scale is None or verdict.status == "failed":
+        return verdict
+    scale = replace(verdict.scale, equivalence=replace(verdict.scale.equivalence, p_value=float("nan"), runs=None))
+    ratio = f"the covariance ratio would be {plain(scale.inflation)} if they are, reported and not judged"
+    reasons = (f"undecided: {why}; {ratio}", *verdict.reasons[1:])
+    return replace(verdict, status="undecided", scale=scale, reasons=reasons)
 
 
 def _other_ways(verdict: Verdict, r: Recording) -> list[str]:
@@ -304,7 +316,7 @@ def evidence_of_windows(r: Recording) -> Evidence:
     return Evidence(
         r.name, r.error[there][:, None], r.covariance[there][:, None], r.nees[there][:, None], r.dof,
         failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures), axes=r.axes,
-        run_numbers=number[there], unit="window",
+        run_numbers=number[there], unit="window", spoilt=tuple(SHARES) if r.unshown else (),
     )  # fmt: skip
 
 

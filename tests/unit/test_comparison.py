@@ -368,6 +368,19 @@ def test_worse_is_a_p_value_up_to_the_rate() -> None:
     assert not replace(c, p_value=0.0501).worse
 
 
+def test_worse_on_the_conservative_side_says_what_it_rests_on() -> None:
+    wiggle = 1.0 + 0.1 * np.linspace(-1.0, 1.0, 20)
+    sentences = [Compared("a", "b", compare(of_runs(ratio * wiggle), of_runs(wiggle)), (0, 0)) for ratio in (0.5, 2.0)]
+    low, high = sentences
+    assert low.worse
+    assert high.worse
+    assert low.comparison.conservative
+    assert not high.comparison.conservative
+    assert low.comparison.unseen == pytest.approx(0.13911, abs=1e-5)  # (1 - p)^20 = 0.05
+    assert "unless rare runs with a large NEES are missing here: up to 14 % of all runs" in low.sentence
+    assert "rare runs" not in high.sentence
+
+
 def test_limits_of_the_distance_by_hand() -> None:
     """With next to no spread the limits are the distance and the reference themselves."""
     wiggle = 1.0 + 1e-6 * np.linspace(-1.0, 1.0, 20)

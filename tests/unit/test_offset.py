@@ -57,6 +57,17 @@ def test_a_step_goes_to_the_offset(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(steps, 0.02, atol=2e-3)
 
 
+def test_the_interval_by_hand(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Student's t of the steps that five runs would go from the offset: 2.7764 standard errors with 4 of freedom."""
+    steps = iter([0.001, -0.002, 0.004, 0.0, 0.002])
+    monkeypatch.setattr("consistency.recording.offset.steps_of", lambda *_: np.array([next(steps)]))
+    found = offset_of([run_of(rng, 0.04, noise=1e-3) for _ in range(5)])
+    assert found is not None
+    reach = 2.776445 * np.sqrt(5e-6 / 5)  # squares about the mean of 0.001 add up to 20e-6
+    assert found.high - found.value == pytest.approx(reach, rel=1e-6)
+    assert found.value - found.low == pytest.approx(reach, rel=1e-6)
+
+
 def test_with_noise_it_is_named(rng: np.random.Generator) -> None:
     """40 ms at 5 m/s are 0.2 m beside a sigma of 0.3 m. The estimate spreads by 1.2 ms: 10 times that is never seen."""
     runs = [run_of(rng, 0.04) for _ in range(20)]

@@ -17,6 +17,7 @@ from documents import blocks
 import consistency as cs
 from consistency.cli import main as command
 from consistency.diagnostics import Verdict
+from consistency.diagnostics.independence import ENOUGH
 from consistency.geometry.conventions import PLANAR, SPATIAL, planar_error, spatial_error
 from consistency.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
 from consistency.notebook.records import Record
@@ -25,6 +26,7 @@ from consistency.recording.relative import Stretch, windows_of
 from consistency.recording.windows import Relative, relative_of, windows
 from consistency.store.storage import plain
 from consistency.types import Array
+from consistency.verdicts.comparison import baseline_of_files, compare_with
 from consistency.verdicts.judge import analyse_recordings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -303,6 +305,61 @@ def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None
     jitter = simulated.truth @ exp(rng.normal(size=(201, 3)) * [0.3, 0.3, 0.0])
     notes = recorded([motion_stretch(replace(simulated, truth=jitter))], "1", True).notes
     assert any("neighbouring windows go opposite ways" in note for note in notes)
+
+
+def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Recording:
+    """Independent windows of poses, by declaration only; true errors are 3 times what is stated."""
+    runs = [pose_stretch(rng, "SE(2)", steps + 1, 5, 9.0, run) for run in range(windows // steps)]
+    return world.relative_recording(
+        "log", "log", runs, AXES["SE(2)"], range(3), replace(Relative(1, "step"), independent=True)
+    )
+
+
+def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
+    """Errors x9: found by 150 windows, and neither a fault nor an all-clear is said with 140."""
+    few = analyse_recordings([declared(rng, ENOUGH - 10)])["log"]
+    assert few.status == "undecided"
+    assert few.faults == ()
+    assert few.answers == ()
+    assert few.reasons[0].startswith("undecided: 140 windows are too few windows to show independence, which takes 150")
+    assert "the covariance ratio would be" in few.reasons[0]
+    assert few.equivalence is not None
+    assert not few.equivalence.shown
+    enough = analyse_recordings([declared(rng, ENOUGH)])["log"]
+    assert enough.status == "overconfident"
+    right = replace(declared(rng, 30), unshown="")
+    assert analyse_recordings([right])["log"].runs == 30
+    base = baseline_of_files([declared(rng, 50)], "log")
+    with pytest.raises(cs.InputError, match="at least 8 runs"):
+        compare_with(base, base, [])
+
+
+def test_motions_are_judged_however_few(rng: np.random.Generator) -> None:
+    assert recorded([motion_stretch(drive(rng, "SE(2)", 20))], "1", True).unshown == ""
+
+
+def test_a_failed_window_stays_failed(rng: np.random.Generator) -> None:
+    stretch = pose_stretch(rng, "SE(2)", 30, 5, 1.0, 0)
+    stretch.estimate[20] = np.nan
+    relative = replace(Relative(1, "step"), independent=True)
+    record = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), relative)
+    assert analyse_recordings([record])["log"].status == "failed"
+
+
+def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng: np.random.Generator) -> None:
+    """True motions that err by 0.2 or 5 sigma for 50 windows at a time: certain but for 1e-5."""
+    simulated = drive(rng, "SE(2)", 400)
+    n = 3
+    root = np.linalg.cholesky(simulated.covariance[0])
+    size = np.where(np.arange(400) // 50 % 2, 5.0, 0.2)[:, None]
+    moved = simulated.motions @ exp(size * rng.normal(size=(400, n)) @ root.T)
+    truth = composed(np.concatenate([np.eye(3)[None], moved]))
+    record = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True)
+    assert any("errors of neighbouring windows are of like size" in note for note in record.notes)
+    verdict = analyse_recordings([record])["log"]
+    assert verdict.reasons[0].endswith("the motions do not seem to be independent, on which this rests")
+    plain_one = recorded([motion_stretch(drive(rng, "SE(2)", 19))], "1", True)
+    assert (plain_one.face, plain_one.unshown) == ("", "")
 
 
 def test_windows_too_wide_for_first_order_are_named(rng: np.random.Generator) -> None:

@@ -26,6 +26,8 @@ def flat(v: Verdict) -> dict[str, Any]:
     }  # fmt: skip
     for part in (_scale, _location, _axes, _bias, _shape, _tails, _innovations, _accuracy, _map, _joint, _rejection):
         s |= part(v)
+    if v.skipped is not None:
+        s |= {"skip": v.skipped.skip.option, "skipped_steps": v.skipped.steps, "skipped_runs": v.skipped.empty}
     if v.convention is not None or v.notes:
         s |= {"convention": v.convention, "align": v.align, "notes": list(v.notes)}
     if v.world is not None:
@@ -65,6 +67,7 @@ def _location(v: Verdict) -> dict[str, Any]:
         "simultaneous": where.simultaneous, "steps_above": where.above, "steps_below": where.below,
         "first_outside": where.first_outside, "first_step": where.first_step, "since": where.since,
         "lasting": where.lasting, "subset": where.subset,
+        "until": None if where.until is None else where.until.step,
     }  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from consistency.diagnostics.skipping import Skipped
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.types import Array, Failure, Indices
 
@@ -73,6 +74,7 @@ class Evidence:
     unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
     reduced: bool = False  # a fit to the truth may have made the errors smaller than the covariance says: no fault
     spoilt: Collection[str] = ()  # questions that such a fit leaves no answer to, which are not asked
+    skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
 
 
 @dataclass(frozen=True)
@@ -244,6 +246,15 @@ class Innovations:
 
 
 @dataclass(frozen=True)
+class Until:
+    """The last of the first steps that carry a fault, 1..T, and what the ratio is in them and after them."""
+
+    step: int
+    early: float  # mean NEES over dof
+    late: Interval  # ratio of true to stated covariance, 95 %
+
+
+@dataclass(frozen=True)
 class Location:
     """Since when, and where; T steps."""
 
@@ -255,6 +266,7 @@ class Location:
     since: int | None = None  # the fault begins there: it was absent before
     lasting: bool = False  # most steps from there on are outside
     subset: str | None = None  # axes that carry the fault, where axes differ from each other
+    until: Until | None = None  # the fault is in the first steps only
 
 
 @dataclass(frozen=True)
@@ -342,6 +354,7 @@ class Verdict:
     joint: JointScore | None = None  # of the verdict on a map
     rejection: RejectionScore | None = None  # of a filter with a guard
     unit: str = "run"  # what a run is called, as in :class:`Evidence`
+    skipped: Skipped | None = None  # first steps of each run that were left out
 
     @property
     def in_world(self) -> Verdict:

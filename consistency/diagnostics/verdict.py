@@ -96,7 +96,7 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     verdict = Verdict(
         evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,
         innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
-        unit=evidence.unit,
+        unit=evidence.unit, skipped=evidence.skipped,
     )  # fmt: skip
     if sample is not None and tests is not None:
         verdict = _with_records(

@@ -42,7 +42,8 @@ def reasons(v: Verdict) -> list[str]:
         lines.append(_nis(v))
     if v.answers:
         lines.append(_questions(v, faults))
-    return [f"{v.status}{_since(v, faults)}: {lines[0]}", *lines[1:]]
+    lines += _first_steps(v)
+    return [f"{v.status}{_since(v, faults)}: {lines[0]}{_without_first(v)}", *lines[1:]]
 
 
 def short(value: float) -> str:
@@ -118,6 +119,34 @@ def _since(v: Verdict, faults: Faults) -> str:
     if not faults or since is None or v.status in ("biased", "heavy-tailed"):  # it is that of the scale
         return ""
     return f" since step {since}"
+
+
+def _without_first(v: Verdict) -> str:
+    return "" if v.skipped is None else f"; {v.skipped.skip.text} of each {_whole(v)} left out"
+
+
+def _whole(v: Verdict) -> str:
+    """What steps belong to: a log, where its windows stand as runs."""
+    return "run" if v.unit == "run" else "log"
+
+
+def _first_steps(v: Verdict) -> list[str]:
+    """What was left out of the beginning, or might be."""
+    if v.skipped is not None:
+        gone = f"; nothing is left of {plural(v.skipped.empty, 'run')}" if v.skipped.empty else ""
+        return [
+            f"--skip {v.skipped.skip.option} leaves {v.skipped.skip.text} out of the statistics{gone}; the false-alarm "
+            "rate holds for a number chosen beforehand or on other data, not for one chosen on these"
+        ]
+    until = None if v.location is None else v.location.until
+    if until is None:
+        return []
+    where = "the first step" if until.step == 1 else f"the first {until.step} steps"
+    return [
+        f"the fault is in {where} only, where the covariance ratio is {short(until.early)}; after that it is "
+        f"{plain(until.late)}. If the start is not meant to count, state --skip {until.step} (skip={until.step} in a "
+        "gate) and judge other runs by it"
+    ]
 
 
 def _sentence(v: Verdict, faults: Faults) -> str:

@@ -195,6 +195,7 @@ def _recording(
             column,
             Places(sheet.place, rows),
             *(None if values is None else values[rows] for values in (error, covariance, nis, dof)),
+            t=sheet.numbers("t")[rows] if "t" in sheet else None,
         )
         for run, rows, column in zip(numbers, members, columns, strict=True)
     ]

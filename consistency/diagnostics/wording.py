@@ -122,7 +122,7 @@ def _since(v: Verdict, faults: Faults) -> str:
 
 
 def _without_first(v: Verdict) -> str:
-    return "" if v.skipped is None else f"; {v.skipped.skip.text} of each {_whole(v)} left out"
+    return "" if v.skipped is None else f"; without {v.skipped.skip.text} of each {_whole(v)}"
 
 
 def _whole(v: Verdict) -> str:
@@ -135,8 +135,9 @@ def _first_steps(v: Verdict) -> list[str]:
     if v.skipped is not None:
         gone = f"; nothing is left of {plural(v.skipped.empty, 'run')}" if v.skipped.empty else ""
         return [
-            f"--skip {v.skipped.skip.option} leaves {v.skipped.skip.text} out of the statistics{gone}; the false-alarm "
-            "rate holds for a number chosen beforehand or on other data, not for one chosen on these"
+            f"{v.skipped.skip.text} of each {_whole(v)} {'is' if v.skipped.skip.size == 1 else 'are'} left out as "
+            f"asked{gone}; a number that was chosen on these data voids the false-alarm rate: choose it beforehand, or "
+            "on other data"
         ]
     until = None if v.location is None else v.location.until
     if until is None:

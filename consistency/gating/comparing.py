@@ -80,9 +80,7 @@ def of_arrays(name: str, candidate: Arrays, reference: Arrays, skip: str | float
     )
 
 
-def _side(
-    side: str, name: str, arrays: Arrays, skip: str | float | Skip | None
-) -> tuple[Candidate, RunSummary]:
+def _side(side: str, name: str, arrays: Arrays, skip: str | float | Skip | None) -> tuple[Candidate, RunSummary]:
     try:
         case = evidence(name, arrays, skip=skip)
     except ValueError as error:

@@ -150,9 +150,7 @@ def read(
     return Record(**_parts(named[name]))
 
 
-def judge(
-    record: Record, *, optimal_gain: bool = False, skip: str | float | None = None, **settings: Any
-) -> Judgement:
+def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | None = None, **settings: Any) -> Judgement:
     """The verdict on a record: consistent, overconfident, conservative, undecided ..., and why.
 
     Parameters

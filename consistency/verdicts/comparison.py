@@ -95,7 +95,9 @@ def baseline_of(results: Tables, name: str = "results", skip: str | float | Skip
     if not results.has_truth:
         raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
     steps = steps_of(results)
-    filters = {each: _summary_of(curves(results, each, steps, maps=False).without_first(first)) for each in results.filters}
+    filters = {
+        each: _summary_of(curves(results, each, steps, maps=False).without_first(first)) for each in results.filters
+    }
     failures = {each: int((results.failures["filter"] == each).sum()) for each in results.filters}
     scenario = results.scenario
     m = results.manifest

@@ -270,8 +270,8 @@ def write_steps(path: Path, pose: Array, P: Array) -> Path:
     ("change", "said"),
     [
         (lambda pose, P: (pose, P), None),
-        (lambda pose, P: (pose * [1, 1, DEGREES], P), "the headings of the estimates are in degrees"),
-        (lambda pose, P: (pose * [1e3, 1e3, 1], P), "the positions of the estimates are in millimetres"),
+        (lambda pose, P: (pose * [1, 1, DEGREES], P), "the headings of the estimates are in degrees; multiply them by pi / 180"),
+        (lambda pose, P: (pose * [1e3, 1e3, 1], P), "the positions of the estimates are in millimetres; divide them by 1000"),
         (lambda pose, P: (pose, np.linalg.inv(P)), "it is an information matrix; invert it"),
     ],
 )

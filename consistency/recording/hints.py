@@ -19,6 +19,7 @@ from consistency.recording.poses import Poses
 from consistency.types import Array
 
 MOST = 4000  # estimates that are looked at, of all runs together
+MOST_FITTED = 1000  # of which so many are, where less than a decade is wrong
 WRONG = 1.0  # decades that the NEES is off, from which a mix-up is looked for
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
 RIGHT = 0.4  # decades that it may be off with the mix-up undone
@@ -61,16 +62,16 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
     off = decades(some)
     limit = np.append(WRONG, np.full(len(off) - 1, APART))
     worst = int(np.argmax(np.abs(off) / limit))
+    gross = bool(abs(off[worst]) > limit[worst])
+    if gross and (best := _gross(_guesses(some, axes), some)) is not None:
+        return [f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, but about right if {best.text}"]
+    some = [poses.some(max(MOST_FITTED // len(runs), 20)) for poses in some]
     declared = fit_of(some)
     if declared is None:
         return []
-    gross = bool(abs(off[worst]) > limit[worst])
     if not gross and declared.size * declared.fault() < LEAST_GAIN:
         return []
     guesses = _guesses(some, axes)
-    best = _gross(guesses, some) if gross else None
-    if best is not None:
-        return [f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, but about right if {best.text}"]
     best = _fine(guesses, some, declared)
     if best is None:
         return []

@@ -4,10 +4,10 @@
     python benchmarks/hints.py --logs 200 --cells 5
 
 A mix-up is made worse step by step; the first column has the smallest factor (of the variance of one axis to that of
-another, or of a variance to 1 in its unit) from which on at least 9 of 10 logs are told so. Honest logs are of filters that
-are right, and of filters that are wrong: a covariance 1/4 to 4 times as large in all axes or in one, a bias, heavy tails,
-a drift. Several kinds of state, sizes, units, numbers of runs, and correlations of neighbouring steps. Exit status 1 if
-more than 6 of 1,200 honest logs get a hint (as many of another number).
+another, or of a variance to 1 in its unit) from which on at least 9 of 10 logs are told so. Honest logs are of filters
+that are right, and of filters that are wrong: a covariance 1/4 to 4 times as large in all axes or in one, a bias, heavy
+tails, a drift. Several kinds of state, sizes, units, numbers of runs, and correlations of neighbouring steps. Exit
+status 1 if more than 6 of 1,200 honest logs get a hint (as large a share of another number).
 """
 
 from __future__ import annotations
@@ -175,7 +175,9 @@ def unlike_axes(kind: str) -> Callable[[float], Array]:
 SMALL, LARGE = (1.2, 1.5, 2.0, 3.0, 5.0), (2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 50.0)
 # name: kind, true convention, sizes by factor, mix-up, factors, what the hint says
 MIXED: dict[str, tuple[str, str | None, Callable[[float], Array], Mess, tuple[float, ...], str]] = {
-    "covariance x, y swapped (planar)": ("planar", None, one_axis("planar", 0), reordered([1, 0, 2]), SMALL, "order y, x"),
+    "covariance x, y swapped (planar)": (
+        "planar", None, one_axis("planar", 0), reordered([1, 0, 2]), SMALL, "order y, x",
+    ),
     "covariance heading first (planar)": (
         "planar", None, one_axis("planar", 2), reordered([2, 0, 1]), SMALL, "components of the covariance",
     ),
@@ -189,14 +191,21 @@ MIXED: dict[str, tuple[str, str | None, Callable[[float], Array], Mess, tuple[fl
         "spatial", None, lambda f: 0.05 * np.repeat([np.sqrt(f), 1.0], 3), reordered([3, 4, 5, 0, 1, 2]), SMALL,
         "--covariance-order",
     ),
-    "so3-body read as so3": ("spatial", "so3-body", one_axis("spatial", 3), read_as("so3"), SMALL, "--error so3-body"),
+    "so3-body read as so3": (
+        "spatial", "so3-body", one_axis("spatial", 3), read_as("so3"), SMALL, "--error so3-body",
+    ),
     "so3 read as so3-body": ("spatial", "so3", one_axis("spatial", 4), read_as("so3-body"), SMALL, "(--error so3)"),
     "states in another order": (
-        "vector", None, lambda _: np.full(4, 0.05), states_reordered([1, 0, 2, 3]), (1.0,), "components of the estimates",
+        "vector", None, lambda _: np.full(4, 0.05), states_reordered([1, 0, 2, 3]), (1.0,),
+        "components of the estimates",
     ),
     "deviations, axes alike (planar)": ("planar", None, all_axes("planar"), deviations, LARGE, "standard deviations"),
-    "deviations, axes unlike (planar)": ("planar", None, unlike_axes("planar"), deviations, LARGE, "standard deviations"),
-    "deviations, axes unlike (space)": ("spatial", None, unlike_axes("spatial"), deviations, LARGE, "standard deviations"),
+    "deviations, axes unlike (planar)": (
+        "planar", None, unlike_axes("planar"), deviations, LARGE, "standard deviations",
+    ),
+    "deviations, axes unlike (space)": (
+        "spatial", None, unlike_axes("spatial"), deviations, LARGE, "standard deviations",
+    ),
     "information, axes alike (planar)": ("planar", None, all_axes("planar"), information, LARGE, "information"),
     "information, axes unlike (state)": ("vector", None, unlike_axes("vector"), information, LARGE, "information"),
     "truth and estimates one file": ("spatial", None, lambda _: np.full(6, 0.05), alone, (1.0,), "the same file"),

@@ -13,6 +13,7 @@ from consistency.recording.poses import Poses
 from consistency.types import Array
 
 FACTOR = 6.0  # by which a wrong filter's covariance is off without a mix-up: the table of benchmarks/hints.py has 4
+SINGULAR = 1e-12  # eigenvalue of a correlation matrix
 ODD = 1e-3  # chance that errors with the stated covariance are not taken for such
 GROUPS = {3: ([0, 1],), 6: ([0, 1, 2], [3, 4, 5])}  # position and attitude, of poses
 
@@ -80,43 +81,51 @@ class Fit:
     def simple(self) -> float:
         """Log likelihood of an estimate with the simple fault that explains the errors best.
 
-        A factor of at most ``FACTOR`` on the covariance of all components, of one, of position or of attitude, or a bias.
+        That is a bias, or a factor of at most ``FACTOR`` on the covariance of all components, of one, of position or of
+        attitude.
         """
         n, w = self.n, self.w
         before = float(np.square(w).sum(axis=1).mean())
-        shift = np.einsum("kij,j->ki", self.root, self.error.mean(axis=0))
+        shift = self.root @ self.error.mean(axis=0)
         best = 0.5 * float((2.0 * w * shift - shift**2).sum(axis=1).mean())
         f = np.exp(np.linspace(-np.log(FACTOR), np.log(FACTOR), 61))
         for group in [list(range(n)), *([j] for j in range(n)), *GROUPS.get(n, ())]:
-            part = np.einsum("kij,kj->ki", self.root[:, :, group], self.error[:, group])
+            part = (self.root[:, :, group] @ self.error[:, group, None])[..., 0]
             a = f**-0.5 - 1.0
             after = before + 2.0 * a * float((w * part).sum(axis=1).mean()) + a**2 * float((part**2).sum(axis=1).mean())
             best = max(best, float((0.5 * (before - after - len(group) * np.log(f))).max()))
         return self.likelihood + best
 
 
-def fit_of(runs: Sequence[Poses]) -> Fit | None:
-    """Errors of some runs; None without any that can be whitened."""
-    parts = []
-    for p in runs:
-        error, P = p.errors(), p.covariance
-        with np.errstate(all="ignore"):
-            smallest = np.where(np.isfinite(P).all(axis=(1, 2)), 0.0, np.nan)
-            good = np.isfinite(error).all(axis=1) & np.isfinite(smallest)
-            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-            good &= np.isfinite(sigma).all(axis=1) & (sigma > 0).all(axis=1)
-            R = P[good] / sigma[good][:, :, None] / sigma[good][:, None, :]
-            definite = np.linalg.eigvalsh(R)[:, 0] > 1e-12 if len(R) else np.zeros(0, bool)
-        good[good] = definite
-        if good.any():
-            root = np.linalg.inv(np.linalg.cholesky(P[good]))
-            parts.append((np.einsum("kij,kj->ki", root, error[good]), root, error[good], error[good] / sigma[good]))
-    if not parts:
+def fit_of(runs: Sequence[Poses], errors: Array | None = None) -> Fit | None:
+    """Errors of some runs; None without any that can be whitened.
+
+    ``errors`` (K, n) are those of all estimates, where they are known.
+    """
+    errors = np.concatenate([p.errors() for p in runs]) if errors is None else errors
+    P = np.concatenate([p.covariance for p in runs])
+    ends = np.cumsum([len(p.t) for p in runs])[:-1]
+    with np.errstate(invalid="ignore"):
+        variance = np.diagonal(P, axis1=1, axis2=2)
+        good = np.isfinite(errors).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (variance > 0).all(axis=1)
+    if not good.any():
         return None
-    whitened = [part[0] for part in parts]
-    root, error, own = (np.concatenate([part[i] for part in parts]) for i in (1, 2, 3))
-    diagonal = np.diagonal(root, axis1=1, axis2=2)
-    return Fit(whitened, root, error, own, -2.0 * float(np.log(diagonal).sum(axis=1).mean()))
+    sigma = np.sqrt(variance[good])
+    R = P[good] / sigma[:, :, None] / sigma[:, None, :]
+    try:
+        L = np.linalg.cholesky(R)
+    except np.linalg.LinAlgError:
+        definite = np.linalg.eigvalsh(R)[:, 0] > SINGULAR
+        if not definite.any():
+            return None
+        good[good], sigma = definite, sigma[definite]
+        L = np.linalg.cholesky(R[definite])
+    error, root = errors[good], np.linalg.inv(L) / sigma[:, None, :]
+    w = np.full(errors.shape, np.nan)
+    w[good] = (root @ error[..., None])[..., 0]
+    whitened = [part[np.isfinite(part).all(axis=1)] for part in np.split(w, ends)]
+    log_det = 2.0 * (np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(sigma).sum(axis=1))
+    return Fit([part for part in whitened if len(part)], root, error, error / sigma, float(log_det.mean()))
 
 
 def _memory(runs: Sequence[Array], axis: int) -> float:
@@ -131,5 +140,5 @@ def _memory(runs: Sequence[Array], axis: int) -> float:
     if not total[0] > 0:
         return float(k)
     rho = total / np.maximum(pairs, 1) * (pairs[0] / total[0])
-    square = np.clip(rho**2 - 1.0 / np.maximum(pairs, 1), 0.0, 1.0)  # less what chance makes
-    return float(1.0 + 2.0 * ((1.0 - np.arange(1, k) / k) * square[1:]).sum())
+    square = rho**2 - 1.0 / np.maximum(pairs, 1)  # less what chance makes
+    return max(1.0, float(1.0 + 2.0 * ((1.0 - np.arange(1, k) / k) * square[1:]).sum()))

@@ -77,8 +77,8 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
         return []
     worst = int(np.argmax(np.abs(off)))
     return [
-        f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, and no single factor explains the errors, but all "
-        f"would be consistent if {best.text}"
+        f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, and no single factor explains the errors, but "
+        f"all would be consistent if {best.text}"
     ]
 
 
@@ -117,9 +117,15 @@ def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: Fit) -> Gue
     """The likeliest guess with which everything is right, where no simple fault is nearly as likely."""
     guesses = [guess for guess in guesses if guess.fine]
     bar, simple, found = LEAST_GAIN + np.log(max(len(guesses), 1)), declared.simple(), []
+    errors = np.concatenate([poses.errors() for poses in some])
     for guess in guesses:
-        fit = fit_of([guess.change(poses) for poses in some])
-        if fit is None or len(fit.w) < len(declared.w):
+        read = [guess.change(poses) for poses in some]
+        same = all(
+            new.estimate is old.estimate and new.truth is old.truth and new.convention == old.convention
+            for new, old in zip(read, some, strict=True)
+        )
+        fit = fit_of(read, errors if same else None)
+        if fit is None or len(fit.w) < len(declared.w) or declared.size * (fit.likelihood - simple) < bar:
             continue
         size = min(fit.size, declared.size)
         if size * (fit.likelihood - simple) >= bar and fit.right():
@@ -318,8 +324,12 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         out[:, part] *= MILLI
         return out
 
-    yield Guess("its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180", lambda p: _weighed(p, angles, DEGREE))
-    yield Guess("its positions are in millimetres (mm^2 for m^2); divide them by 1000", lambda p: _weighed(p, part, MILLI))
+    yield Guess(
+        "its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180", lambda p: _weighed(p, angles, DEGREE)
+    )
+    yield Guess(
+        "its positions are in millimetres (mm^2 for m^2); divide them by 1000", lambda p: _weighed(p, part, MILLI)
+    )
     yield Guess(
         "the positions of the estimates and their covariance are in millimetres; divide them by 1000",
         lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),

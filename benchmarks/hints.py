@@ -232,10 +232,10 @@ def smallest(rng: np.random.Generator, name: str, cells: int) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--logs", type=int, default=1200, help="Honest logs.")
-    parser.add_argument("--cells", type=int, default=20, help="Logs of each mix-up and factor.")
+    parser.add_argument("--cells", type=int, default=20, help="Logs of each mix-up and factor; 0 for none.")
     parser.add_argument("--seed", type=int, default=5)
     given = parser.parse_args()
-    for number, name in enumerate(MIXED):
+    for number, name in enumerate(MIXED if given.cells else ()):
         print(f"{name:<36} {smallest(np.random.default_rng((given.seed, number)), name, given.cells)}", flush=True)
     found: dict[str, int] = dict.fromkeys((f"{k}, {w}" for k, w in itertools.product(AXES, WRONG)), 0)
     for number in range(given.logs):

@@ -48,7 +48,8 @@ class Fit:
 
         Squares of Gaussian errors with the autocorrelation rho have that of rho^2, so that K of them say as much as
         K / (1 + 2 sum (1 - l / k) rho_l^2) independent ones; the mean is 0 by assumption, and an error that is constant
-        over a run counts once. No more than the spread of the NEES over estimates and over 8 or more runs allows.
+        over a run counts once. Chance in the rho of a single run leaves down to a third of that. It is no more than the
+        spread of the NEES over estimates, and over 8 or more runs, allows.
         """
         K, n = self.w.shape
         size = K / max(_memory(self.whitened, j) for j in range(n))

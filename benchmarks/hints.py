@@ -74,7 +74,9 @@ def sizes(rng: np.random.Generator, kind: str) -> Array:
     """Standard deviations: positions 1 mm to 10 m, angles 0.05 to 5 degrees, states of any unit."""
 
     def block(n: int, low: float, high: float) -> Array:
-        return np.exp(rng.uniform(np.log(low), np.log(high)) + rng.uniform(-0.5, 0.5, n) * 0.5 * np.log(SPREAD))
+        return np.asarray(
+            np.exp(rng.uniform(np.log(low), np.log(high)) + rng.uniform(-0.5, 0.5, n) * 0.5 * np.log(SPREAD))
+        )
 
     if kind == "spatial":
         return np.concatenate([block(3, 1e-3, 10.0), block(3, 1e-3, 0.1)])

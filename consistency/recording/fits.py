@@ -58,7 +58,7 @@ class Fit:
         means = np.array([np.square(w).mean() for w in self.whitened])
         if len(means) >= 8 and means.std() > 0:
             size = min(size, 2.0 * float(means.mean()) ** 2 * len(means) / (n * float(means.var(ddof=1))))
-        return max(size, 1.0)
+        return max(float(size), 1.0)
 
     def right(self) -> bool:
         """Whether scale, mean, correlations and median of the errors are as the covariance says."""

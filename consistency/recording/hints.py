@@ -120,18 +120,20 @@ def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: Fit) -> Gue
     errors = np.concatenate([poses.errors() for poses in some])
     for guess in guesses:
         read = [guess.change(poses) for poses in some]
+        if any(new.truth is not old.truth for new, old in zip(read, some, strict=True)):
+            continue  # a density of the truth in another unit is no likelier
         same = all(
-            new.estimate is old.estimate and new.truth is old.truth and new.convention == old.convention
+            new.estimate is old.estimate and new.convention == old.convention
             for new, old in zip(read, some, strict=True)
         )
         fit = fit_of(read, errors if same else None)
         if fit is None or len(fit.w) < len(declared.w) or declared.size * (fit.likelihood - simple) < bar:
             continue
-        size = min(fit.size, declared.size)
-        if size * (fit.likelihood - simple) >= bar and fit.right():
-            found.append((size * fit.likelihood, guess))
-    top = max((value for value, _ in found), default=0.0)
-    return next((guess for value, guess in found if value >= top - 1.0), None)
+        gain = min(fit.size, declared.size) * (fit.likelihood - simple)
+        if gain >= bar and fit.right():
+            found.append((gain, guess))
+    most = max((gain for gain, _ in found), default=0.0)
+    return next((guess for gain, guess in found if gain >= most - 1.0), None)  # nearly as likely: the first
 
 
 def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:

@@ -174,7 +174,7 @@ def unlike_axes(kind: str) -> Callable[[float], Array]:
     return lambda factor: np.geomspace(1.0, factor**-0.5, len(AXES[kind]))
 
 
-SMALL, LARGE = (1.2, 1.5, 2.0, 3.0, 5.0), (2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 50.0)
+SMALL, LARGE = (1.2, 1.5, 2.0, 3.0, 5.0), (4.0, 8.0, 12.0, 20.0, 50.0, 100.0, 200.0)
 # name: kind, true convention, sizes by factor, mix-up, factors, what the hint says
 MIXED: dict[str, tuple[str, str | None, Callable[[float], Array], Mess, tuple[float, ...], str]] = {
     "covariance x, y swapped (planar)": (

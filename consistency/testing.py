@@ -62,6 +62,7 @@ def assert_consistent(
     nis: ArrayLike | None = None,
     nis_dof: ArrayLike | None = None,
     optimal_gain: bool = False,
+    skip: int | str | None = None,
     name: str | None = None,
 ) -> Verdict:
     """Pass an estimator whose errors are shown to have the covariance that it states.
@@ -89,6 +90,8 @@ def assert_consistent(
     innovations, innovation_covariances : (runs, steps, m), (runs, steps, m, m); all NaN in steps without any
     nis, nis_dof : (runs, steps); nis_dof is 0 in steps without any, and may be one number
     optimal_gain : the innovations are those of an optimal gain, and none was gated away: judge them, not only report
+    skip : first steps of each run to leave out of the statistics (20), of results also seconds ("2s"); a number that
+        was chosen on the same runs voids the false-alarm rate
     name : of the estimator, for messages
 
     Returns
@@ -113,12 +116,12 @@ def assert_consistent(
     }  # fmt: skip
     if filter is not None or hasattr(errors, "estimates"):
         _refuse(arrays, "results bring their own")
-        candidate = of_results(cast("Results", errors), filter, name, subsets, method)
+        candidate = of_results(cast("Results", errors), filter, name, subsets, method, skip)
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
         unchecked = Arrays(cast(ArrayLike, errors), **arrays)
-        candidate = evidence(name or "the estimator", unchecked, subsets, method, optimal_gain)
+        candidate = evidence(name or "the estimator", unchecked, subsets, method, optimal_gain, skip)
 
     def look(rate: float) -> _Look:
         verdict = candidate.judge(rate, demand)
@@ -150,6 +153,7 @@ def assert_not_worse(
     detect: float | None = None,
     power: float | None = None,
     axes: Sequence[str] | None = None,
+    skip: int | str | None = None,
     name: str | None = None,
 ) -> Comparison:
     """Pass a candidate a that is not less consistent than a reference b on the same trials, row by row.
@@ -168,6 +172,7 @@ def assert_not_worse(
     detect : a covariance ratio farther from 1 by this factor must be found
     power : chance to find it
     axes : names of the components
+    skip : first steps of each run to leave out of both, as in :func:`assert_consistent`
     name : of the candidate, for messages
 
     Raises
@@ -187,7 +192,7 @@ def assert_not_worse(
     }  # fmt: skip
     if filter is not None or hasattr(errors_a, "estimates"):
         _refuse(arrays, "results bring their own; the reference is named by than and reference")
-        sides = of_filters(cast("Results", errors_a), filter, than, reference, name)
+        sides = of_filters(cast("Results", errors_a), filter, than, reference, name, skip)
     else:
         if than is not None or reference is not None:
             raise ValueError("than and reference need results in place of errors_a")
@@ -195,7 +200,7 @@ def assert_not_worse(
             dof = current().marked.get("dof")
         a = Arrays(cast(ArrayLike, errors_a), covariances_a, nees_a, dof, axes=axes)
         b = Arrays(errors_b, covariances_b, nees_b, dof, axes=axes)
-        sides = of_arrays(name or "the candidate", a, b)
+        sides = of_arrays(name or "the candidate", a, b, skip)
     return _compare(sides, demand)
 
 

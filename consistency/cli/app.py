@@ -50,6 +50,10 @@ SlurmOptions = Annotated[
     ),
 ]
 LOST_HELP = "share of lost runs that must be excluded"
+Skip = Annotated[
+    str | None,
+    typer.Option("--skip", metavar="N|Ns", help="Leave the first N steps, or seconds (2s), of each run out."),
+]
 DETECT_HELP = "ratio of true to stated covariance that must be found"
 FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC)}  # a disk, a quota, a limit
 SCENARIO = "Built-in name (see 'list') or path of a .toml file."
@@ -309,6 +313,7 @@ def analyse(
     confidence: Annotated[
         float | None, typer.Option("--confidence", help="1 less the --false-alarm, in its place.")
     ] = None,
+    skip: Skip = None,
     report: Annotated[
         Path | None, typer.Option("--report", help="Folder for an HTML and a PDF page on files of another estimator.")
     ] = None,
@@ -322,21 +327,21 @@ def analyse(
     from consistency.store.storage import require_free
     from consistency.terminal.table import print_verdicts, verdicts_json
     from consistency.verdicts.judge import analyse as judge_results
-    from consistency.verdicts.judge import analyse_recordings, settings_of
+    from consistency.verdicts.judge import analyse_recordings, settings_of, skip_asked
 
     if fail_on not in (None, "inconsistent"):
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
     if innovations not in (None, "optimal"):
         raise InputError(f"--innovations must be 'optimal', got '{innovations}'")
     changes = _options(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance, lost=lost)
-    settings = settings_of(**changes) if changes else None
+    settings, first = settings_of(**changes) if changes else None, skip_asked(skip)
     written: list[Path] = []
     if overwrite and report is None:
         raise InputError("--overwrite goes with --report: nothing else is written")
     if files.are(path):
         if report is not None:
             require_free(report, overwrite, "verdict", "--report")
-        recordings = files.read(path)
+        recordings = [recording.without_first(first) for recording in files.read(path)]
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None:
@@ -350,7 +355,7 @@ def analyse(
             raise InputError(
                 "--innovations is for files of another estimator; filters of the bench declare it themselves"
             )
-        verdicts = judge_results(results, filters, settings=settings)
+        verdicts = judge_results(results, filters, settings=settings, skip=first)
         if not results.manifest["complete"]:
             done, total = results.manifest["finished_runs"], results.manifest["runs"]
             text = f"{path}: only {done} of {total} runs are there; the same 'consistency run' with --resume goes on"
@@ -432,6 +437,7 @@ def compare(
         ),
     ] = None,
     false_alarm: FalseAlarm = 0.05,
+    skip: Skip = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,
 ) -> None:
@@ -444,11 +450,13 @@ def compare(
         is_baseline,
         read_baseline,
     )
+    from consistency.verdicts.judge import skip_asked
 
     if fail_on not in (None, "worse"):
         raise InputError(f"--fail-on must be 'worse', got '{fail_on}'")
     if not 0.0 < false_alarm < 1.0:
         raise InputError(f"--false-alarm must lie between 0 and 1, got {false_alarm}")
+    first = skip_asked(skip)
     sides = [each for each in (path, other) if each is not None]
     estimates = [each for each in sides if not is_baseline(each) and files.are(each)]
     if not estimates and (unread := files.given()):
@@ -459,7 +467,8 @@ def compare(
         )
     read = {each: files.read(each) for each in estimates}
     new, *old = (
-        baseline_of_files(read[each], str(each), files.truth) if each in read else read_baseline(each) for each in sides
+        baseline_of_files(read[each], str(each), files.truth, first) if each in read else read_baseline(each, first)
+        for each in sides
     )
     if old:
         compared = compare_with(new, old[0], filters or [], false_alarm)
@@ -480,18 +489,19 @@ def baseline(
     path: Judged,
     out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],
     files: FileOptions,
+    skip: Skip = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Keep what a later 'compare' needs of results, one row a run."""
     from consistency.store.results import open_results
-    from consistency.verdicts.comparison import baseline_of_files, write_baseline
+    from consistency.verdicts.comparison import baseline_of, baseline_of_files, write_baseline
 
     if files.are(path):
         recordings = files.read(path)
-        write_baseline(baseline_of_files(recordings, str(path), files.truth), out, overwrite)
+        write_baseline(baseline_of_files(recordings, str(path), files.truth, skip), out, overwrite)
         tell_notes(recordings)
     else:
-        write_baseline(open_results(path), out, overwrite)
+        write_baseline(baseline_of(open_results(path), str(path), skip), out, overwrite)
     print(f"baseline in {out}; next: consistency compare NEW {out}")
 
 

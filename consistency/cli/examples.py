@@ -18,6 +18,7 @@ EXAMPLES = {
         "analyse mine.npz --report look",
         "analyse est.txt --truth truth.txt --covariance P.txt --error so3",
         "analyse est --truth truth --align posyaw",
+        "analyse results --skip 2s",
     ),
     "plan": ("plan herath2007-stereo --filter ekf-uvd --detect 1.2", "plan --like results"),
     "compare": (

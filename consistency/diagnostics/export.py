@@ -29,6 +29,8 @@ def flat(v: Verdict) -> dict[str, Any]:
         s |= part(v)
     if v.ends is not None:
         s["early_ends"] = vars(v.ends) | {"lost": v.ends.lost}
+    if v.skipped is not None:
+        s |= {"skip": v.skipped.skip.option, "skipped_steps": v.skipped.steps, "skipped_runs": v.skipped.empty}
     if v.convention is not None or v.notes:
         s |= {"convention": v.convention, "align": v.align, "notes": list(v.notes)}
     if v.world is not None:
@@ -79,6 +81,7 @@ def _location(v: Verdict) -> dict[str, Any]:
         "simultaneous": where.simultaneous, "steps_above": where.above, "steps_below": where.below,
         "first_outside": where.first_outside, "first_step": where.first_step, "since": where.since,
         "lasting": where.lasting, "subset": where.subset,
+        "until": None if where.until is None else where.until.step,
     }  # fmt: skip
 
 

@@ -22,16 +22,19 @@ from consistency.diagnostics.records import (
     Bias,
     Interval,
     Location,
+    Settings,
     Shape,
     Tails,
+    Until,
 )  # fmt: skip
 from consistency.diagnostics.sample import ATTITUDE, POSITION, Errors, Sample
-from consistency.diagnostics.scale import ratio_interval
+from consistency.diagnostics.scale import ratio_interval, run_means
 from consistency.diagnostics.scaling import INTERVAL, pointwise_band
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.whitening import mean_of_runs, standardise
 from consistency.types import Array, Indices
 
+DETECT = Settings().factor
 FEWEST = 8  # runs; with fewer the axes are not told apart
 SIGN = 2.0  # standard errors from 0, of steps that are all one and the same, at which a correlation has a sign
 VISIBLE = 0.05  # a stated correlation that is worth a word
@@ -40,8 +43,11 @@ SURE = 0.04  # false-alarm rate of naming an axis, or a beginning, that does not
 Answers = Mapping[str, Answer]
 
 
-def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = True) -> Location:
-    """Steps outside the band, since when, and which axes; a fault of what is not ``ordered`` in time begins nowhere."""
+def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = True, detect: float = DETECT) -> Location:
+    """Steps outside the band, since when or until when, and which axes.
+
+    A fault of what is not ``ordered`` in time begins and ends nowhere. ``detect`` is that of the settings.
+    """
     outside = band.outside
     first = int(np.argmax(outside)) if outside.any() else None
     faulty = first is not None and _any(answers, (STEP,))
@@ -60,6 +66,7 @@ def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = Tr
         since=since,
         lasting=lasting,
         subset=chief_axes(sample, late) if sample.errors is not None and _any(answers, SCALE) else None,
+        until=until(sample, band, detect) if ordered and _any(answers, (*SCALE, *BIAS)) else None,
     )
 
 
@@ -81,6 +88,48 @@ def _absent_before(sample: Sample, first: int, sign: int) -> bool:
     error = float(early.std(ddof=1) / (early.mean() * np.sqrt(len(early))))
     upper = sign * np.log(early.mean()) + float(stats.t.isf(1.0 - INTERVAL, len(early) - 1)) * error
     return bool(upper < 0.5 * sign * np.log(late.mean()))
+
+
+def until(sample: Sample, band: Band, detect: float) -> Until | None:
+    """The first steps that alone carry the fault, or None.
+
+    They are 1, 2, 4, ... steps from the first judged one on, at most half of all. With the means a_i over them and b_i
+    over the others of run i, the fault of the others is shown to be less than half of theirs, on the logarithm:
+    D_i = b_i / mean b - a_i / (2 mean a) has the standard error of log mean b - log(mean a) / 2 to first order;
+    Student's t over runs, Bonferroni over the numbers of steps and both signs. A fault that is the same in all steps
+    is said to be in the first ones with probability ``SURE`` at most. Nothing is left of the fault afterwards: the
+    interval of the ratio holds 1 or lies within [1 / detect, detect], and no step is outside the band on that side.
+    """
+    ends, early, late = _splits(sample)
+    if len(early) < FEWEST or not len(ends):
+        return None
+    bar = float(stats.t.isf(SURE / (2.0 * len(ends)), len(early) - 1)) / np.sqrt(len(early))
+    for end, a, b in zip(ends, early.T, late.T, strict=True):
+        if not a.mean() > 0 or not b.mean() > 0:
+            continue
+        sign = 1.0 if a.mean() > 1.0 else -1.0
+        left = sign * (np.log(b.mean()) - 0.5 * np.log(a.mean()))
+        error = float((b / b.mean() - 0.5 * a / a.mean()).std(ddof=1))
+        if left + bar * error >= 0.0 or (band.above if sign > 0 else band.below)[end:].any():
+            continue
+        rest = ratio_interval(b, sample.dof, INTERVAL)
+        if rest.holds(1.0) or (rest.low >= 1.0 / detect and rest.high <= detect):
+            return Until(int(end), float(a.mean()), rest)
+    return None
+
+
+def _splits(sample: Sample) -> tuple[Indices, Array, Array]:
+    """Ends (K,) of the first steps, and mean NEES over dof before and after each, (runs, K), of runs with both."""
+    judged = np.flatnonzero(sample.counted.any(axis=0))
+    ends = judged[2 ** np.arange((len(judged) // 2).bit_length()) - 1] + 1
+    means, counts = (
+        np.stack(part, axis=-1) for part in zip(*map(run_means, np.split(sample.nees, ends, axis=1)), strict=True)
+    )
+    sums = np.where(counts > 0, means * counts, 0.0)
+    before, many = np.cumsum(sums, axis=1)[:, :-1], np.cumsum(counts, axis=1)[:, :-1]
+    both = (many > 0).all(axis=1) & (counts[:, -1] > 0)
+    after, fewer = sums.sum(axis=1)[:, None] - before, counts.sum(axis=1)[:, None] - many
+    return ends, before[both] / many[both] / sample.dof, after[both] / fewer[both] / sample.dof
 
 
 def chief_axes(sample: Sample, steps: slice = slice(None)) -> str | None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.diagnostics.ends import EarlyEnds
+from consistency.diagnostics.skipping import Skipped
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.types import Array, Failure, Indices
 
@@ -78,6 +79,7 @@ class Evidence:
     unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
     reduced: bool = False  # a fit to the truth may have made the errors smaller than the covariance says: no fault
     spoilt: Collection[str] = ()  # questions that such a fit leaves no answer to, which are not asked
+    skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
 
 
 @dataclass(frozen=True)
@@ -267,6 +269,15 @@ class Innovations:
 
 
 @dataclass(frozen=True)
+class Until:
+    """The last of the first steps that carry a fault, 1..T, and what the ratio is in them and after them."""
+
+    step: int
+    early: float  # mean NEES over dof
+    late: Interval  # ratio of true to stated covariance, 95 %
+
+
+@dataclass(frozen=True)
 class Location:
     """Since when, and where; T steps."""
 
@@ -278,6 +289,7 @@ class Location:
     since: int | None = None  # the fault begins there: it was absent before
     lasting: bool = False  # most steps from there on are outside
     subset: str | None = None  # axes that carry the fault, where axes differ from each other
+    until: Until | None = None  # the fault is in the first steps only
 
 
 @dataclass(frozen=True)
@@ -367,6 +379,7 @@ class Verdict:
     unit: str = "run"  # what a run is called, as in :class:`Evidence`
     lost: Lost | None = None  # where there is a NEES
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
+    skipped: Skipped | None = None  # first steps of each run that were left out
 
     @property
     def in_world(self) -> Verdict:

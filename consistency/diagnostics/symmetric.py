@@ -54,6 +54,10 @@ class Symmetric:
             return self.entry(here[-2], here[-1])[here[:-2]]
         return self._each(lambda entry: entry[here])
 
+    def without(self, some: Array) -> Symmetric:
+        """NaN where ``some`` (...) is true."""
+        return self._each(lambda entry: np.where(some, np.nan, entry))
+
     def part(self, index: Sequence[int]) -> Symmetric:
         """Rows and columns ``index`` of all matrices."""
         return Symmetric([[self.entry(i, j) for j in index] for i in index])

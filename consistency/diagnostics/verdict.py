@@ -92,7 +92,7 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     verdict = Verdict(
         evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,
         innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
-        unit=evidence.unit,
+        unit=evidence.unit, skipped=evidence.skipped,
     )  # fmt: skip
     if sample is not None and evidence.landmarks is None:
         ends = early_ends(sample.nees)
@@ -148,7 +148,7 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
     if step is not None and step.found and not band.outside.any():  # found by what Holm's correction left over
         rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
         band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
-    location = location_of(sample, band, by_question, ordered=evidence.landmarks is None)
+    location = location_of(sample, band, by_question, ordered=evidence.landmarks is None, detect=settings.factor)
     scale = scale_of(sample, tests, at_share(verdict), location, shown)
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
         return replace(verdict, scale=scale, location=location, tails=tails_of(tests, None))

@@ -44,7 +44,8 @@ def reasons(v: Verdict) -> list[str]:
         lines.append(_nis(v))
     if v.answers:
         lines.append(_questions(v, faults))
-    return [f"{v.status}: {lines[0]}", *lines[1:]]
+    lines += _first_steps(v)
+    return [f"{v.status}: {lines[0]}{_without_first(v)}", *lines[1:]]
 
 
 # --- the sentence ------------------------------------------------------------------------------------
@@ -69,6 +70,35 @@ def _failures(v: Verdict) -> list[str]:
             f"runs, first run {v.joint.not_definite[0]}"
         )
     return lines
+
+
+def _without_first(v: Verdict) -> str:
+    return "" if v.skipped is None else f"; without {v.skipped.skip.text} of each {_whole(v)}"
+
+
+def _whole(v: Verdict) -> str:
+    """What steps belong to: a log, where its windows stand as runs."""
+    return "run" if v.unit == "run" else "log"
+
+
+def _first_steps(v: Verdict) -> list[str]:
+    """What was left out of the beginning, or might be."""
+    if v.skipped is not None:
+        gone = f"; nothing is left of {plural(v.skipped.empty, 'run')}" if v.skipped.empty else ""
+        return [
+            f"{v.skipped.skip.text} of each {_whole(v)} {'is' if v.skipped.skip.size == 1 else 'are'} left out as "
+            f"asked{gone}; a number that was chosen on these data voids the false-alarm rate: choose it beforehand, or "
+            "on other data"
+        ]
+    until = None if v.location is None else v.location.until
+    if until is None:
+        return []
+    where = "the first step" if until.step == 1 else f"the first {until.step} steps"
+    return [
+        f"the fault is in {where} only, where the covariance ratio is {short(until.early)}; after that it is "
+        f"{plain(until.late)}. If the start is not meant to count, state --skip {until.step} (skip={until.step} in a "
+        "gate) and judge other runs by it"
+    ]
 
 
 def _sentence(v: Verdict, faults: Faults) -> str:

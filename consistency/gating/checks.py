@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.diagnostics import Evidence, Settings, Verdict, judge, nis_of
+from consistency.diagnostics.skipping import Skip, skip_of, without_first
 from consistency.gating.watch import Terms
 from consistency.types import Array, Failure, Indices
 
@@ -67,6 +68,7 @@ def evidence(
     subsets: Mapping[str, Sequence[int]] | None = None,
     method: str = "max",
     optimal_gain: bool = False,
+    skip: str | float | Skip | None = None,
 ) -> Candidate:
     """One estimator with checked arrays; errors as :func:`consistency.testing.assert_consistent`."""
     errors, covariances, nees, dof, axes = (
@@ -110,8 +112,13 @@ def evidence(
                 "innovations alone are judged only with optimal_gain=True: those of any other gain are not white, nor "
                 "of the stated size, even if the filter is right"
             )
-        dof = max(1, int(arrays["nis_dof"].sum(axis=1).min()))
-    return Candidate(Evidence(name, **arrays, optimal_gain=optimal_gain), len(first), dof, subsets, method)
+        dof = 0
+    parts = {key: arrays.get(key) for key in ("covariance", "nees", "nis", "nis_dof", "innovations")}
+    rest, skipped = without_first(skip_of(skip), parts, name)
+    arrays |= {key: value for key, value in rest.items() if value is not None}
+    dof = dof or max(1, int(arrays["nis_dof"].sum(axis=1).min()))
+    full = Evidence(name, **arrays, optimal_gain=optimal_gain, skipped=skipped)
+    return Candidate(full, len(first), dof, subsets, method)
 
 
 def of_results(
@@ -120,6 +127,7 @@ def of_results(
     name: str | None = None,
     subsets: Mapping[str, Sequence[int]] | None = None,
     method: str = "max",
+    skip: str | float | Skip | None = None,
 ) -> Candidate:
     """One filter of the bench's own results, with its failed runs.
 
@@ -128,7 +136,7 @@ def of_results(
     Raises
     ------
     ValueError
-        No results, no such filter, or more than one to choose from.
+        No results, no such filter, or more than one to choose from; ``skip`` leaves nothing.
     """
     from consistency.store.results import POSE, Results
     from consistency.verdicts.curves import curves
@@ -140,7 +148,7 @@ def of_results(
         if len(results.filters) != 1:
             raise ValueError(f"filter: name one of {', '.join(results.filters)}")
         filter_name = results.filters[0]
-    c = curves(results, filter_name)
+    c = curves(results, filter_name).without_first(skip_of(skip))
     full = evidence_of(c)
     dof = len(POSE) if c.error is not None else max(1, int(c.nis_dof.sum(axis=1).min()))
     return Candidate(replace(full, name=name or filter_name), len(c.runs), dof, subsets, method)

@@ -10,6 +10,7 @@ import numpy as np
 
 from consistency.diagnostics import Comparison, RunSummary, compare, summary, whiten
 from consistency.diagnostics.comparison import FailedRuns
+from consistency.diagnostics.skipping import Skip
 from consistency.gating.checks import Arrays, Candidate, evidence, of_results
 
 if TYPE_CHECKING:
@@ -66,10 +67,10 @@ class Sides:
         return lines
 
 
-def of_arrays(name: str, candidate: Arrays, reference: Arrays) -> Sides:
+def of_arrays(name: str, candidate: Arrays, reference: Arrays, skip: str | float | Skip | None = None) -> Sides:
     """Both sides from arrays, row i of both the same trial; errors as :func:`consistency.testing.assert_not_worse`."""
-    a, row_a = _side("candidate a", name, candidate)
-    b, row_b = _side("reference b", name, reference)
+    a, row_a = _side("candidate a", name, candidate, skip)
+    b, row_b = _side("reference b", name, reference, skip)
     if a.runs != b.runs:
         raise ValueError(f"the candidate has {a.runs} runs and the reference {b.runs}; row i of both must be one trial")
     if a.planned_dof != b.planned_dof:
@@ -79,9 +80,9 @@ def of_arrays(name: str, candidate: Arrays, reference: Arrays) -> Sides:
     )
 
 
-def _side(side: str, name: str, arrays: Arrays) -> tuple[Candidate, RunSummary]:
+def _side(side: str, name: str, arrays: Arrays, skip: str | float | Skip | None) -> tuple[Candidate, RunSummary]:
     try:
-        case = evidence(name, arrays)
+        case = evidence(name, arrays, skip=skip)
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
     e, P = case.evidence.error, case.evidence.covariance
@@ -96,6 +97,7 @@ def of_filters(
     than: str | None,
     reference: Results | Baseline | str | Path | None,
     name: str | None,
+    skip: str | float | Skip | None = None,
 ) -> Sides:
     """Both sides from results, or from results and a baseline of an earlier state.
 
@@ -105,18 +107,22 @@ def of_filters(
         No such filter, nothing to compare with, or a baseline that cannot be read.
     """
     from consistency.store.results import POSE
-    from consistency.verdicts.comparison import Baseline, baseline_of, read_baseline
+    from consistency.verdicts.comparison import Baseline, baseline_of, read_baseline, require_skip
 
     if reference is None and than is None:
         raise ValueError("than: name the filter to compare with, or give other results as reference")
-    candidate = of_results(results, filter_name, name)
-    new = baseline_of(results)
+    candidate = of_results(results, filter_name, name, skip=skip)
+    new = baseline_of(results, skip=skip)
     if reference is None:
         old = new
     elif isinstance(reference, Baseline):
-        old = reference
+        old = require_skip(reference, skip)
     else:
-        old = read_baseline(Path(reference)) if isinstance(reference, str | Path) else baseline_of(reference)
+        old = (
+            read_baseline(Path(reference), skip)
+            if isinstance(reference, str | Path)
+            else baseline_of(reference, skip=skip)
+        )
     of_a = filter_name or results.filters[0]
     of_b = than or of_a
     if of_b not in old.filters:

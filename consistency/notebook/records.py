@@ -15,7 +15,7 @@ from consistency.diagnostics.wording import plural
 from consistency.errors import InputError
 from consistency.recording import Recording, read_recordings
 from consistency.store.atomic import write_whole
-from consistency.verdicts.judge import analyse_recordings, settings_of
+from consistency.verdicts.judge import analyse_recordings, settings_of, skip_asked
 
 if TYPE_CHECKING:
     from consistency.reporting.drawing import Sheet
@@ -150,20 +150,22 @@ def read(
     return Record(**_parts(named[name]))
 
 
-def judge(record: Record, *, optimal_gain: bool = False, **settings: Any) -> Judgement:
+def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | None = None, **settings: Any) -> Judgement:
     """The verdict on a record: consistent, overconfident, conservative, undecided ..., and why.
 
     Parameters
     ----------
     optimal_gain : the filter declares one and gates nothing away, so that its innovations are judged
+    skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
     settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow``, ``lost`` of
         :class:`consistency.diagnostics.Settings`
 
     Raises
     ------
     InputError
-        A setting out of its range.
+        A setting out of its range, or nothing is left.
     """
+    record = record.without_first(skip_asked(skip))
     verdict = analyse_recordings([record], None, settings_of(**settings), optimal_gain)[record.name]
     return Judgement(**_parts(verdict), record=record)
 

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from consistency.diagnostics.whitening import whiten
 from consistency.geometry import wrap
 from consistency.geometry.conventions import PLANAR, SPATIAL
-from consistency.recording.frames import fitted_frame, moved, spread
+from consistency.recording.fits import Fit, fit_of
+from consistency.recording.frames import Frame, fitted_frame, moved, spread
 from consistency.recording.poses import Poses
 from consistency.types import Array
 
 MOST = 4000  # estimates that are looked at, of all runs together
+MOST_FITTED = 1000  # of which so many are, where less than a decade is wrong
 WRONG = 1.0  # decades that the NEES is off, from which a mix-up is looked for
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
 RIGHT = 0.4  # decades that it may be off with the mix-up undone
+LEAST_GAIN = float(np.log(1e4))  # log likelihood that a reading gains over simple faults, and as much as it has rivals
+ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
+ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
 ALIKE = 0.01  # decades between guesses of which the likelier is named
 DEGREE = np.pi / 180.0
 MILLI = 1e-3
@@ -36,29 +43,97 @@ class Guess:
     text: str
     change: Change
     last: bool = False  # named only where nothing else fits: it has a fit of its own for each run
+    fine: bool = True  # named where less than a decade is wrong too: no bias and no drift looks like it
 
 
 def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 0.0) -> list[str]:
-    """What the error may really be, where the NEES is off by a decade or more and one guess brings it right; or none.
+    """What the files may really be, where the covariance does not fit and one other reading of them does; or none.
 
-    The NEES of a median estimate is compared with that of a right one. The best guess is named.
+    Where the NEES of a median estimate is off by a decade or more, the guess that brings it nearest to a right one is
+    named. Where it is off by less, a guess is named with which everything is as the covariance says, and no simple
+    fault of a filter explains as much (:mod:`consistency.recording.fits`).
     """
     some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
+    if _same(some):
+        return [
+            f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies of "
+            "one; give the true poses as the truth"
+        ]
     off = decades(some)
     limit = np.append(WRONG, np.full(len(off) - 1, APART))
     worst = int(np.argmax(np.abs(off) / limit))
-    if not abs(off[worst]) > limit[worst]:
+    gross = bool(abs(off[worst]) > limit[worst])
+    if gross and (best := _gross(_guesses(some, axes), some)) is not None:
+        return [f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, but about right if {best.text}"]
+    some = [poses.some(max(MOST_FITTED // len(runs), 20)) for poses in some]
+    declared = fit_of(some)
+    if declared is None:
         return []
-    guesses = _guesses(some)
+    if not gross and declared.size * declared.fault() < LEAST_GAIN:
+        return []
+    guesses = _guesses(some, axes)
+    best = _fine(guesses, some, declared)
+    if best is None:
+        return []
+    worst = int(np.argmax(np.abs(off)))
+    return [
+        f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, and no single factor explains the errors, but "
+        f"all would be consistent if {best.text}"
+    ]
+
+
+def _of(axes: Sequence[str], worst: int) -> str:
+    return "" if worst == 0 else f" of {axes[worst - 1]} by itself"
+
+
+def _times(off: float) -> str:
+    return f"{10.0 ** abs(off):.2g} times too {'large' if off > 0 else 'small'}"
+
+
+def _same(runs: Sequence[Poses]) -> bool:
+    """Whether the errors are rounding in nearly all estimates, in values and beside their standard deviations."""
+    same = total = 0
+    for p in runs:
+        error, known = np.abs(p.errors()), p.known().rows
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))[known]
+            rounding = ROUNDING * max(1.0, float(np.abs(p.truth).max(initial=0.0)))
+            same += int(((error[known] <= rounding) & (error[known] <= NEGLIGIBLE * sigma)).all(axis=1).sum())
+        total += len(known)
+    return total >= LEAST and same >= NEARLY_ALL * total
+
+
+def _gross(guesses: Sequence[Guess], some: Sequence[Poses]) -> Guess | None:
+    """The guess with which the NEES of a median estimate is nearest to a right one, if it is near."""
     left = np.array([np.abs(decades([guess.change(poses) for poses in some])).max() for guess in guesses])
     first = np.where([guess.last for guess in guesses], np.nan, left)
     left = first if np.nanmin(first) < RIGHT else left
     if not np.nanmin(left) < RIGHT:
-        return []
-    best = int(np.flatnonzero(left <= np.nanmin(left) + ALIKE)[0])
-    of = "" if worst == 0 else f" of {axes[worst - 1]} by itself"
-    size = f"{10.0 ** abs(off[worst]):.2g} times too {'large' if off[worst] > 0 else 'small'}"
-    return [f"{name}: the NEES{of} is {size}, but about right if {guesses[best].text}"]
+        return None
+    return guesses[int(np.flatnonzero(left <= np.nanmin(left) + ALIKE)[0])]
+
+
+def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: Fit) -> Guess | None:
+    """The likeliest guess with which everything is right, where no simple fault is nearly as likely."""
+    guesses = [guess for guess in guesses if guess.fine]
+    bar, simple, found = LEAST_GAIN + np.log(max(len(guesses), 1)), declared.simple(), []
+    errors = np.concatenate([poses.errors() for poses in some])
+    for guess in guesses:
+        read = [guess.change(poses) for poses in some]
+        if any(new.truth is not old.truth for new, old in zip(read, some, strict=True)):
+            continue  # a density of the truth in another unit is no likelier
+        same = all(
+            new.estimate is old.estimate and new.convention == old.convention
+            for new, old in zip(read, some, strict=True)
+        )
+        fit = fit_of(read, errors if same else None)
+        if fit is None or len(fit.w) < len(declared.w) or declared.size * (fit.likelihood - simple) < bar:
+            continue
+        gain = min(fit.size, declared.size) * (fit.likelihood - simple)
+        if gain >= bar and fit.right():
+            found.append((gain, guess))
+    most = max((gain for gain, _ in found), default=0.0)
+    return next((guess for gain, guess in found if gain >= most - 1.0), None)  # nearly as likely: the first
 
 
 def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
@@ -99,15 +174,88 @@ def decades(runs: Sequence[Poses]) -> Array:
 # --- guesses ----------------------------------------------------------------------------------------
 
 
-def _guesses(runs: Sequence[Poses]) -> list[Guess]:
+def _guesses(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
     """What may be, the likelier first."""
-    kind = runs[0].manifold
+    kind, convention = runs[0].manifold, runs[0].convention
     guesses = [*_covariances()]
     if kind == "spatial":
-        guesses = [*_orders(runs[0].convention), *_quaternions(), *guesses, *_units(3, slice(3, 6)), *_frames(runs)]
-    elif kind == "planar":
-        guesses = [*_sides(runs[0].convention), *_headings(), *guesses, *_units(2, slice(2, 3)), *_frames(runs)]
-    return guesses
+        own = [*_orders(convention), *_quaternions(), *guesses, *_permuted(axes, 3)]
+        return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_frames(runs)]
+    if kind == "planar":
+        own = [*_sides(convention), *_headings(), *guesses, *_permuted(axes, 3)]
+        return [*own, *_units(2, slice(2, 3)), _mirrored(convention), *_frames(runs)]
+    return [*guesses, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
+
+
+def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:
+    """Components of the covariance, or of estimates and covariance, in another order; of six in both blocks alike."""
+    n = width if len(axes) != 2 * width else 2 * width
+    if width > SWAPS:
+        return
+    orders: Iterable[tuple[int, ...]] = itertools.permutations(range(width))
+    if width > ALL_ORDERS:
+        orders = (_swap(width, *pair) for pair in itertools.combinations(range(width), 2))
+    for order in orders:
+        if order == tuple(range(width)):
+            continue
+        there = [axes[order.index(slot)] for slot in range(width)]
+        words = f"in the order {', '.join(there)}{' (rotations alike)' * (n > width)}"
+        whole = [*order, *(width + i for i in order)][:n]
+        if states:
+            what = f"the components of the estimates and of their covariance are {words}, beside those of the truth"
+        else:
+            what = f"the components of the covariance are {words}"
+        change = _reordered_states(whole) if states else _reordered(whole)
+        yield Guess(f"{what}; write them as {', '.join(axes[:width])}", change)
+
+
+def _swap(width: int, i: int, j: int) -> tuple[int, ...]:
+    order = list(range(width))
+    order[i], order[j] = j, i
+    return tuple(order)
+
+
+def _reordered(order: list[int]) -> Change:
+    return lambda p: replace(p, covariance=p.covariance[:, order][:, :, order])
+
+
+def _reordered_states(order: list[int]) -> Change:
+    return lambda p: replace(_reordered(order)(p), estimate=p.estimate[:, order])
+
+
+def _ned(convention: str) -> Iterator[Guess]:
+    """A world whose z points down, with a body whose z does so too or not."""
+    north = Frame(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
+    down = np.diag([1.0, -1.0, -1.0])
+    turned = {"so3-body": slice(3, 6), "left": slice(0, 6)}.get(convention, slice(0, 0))
+    T = np.eye(6)
+    T[turned, turned] = np.kron(np.eye(2), down)[turned, turned]
+
+    def with_body(p: Poses) -> Poses:
+        p = moved(p, north)
+        finite = np.isfinite(p.estimate).all(axis=1)
+        p.estimate[finite, 3:] = (Rotation.from_quat(p.estimate[finite, 3:]) * Rotation.from_matrix(down)).as_quat()
+        return replace(p, covariance=T @ p.covariance @ T)
+
+    worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
+    remedy = "write both in one (swap x and y, turn z over)"
+    yield Guess(f"{worlds}; {remedy}", lambda p: moved(p, north), fine=False)
+    yield Guess(f"{worlds}, and their bodies have z down and z up; {remedy}", with_body, fine=False)
+
+
+def _mirrored(convention: str) -> Guess:
+    """A plane of x north and y east."""
+    A = np.diag([1.0, -1.0, -1.0])
+    if convention != "left":
+        A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]
+
+    def change(p: Poses) -> Poses:
+        x, y, heading = p.estimate.T
+        own = np.column_stack([y, x, wrap(0.5 * np.pi - heading)])
+        return replace(p, estimate=own, covariance=A @ p.covariance @ A.T)
+
+    words = "one file is in a plane of x north, y east, the other in one of x east, y north"
+    return Guess(f"{words}; write both in one (swap x and y, heading = pi/2 - heading)", change, fine=False)
 
 
 def _orders(convention: str) -> Iterator[Guess]:
@@ -152,11 +300,12 @@ def _quaternions() -> Iterator[Guess]:
 
 def _headings() -> Iterator[Guess]:
     degrees = np.array([1.0, 1.0, DEGREE])
-    yield Guess("the headings of both files are in degrees", lambda p: _scaled(p, degrees, degrees))
-    yield Guess("the headings of the estimates are in degrees", lambda p: _scaled(p, degrees, None))
-    yield Guess("the headings of the truth are in degrees", lambda p: _scaled(p, None, degrees))
+    remedy = "; multiply them by pi / 180"
+    yield Guess(f"the headings of both files are in degrees{remedy}", lambda p: _scaled(p, degrees, degrees))
+    yield Guess(f"the headings of the estimates are in degrees{remedy}", lambda p: _scaled(p, degrees, None))
+    yield Guess(f"the headings of the truth are in degrees{remedy}", lambda p: _scaled(p, None, degrees))
     both = "the headings of both files and their variances are in degrees"
-    yield Guess(both, lambda p: _weighed(_scaled(p, degrees, degrees), slice(2, 3), DEGREE))
+    yield Guess(f"{both}{remedy}", lambda p: _weighed(_scaled(p, degrees, degrees), slice(2, 3), DEGREE))
 
 
 def _scaled(p: Poses, estimate: Array | None, truth: Array | None) -> Poses:
@@ -177,14 +326,21 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         out[:, part] *= MILLI
         return out
 
-    yield Guess("its angles are in degrees (deg^2 for rad^2)", lambda p: _weighed(p, angles, DEGREE))
-    yield Guess("its positions are in millimetres (mm^2 for m^2)", lambda p: _weighed(p, part, MILLI))
     yield Guess(
-        "the positions of the estimates and their covariance are in millimetres",
+        "its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180", lambda p: _weighed(p, angles, DEGREE)
+    )
+    yield Guess(
+        "its positions are in millimetres (mm^2 for m^2); divide them by 1000", lambda p: _weighed(p, part, MILLI)
+    )
+    yield Guess(
+        "the positions of the estimates and their covariance are in millimetres; divide them by 1000",
         lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
     )
-    yield Guess("the positions of the truth are in millimetres", lambda p: replace(p, truth=shrunk(p.truth)))
-    yield Guess("the positions of the estimates are in millimetres", lambda p: replace(p, estimate=shrunk(p.estimate)))
+    for of, change in (
+        ("truth", lambda p: replace(p, truth=shrunk(p.truth))),
+        ("estimates", lambda p: replace(p, estimate=shrunk(p.estimate))),
+    ):
+        yield Guess(f"the positions of the {of} are in millimetres; divide them by 1000", change)
 
 
 def _weighed(p: Poses, part: slice, factor: float) -> Poses:
@@ -226,7 +382,7 @@ def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
             f"the world of the estimates is {turn}shifted by ({where}) m to meet that of the truth; "
             f"write both in one world, or add --align posyaw{'-all' * (len(runs) > 1)}"
         )
-        yield Guess(words, lambda p: moved(p, frame))
+        yield Guess(words, lambda p: moved(p, frame), fine=False)
     if len(runs) > 1:
         words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
-        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True)
+        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True, fine=False)

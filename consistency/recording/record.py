@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from consistency.diagnostics import nees
+from consistency.diagnostics.skipping import Skip, Skipped, without_first
 from consistency.errors import InputError
 from consistency.types import Array, Failure, Indices
 
@@ -48,14 +50,33 @@ class Recording:
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
     spoilt: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
+    times: Array | None = None  # (R, T), s, of the steps of each run, or of the beginnings of windows; None with one t
+    skipped: Skipped | None = None  # first steps that are left out of the statistics
+
+    def without_first(self, skip: Skip | None) -> Self:
+        """The first steps of each run left out of the statistics: covariance, NEES and NIS are NaN there.
+
+        Raises
+        ------
+        InputError
+            Nothing is left, or seconds are asked for and there are no times.
+        """
+        arrays = {"covariance": self.covariance, "nees": self.nees, "nis": self.nis, "nis_dof": self.nis_dof}
+        try:
+            rest, skipped = without_first(skip, arrays, self.name, self.t if self.times is None else self.times)
+        except ValueError as error:
+            raise InputError(f"--{error}") from None
+        return replace(self, **rest, skipped=skipped)
 
     @property
     def left_out_steps(self) -> list[int]:
         """Steps, counted from 1, in which the covariance of some run is not of full rank yet."""
         if self.error is None or self.nees is None:
             return []
-        skipped = np.isfinite(self.error).all(axis=-1) & np.isnan(self.nees)
-        return [int(k) + 1 for k in np.flatnonzero(skipped.any(axis=0))]
+        deficient = np.isfinite(self.error).all(axis=-1) & np.isnan(self.nees)
+        if self.skipped is not None:
+            deficient[:, : self.skipped.steps] = False
+        return [int(k) + 1 for k in np.flatnonzero(deficient.any(axis=0))]
 
 
 @dataclass(frozen=True)
@@ -70,6 +91,7 @@ class Track:
     nis: Array | None = None  # (k,)
     nis_dof: Array | None = None  # (k,)
     nees: Array | None = None  # (k,)
+    t: Array | None = None  # (k,), s; of windows, of their beginnings
 
 
 def assemble(
@@ -140,6 +162,7 @@ def assemble(
         failures=tuple(failures),
         convention=convention,
         notes=tuple(notes),
+        times=grid(lambda part: part.t),
     )
 
 
@@ -270,8 +293,8 @@ def _judged(track: Track) -> tuple[int, int, str]:
 
 def _cut(track: Track, start: int, end: int) -> Track:
     """Rows before ``end``, with their NEES from ``start`` on."""
-    error, P, nis, dof = (
-        None if v is None else v[:end] for v in (track.error, track.covariance, track.nis, track.nis_dof)
+    error, P, nis, dof, t = (
+        None if v is None else v[:end] for v in (track.error, track.covariance, track.nis, track.nis_dof, track.t)
     )
     values = None
     if error is not None and P is not None:
@@ -279,7 +302,7 @@ def _cut(track: Track, start: int, end: int) -> Track:
         values[start:] = nees(error[start:], P[start:])
         if start:
             P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
-    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values)
+    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values, t)
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:

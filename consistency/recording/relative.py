@@ -57,6 +57,7 @@ class Windows:
     run: int
     place: Places  # (W,)
     t: Array  # (W,), s, at the end of each
+    start: Array  # (W,), s, at the beginning of each
     error: Array  # (W, n), NaN where the estimate is
     covariance: Array  # (W, n, n)
     left_out: int
@@ -87,10 +88,10 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
     covariance = _of_motions(s, T, first, last) if relative.motions else _of_poses(s, T, D, first, last, relative)
     if sound < len(s.t):  # a broken row ends the run, in a window of its own
         finite = np.isfinite(s.estimate[sound]).all()
-        last = np.append(last, sound)
+        first, last = np.append(first, max(sound - 1, 0)), np.append(last, sound)
         error = np.concatenate([error, np.full((1, error.shape[1]), 0.0 if finite else np.nan)])
         covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
-    return Windows(s.run, s.place.at(last), s.t[last], error, covariance, left_out)
+    return Windows(s.run, s.place.at(last), s.t[last], s.t[first], error, covariance, left_out)
 
 
 def _sound(s: Stretch, relative: Relative) -> int:
@@ -160,7 +161,7 @@ def relative_recording(
         columns, t = common_times(times)
     part = list(judged)
     tracks = [
-        Track(one.run, column, one.place, one.error[:, part], one.covariance[:, part][:, :, part])
+        Track(one.run, column, one.place, one.error[:, part], one.covariance[:, part][:, :, part], t=one.start)
         for one, column in zip(found, columns, strict=True)
     ]
     notes = _notes(name, found, axes, stretches[0].convention, relative)

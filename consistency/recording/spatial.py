@@ -93,7 +93,10 @@ def recordings_of(
     poses = moved.runs
     matches = [_match(one, *files, shift) for one, files in zip(poses, source.files, strict=True)]
     columns, t = common_times([run.t for run in matches])
-    tracks = [Track(i, c, run.place, run.error, run.P) for i, (c, run) in enumerate(zip(columns, matches, strict=True))]
+    tracks = [
+        Track(i, c, run.place, run.error, run.P, t=run.t)
+        for i, (c, run) in enumerate(zip(columns, matches, strict=True))
+    ]
     kind = poses[0].convention
     notes = [
         *_notes(source.path, matches, poses[0].max_dt),

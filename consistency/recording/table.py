@@ -189,12 +189,13 @@ def _recording(
             notes.append(f"{name}: step k below is the k-th step of the file, which has {steps[0]:g} to {steps[-1]:g}")
     else:
         columns, t = common_times([keys[rows] for rows in members])
+    clock = sheet.numbers("t") if "t" in sheet else None
     tracks = [
         Track(
             run,
             column,
             Places(sheet.place, rows),
-            *(None if values is None else values[rows] for values in (error, covariance, nis, dof)),
+            *(None if values is None else values[rows] for values in (error, covariance, nis, dof, None, clock)),
         )
         for run, rows, column in zip(numbers, members, columns, strict=True)
     ]

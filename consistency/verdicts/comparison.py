@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from consistency.diagnostics import Comparison, Evidence, RunSummary, compare, summary
 from consistency.diagnostics.comparison import FailedRuns
+from consistency.diagnostics.skipping import Skip
 from consistency.errors import InputError
 from consistency.reading import HUGE, read_json, reading
 from consistency.recording import Recording
@@ -21,7 +22,7 @@ from consistency.store.atomic import write_whole
 from consistency.store.results import POSE, Tables, open_results
 from consistency.store.storage import SCHEMA_VERSION, manifest_of, plain
 from consistency.verdicts.curves import Curves, curves, steps_of
-from consistency.verdicts.judge import evidence_of_windows
+from consistency.verdicts.judge import evidence_of_windows, skip_asked
 
 DETECT = 1.5  # ratio that a sentence speaks of
 HIGHEST_DOF = 1000  # of an error in a baseline
@@ -38,6 +39,7 @@ class Baseline:
     failures: dict[str, int]
     manifest: dict[str, Any]
     axes: dict[str, tuple[str, ...]]  # names of the components of each filter's error
+    skip: str | None = None  # first steps that were left out: 20, 2s
 
     def of_the_trials_of(self, other: Baseline) -> bool:
         """Whether both are of the same trials, so that runs of one number belong together."""
@@ -86,28 +88,37 @@ class Compared:
         return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
 
 
-def baseline_of(results: Tables, name: str = "results") -> Baseline:
-    """Summaries of all filters.
+def baseline_of(results: Tables, name: str = "results", skip: str | float | Skip | None = None) -> Baseline:
+    """Summaries of all filters, with the first steps of each run left out where ``skip`` says so.
 
     Raises
     ------
     InputError
-        The results have no truth.
+        The results have no truth, or nothing is left.
     """
+    first = skip_asked(skip)
     if not results.has_truth:
         raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
     steps = steps_of(results)
-    filters = {each: _summary_of(curves(results, each, steps, maps=False)) for each in results.filters}
+    filters = {
+        each: _summary_of(curves(results, each, steps, maps=False).without_first(first)) for each in results.filters
+    }
     failures = {each: int((results.failures["filter"] == each).sum()) for each in results.filters}
     scenario = results.scenario
     m = results.manifest
     origin = (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed"))
     axes = dict.fromkeys(filters, tuple(POSE))
-    return Baseline(name, scenario.name if scenario else None, origin, filters, failures, m, axes)
+    return Baseline(name, scenario.name if scenario else None, origin, filters, failures, m, axes, _option(first))
 
 
-def baseline_of_files(recordings: Sequence[Recording], name: str, truth: Path | None = None) -> Baseline:
-    """Summaries of estimators whose files were read.
+def _option(skip: Skip | None) -> str | None:
+    return None if skip is None else skip.option
+
+
+def baseline_of_files(
+    recordings: Sequence[Recording], name: str, truth: Path | None = None, skip: str | float | Skip | None = None
+) -> Baseline:
+    """Summaries of estimators whose files were read, with the first steps left out where ``skip`` says so.
 
     Parameters
     ----------
@@ -116,10 +127,11 @@ def baseline_of_files(recordings: Sequence[Recording], name: str, truth: Path | 
     Raises
     ------
     InputError
-        An estimator has no NEES.
+        An estimator has no NEES, or nothing of it is left.
     """
-    filters = {}
+    filters, first = {}, skip_asked(skip)
     for r in recordings:
+        r = r.without_first(first)
         if r.nees is None:
             raise InputError(f"{name}: has no truth of {r.name}; give it with --truth, as only a NEES can be compared")
         of = evidence_of_windows(r) if r.independent and not r.unshown else r
@@ -128,7 +140,7 @@ def baseline_of_files(recordings: Sequence[Recording], name: str, truth: Path | 
         filters[r.name] = summary(of.nees, r.dof, of.error, of.covariance, numbers)
     failures = {r.name: len(r.failures) for r in recordings}
     origin = (None if truth is None else _digest(truth), None)
-    return Baseline(name, None, origin, filters, failures, {}, {r.name: r.axes for r in recordings})
+    return Baseline(name, None, origin, filters, failures, {}, {r.name: r.axes for r in recordings}, _option(first))
 
 
 def _digest(truth: Path) -> str:
@@ -160,6 +172,7 @@ def write_baseline(of: Tables | Baseline, path: Path, overwrite: bool = False) -
         kind="baseline",
         scenario=base.scenario,
         origin=list(base.origin),
+        skip=base.skip,
         filters={
             name: {key: plain(value) for key, value in vars(s).items()}
             | {"failures": base.failures[name], "axes": list(base.axes[name])}
@@ -180,8 +193,12 @@ def is_baseline(path: Path) -> bool:
         return file.read(64).lstrip().startswith(b"{")
 
 
-def read_baseline(path: Path) -> Baseline:
+def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baseline:
     """A results folder, or a file of :func:`write_baseline`.
+
+    Parameters
+    ----------
+    skip : first steps to leave out; of a file those that it was written without
 
     Raises
     ------
@@ -189,7 +206,7 @@ def read_baseline(path: Path) -> Baseline:
         Neither, or damaged.
     """
     if path.is_dir():
-        return baseline_of(open_results(path), str(path))
+        return baseline_of(open_results(path), str(path), skip)
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")
@@ -198,7 +215,24 @@ def read_baseline(path: Path) -> Baseline:
         filters = {name: row.summary() for name, row in rows.filters.items()}
     failures = {name: row.failures for name, row in rows.filters.items()}
     axes = {name: tuple(row.axes) for name, row in rows.filters.items()}
-    return Baseline(str(path), rows.scenario, (rows.origin[0], rows.origin[1]), filters, failures, data, axes)
+    origin = rows.origin[0], rows.origin[1]
+    return require_skip(Baseline(str(path), rows.scenario, origin, filters, failures, data, axes, rows.skip), skip)
+
+
+def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
+    """The baseline, if the same first steps were left out of it.
+
+    Raises
+    ------
+    InputError
+        They were not.
+    """
+    asked = _option(skip_asked(skip))
+    if base.skip != asked:
+        own = "of all steps" if base.skip is None else f"with --skip {base.skip}"
+        wanted = "without --skip" if asked is None else f"with --skip {asked}"
+        raise InputError(f"{base.name}: was written {own}; write it again {wanted}, or compare by the same steps")
+    return base
 
 
 Number = Annotated[float, Field(ge=0.0, le=HUGE**4)] | None  # None where a run has no value
@@ -234,6 +268,7 @@ class _Rows(BaseModel):
     scenario: str | None
     origin: Annotated[list[Any], Field(min_length=2, max_length=2)]
     filters: dict[str, _Summary]
+    skip: str | None = None  # files written before lack it
 
 
 def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = 0.05) -> list[Compared]:

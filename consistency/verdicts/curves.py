@@ -11,6 +11,7 @@ from scipy import stats
 
 from consistency.diagnostics import scale
 from consistency.diagnostics.blocks import by_runs, by_steps
+from consistency.diagnostics.skipping import Skip, Skipped, without_first
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, planar_error
@@ -95,6 +96,25 @@ class Curves:
     own: Errors | None = None  # in that convention, where it is not the additive one
     landmarks: Landmarks | None = None  # None where no run has a map, or where they were not asked for
     rejections: Rejections | None = None  # None of a filter without a guard
+    skipped: Skipped | None = None  # first steps that are left out, and NaN in all but the errors
+
+    def without_first(self, skip: Skip | None) -> Curves:
+        """The first steps of each run left out of the statistics; maps, which are of the last step, stay.
+
+        Raises
+        ------
+        InputError
+            Nothing is left.
+        """
+        own = self.own or Errors(None, None, None)  # type: ignore[arg-type]
+        arrays = {"covariance": self.covariance, "nees": self.nees, "nis": self.nis, "nis_dof": self.nis_dof}
+        arrays |= {"own_covariance": own.covariance, "own_nees": own.nees}
+        try:
+            rest, skipped = without_first(skip, arrays, self.filter, self.t)
+        except ValueError as error:
+            raise InputError(f"--{error}") from None
+        new_own = Errors(own.error, rest.pop("own_covariance"), rest.pop("own_nees"))
+        return replace(self, **rest, own=None if self.own is None else new_own, skipped=skipped)
 
     def of_run(self, run: int) -> Curves:
         """One run alone, R = 1, or none where there is no such run; maps and rejections are left out."""

@@ -27,6 +27,7 @@ from consistency.diagnostics import (
 )
 from consistency.diagnostics.questions import SHARES
 from consistency.diagnostics.scale import FEW
+from consistency.diagnostics.skipping import Skip, skip_of
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.wording import plain
 from consistency.errors import InputError
@@ -65,11 +66,26 @@ def settings_of(confidence: float | None = None, **given: Any) -> Settings:
         raise refused(error) from None
 
 
+def skip_asked(given: str | float | Skip | None) -> Skip | None:
+    """The first steps or seconds that an option asks to leave out.
+
+    Raises
+    ------
+    InputError
+        It is neither a number of steps nor of seconds.
+    """
+    try:
+        return skip_of(given)
+    except ValueError as error:
+        raise refused(error) from None
+
+
 def analyse(
     results: Tables,
     filters: Sequence[str] | None = None,
     confidence: float | None = None,
     settings: Settings | None = None,
+    skip: str | float | Skip | None = None,
 ) -> dict[str, Verdict]:
     """A verdict for every filter of the results, or for those named.
 
@@ -78,17 +94,19 @@ def analyse(
     confidence : 1 less the false-alarm rate of a verdict, in place of ``settings``
     settings : what to ask; the defaults of :class:`Settings` where None. Results of a run until decided are then
         judged as that run was.
+    skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
 
     Raises
     ------
     InputError
-        Unknown filter, or a confidence outside (0, 1).
+        Unknown filter, a confidence outside (0, 1), or nothing is left.
     """
     design = design_of(results) if settings is None and confidence is None else None
     settings = settings_of(confidence) if settings is None else settings
+    first = skip_asked(skip)
     verdicts, steps = {}, steps_of(results)
     for name in filters or results.filters:
-        verdict, ends = _of_poses(curves(results, name, steps, maps=False), settings, design)
+        verdict, ends = _of_poses(curves(results, name, steps, maps=False).without_first(first), settings, design)
         verdicts[name] = with_map(verdict, results, ends, settings, design)
     return verdicts
 
@@ -222,6 +240,7 @@ def evidence_of(c: Curves, runs: int | None = None, additive: bool = False) -> E
         failures=tuple(f for f in c.failures if f.run in numbers),
         axes=POSE,
         run_numbers=numbers,
+        skipped=c.skipped,
     )
 
 
@@ -263,6 +282,7 @@ def analyse_recordings(
             evidence = Evidence(
                 name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
                 failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, spoilt=r.spoilt,
+                skipped=r.skipped,
             )  # fmt: skip
         verdict = _unshown(judge(evidence, settings), r.unshown)
         first, *rest = verdict.reasons
@@ -316,7 +336,7 @@ def evidence_of_windows(r: Recording) -> Evidence:
     return Evidence(
         r.name, r.error[there][:, None], r.covariance[there][:, None], r.nees[there][:, None], r.dof,
         failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures), axes=r.axes,
-        run_numbers=number[there], unit="window", spoilt=tuple(SHARES) if r.unshown else (),
+        run_numbers=number[there], unit="window", spoilt=tuple(SHARES) if r.unshown else (), skipped=r.skipped,
     )  # fmt: skip
 
 

@@ -495,7 +495,7 @@ KEYS = {
     "acceptance", "alive", "allow", "anees", "answers", "band", "confidence", "detectable", "dof", "effective_dof",
     "failures", "false_alarm", "first_outside", "first_step", "judged_steps", "lasting", "left_out_steps",
     "mean_anees", "median_run", "p_value", "pit", "pit_half_width", "ratio", "ratio_interval", "runs", "share_inside",
-    "simultaneous", "since", "steps", "steps_above", "steps_below", "subset", "worst_run",
+    "simultaneous", "since", "steps", "steps_above", "steps_below", "subset", "until", "worst_run",
 }  # fmt: skip
 OF_ERRORS = KEYS | {
     "axes", "bias", "bias_step", "coverage", "coverage_interval", "coverage_one_step", "groups", "impossible",

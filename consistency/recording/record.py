@@ -47,6 +47,7 @@ class Recording:
     face: str = ""  # what the verdict has to say of that
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
     spoilt: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
+    unseen: float = 0.0  # share of the NEES that a fit to the truth may have taken without its being made up for
 
     @property
     def left_out_steps(self) -> list[int]:

@@ -235,9 +235,9 @@ def test_what_is_left_of_white_errors_and_of_slow_ones(rng: np.random.Generator)
     """
     for correlation, taken, spread in ((0.0, 0.02, 0.004), (0.8, 0.168, 0.04)):
         residuals, bases = residuals_of(rng, 40, 50, correlation)
-        M = np.array(left_covariances(residuals, bases, False))
+        M = np.array(left_covariances(residuals, bases, False).covariances)
         assert 1.0 - taken - spread < M[:, :, range(3), range(3)].mean() < 1.0 - taken + spread + 0.02 * correlation
-        larger = np.array(left_covariances([10.0 * r for r in residuals], bases, False))
+        larger = np.array(left_covariances([10.0 * r for r in residuals], bases, False).covariances)
         np.testing.assert_allclose(M, larger, atol=1e-6)
 
 

@@ -43,8 +43,8 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
     part of the run are not looked for then; the result is moved ``MARGIN`` standard errors (jackknife over runs)
     towards I, and is too large rather than too small where errors are correlated for longer. Errors that alternate or
     oscillate lose less to such a fit than the model says. They are told by a correlation at some lag that is smaller
-    than any sum of exponentials, of any length, makes it: Student's t over runs for each component and bin of lags, at
-    ``DOUBT`` together (Bonferroni). Then I is returned, which is never too small.
+    than any sum of exponentials, of any length, makes it: Student's t over runs for each bin of lags, in each component
+    and in all together, at ``DOUBT`` (Bonferroni). Then I is returned, which is never too small.
 
     Parameters
     ----------
@@ -99,9 +99,12 @@ def _oscillate(seen: Array, expected: Array, pairs: Array) -> bool:
     N = len(seen)
     weights = _weights(*(values.sum(axis=0) for values in (seen, expected, pairs)))
     off = seen - np.einsum("iambj,bj->iam", expected, weights)
-    mean, spread = off.mean(axis=0), off.std(axis=0, ddof=1) / np.sqrt(N)
-    t = mean[spread > 0] / spread[spread > 0]
-    return bool((stats.t.cdf(t, N - 1) * off[0].size <= DOUBT).any())
+    for each in (off, off.sum(axis=1)):
+        mean, spread = each.mean(axis=0), each.std(axis=0, ddof=1) / np.sqrt(N)
+        t = mean[spread > 0] / spread[spread > 0]
+        if (stats.t.cdf(t, N - 1) * mean.size <= 0.5 * DOUBT).any():
+            return True
+    return False
 
 
 def _at_most(residuals: Sequence[Array], bases: Sequence[Array]) -> float:

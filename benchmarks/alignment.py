@@ -30,7 +30,7 @@ from consistency.recording.poses import Poses
 from consistency.recording.sheet import Places
 from consistency.types import Array
 
-SEED, RUNS, STEPS, DRAWS, FEWER, QUICK = 20261123, 60, 400, 500, 100, 20
+SEED, RUNS, STEPS, DRAWS, OFTEN, FEWER, QUICK = 20261123, 60, 400, 500, 400, 100, 20
 FALSE_ALARM = 0.05
 MOST_LOST = 5.0  # points
 QUICK_FAILURE = 1.0 / 5000.0
@@ -67,6 +67,29 @@ def turn_on(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     return np.asarray(np.sqrt(0.5) * (white(rng, shape) + white(rng, (shape[0], 1, shape[2]))))
 
 
+def differences(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Of neighbouring white ones: their sum over a run is next to nothing."""
+    runs, steps, n = shape
+    return np.asarray(np.diff(white(rng, (runs, steps + 1, n)), axis=1) / np.sqrt(2.0))
+
+
+def periods(rng: np.random.Generator, shape: tuple[int, ...], count: float, axes: Sequence[int] = (0, 1, 2)) -> Array:
+    """Gaussian, of so many periods over the run in these axes, with a phase of their own; white in the others."""
+    angle = 2.0 * np.pi * count * np.arange(shape[1])[:, None] / shape[1]
+    a, b, out = white(rng, (shape[0], 1, 3)), white(rng, (shape[0], 1, 3)), white(rng, shape)
+    out[..., list(axes)] = (a * np.cos(angle) + b * np.sin(angle))[..., list(axes)]
+    return out
+
+
+def second_order(rng: np.random.Generator, shape: tuple[int, ...], period: float, decay: float) -> Array:
+    """Oscillating, with this period and time constant in steps; stationary after ten time constants."""
+    size, before = np.exp(-1.0 / decay), int(10 * decay)
+    a, b = 2.0 * size * np.cos(2.0 * np.pi / period), -(size**2)
+    variance = (1.0 - b) / ((1.0 + b) * ((1.0 - b) ** 2 - a**2))
+    w = white(rng, (shape[0], before + shape[1], shape[2])) / np.sqrt(variance)
+    return np.asarray(signal.lfilter([1.0], [1.0, -a, -b], w, axis=1)[:, before:])
+
+
 @dataclass(frozen=True)
 class World:
     """Whitened errors (runs, steps, 3) and how standard deviations grow."""
@@ -82,6 +105,12 @@ WORLDS = {
     "AR(.99)": World("errors of neighbouring steps correlate by 0.99", lambda r, s: first_order(r, s, 0.99)),
     "drift": World("odometry: errors are sums of independent ones, variances grow from step to step", drift, True),
     "constant": World("half of the variance is one error in all steps of a run, half is white", turn_on),
+    "AR(-.5)": World("errors of neighbouring steps correlate by -0.5", lambda r, s: first_order(r, s, -0.5)),
+    "differences": World("differences of independent errors", differences),
+    "1 period": World("one period over the run", lambda r, s: periods(r, s, 1.0)),
+    "1.5 periods": World("one and a half periods over the run", lambda r, s: periods(r, s, 1.5)),
+    "2 periods of heading": World("white, heading two periods over the run", lambda r, s: periods(r, s, 2.0, (2,))),
+    "AR(2)": World("oscillating, period 50, time constant 60 steps", lambda r, s: second_order(r, s, 50.0, 60.0)),
 }
 
 
@@ -108,6 +137,10 @@ POWER = [
     Case("drift", 1.3, ("none", *ALIGNED), draws=FEWER),
 ]
 FURTHER = [Case(world, 1.0, ALIGNED, 100, draws=FEWER) for world in ("AR(.95)", "AR(.99)", "constant")]
+OSCILLATING = [
+    *(Case(world, 1.0, ALIGNED, 20, draws=OFTEN) for world in ("AR(-.5)", "differences", "1 period")),
+    *(Case(world, 1.0, ALIGNED, 100, draws=OFTEN) for world in ("1.5 periods", "2 periods of heading", "AR(2)")),
+]
 OFFSET = [
     *(Case(world, 1.0, ("offset",), 100, draws=FEWER) for world in ("white", "AR(.95)", "drift")),
     *(Case("AR(.99)", 1.0, ("offset",), 100, runs, FEWER) for runs in (1, 5, 20)),
@@ -260,9 +293,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     fresh = int(np.random.SeedSequence().generate_state(1)[0])
     seed = options.seed if options.seed is not None else fresh if options.quick else SEED
     print(f"seed {seed}", flush=True)
-    cases = [case for case in [*NULL, *POWER, *FURTHER, *OFFSET] if options.only in f"{case.world} {case.modes}"]
+    cases = [*NULL, *POWER, *FURTHER, *OSCILLATING, *OFFSET]
+    cases = [case for case in cases if options.only in f"{case.world} {case.modes}"]
+    if options.draws is not None:
+        cases = [replace(case, draws=min(case.draws, options.draws)) for case in cases]
     if options.quick:
-        cases = [replace(case, draws=QUICK, steps=100) for case in cases if case.ratio == 1.0 and case.runs >= RUNS]
+        right = [case for case in cases if case.ratio == 1.0 and case.runs >= RUNS]
+        cases = list(dict.fromkeys(replace(case, draws=QUICK, steps=min(case.steps, 100)) for case in right))
     started, rows = time.monotonic(), []
     for row in measure(cases, seed, options.workers):
         rows.append(row)
@@ -284,6 +321,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="JSON file to write")
     parser.add_argument("--docs", type=Path, help="document whose table to replace")
     parser.add_argument("--only", default="", help="cases whose world or modes contain this text")
+    parser.add_argument("--draws", type=int, help="of each case at most")
     parser.add_argument("--seed", type=int)
     parser.add_argument("--workers", type=int, default=2)
     return parser.parse_args(arguments)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, optimize
+from scipy import fft, linalg, optimize, stats
 
 from consistency.types import Array
 
@@ -13,13 +14,23 @@ ENOUGH = 20  # runs that show how their errors depend on each other
 REACH = 10  # longest time constant that is looked for in a run with a fit of its own: this part of its steps
 SHORTEST = 0.5  # steps; errors of a shorter time constant are white
 MARGIN = 2.0  # standard errors by which more is taken to be left than seems: by simulation, benchmarks/alignment.py
+DOUBT = 0.01  # chance that correlations are called oscillating though they are sums of exponentials
 LONGEST, WIDER = (
     2,
     1.4,
 )  # the longest lag that is looked at is this part of the steps; each bin of lags ends so much later
 
 
-def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared: bool) -> list[Array]:
+@dataclass(frozen=True)
+class Left:
+    """Covariances of what a fit leaves."""
+
+    covariances: list[Array]  # (T_i, n, n) for each run
+    oscillating: bool = False  # the errors are not what is assumed of them; the covariances are I
+    unseen: float = 0.0  # share of the NEES that the fit may have taken without its being made up for
+
+
+def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared: bool) -> Left:
     """Covariance of whitened residuals in each step, where that of whitened errors is I.
 
     A fit with d parameters projects whitened errors w of covariance C, all steps stacked, to r = (I - Q Q') w. Their
@@ -30,7 +41,10 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
 
     A fit of its own in each run looks as an error does that is constant over the run. So correlations longer than a
     part of the run are not looked for then; the result is moved ``MARGIN`` standard errors (jackknife over runs)
-    towards I, and is too large rather than too small where errors are correlated for longer.
+    towards I, and is too large rather than too small where errors are correlated for longer. Errors that alternate or
+    oscillate lose less to such a fit than the model says. They are told by a correlation at some lag that is smaller
+    than any sum of exponentials, of any length, makes it: Student's t over runs for each bin of lags, in each component
+    and in all together, at ``DOUBT`` (Bonferroni). Then I is returned, which is never too small.
 
     Parameters
     ----------
@@ -38,30 +52,80 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
     bases : (T_i, n, d) for each run; columns of Q, orthonormal in each run, or over all runs where ``shared``
     shared : one fit for all runs; else each run has its own
 
-    Returns
-    -------
-    (T_i, n, n) for each run
     """
     longest, n = max(map(len, residuals)), residuals[0].shape[1]
     kernels, edges = _kernels(longest, shared), _bins(longest)
+    every = kernels if shared else np.concatenate([kernels, _slower(longest)])
     seen = np.array([_binned(_products(r), edges) for r in residuals])  # (N, n, bins)
     pairs = np.array([_binned(np.maximum(len(r) - np.arange(longest), 0.0), edges) for r in residuals])  # (N, bins)
-    expected = _expected(bases, kernels, edges, shared)  # (N, n, bins, n, J)
+    whole = _expected(bases, every, edges, shared)  # (N, n, bins, n, J)
+    if not shared and _oscillate(seen, whole, pairs):
+        return Left([np.tile(np.eye(n), (len(r), 1, 1)) for r in residuals], True, _at_most(residuals, bases))
+    expected = whole[..., : len(kernels)]
     shares = _shares(*(values.sum(axis=0) for values in (seen, expected, pairs)))
     left = _left(bases, shares @ kernels, shared)
     if shared:
-        return left
+        return Left(left)
     taken = sum(float(np.trace(np.eye(n) - M, axis1=1, axis2=2).sum()) for M in left)
-    whole = n * sum(map(len, residuals))
-    error = MARGIN * _error(seen, expected, pairs) * (whole - taken)
+    error = MARGIN * _error(seen, expected, pairs) * (n * sum(map(len, residuals)) - taken)
     back = min(error / taken, 1.0) if taken > 0 else 0.0
-    return [M + back * (np.eye(n) - M) for M in left]
+    return Left([M + back * (np.eye(n) - M) for M in left])
+
+
+def inflation_of_mean(residuals: Sequence[Array], bases: Sequence[Array]) -> float:
+    """Variance of the mean of all runs over what it is if runs are independent, in the worst direction.
+
+    A fit to all runs has one error in all of them. With m_i the mean residual of run i and s_i = Q_i' r_i, run i adds
+    m_i / N - q s_i to the mean, where q is the mean of the m_i that a unit of each parameter makes. The sum of the
+    squares of these is the variance of the mean under any dependence of steps (Liang & Zeger 1986, eq. 7), and 1 / N
+    of the sample covariance of the m_i is what a test of the mean takes it to be.
+
+    Parameters
+    ----------
+    residuals : (T_i, n) for each run
+    bases : (T_i, n, d) for each run; columns of Q, orthonormal over all runs
+    """
+    means = np.array([r.mean(axis=0) for r in residuals])
+    scores = np.array([np.einsum("kap,ka->p", Q, r) for Q, r in zip(bases, residuals, strict=True)])
+    q = np.mean([Q.mean(axis=0) for Q in bases], axis=0)
+    parts, N = means / len(means) - scores @ q.T, len(means)
+    variance, assumed = N * parts.T @ parts, np.atleast_2d(np.cov(means.T))
+    little = np.finfo(float).eps * max(float(np.trace(variance)), np.finfo(float).tiny)
+    return float(linalg.eigh(variance, assumed + little * np.eye(len(variance)), eigvals_only=True)[-1])
+
+
+def _oscillate(seen: Array, expected: Array, pairs: Array) -> bool:
+    """Is a lagged product smaller than those kernels of ``expected`` that fit best make it?"""
+    N = len(seen)
+    weights = _weights(*(values.sum(axis=0) for values in (seen, expected, pairs)))
+    off = seen - np.einsum("iambj,bj->iam", expected, weights)
+    for each in (off, off.sum(axis=1)):
+        mean, spread = each.mean(axis=0), each.std(axis=0, ddof=1) / np.sqrt(N)
+        t = mean[spread > 0] / spread[spread > 0]
+        if (stats.t.cdf(t, N - 1) * mean.size <= 0.5 * DOUBT).any():
+            return True
+    return False
+
+
+def _at_most(residuals: Sequence[Array], bases: Sequence[Array]) -> float:
+    """Share of the NEES that a fit takes at most: of each component the largest value of its mean periodogram."""
+    size = _size(max(map(len, residuals)))
+    periodograms = sum(np.square(np.abs(fft.rfft(r, size, axis=0))) for r in residuals)
+    squares = sum(np.square(r).sum(axis=0) for r in residuals)
+    largest = np.max(periodograms, axis=0) / np.where(squares > 0, squares, 1.0)
+    directions = sum(np.square(Q).sum(axis=(0, 2)) for Q in bases)
+    return min(float(directions @ largest) / sum(r.size for r in residuals), 1.0)
+
+
+def _weights(seen: Array, expected: Array, pairs: Array) -> Array:
+    """Sizes of the kernels in each component, (n, J), from sums over runs."""
+    design = (expected / pairs[:, None, None]).reshape(seen.size, -1)
+    return np.asarray(optimize.nnls(design, (seen / pairs).ravel())[0].reshape(len(seen), -1))
 
 
 def _shares(seen: Array, expected: Array, pairs: Array) -> Array:
     """Shares of the kernels in the variance of each component, (n, J), from sums over runs."""
-    design = (expected / pairs[:, None, None]).reshape(seen.size, -1)
-    weights = optimize.nnls(design, (seen / pairs).ravel())[0].reshape(len(seen), -1)
+    weights = _weights(seen, expected, pairs)
     total = weights.sum(axis=1, keepdims=True)
     white = np.arange(weights.shape[1]) == 0
     return np.where(total > 0, weights / np.where(total > 0, total, 1.0), white)
@@ -82,6 +146,12 @@ def _kernels(longest: int, shared: bool) -> Array:
     times = most / 2.0 ** np.arange(np.floor(np.log2(most / SHORTEST)) + 1.0)
     rows = [lag == 0, *(np.exp(-lag / tau) for tau in times)]
     return np.array([*rows, np.ones(longest)] if shared else rows, float)
+
+
+def _slower(longest: int) -> Array:
+    """Exponentials longer than those of a run with a fit of its own, up to a constant; (J, longest)."""
+    times = max(longest / REACH, SHORTEST) * 2.0 ** np.arange(1.0, np.ceil(np.log2(2 * REACH)) + 1.0)
+    return np.exp(-np.arange(longest) / times[:, None])
 
 
 # --- lags ---------------------------------------------------------------------------------------------------

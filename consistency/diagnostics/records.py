@@ -80,6 +80,7 @@ class Evidence:
     reduced: bool = False  # a fit to the truth may have made the errors smaller than the covariance says: no fault
     spoilt: Collection[str] = ()  # questions that such a fit leaves no answer to, which are not asked
     skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
+    unseen: float = 0.0  # share of the NEES that such a fit may have taken: consistent is shown with it added
 
 
 @dataclass(frozen=True)

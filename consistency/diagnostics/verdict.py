@@ -60,8 +60,9 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     are white. Without truth they are judged alone.
 
     Where a fit to the truth took of the errors (``Evidence.reduced``) what is not known, a covariance that is too large
-    is no fault, as with ``allow="conservative"``; but consistent is shown on both sides. Questions that it leaves no
-    answer to (``Evidence.spoilt``) are not asked.
+    is no fault, as with ``allow="conservative"``; but consistent is shown on both sides, with the share of the NEES
+    added that it may have taken at most (``Evidence.unseen``). Questions that it leaves no answer to
+    (``Evidence.spoilt``) are not asked.
 
     A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
     pose and map together, where it is given.
@@ -98,7 +99,7 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
         ends = early_ends(sample.nees)
         verdict = replace(verdict, ends=ends if ends.runs else None)
     if sample is not None and tests is not None:
-        shown = _equivalence(sample, both_sides, look, evidence.reduced)
+        shown = _equivalence(sample, both_sides, look, evidence)
         lost = lost_of(evidence, sample.nees, sample.dof, settings, any_time=look is not None)
         verdict = _with_records(replace(verdict, lost=lost), evidence, sample, tests, shown)
     verdict = replace(verdict, status=status_of(verdict, sample, tests, joint))
@@ -168,11 +169,13 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
     )
 
 
-def _equivalence(sample: Sample, settings: Settings, look: Look | None, reduced: bool) -> Equivalence:
+def _equivalence(sample: Sample, settings: Settings, look: Look | None, evidence: Evidence) -> Equivalence:
     if look is not None:
         return equivalence_by_betting(sample.means(), sample.dof, settings)
     factor = max(settings.factor, settings.tolerated)
-    return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, not reduced)
+    return equivalence(
+        sample.means(), sample.dof, sample.longest, settings, factor, not evidence.reduced, evidence.unseen
+    )
 
 
 def _excused(all_answers: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:

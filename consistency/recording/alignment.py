@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.diagnostics.fitted import ENOUGH, left_covariances
+from consistency.diagnostics.fitted import ENOUGH, inflation_of_mean, left_covariances
 from consistency.diagnostics.questions import BIAS, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.errors import InputError
 from consistency.recording.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
@@ -28,6 +28,8 @@ COMMON = 0.25  # of the variance of the mean error of all runs: that of the fram
 ALL_BUT_SCALE = tuple(q for q in SHARES if q != MAIN and q not in INNOVATIONS)
 OF_RUNS = "what is constant over a run, a covariance that is too large, and single steps and axes are not judged"
 OF_ALL = "an error that is the same in all runs and steps is not judged"
+OSCILLATING = "the errors alternate or oscillate, so that it is not known what the frame takes of them"
+NO_MEAN = "the errors cancel over each run, so that the frame's own error outweighs their mean"
 SLIGHT = 0.01  # of a covariance: what an uncertain first pose adds to the others, and counts as nothing below
 ROUNDS, SETTLED = 5, 1e-4  # of clocks and frames in turn, and the change of the offset, s, that ends them
 
@@ -42,10 +44,13 @@ class Aligned:
     face: str = ""  # what the verdict has to say of it
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
     spoilt: tuple[str, ...] = ()  # questions that have no answer
+    unseen: float = 0.0  # share of the NEES that a frame may have taken without its being made up for
 
     def on(self, recording: Recording) -> Recording:
         """The recording of these runs, which says how they were aligned."""
-        return replace(recording, align=self.mode, face=self.face, reduced=self.reduced, spoilt=self.spoilt)
+        return replace(
+            recording, align=self.mode, face=self.face, reduced=self.reduced, spoilt=self.spoilt, unseen=self.unseen
+        )
 
 
 def require_alignment(mode: str | None, truth: object) -> str | None:
@@ -155,8 +160,14 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
             f"{name}: fewer than {ENOUGH} runs do not show what the frame takes of the errors; nothing makes up for it"
         )
         return Aligned(runs, notes=(note,), face=f"{what}: {OF_RUNS}", reduced=True, spoilt=ALL_BUT_SCALE)
-    left = left_covariances([found[i].whitened for i in some], bases, bool(for_all))
-    kept = [max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST) for M in left]
+    residuals = [found[i].whitened for i in some]
+    left = left_covariances(residuals, bases, bool(for_all))
+    if left.oscillating:
+        most = f"at most about {100.0 * left.unseen:.2g} % of the NEES"
+        note = f"{name}: the errors alternate or oscillate; nothing makes up for what the frame takes of them, {most}"
+        face = f"{what}: {OF_RUNS}, and {OSCILLATING} ({most})"
+        return Aligned(runs, notes=(note,), face=face, reduced=True, spoilt=ALL_BUT_SCALE, unseen=left.unseen)
+    kept = [max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST) for M in left.covariances]
     factors = dict(zip(some, kept, strict=True))
     out = [replace(p, covariance=p.covariance * factors.get(i, 1.0)) for i, p in enumerate(runs)]
     note = (
@@ -164,10 +175,12 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
     )
     if not for_all:
         return Aligned(out, notes=(note,), face=f"{what}: {OF_RUNS}", reduced=True, spoilt=ALL_BUT_SCALE)
-    added = len(some) * (max(float(np.linalg.eigvalsh(M)[:, -1].max()) for M in left) - 1.0)
-    if added <= COMMON:
-        return Aligned(out, notes=(note,), face=f"{what}: {OF_ALL}")
-    return Aligned(out, notes=(note,), face=f"{what}: {OF_ALL}, nor are single steps", spoilt=(STEP, *BIAS))
+    added = len(some) * (max(float(np.linalg.eigvalsh(M)[:, -1].max()) for M in left.covariances) - 1.0)
+    if added > COMMON:
+        return Aligned(out, notes=(note,), face=f"{what}: {OF_ALL}, nor are single steps", spoilt=(STEP, *BIAS))
+    if inflation_of_mean(residuals, bases) > 1.0 + COMMON:
+        return Aligned(out, notes=(note,), face=f"{what}: {OF_ALL}, nor is a bias: {NO_MEAN}", spoilt=BIAS)
+    return Aligned(out, notes=(note,), face=f"{what}: {OF_ALL}")
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:

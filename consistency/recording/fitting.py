@@ -54,9 +54,10 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
     """
     k, d = len(sound.rows), len(free)
     truth = [_small(side * motion).placed(sound.truth, p.manifold) for side in (-STEP, STEP) for motion in free]
-    after, before = p.error_of(np.tile(sound.rows, 2 * d), np.concatenate(truth)).reshape(2, d * k, -1)
+    errors = p.error_of(np.tile(sound.rows, 2 * d), np.concatenate(truth))
+    after, before = errors.reshape(2, d * k, errors.shape[-1])
     change = _whitened(p, np.tile(sound.rows, d), (after - before) / (2.0 * STEP), judged)
-    return np.moveaxis(change.reshape(d, k, -1), 0, -1)
+    return np.moveaxis(change.reshape(d, k, len(judged)), 0, -1)
 
 
 def _small(motion: Array) -> Frame:

@@ -49,6 +49,7 @@ class Recording:
     face: str = ""  # what the verdict has to say of that
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
     spoilt: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
+    unseen: float = 0.0  # share of the NEES that a fit to the truth may have taken without its being made up for
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
     times: Array | None = None  # (R, T), s, of the steps of each run, or of the beginnings of windows; None with one t
     skipped: Skipped | None = None  # first steps that are left out of the statistics

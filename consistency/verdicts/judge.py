@@ -282,7 +282,7 @@ def analyse_recordings(
             evidence = Evidence(
                 name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
                 failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, spoilt=r.spoilt,
-                skipped=r.skipped,
+                skipped=r.skipped, unseen=r.unseen,
             )  # fmt: skip
         verdict = _unshown(judge(evidence, settings), r.unshown)
         first, *rest = verdict.reasons

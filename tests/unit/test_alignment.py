@@ -16,8 +16,22 @@ from typer.testing import CliRunner
 
 import consistency as cs
 from consistency.cli.app import app
-from consistency.diagnostics import Evidence, Settings, judge
-from consistency.diagnostics.fitted import _binned, _bins, _expected, _kernels, _left, _shares, left_covariances
+from consistency.diagnostics import Evidence, Settings, fitted, judge
+from consistency.diagnostics.equivalence import equivalence
+from consistency.diagnostics.fitted import (
+    _at_most,
+    _binned,
+    _bins,
+    _expected,
+    _kernels,
+    _left,
+    _oscillate,
+    _shares,
+    _slower,
+    inflation_of_mean,
+    left_covariances,
+)
+from consistency.diagnostics.questions import BIAS
 from consistency.errors import InputError
 from consistency.geometry import wrap
 from consistency.recording.alignment import ALL_BUT_SCALE, FREE, aligned, clocks_and_frames
@@ -210,6 +224,12 @@ def test_shares_are_those_of_the_expected_products(tangents: list[Array]) -> Non
     np.testing.assert_allclose(found.sum(axis=1), 1.0)
 
 
+@pytest.fixture
+def sure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors are called oscillating by chance in one of ten million tests."""
+    monkeypatch.setattr(fitted, "DOUBT", 1e-7)
+
+
 def residuals_of(
     rng: np.random.Generator, runs: int, steps: int, correlation: float
 ) -> tuple[list[Array], list[Array]]:
@@ -227,7 +247,7 @@ def residuals_of(
     return left, bases
 
 
-def test_what_is_left_of_white_errors_and_of_slow_ones(rng: np.random.Generator) -> None:
+def test_what_is_left_of_white_errors_and_of_slow_ones(rng: np.random.Generator, sure: None) -> None:
     """1 - 1/T of white ones, and 1 - 0.17 of AR(.8) in 50 steps: the variance of a mean is 0.168.
 
     The correlation of 40 runs of 50 steps spreads by 0.01, so that 0.168 does by 0.008, and the margin takes twice as
@@ -235,10 +255,177 @@ def test_what_is_left_of_white_errors_and_of_slow_ones(rng: np.random.Generator)
     """
     for correlation, taken, spread in ((0.0, 0.02, 0.004), (0.8, 0.168, 0.04)):
         residuals, bases = residuals_of(rng, 40, 50, correlation)
-        M = np.array(left_covariances(residuals, bases, False))
+        M = np.array(left_covariances(residuals, bases, False).covariances)
         assert 1.0 - taken - spread < M[:, :, range(3), range(3)].mean() < 1.0 - taken + spread + 0.02 * correlation
-        larger = np.array(left_covariances([10.0 * r for r in residuals], bases, False))
+        larger = np.array(left_covariances([10.0 * r for r in residuals], bases, False).covariances)
         np.testing.assert_allclose(M, larger, atol=1e-6)
+
+
+# --- errors that oscillate --------------------------------------------------------------------------------------
+
+
+def waves(rng: np.random.Generator, runs: int, steps: int, periods: float) -> Array:
+    """Gaussian errors of so many periods over a run, with a phase of their own in each axis."""
+    angle = 2.0 * np.pi * periods * np.arange(steps)[:, None] / steps
+    a, b = rng.normal(size=(2, runs, 1, 3))
+    out: Array = a * np.cos(angle) + b * np.sin(angle)
+    return out
+
+
+def constants(runs: int, steps: int) -> list[Array]:
+    """Bases of a frame of each run that shifts its three components."""
+    Q = np.zeros((steps, 3, 3))
+    Q[:, range(3), range(3)] = steps**-0.5
+    return [Q] * runs
+
+
+@pytest.mark.parametrize("axes", [(0, 1, 2), (2,)])
+@pytest.mark.parametrize("kind", ["alternating", "two periods", "one and a half"])
+def test_errors_that_oscillate_are_told(kind: str, axes: tuple[int, ...], rng: np.random.Generator) -> None:
+    """Correlations of -1/2 or -1 where sums of exponentials have none: ten standard errors of 100 runs, by trial."""
+    errors = rng.normal(size=(100, 30, 3))
+    other = {
+        "alternating": np.diff(rng.normal(size=(100, 31, 3)), axis=1) / np.sqrt(2.0),
+        "two periods": waves(rng, 100, 30, 2.0),
+        "one and a half": waves(rng, 100, 30, 1.5),
+    }[kind]
+    errors[..., list(axes)] = other[..., list(axes)]
+    residuals = list(errors - errors.mean(axis=1, keepdims=True))
+    left = left_covariances(residuals, constants(100, 30), False)
+    assert left.oscillating
+    np.testing.assert_array_equal(left.covariances, np.tile(np.eye(3), (100, 30, 1, 1)))
+    assert left.unseen == _at_most(residuals, constants(100, 30))
+    assert not left_covariances(residuals, orthonormal(constants(100, 30)), True).oscillating
+
+
+def test_slow_errors_and_constant_ones_do_not_oscillate(rng: np.random.Generator, sure: None) -> None:
+    """Also where they last longer than what is made up for; by chance in four of ten million tests."""
+    for slow in (
+        rng.normal(size=(40, 30, 3)).cumsum(axis=1),
+        rng.normal(size=(40, 30, 3)) + rng.normal(size=(40, 1, 3)),
+        np.array(residuals_of(rng, 40, 30, 0.5)[0]),
+        np.array(residuals_of(rng, 40, 30, 0.97)[0]),
+    ):
+        left = left_covariances(list(slow - slow.mean(axis=1, keepdims=True)), constants(40, 30), False)
+        assert not left.oscillating
+        assert left.unseen == 0.0
+        assert np.trace(left.covariances[0][0]) < 3.0
+
+
+@pytest.mark.parametrize(("side", "told"), [(-1.0, True), (1.0, False), (0.0, False)])
+def test_a_product_that_is_too_small_counts_and_one_too_large_does_not(
+    side: float, told: bool, rng: np.random.Generator
+) -> None:
+    """One bin of one component lies 4 standard errors off, with 40 runs: a p value of 1.3e-4 times 9 bins."""
+    bases, kernels, edges = constants(40, 12), _kernels(12, False), _bins(12)
+    expected = _expected(bases, np.concatenate([kernels, _slower(12)]), edges, False)
+    pairs = np.array([_binned(12.0 - np.arange(12), edges)] * 40)
+    seen = expected[..., range(3), :].sum(axis=-1) @ np.ones(3) * 0.0 + expected[:, :, :, :, 0].sum(axis=-1)
+    noise = rng.normal(size=40)
+    noise = (noise - noise.mean()) / noise.std(ddof=1)
+    seen[:, 1, 2] += 0.01 * (noise + side * 4.0 / np.sqrt(40))
+    assert _oscillate(seen, expected, pairs) is told
+
+
+def test_slower_exponentials_reach_beyond_the_run() -> None:
+    found = _slower(200)
+    times = -1.0 / np.log(found[:, 1])
+    np.testing.assert_allclose(times, 20.0 * 2.0 ** np.arange(1, 6))
+    np.testing.assert_array_equal(found[:, 0], 1.0)
+
+
+def test_most_that_a_fit_takes_is_that_of_a_wave_it_follows() -> None:
+    """One frequency in one of three components: a unit vector along it takes half of the sum of its squares."""
+    wave = np.zeros((40, 3))
+    wave[:, 1] = 5.0 * np.cos(np.pi * np.arange(40) / 2.0)
+    assert _at_most([wave] * 3, constants(3, 40)) == pytest.approx(0.5 / 3.0, rel=1e-3)
+    assert _at_most([wave] * 3, [Q[..., [0, 2]] for Q in constants(3, 40)]) == 0.0
+    assert _at_most([np.ones((4, 3))], [np.ones((4, 3, 9))]) == 1.0
+
+
+def test_variance_of_the_mean_is_that_of_what_each_run_adds(tangents: list[Array], rng: np.random.Generator) -> None:
+    """A run added a little more often moves the mean, by numbers, by what it adds to it."""
+    bases = orthonormal([*tangents, *tangents])
+    errors = [rng.normal(size=Q.shape[:2]) for Q in bases]
+
+    def left(w: list[Array]) -> list[Array]:
+        c = sum(np.einsum("kap,ka->p", Q, x) for Q, x in zip(bases, w, strict=True))
+        return [x - Q @ c for Q, x in zip(bases, w, strict=True)]
+
+    def mean(w: list[Array]) -> Array:
+        return np.mean([x.mean(axis=0) for x in left(w)], axis=0)
+
+    r, step = left(errors), 1e-3
+    more = [[(1.0 + step * (i == j)) * x for j, x in enumerate(r)] for i in range(len(r))]
+    parts = np.array([(mean(w) - mean(r)) / step for w in more])
+    assumed = np.cov(np.array([x.mean(axis=0) for x in r]).T) / len(r)
+    worst = linalg.eigvals(np.linalg.solve(assumed, parts.T @ parts)).real.max()
+    assert inflation_of_mean(r, bases) == pytest.approx(worst, rel=1e-6)
+    assert inflation_of_mean([0.0 * x for x in r], bases) == pytest.approx(0.0)
+
+
+def with_waves(rng: np.random.Generator, runs: int, steps: int) -> list[Poses]:
+    """Planar runs with errors of two periods over a run."""
+    found = []
+    for w in waves(rng, runs, steps, 2.0):
+        p = run_of(rng, "planar", "so2", noise=0.0, steps=steps)
+        found.append(_with_errors(p, np.einsum("kij,kj->ki", np.linalg.cholesky(p.covariance), w)))
+    return found
+
+
+def test_nothing_makes_up_for_a_frame_of_runs_that_oscillate(rng: np.random.Generator) -> None:
+    runs = with_waves(rng, 24, 20)
+    found = aligned("est", runs, "posyaw", range(3))
+    for back, p in zip(found.runs, runs, strict=True):
+        np.testing.assert_allclose(np.linalg.det(back.covariance), np.linalg.det(p.covariance), rtol=1e-9)
+    assert found.reduced
+    assert found.spoilt == ALL_BUT_SCALE
+    assert 0.3 < found.unseen < 0.6  # half of the NEES of a wave, and a little more where noise makes it so
+    assert "the errors alternate or oscillate; nothing makes up" in found.notes[1]
+    assert f"at most about {100 * found.unseen:.2g} % of the NEES)" in found.face
+
+
+def test_a_frame_of_all_runs_leaves_no_bias_of_errors_that_cancel(rng: np.random.Generator) -> None:
+    found = aligned("est", with_waves(rng, 24, 20), "posyaw-all", range(3))
+    assert found.spoilt == BIAS
+    assert "nor is a bias: the errors cancel over each run" in found.face
+    white = aligned("est", [run_of(rng, "planar", "so2", steps=20) for _ in range(24)], "posyaw-all", range(3))
+    assert white.spoilt == ()  # its ratio of 0.7 to 1.1 stays below 1.25
+    assert white.unseen == 0.0
+
+
+def test_what_a_frame_may_have_taken_is_added_before_consistent_is_said(rng: np.random.Generator) -> None:
+    """60 runs of 20 steps know their ratio to 3 %: within 1.5 with a tenth added, and not with 0.4 added."""
+    error, P = rng.normal(size=(60, 20, 3)), np.broadcast_to(np.eye(3), (60, 20, 3, 3))
+    for unseen, status in ((0.0, "consistent"), (0.1, "consistent"), (0.4, "undecided"), (1.0, "undecided")):
+        v = judge(Evidence("f", error, P, reduced=True, spoilt=ALL_BUT_SCALE, unseen=unseen), Settings(1e-6))
+        assert v.status == status
+        assert "would probably decide" not in v.reasons[0]
+    means = np.square(error).mean(axis=(1, 2))
+    for unseen in (0.1, 0.25):
+        wide = equivalence(means, 3, 20, Settings(), 1.5, False, unseen)
+        assert wide.p_value == pytest.approx(equivalence(means / (1.0 - unseen), 3, 20, Settings(), 1.5).p_value)
+
+
+def test_covariances_are_multiplied_by_what_their_own_run_keeps(rng: np.random.Generator, sure: None) -> None:
+    """White errors keep 1 - 1/T of their NEES: T = 6 and 24, less what the margin gives back."""
+    runs = [run_of(rng, "planar", "so2", steps=6 if i % 2 else 24) for i in range(30)]
+    found = aligned("est", runs, "posyaw", range(3))
+    shares = [(b.covariance / p.covariance)[:, 2, 2].mean() for b, p in zip(found.runs, runs, strict=True)]
+    np.testing.assert_allclose(shares[1::2], 1.0 - 1.0 / 6.0, atol=0.08)
+    np.testing.assert_allclose(shares[::2], 1.0 - 1.0 / 24.0, atol=0.02)
+
+
+def test_a_run_that_has_no_part_in_the_frame_keeps_its_covariance(rng: np.random.Generator) -> None:
+    runs = [run_of(rng, "planar", "so2", steps=6) for _ in range(24)]
+    runs[3].estimate[:] = np.nan
+    found = aligned("est", runs, "posyaw-all", range(3))
+    kept = [
+        np.linalg.det(b.covariance / 1.0)[0] / np.linalg.det(p.covariance)[0]
+        for b, p in zip(found.runs, runs, strict=True)
+    ]
+    assert kept[3] == pytest.approx(1.0, abs=1e-9)
+    assert max(kept[:3] + kept[4:]) < 1.0 - 1e-3
 
 
 # --- the first pose -------------------------------------------------------------------------------------------
@@ -332,6 +519,20 @@ def test_a_frame_of_each_run_hides_no_covariance_that_is_too_small(tmp_path: Pat
     assert "a frame of 3 degrees of freedom for all runs" in verdict.reasons[0]
 
 
+def test_a_verdict_on_runs_that_oscillate_is_undecided_and_says_why(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A wave in 24 runs has 144 squares: 1e-6 of right ones are found at fault."""
+    some = iter(with_waves(rng, 24, 20))
+    monkeypatch.setitem(globals(), "run_of", lambda *_: next(some))
+    tables(tmp_path, rng, 24, 1.0, "each")
+    record = cs.read(tmp_path / "est.csv", truth=tmp_path / "truth.csv", align="posyaw")
+    verdict = cs.judge(record, false_alarm=1e-6)
+    assert record.unseen > 0.3
+    assert verdict.status == "undecided"
+    assert "the errors alternate or oscillate, so that it is not known what the frame takes" in verdict.reasons[0]
+
+
 def test_few_runs_are_said_to_be_few(tmp_path: Path, rng: np.random.Generator) -> None:
     tables(tmp_path, rng, 5, 1.0, "all")
     record = cs.read(tmp_path / "est.csv", truth=tmp_path / "truth.csv", align="posyaw-all")
@@ -381,6 +582,18 @@ def test_clock_and_frame_are_found_together(rng: np.random.Generator) -> None:
     sizes = [np.nanmax(np.abs(p.errors(shift)[:, :2])) for p in found.runs]
     assert max(sizes) < 0.02
     np.testing.assert_array_equal(found.runs[0].t, runs[0].t)
+
+
+def test_frames_are_those_of_the_clock_that_is_said(rng: np.random.Generator) -> None:
+    runs = []
+    for _ in range(4):
+        p = run_of(rng, "planar", "so2", noise=0.1)
+        runs.append(moved(replace(p, estimate=p.estimate + _ahead(p, 0.03) - p.truth), WORLD["planar"]))
+    shift, _, found = clocks_and_frames("est", runs, "estimate", "posyaw-all", range(3))
+    again = aligned("est", [p.later(shift) for p in runs], "posyaw-all", range(3))
+    for one, other in zip(found.runs, again.runs, strict=True):
+        np.testing.assert_allclose(one.estimate, other.estimate, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-12)
 
 
 def _ahead(p: Poses, seconds: float) -> Array:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from consistency.tuning.fit import LIMIT, UNITS, Fit, _derivatives, _Search, maximise
+from consistency.tuning.fit import LIMIT, Fit, _derivatives, _Search, maximise
+from consistency.tuning.profile import UNITS
 from consistency.types import Array
 
 SIGMAS = 4.8  # bound on a normal number, so that each assertion fails by chance in less than 1e-5 of all runs

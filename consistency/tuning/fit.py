@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from consistency.tuning.profile import AT_LIMIT, STEP, Profile, units
+from consistency.tuning.profile import AT_LIMIT, STEP, Profile
 from consistency.types import Array
 
 LIMIT = float(np.log(1e4))  # factors that are tried lie within 1e-4 and 1e4
@@ -37,9 +37,9 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> Fit | None:
     The search is COBYQA (Ragonneau & Zhang 2025; SciPy), a trust region on quadratic models without derivatives, and
     one Newton step at its end. The score is smooth, for all settings see the same trials.
 
-    Intervals are those of misspecified likelihoods, H^-1 J H^-1 (White 1982, Econometrica 50(1), th. 3.2): H is the
-    curvature of the total, J the spread of the slopes of runs, which are independent whatever ties steps to each
-    other. Fewer than 20 runs are cut into blocks of steps. The quantile is Student's.
+    Intervals are those of the profile of the score, scaled by the spread of independent runs; fewer than 20 runs are
+    cut into blocks of steps (:mod:`consistency.tuning.profile`). They are open on a side on which all that may be
+    tried is inside.
     """
     search = _Search(score)
     start = next((start for start in starts if np.isfinite(search.total(start))), None)
@@ -56,12 +56,13 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> Fit | None:
     best = np.clip(found.x, -LIMIT, LIMIT)
     edge = tuple(int(np.sign(x)) if abs(x) > LIMIT - AT_LIMIT else 0 for x in best)
     free = [i for i, at in enumerate(edge) if at == 0]
-    slopes, curvature = _derivatives(search, best, free)
-    if free and np.isfinite(curvature).all() and np.linalg.eigvalsh(curvature[np.ix_(free, free)])[-1] < 0.0:
+    slope, curvature = _derivatives(search, best, free)
+    bend = -curvature[np.ix_(free, free)]
+    if free and np.isfinite(bend).all() and np.linalg.eigvalsh(bend)[0] > 0.0:
         moved = best.copy()
-        moved[free] -= np.clip(np.linalg.solve(curvature[np.ix_(free, free)], slopes.sum(axis=0)[free]), -STEP, STEP)
+        moved[free] += np.clip(np.linalg.solve(bend, slope[free]), -STEP, STEP)
         best = moved if search.total(moved) > search.total(best) else best
-    interval = Profile(search, search.settings_tried, best, curvature, slopes, LIMIT).intervals()
+    interval = Profile(search, search.tried, best, np.nan_to_num(curvature), LIMIT).intervals()
     return Fit(best, interval, edge, search.total(best) - first, search.settings)
 
 
@@ -87,7 +88,7 @@ class _Search:
         return total if np.isfinite(total) else -np.inf
 
     @property
-    def settings_tried(self) -> list[Array]:
+    def tried(self) -> list[Array]:
         return [np.frombuffer(key) for key in self._known]
 
     @property
@@ -96,22 +97,20 @@ class _Search:
 
 
 def _derivatives(search: _Search, x: Array, free: Sequence[int]) -> tuple[Array, Array]:
-    """Slopes of independent units (units, p) and curvature of the total (p, p), 0 but by the ``free`` log factors."""
+    """Slope (p,) and curvature (p, p) of the total by the ``free`` log factors, 0 by the others."""
 
-    def at(*moves: tuple[int, float]) -> Array:
+    def at(*moves: tuple[int, float]) -> float:
         moved = x.copy()
         for i, by in moves:
             moved[i] += by
-        return search(moved)
+        return float(search(moved).sum())
 
-    here = search(x)
-    slopes, curvature = np.zeros((len(units(here)), len(x))), np.zeros((len(x), len(x)))
+    here, slope, curvature = at(), np.zeros(len(x)), np.zeros((len(x), len(x)))
     up, down = {i: at((i, STEP)) for i in free}, {i: at((i, -STEP)) for i in free}
     for i in free:
-        slopes[:, i] = units(up[i] - down[i]) / (2.0 * STEP)
-        curvature[i, i] = (up[i].sum() - 2.0 * here.sum() + down[i].sum()) / STEP**2
+        slope[i] = (up[i] - down[i]) / (2.0 * STEP)
+        curvature[i, i] = (up[i] - 2.0 * here + down[i]) / STEP**2
     for i, j in combinations(free, 2):
-        both = at((i, STEP), (j, STEP)).sum() + at((i, -STEP), (j, -STEP)).sum() + 2.0 * here.sum()
-        single = up[i].sum() + down[i].sum() + up[j].sum() + down[j].sum()
-        curvature[i, j] = curvature[j, i] = (both - single) / (2.0 * STEP**2)
-    return slopes, curvature
+        both = at((i, STEP), (j, STEP)) + at((i, -STEP), (j, -STEP)) + 2.0 * here
+        curvature[i, j] = curvature[j, i] = (both - up[i] - down[i] - up[j] - down[j]) / (2.0 * STEP**2)
+    return slope, curvature

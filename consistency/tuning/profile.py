@@ -45,28 +45,25 @@ class Profile:
 
     Let d_r be the fall of unit r from the best setting to another one, W = 2 sum d_r, and V the variance of sum d_r by
     the scatter of its n terms. To first order W is lambda times a chi-square number of one degree of freedom, with
-    lambda = (H^-1 J H^-1)_ii / (H^-1)_ii (Kent 1982, Biometrika 69(1), sec. 3), and V / W tends to lambda, for both
-    grow as the square of the distance. A setting is outside if W exceeds the quantile of chi-square, which is enough
-    where the likelihood is true, and W / (V / W) exceeds the square of Student's.
+    lambda = (H^-1 J H^-1)_ii / (H^-1)_ii, H the curvature of the score and J the spread of its slopes (Kent 1982,
+    Biometrika 69(1)), and V / W tends to lambda, for both grow as the square of the distance. A setting is outside if
+    W exceeds the quantile of chi-square, which would do if the likelihood were true, and W / (V / W) the square of
+    Student's. The others follow by Newton's steps (Venzon & Moolgavkar 1988, Applied Statistics 37(1)).
     """
 
     score: Callable[[Array], Array]  # log densities (R, T) of log factors (p,), NaN where a run failed
     known: Sequence[Array]  # settings (p,) that were tried
     best: Array  # (p,)
     curvature: Array  # (p, p) of the total; 0 where it is not known
-    slopes: Array  # (units, p), 0 where they are not known
     limit: float  # of log factors, on both sides
 
     def __post_init__(self) -> None:
-        n, p = self.slopes.shape
         self._top = units(self.score(self.best))
-        self._student = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, n - p))
+        self._student = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(self._top) - len(self.best)))
         value, vector = np.linalg.eigh(-self.curvature)
         self._bend = vector * np.maximum(value, WEAK) @ vector.T
         self._inverse = np.linalg.inv(self._bend)
-        about = (self.slopes - self.slopes.mean(axis=0)) @ self._inverse
-        robust = np.sqrt(n / (n - p) * (about**2).sum(axis=0))
-        self._reach = np.maximum(self._student * robust, NORMAL * np.sqrt(np.diag(self._inverse)))
+        self._reach = NORMAL * np.sqrt(np.diag(self._inverse))
 
     def intervals(self) -> Array:
         """Of each log factor, (p, 2); infinite on a side on which the data do not bound it."""

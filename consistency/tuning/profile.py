@@ -82,7 +82,7 @@ class Profile:
             return np.inf
         n, W = len(fall), 2.0 * max(float(fall.sum()) - back, 0.0)
         V = n / (n - len(x)) * float(((fall - fall.mean()) ** 2).sum())
-        return float(min(np.sqrt(W) / NORMAL, W / max(self._student * np.sqrt(V), np.finfo(float).tiny)))
+        return float(W / max(NORMAL * np.sqrt(W), self._student * np.sqrt(V))) if W > 0.0 else 0.0
 
     def _end(self, i: int, side: float) -> float:
         """End of the interval of log factor ``i`` on one side."""
@@ -149,7 +149,8 @@ def _guess(seen: Sequence[tuple[float, float]]) -> float:
     if outside := [s for s in seen if s[0] > a]:
         b, at_b = min(outside)
         part = (1.0 - at_a) / (at_b - at_a) if np.isfinite(at_b) else 0.5
-        return a + float(np.clip(part, 0.1, 0.9)) * (b - a)
+        part = part if min(1.0 - at_a, at_b - 1.0) < NEAR else float(np.clip(part, 0.1, 0.9))
+        return a + part * (b - a)
     before, at_before = max(s for s in inside if s[0] < a)
     slope = (at_a - at_before) / (a - before)
     return min(a + (1.0 - at_a) / slope, 3.0 * a) if slope > 0.0 else 3.0 * a

@@ -14,7 +14,9 @@ from consistency.types import Array
 CONFIDENCE = 0.95
 UNITS = 20  # independent parts that an interval needs at least; fewer runs are cut into blocks of steps
 WEAK = 1.0  # curvature below which a log factor is hardly told: its standard deviation is then above a factor of e
-FARTHEST = 1.0  # step of a log factor while others are held, where a quadratic model is still believed
+TRUSTED = 16.0  # curvature above which it holds as far as the ends: a standard deviation of a factor of 1.3
+FARTHEST = 1.5  # step of a log factor in which a quadratic model is still believed
+TINY = 1e-6  # curvature of nothing
 LOOKS = 8  # places at which an end is looked for; one or two do where the score is nearly quadratic
 STEP = 0.05  # in log factors, for differences
 AT_LIMIT = 0.05  # in log factors from a limit
@@ -61,6 +63,8 @@ class Profile:
         self._top = units(self.score(self.best))
         self._student = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(self._top) - len(self.best)))
         value, vector = np.linalg.eigh(-self.curvature)
+        self._doubtful = bool(value[0] < TRUSTED)
+        self._ends: list[Array] = []  # settings near ends
         self._bend = vector * np.maximum(value, WEAK) @ vector.T
         self._inverse = np.linalg.inv(self._bend)
         self._reach = NORMAL * np.sqrt(np.diag(self._inverse))
@@ -89,56 +93,77 @@ class Profile:
         room = self.limit - side * self.best[i]
         if room <= AT_LIMIT:
             return side * np.inf
-        x, seen, careful = self._start(i, side), [(0.0, 0.0)], False
+        x, seen, careful = self._start(i, side), [(0.0, 0.0)], self._doubtful
+        inside = 0.0
         for _ in range(LOOKS):
             distance, look = side * (x[i] - self.best[i]), self._look(x, i, careful)
             now = [*seen, (distance, look.depth)]
-            further = min(_guess(now), room)
+            further = min(_guess(now), distance + FARTHEST if side > 0.0 else room, room)
             if look.settled:
-                seen = now
                 if further >= room and (distance >= room or abs(look.depth - 1.0) < NEAR):
                     break
                 if abs(look.depth - 1.0) < NEAR:
+                    self._ends.append(x)
                     return float(self.best[i] + side * further)
+                seen = now
+            inside = max(inside, distance if look.depth < 1.0 else 0.0)  # the others can only bring it nearer
+            if further <= inside:
+                further = (inside + min((a for a, depth in now if a > inside), default=inside + FARTHEST)) / 2.0
             moved = x + look.step
             turn = (moved - self.best) * (further / distance - 1.0)
             x = np.clip(moved + np.clip(turn, -FARTHEST, FARTHEST), -self.limit, self.limit)
-            x[i], careful = self.best[i] + side * further, not look.settled
+            x[i], careful = self.best[i] + side * further, self._doubtful or not look.settled
         outside = [distance for distance, depth in seen if depth >= 1.0]
         return float(self.best[i] + side * min(outside, default=np.inf))
 
     def _start(self, i: int, side: float) -> Array:
-        """Where the end would be if the score were quadratic, or further if a known setting is inside there."""
-        x = self.best + self._inverse[:, i] / self._inverse[i, i] * side * self._reach[i]
-        guess = self._reach[i]
+        """Where the end would be if the score were quadratic, or further if a known setting is inside there.
+
+        Where the curvature is not to be trusted, the others start where the ends found before tell them to go.
+        """
+        x, guess = self.best + self._inverse[:, i] / self._inverse[i, i] * side * self._reach[i], self._reach[i]
+        if self._doubtful:
+            for end in self._ends:
+                shift = side * (end[i] - self.best[i]) / self._reach[i]
+                if shift > 0.0:
+                    x = np.logaddexp(self.best, np.log(min(shift, 1.0)) + end)
         for other in self.known:
             distance, depth = side * (other[i] - self.best[i]), self.depth(other)
-            if depth < 1.0 + NEAR and min(distance / max(depth, 0.1), distance + FARTHEST) > (1.0 + NEAR) * guess:
-                x, guess = other.copy(), min(distance / max(depth, 0.1), distance + FARTHEST)
+            further = min(distance / max(depth, 0.1), distance + FARTHEST)
+            if depth < 1.0 + NEAR and further > (1.0 + NEAR) * guess:
+                x, guess = other, further
         x = np.clip(x, -self.limit, self.limit)
         x[i] = np.clip(self.best[i] + side * guess, -self.limit, self.limit)
         return np.asarray(x)
 
     def _look(self, x: Array, i: int, careful: bool) -> Look:
-        """Differences tell how the other factors should move; if ``careful``, also how the score bends there."""
+        """Differences tell how the other factors should move; if ``careful``, also how the score bends there.
+
+        The score is taken to be quadratic in factors, not in their logarithms: it levels off as a noise goes to 0.
+        """
         p, here = len(x), float(self.score(x).sum())
         others = np.flatnonzero(np.arange(p) != i)
-        slope, scale = np.zeros(p), np.ones(p)
+        slope, bend = np.zeros(p), self._bend.copy()
         if not np.isfinite(here):
             return Look(np.inf, slope, True)
         for j in others:
             h = -STEP if x[j] > 0.0 else STEP
             ahead = float(self.score(x + h * np.eye(p)[j]).sum())
+            slope[j] = (ahead - here) / h + h / 2.0 * bend[j, j]
             if careful:
                 behind = float(self.score(x - h * np.eye(p)[j]).sum())
-                scale[j] = max((2.0 * here - ahead - behind) / STEP**2, WEAK) / self._bend[j, j]
-            slope[j] = (ahead - here) / h + h / 2.0 * scale[j] * self._bend[j, j]
-        bend = self._bend * np.sqrt(np.outer(scale, scale))
-        step = np.zeros(p)
-        step[others] = np.linalg.solve(bend[np.ix_(others, others)], slope[others])
-        step = np.where(np.isfinite(step), np.clip(step, -FARTHEST, FARTHEST), 0.0)
-        back = max(float(np.nan_to_num(slope) @ step) / 2.0, 0.0)
+                slope[j], known = (ahead - behind) / (2.0 * h), bend[j, j]
+                bend[j, j] = max((2.0 * here - ahead - behind) / STEP**2 + slope[j], TINY)
+                shrunk = np.sqrt(min(bend[j, j] / known, 1.0))
+                bend[j, others[others != j]] *= shrunk
+                bend[others[others != j], j] *= shrunk
+        slope = np.nan_to_num(slope)
+        grown = np.zeros(p)
+        grown[others] = np.linalg.solve(bend[np.ix_(others, others)], slope[others])
+        grown = np.clip(np.nan_to_num(grown), -1.0, np.expm1(FARTHEST))
+        back = max(float(slope @ grown - grown @ bend @ grown / 2.0), 0.0)
         fall = float(self._top.sum()) - here
+        step = np.log(np.maximum(1.0 + grown, np.exp(-FARTHEST)))
         return Look(self.depth(x, back), step, back <= SETTLED * max(fall, NORMAL**2 / 2.0))
 
 

@@ -108,7 +108,7 @@ class Profile:
                 seen = now
             inside = max(inside, distance if look.depth < 1.0 else 0.0)  # the others can only bring it nearer
             if further <= inside:
-                further = (inside + min((a for a, depth in now if a > inside), default=inside + FARTHEST)) / 2.0
+                further = min((inside + min((a for a, _ in now if a > inside), default=inside + FARTHEST)) / 2.0, room)
             moved = x + look.step
             turn = (moved - self.best) * (further / distance - 1.0)
             x = np.clip(moved + np.clip(turn, -FARTHEST, FARTHEST), -self.limit, self.limit)

@@ -38,6 +38,7 @@ MOST_TOLERATED = 1.1  # ratio of true to stated covariance: what a verdict may e
 class Factor:
     """By what the variances of a group of noises are to be multiplied, with a 95 % interval, NaN without one.
 
+    The interval is open, with an end of 0 or infinity, on a side on which the data do not bound the factor.
     ``edge`` is -1 or 1 where the factor lies at the lower or upper limit of what is tried, which is then no estimate.
     """
 

@@ -18,6 +18,7 @@ from consistency.store.storage import manifest_of, plain, write_folder
 from consistency.tuning.fit import LIMIT
 from consistency.tuning.groups import sigma_by_channel
 from consistency.tuning.parts import with_belief
+from consistency.tuning.profile import CONFIDENCE
 from consistency.tuning.tune import Factor, Setting, Tuning
 
 TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}
@@ -70,17 +71,19 @@ def _factors(setting: Setting, before: Belief) -> list[str]:
 
 
 def factor_text(factor: Factor) -> str:
-    """x1.02 [0.97, 1.07], of variances; a bound where the factor is at the limit of what is tried."""
+    """x1.02 [0.97, 1.07], of variances; "at most" or "at least" where the data bound it on one side alone."""
     low, high = factor.interval.low, factor.interval.high
+    bound = f"at most x{short(high)}" if np.isfinite(high) else f"at least x{short(low)}" if low > 0.0 else ""
     if factor.edge:
-        bound = f"below x{short(high)}" if factor.edge < 0 else f"above x{short(low)}"
-        known = bound if np.isfinite(high if factor.edge < 0 else np.log(max(low, 1e-300))) else "not known"
-        return f"is at the limit of what is tried, x{np.exp(factor.edge * LIMIT):g}; {known} with 95 %"
+        limit = np.exp(factor.edge * LIMIT)
+        return f"is at the limit of what is tried, x{limit:g}; {bound or 'not known'} with {100.0 * CONFIDENCE:g} %"
     if np.isnan(low):
         return f"x{short(factor.value)}"
-    if not (np.isfinite(high) and low > 0.0):
+    if not bound:
         return f"x{short(factor.value)}, which these data do not bound"
-    return f"x{short(factor.value)} [{short(low)}, {short(high)}]"
+    if low > 0.0 and np.isfinite(high):
+        return f"x{short(factor.value)} [{short(low)}, {short(high)}]"
+    return f"x{short(factor.value)}, {bound} with {100.0 * CONFIDENCE:g} %"
 
 
 def _power(verdict: Verdict) -> str:
@@ -143,7 +146,7 @@ def _next(tuning: Tuning, out: Path) -> str:
 
 
 def as_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
-    """The outcome for programs; numbers that are not finite become null."""
+    """The outcome for programs; numbers that are not finite become null. An open interval has low 0 or high null."""
     data = {
         "filter": tuning.filter,
         "world": tuning.parts.world.name,

@@ -128,6 +128,31 @@ def test_without_memory_the_variance_is_that_of_a_sample(rng: np.random.Generato
     assert np.isclose(found.regression.cov[0, 0], rows.r.var(ddof=1) / 30, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("tracks", "length", "memory"), [(12, 9, True), (2, 30, False), (1, 30, False)])
+def test_the_scatter_of_tracks_is_that_of_their_scores(
+    rng: np.random.Generator, tracks: int, length: int, memory: bool
+) -> None:
+    """H^-1 J H^-1 with J from the slopes of each track's dense likelihood, about their mean; 0 of a single track."""
+    rows = rows_of(rng, tracks, length, 1.5, 0.4 if memory else 0.0, 1.0 if memory else 0.0)
+    found = fit(rows, 1.0, memory)
+    free = 3 if memory else 1
+    lag = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+    residuals = (rows.r - rows.X @ found.regression.beta).reshape(tracks, length)
+
+    def by_track(theta: Array) -> Array:
+        p = Parameters.of(theta, max(rows.length, 1.0))
+        V = p.a[0] ** 2 * (p.rho**lag + p.ratio)
+        return np.asarray(stats.multivariate_normal(cov=V).logpdf(residuals)).reshape(tracks)
+
+    steps = 1e-4 * np.eye(3)[:free]
+    scores = np.column_stack([(by_track(found.theta + d) - by_track(found.theta - d)) / 2e-4 for d in steps])
+    scores -= scores.mean(axis=0)
+    wanted = found.cov[:free, :free] @ scores.T @ scores @ found.cov[:free, :free] * tracks / max(tracks - 1, 1)
+    scale = np.abs(wanted).max()
+    assert np.allclose(found.robust[:free, :free], wanted, rtol=1e-4, atol=1e-4 * scale + 1e-12)
+    assert scale > 1e-6 or tracks == 1
+
+
 def test_a_fit_is_the_top_of_the_likelihood(rng: np.random.Generator) -> None:
     rows = rows_of(rng, 60, 8, 1.5, 0.5, 1.0)
     found = fit(rows, 1.0)

@@ -19,6 +19,8 @@ from scipy import stats
 import consistency as cs
 from consistency.cli import main
 from consistency.diagnostics import Settings
+from consistency.diagnostics.records import Interval
+from consistency.diagnostics.wording import short
 from consistency.filters.compiled import problem_of
 from consistency.filters.stepping import run_filter, step_through
 from consistency.geometry import pose_error
@@ -286,6 +288,48 @@ def test_the_words_say_what_came_of_it(tuned: Tuning) -> None:
     assert data["chosen"]["factors"][0]["factor"] == tuned.factors[0].value
     assert data["chosen"]["sigma"]["R.x"] == tuned.belief.sensor.sigma[0]
     assert (data["no_setting"], data["nearest"]) == (tuned.no_setting, None if tuned.other is None else data["nearest"])
+
+
+def with_interval(tuned: Tuning, low: float, high: float, edge: int = 0) -> Tuning:
+    """The same outcome with another interval of Q."""
+    q, r = tuned.factors
+    changed = replace(q, interval=Interval(q.value, low, high), edge=edge)
+    return replace(tuned, chosen=replace(tuned.chosen, factors=(changed, r)))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "edge", "said"),
+    [
+        (0.0, 0.004, 0, ", at most x0.004 with 95 %"),
+        (3.0, np.inf, 0, ", at least x3.00 with 95 %"),
+        (0.0, np.inf, 0, ", which these data do not bound"),
+        (np.nan, np.nan, 0, ""),
+        (0.0, 0.5, -1, "is at the limit of what is tried, x0.0001; at most x0.50 with 95 %"),
+        (20.0, np.inf, 1, "is at the limit of what is tried, x10000; at least x20.0 with 95 %"),
+        (0.0, np.inf, 1, "is at the limit of what is tried, x10000; not known with 95 %"),
+    ],
+)
+def test_an_open_interval_is_said_and_exported(tuned: Tuning, low: float, high: float, edge: int, said: str) -> None:
+    changed = with_interval(tuned, low, high, edge)
+    text = said if edge else f"x{short(changed.factors[0].value)}{said}"
+    assert factor_text(changed.factors[0]) == text
+    assert f"  Q {text} (sigma: Q.v" in str(changed)
+    exported = json.loads(json.dumps(as_data(changed), allow_nan=False))["chosen"]["factors"][0]
+    assert exported["low"] == (None if np.isnan(low) else low)
+    assert exported["high"] == (high if np.isfinite(high) else None)
+    assert exported["edge"] == edge
+
+
+def test_a_process_noise_that_few_short_runs_hardly_tell_has_an_open_interval(small: Small) -> None:
+    """A tenth of the true noise, in 6 runs of 4 steps: what it adds to a step is a ten-thousandth of R."""
+    scenario = off(small("linear-gaussian", truth__steps=4, truth__motion__sigma_v=0.005,
+                         truth__motion__sigma_omega=0.0087), 1.0, 1.0)  # fmt: skip
+    tuning = cs.tune(scenario, "kf", runs=6, seed=SEED, jobs=1)
+    q, r = tuning.factors
+    assert q.interval.low == 0.0
+    assert 1.0 < q.interval.high < np.inf
+    assert 0.0 < r.interval.low < r.value < r.interval.high
+    assert f"at most x{short(q.interval.high)} with 95 %" in str(tuning)
 
 
 def test_the_uncertainty_of_a_fit_is_no_fault_but_no_more_is() -> None:

@@ -14,7 +14,7 @@ import pandas as pd
 from consistency.errors import InputError
 from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading
 from consistency.recording.text import Block, blocks
-from consistency.store.parquet import read_frame
+from consistency.store.parquet import are_no_numbers, read_frame
 from consistency.types import Array, Indices
 
 
@@ -45,8 +45,9 @@ class Sheet:
         with reading(self.path, f"column '{column}' cannot be read as numbers"):
             values: Array = pd.to_numeric(cells, errors="coerce").to_numpy(float, na_value=np.nan)
             values = bounded(values)
-            bad = np.isnan(values) & ~cells.isna().to_numpy()
-        what = "not a number"
+            other = are_no_numbers(cells)
+            bad = other | np.isnan(values) & ~cells.isna().to_numpy()
+        what = "a truth value or a date, which is to be written as a number" if other.any() else "not a number"
         if not bad.any() and (finite or whole):
             bad, what = ~np.isfinite(values), "not a finite number"
         if not bad.any() and whole:

@@ -592,6 +592,7 @@ def monitor(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
+    from consistency.reading import one_line
     from consistency.reporting import require_plot, write_monitor_plot
     from consistency.terminal.table import print_watched, watched_json
     from consistency.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
@@ -607,7 +608,7 @@ def monitor(
     else:
         log = read_innovations(Path(path), filter_name, run)
         for note in log.notes:
-            print(f"consistency: {note}", file=sys.stderr)
+            print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
         if plot is not None:
             require_plot(plot, overwrite)
         watched = watch(log, watcher)

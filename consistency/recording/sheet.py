@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
-from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading
+from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading, require_name
 from consistency.recording.text import Block, blocks
 from consistency.store.parquet import are_no_numbers, read_frame
 from consistency.types import Array, Indices
@@ -122,6 +122,9 @@ def read_sheet(path: Path) -> Sheet:
     sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
     if sheet.data.empty:
         raise InputError(f"{path}: holds no row")
+    if "filter" in sheet:
+        for name in sheet.data["filter"].dropna().unique():
+            require_name(str(name), f"{path}: column 'filter'")
     return sheet
 
 

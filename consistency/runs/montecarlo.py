@@ -14,6 +14,7 @@ from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter, usable_names
 from consistency.filters.stepping import error_of, name_of
 from consistency.protocols import Filter
+from consistency.reading import require_name
 from consistency.runs.backends.local import Local
 from consistency.runs.campaign import Campaign, own_errors
 from consistency.runs.campaign import Interrupted as Interrupted
@@ -194,6 +195,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
         raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
     model = belief.sensor.model
     for filter_ in instances:
+        require_name(name_of(filter_), "filter")
         error_of(filter_)
         sensors = getattr(filter_, "sensors", None)
         if sensors is not None and model not in sensors:

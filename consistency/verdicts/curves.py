@@ -15,7 +15,7 @@ from consistency.diagnostics.symmetric import Symmetric
 from consistency.errors import InputError
 from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry.conventions import ADDITIVE, planar_error
-from consistency.reading import LARGEST_NUMBER
+from consistency.reading import LARGEST_NUMBER, one_line
 from consistency.store.parquet import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, Columns
 from consistency.store.results import JOINT, POSE, Tables
 from consistency.types import Array, Failure, Indices
@@ -175,7 +175,7 @@ def curves(results: Tables, filter_name: str, steps: int | None = None, maps: bo
             _fill(own, at, batch, OWN_COVARIANCE)
         if own_nees is not None:
             own_nees.reshape(-1)[at] = batch["own_nees"]
-    failures = tuple(Failure(filter_name, int(r), int(s), str(why)) for _, r, s, why in broken.itertuples(index=False))
+    failures = tuple(Failure(filter_name, int(r), int(s), one_line(why, 2000)) for _, r, s, why in broken.itertuples(index=False))
     own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
     error = _errors(results, runs, pose, t) if results.has_truth else None
     _require_agreement(filter_name, runs, Errors(error, covariance, nees))

@@ -140,6 +140,15 @@ def test_a_nees_that_no_number_holds_fails_any_filter(world: cs.Scenario) -> Non
         array[STEP - 1] = kept
 
 
+def test_names_and_reasons_stand_on_one_line(world: cs.Scenario, doomed: Control) -> None:
+    with pytest.raises(cs.InputError, match=r"filter: the name 'two\\nlines' has a control character"):
+        cs.run_trials(world, [Still("two\nlines")], runs=1)
+    exception = RuntimeError("one\n::error::two\x1b[2J\udc80")
+    failure = run_filter(Still("bad", raises(exception), doomed), cs.simulate(world, DOOMED), world.belief).failure
+    assert failure is not None
+    assert failure.reason == "RuntimeError: one ::error::two [2J\\udc80"
+
+
 @pytest.mark.parametrize("exception", [SystemExit("enough"), GeneratorExit("gone"), RuntimeError("x" * 10**6)])
 def test_what_a_filter_throws_is_a_result_in_any_process(
     world: cs.Scenario, doomed: Control, exception: BaseException

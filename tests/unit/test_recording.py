@@ -871,6 +871,16 @@ BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
         "est.csv, line 5: column 'P_xx': a truth value or a date",
     ),
     "truth values of the truth": (csv(None, lambda table: table.assign(x=False)), EST, "truth.csv, line 2: column 'x'"),
+    "name of two lines": (
+        lambda at: poses()[0].assign(filter="a\n::error::b").to_parquet(at / "est.parquet"),
+        ("est.parquet", "--truth", "est.parquet"),
+        r"est.parquet: column 'filter': the name 'a\n::error::b' has a control character; rename it",
+    ),
+    "file of two lines": (
+        lambda at: write(at)[0].rename(at / "est\x1b[2J.csv"),
+        ("est\x1b[2J.csv", "--truth", "truth.csv"),
+        r"file: the name 'est\x1b[2J.csv' has a control character",
+    ),
     "dates": (
         lambda at: poses()[0].assign(t=pd.Timestamp("2024-01-01 00:00:07")).to_parquet(at / "est.parquet"),
         ("est.parquet", "--truth", "est.parquet"),

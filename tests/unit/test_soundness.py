@@ -136,6 +136,7 @@ MANIFESTS: list[tuple[dict[str, Any], str]] = [
     ({"filters": "one"}, r"key 'filters': Input should be a valid list"),
     ({"filters": []}, r"key 'filters': "),
     ({"filters": ["one", "one"]}, r"key 'filters': .*a name is there twice"),
+    ({"filters": ["one", "two\u2028"]}, r"key 'filters': .*the name 'two\\u2028' has a control character"),
     ({"filters": ["one"]}, r"failures\.parquet: 'two' is no filter"),
     ({"filters": ["one", "two", "three"]}, r"run 0 of 'three' is missing"),
     ({"complete": "yes"}, r"key 'complete'"),

@@ -248,7 +248,7 @@ def run(
 
                 recorded = screened_log(recorded, screen)
                 say(screening_line(recorded))
-            resolve_filters(filters, recorded.belief)
+            resolve_filters(filters, recorded.belief, recorded.name)
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")
             results = run_log(

@@ -175,7 +175,9 @@ def curves(results: Tables, filter_name: str, steps: int | None = None, maps: bo
             _fill(own, at, batch, OWN_COVARIANCE)
         if own_nees is not None:
             own_nees.reshape(-1)[at] = batch["own_nees"]
-    failures = tuple(Failure(filter_name, int(r), int(s), one_line(why, 2000)) for _, r, s, why in broken.itertuples(index=False))
+    failures = tuple(
+        Failure(filter_name, int(r), int(s), one_line(why, 2000)) for _, r, s, why in broken.itertuples(index=False)
+    )
     own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
     error = _errors(results, runs, pose, t) if results.has_truth else None
     _require_agreement(filter_name, runs, Errors(error, covariance, nees))

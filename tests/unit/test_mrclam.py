@@ -78,7 +78,7 @@ def test_the_log_is_the_drive_after_the_calibration(folder: Path) -> None:
 
 
 def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"Robot2_Odometry.dat.gz: is missing; it must be a file of UTIAS MRCLAM"):
+    with pytest.raises(cs.InputError, match=r"Robot2_Odometry.dat: is missing; it must be a file of UTIAS MRCLAM"):
         conversion.read_robot(folder, 2)
     experiment = sibling(str(SCRIPTS / "e15_mrclam.py"), "e15_mrclam")
     with pytest.raises(cs.InputError, match="holds no folder MRCLAM_DatasetN"):

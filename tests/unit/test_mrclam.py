@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import shutil
 import sys
 from pathlib import Path
 
@@ -75,6 +77,18 @@ def test_the_log_is_the_drive_after_the_calibration(folder: Path) -> None:
     assert np.std(turn) == pytest.approx(0.01, rel=0.2)
     driven = np.array([trial.start, *trial.truth[1:]])[:, 2]
     assert np.abs(np.diff(driven) - trial.controls[:, 2] * conversion.DT).max() < 2e-3
+
+
+def test_files_may_be_gzipped_or_not(folder: Path, tmp_path: Path) -> None:
+    for path in folder.iterdir():
+        unpacked = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+        (tmp_path / path.name.removesuffix(".gz")).write_bytes(unpacked)
+    packed, plain = (conversion.read_robot(at, 1) for at in (folder, tmp_path))
+    for name in ("odometry", "measurements", "truth", "landmarks"):
+        np.testing.assert_array_equal(getattr(packed, name), getattr(plain, name))
+    shutil.copy(folder / "Robot1_Odometry.dat.gz", tmp_path)
+    with pytest.raises(cs.InputError, match=r"Odometry.dat.gz: stands beside Robot1_Odometry.dat; take one"):
+        conversion.read_robot(tmp_path, 1)
 
 
 def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:

@@ -325,17 +325,20 @@ def analyse(
     changes = _options(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance)
     settings = settings_of(**changes) if changes else None
     written: list[Path] = []
+    refused: InputError | None = None  # of a report, said below the verdict
     if overwrite and report is None:
         raise InputError("--overwrite goes with --report: nothing else is written")
     if files.are(path):
-        if report is not None:
-            require_free(report, overwrite, "verdict", "--report")
         recordings = files.read(path)
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None:
-            data = verdicts_json(verdicts)
-            written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
+            try:
+                require_free(report, overwrite, "verdict", "--report")
+                data = verdicts_json(verdicts)
+                written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
+            except InputError as error:
+                refused = error
     else:
         results = open_results(path)
         if report is not None:
@@ -357,7 +360,12 @@ def analyse(
         print_verdicts(verdicts, reasons=True)
         for file in written:
             print(file)
-    if fail_on and not all(verdict.consistent for verdict in verdicts.values()):
+    is_failed = fail_on is not None and not all(verdict.consistent for verdict in verdicts.values())
+    if refused is not None and not is_failed:
+        raise refused
+    if refused is not None:
+        print(f"consistency: {refused}", file=sys.stderr)
+    if is_failed:
         raise typer.Exit(1)
 
 

@@ -69,6 +69,8 @@ def consistency_runs(request: pytest.FixtureRequest) -> int:
     """
     gates = request.config.pluginmanager.get_plugin(NAME)
     assert isinstance(gates, Gates)
+    if gates.runs is None and "dof" not in marked(request.node)[0]:
+        request.node.stash[WATCH].plan = lambda dof: gates.runs_of(request.node, dof)
     return gates.runs_of(request.node)
 
 
@@ -100,14 +102,14 @@ class Gates:
     def pytest_collection_finish(self, session: pytest.Session) -> None:
         self.collected = max(1, len(session.items))
 
-    def runs_of(self, item: pytest.Item) -> int:
-        """Runs given on the command line, or planned for the marker of a test."""
+    def runs_of(self, item: pytest.Item, dof: int | None = None) -> int:
+        """Runs given on the command line, or planned for the marker of a test, or as if it had ``dof``."""
         from consistency.diagnostics import gate_runs
 
         if self.runs is not None:
             return self.runs
         options, _ = marked(item)
-        terms = DEFAULTS | options
+        terms = DEFAULTS | options | ({} if dof is None else {"dof": dof})
         if self.budget is not None and "false_alarm" not in options:  # enough whatever else will run
             terms["false_alarm"] = in_place_rate(self.budget, self.collected)
         return gate_runs(**{key: value for key, value in terms.items() if key != "tolerance"})

@@ -14,7 +14,7 @@ from consistency.diagnostics import Comparison, Verdict, gate_runs
 from consistency.diagnostics.comparison import FEWEST
 from consistency.gating.checks import Arrays, Candidate, evidence, of_results
 from consistency.gating.comparing import Sides, of_arrays, of_filters
-from consistency.gating.watch import Entry, Terms, current, terms
+from consistency.gating.watch import DEFAULTS, Entry, Terms, current, terms
 from consistency.gating.wording import fault_text, few_to_compare, undecided_text
 
 if TYPE_CHECKING:
@@ -271,8 +271,20 @@ def _settle(
             text = few_to_compare(gate, candidate.name, candidate.runs, least, demand)
         else:
             text = undecided_text(gate, candidate.name, result.reasons[0], least, candidate.planned_dof, demand)
+            text += _marker_text(candidate.planned_dof, candidate.runs)
         raise InsufficientTrials(text, least, candidate.runs, result.verdict)
     return result
+
+
+def _marker_text(dof: int, runs: int) -> str:
+    """The marker that a test lacks whose fixture has planned for more dimensions than its error has."""
+    plan = current().plan
+    if plan is None or dof >= DEFAULTS["dof"] or (planned := plan(dof)) <= runs:
+        return ""
+    return (
+        f". The fixture consistency_runs has planned for an error of {DEFAULTS['dof']} dimensions: with "
+        f"@pytest.mark.consistency(dof={dof}) at this test it gives {planned} runs"
+    )
 
 
 def _deciding(result: _Look, runs: int) -> int:

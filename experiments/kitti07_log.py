@@ -143,7 +143,8 @@ def log_of(data: Recording, slots: int = SLOTS, gated: bool = True) -> tuple[Tri
     gated : whether a landmark begins anew where it leaves the common motion
     """
     mount = Mount(position=tuple(data.lever), rotation=roll_pitch_heading(data.axes.T @ KITTI_FROM_SENSOR))
-    sensor = BelievedSensor(model="uvd", sigma=SIGMA_PX, f=data.f, B=data.B, mount=mount)
+    searched = MIN_DISPARITY, float(data.size[0])  # the tracker has no other limit than the image
+    sensor = BelievedSensor(model="uvd", sigma=SIGMA_PX, f=data.f, B=data.B, mount=mount, disparity=searched)
     belief = Belief(motion=BelievedMotion(sigma_v=SIGMA_V, sigma_omega=SIGMA_OMEGA), sensor=sensor)
     rows = fresh_observations(data)
     if gated:

@@ -85,7 +85,7 @@ def read_robot(folder: Path, robot: int) -> Recording:
         A file is missing, damaged, or has other columns.
     """
     odometry, measurements, truth = (
-        _read(folder / f"Robot{robot}_{name}.dat.gz", columns)
+        _read(folder / f"Robot{robot}_{name}.dat", columns)
         for name, columns in (("Odometry", 3), ("Measurement", 4), ("Groundtruth", 4))
     )
     places = _read(folder / "Landmark_Groundtruth.dat", 5)
@@ -97,6 +97,11 @@ def read_robot(folder: Path, robot: int) -> Recording:
 
 
 def _read(path: Path, columns: int) -> Array:
+    """Numbers of a file, as the data are distributed or gzipped, with .gz at the end of the name."""
+    packed = path.with_name(f"{path.name}.gz")
+    if path.is_file() and packed.is_file():
+        raise InputError(f"{packed}: stands beside {path.name}; take one of them away")
+    path = path if path.is_file() or not packed.is_file() else packed
     try:
         rows = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError, EOFError, zlib.error) as error:

@@ -254,7 +254,7 @@ def run(
 
                 recorded = screened_log(recorded, screen)
                 say(screening_line(recorded))
-            resolve_filters(filters, recorded.belief)
+            resolve_filters(filters, recorded.belief, recorded.name)
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")
             results = run_log(
@@ -336,17 +336,20 @@ def analyse(
     changes = _options(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance, lost=lost)
     settings, first = settings_of(**changes) if changes else None, skip_asked(skip)
     written: list[Path] = []
+    refused: InputError | None = None  # of a report, said below the verdict
     if overwrite and report is None:
         raise InputError("--overwrite goes with --report: nothing else is written")
     if files.are(path):
-        if report is not None:
-            require_free(report, overwrite, "verdict", "--report")
         recordings = [recording.without_first(first) for recording in files.read(path)]
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None:
-            data = verdicts_json(verdicts)
-            written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
+            try:
+                require_free(report, overwrite, "verdict", "--report")
+                data = verdicts_json(verdicts)
+                written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
+            except InputError as error:
+                refused = error
     else:
         results = open_results(path)
         if report is not None:
@@ -368,7 +371,12 @@ def analyse(
         print_verdicts(verdicts, reasons=True)
         for file in written:
             print(file)
-    if fail_on and not all(verdict.consistent for verdict in verdicts.values()):
+    is_failed = fail_on is not None and not all(verdict.consistent for verdict in verdicts.values())
+    if refused is not None and not is_failed:
+        raise refused
+    if refused is not None:
+        print(f"consistency: {refused}", file=sys.stderr)
+    if is_failed:
         raise typer.Exit(1)
 
 
@@ -609,6 +617,7 @@ def monitor(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
+    from consistency.reading import one_line
     from consistency.reporting import require_plot, write_monitor_plot
     from consistency.terminal.table import print_watched, watched_json
     from consistency.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
@@ -624,7 +633,7 @@ def monitor(
     else:
         log = read_innovations(Path(path), filter_name, run)
         for note in log.notes:
-            print(f"consistency: {note}", file=sys.stderr)
+            print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
         if plot is not None:
             require_plot(plot, overwrite)
         watched = watch(log, watcher)

@@ -113,8 +113,10 @@ class FileOptions:
 
 def tell_notes(*read: list[Recording]) -> None:
     """What was assumed and left out, to standard error; said when nothing is refused any more."""
+    from consistency.reading import one_line
+
     for note in dict.fromkeys(note for recordings in read for one in recordings for note in one.notes):
-        print(f"consistency: {note}", file=sys.stderr)
+        print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
 
 
 def reads_files(command: Callable[..., Any]) -> Callable[..., Any]:

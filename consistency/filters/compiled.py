@@ -67,6 +67,7 @@ class Compiled:
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
     allow it; the numbers are the same. ``realisable`` is that of the twin: False for a bound that is told the truth.
+    ``needs``, of the twin too, are the keys of ``belief.sensor`` that it cannot do without and others can.
     """
 
     local_from = LOCAL_FROM
@@ -86,6 +87,7 @@ class Compiled:
         self.innovations, self.error = innovations, error
         self.name: str = twin.name
         self.realisable: bool = is_realisable(twin)
+        self.needs: tuple[str, ...] = getattr(twin, "needs", ())
         self.guard = guard
 
     def guarded(self, kind: str) -> Compiled:

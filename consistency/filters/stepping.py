@@ -14,6 +14,7 @@ from consistency.filters.kernel.linalg import definiteness
 from consistency.filters.record import Record
 from consistency.geometry.conventions import ADDITIVE, PLANAR
 from consistency.protocols import Filter, WholeTrial
+from consistency.reading import one_line
 from consistency.scenario import Belief
 from consistency.types import Array, Estimates, Gaussian, Info, Map, Trial
 
@@ -135,7 +136,7 @@ def reason_of(exception: BaseException) -> str:
         text = f"its message cannot be read ({type(error).__name__})"
     what = "out of memory" if isinstance(exception, MemoryError) else type(exception).__name__
     text = text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
-    return f"{what}: {text}".encode(errors="backslashreplace").decode()
+    return f"{what}: {one_line(text.encode(errors='backslashreplace').decode(), 8 * LONGEST)}"
 
 
 def _nis(info: Info) -> float:

@@ -77,6 +77,7 @@ class Watch:
     marked: Mapping[str, Any] = field(default_factory=dict)  # of the marker, only what was said
     budget: float | None = None
     tests: int = 1  # collected
+    plan: Callable[[int], int] | None = None  # runs that the fixture would give by dimension of the error; None unasked
     budgeted: int = 0  # gates of this test that ran on the budget
     keep: Callable[[Entry], None] = lambda entry: None
 

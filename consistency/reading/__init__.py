@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ LARGEST_NUMBER = HUGE**2  # that a filter may say, or a NEES be; sums of squares
 DEEPEST = 64  # parts of a dotted key
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}")
+UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # categories of Unicode: control, surrogate, ends of lines and paragraphs
 _SHOWN = 160  # characters of a parser's own words
 
 
@@ -62,6 +64,19 @@ def one_line(value: object, longest: int = _SHOWN) -> str:
     text = "".join(char if char.isprintable() else " " for char in str(value)[: 4 * longest])
     text = " ".join(text.split())
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
+
+
+def require_name(name: str, where: str, remedy: str = "rename it") -> str:
+    """A name of something, as it is, which can be printed: on one line, and to a terminal.
+
+    Raises
+    ------
+    InputError
+        It has a line break or another control character.
+    """
+    if any(unicodedata.category(char) in UNPRINTABLE for char in name):
+        raise InputError(f"{where}: the name {one_line(ascii(name), 60)} has a control character; {remedy}")
+    return name
 
 
 def is_file(path: Path) -> bool:

@@ -13,6 +13,7 @@ from typing import Any
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
+from consistency.reading import require_name
 from consistency.recording.alignment import ALIGNMENTS, require_alignment
 from consistency.recording.archive import read_archive
 from consistency.recording.bags import is_bag, read_bags
@@ -128,6 +129,7 @@ def read_recordings(
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
+    require_name(estimates.name, "file")
     suffix = estimates.suffix.lower()
     own: dict[str, object] = {"state": state, "max-dt": max_dt, "covariance": covariance, "truth": truth}
     own |= {"covariance-order": covariance_order, "time-offset": time_offset, "axes": axes}

@@ -10,7 +10,7 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, planar_error
-from consistency.reading import is_file, reading, require_room
+from consistency.reading import is_file, reading, require_name, require_room
 from consistency.recording.hints import hints, turns
 from consistency.recording.interpolation import Manifold
 from consistency.recording.poses import Poses
@@ -227,7 +227,7 @@ def step_times(path: Path, arrays: dict[str, Array], steps: int) -> Array:
 def _axes(path: Path, arrays: dict[str, Array], n: int) -> tuple[str, ...]:
     if "axes" not in arrays:
         return tuple(f"e{i + 1}" for i in range(n))
-    axes = tuple(str(axis) for axis in np.atleast_1d(arrays["axes"]))
+    axes = tuple(require_name(str(axis), f"{path}: key 'axes'") for axis in np.atleast_1d(arrays["axes"]))
     if len(axes) != n:
         raise InputError(f"{path}: key 'axes' names {len(axes)} components, the error has {n}")
     return axes

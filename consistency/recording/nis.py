@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.reading import MOST_DOF, one_line
+from consistency.reading import MOST_DOF, one_line, require_name
 from consistency.recording.archive import load_arrays, run_lengths, step_times, whole_numbers
 from consistency.recording.record import listed
 from consistency.recording.sheet import Sheet, are_dof, bounded, read_sheet
@@ -48,6 +48,7 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     suffix = path.suffix.lower()
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    require_name(path.name, "file")
     if suffix not in SUFFIXES:
         raise InputError(f"{path}: unknown kind of file; known are {', '.join(SUFFIXES)}, .ulg")
     if suffix == ".npz":

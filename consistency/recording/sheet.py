@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
-from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading
+from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading, require_name
 from consistency.recording.text import Block, blocks
-from consistency.store.parquet import read_frame
+from consistency.store.parquet import are_no_numbers, read_frame
 from consistency.types import Array, Indices
 
 
@@ -45,8 +45,9 @@ class Sheet:
         with reading(self.path, f"column '{column}' cannot be read as numbers"):
             values: Array = pd.to_numeric(cells, errors="coerce").to_numpy(float, na_value=np.nan)
             values = bounded(values)
-            bad = np.isnan(values) & ~cells.isna().to_numpy()
-        what = "not a number"
+            other = are_no_numbers(cells)
+            bad = other | np.isnan(values) & ~cells.isna().to_numpy()
+        what = "a truth value or a date, which is to be written as a number" if other.any() else "not a number"
         if not bad.any() and (finite or whole):
             bad, what = ~np.isfinite(values), "not a finite number"
         if not bad.any() and whole:
@@ -121,6 +122,9 @@ def read_sheet(path: Path) -> Sheet:
     sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
     if sheet.data.empty:
         raise InputError(f"{path}: holds no row")
+    if "filter" in sheet:
+        for name in sheet.data["filter"].dropna().unique():
+            require_name(str(name), f"{path}: column 'filter'")
     return sheet
 
 

@@ -14,6 +14,7 @@ from consistency.errors import InputError
 from consistency.filters import filter_names, get_filter, usable_names
 from consistency.filters.stepping import error_of, name_of
 from consistency.protocols import Filter
+from consistency.reading import require_name
 from consistency.runs.backends.local import Local
 from consistency.runs.campaign import Campaign, own_errors
 from consistency.runs.campaign import Interrupted as Interrupted
@@ -21,6 +22,7 @@ from consistency.runs.isolating import Isolation
 from consistency.runs.resuming import PLAN, place_for, place_with
 from consistency.runs.work import Backend, Recorded, Simulated, Work
 from consistency.scenario import Belief, Scenario
+from consistency.scenario.tables import UNITS
 from consistency.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.store.journal import Journal
 from consistency.store.log import Log, write_log
@@ -127,7 +129,7 @@ def run_log(
     Parameters and exceptions are those of :func:`run_trials`. A resume is refused if a file of the log has changed,
     or how it was screened.
     """
-    instances = resolve_filters(filters, log.belief)
+    instances = resolve_filters(filters, log.belief, log.name)
     trials = {trial.run: trial for trial in log.trials}
     work = Work(Recorded(trials), Isolation(instances, log.belief, timeout, memory))
     own = {"log_sha256": log.sha256} | ({"screening": log.screening} if log.screening else {})
@@ -178,8 +180,8 @@ def _known(filters: Sequence[Filter]) -> dict[str, Any]:
     return {"filters": [name_of(f) for f in filters], "error": own_errors(filters)}
 
 
-def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Filter]:
-    """Filters by name or as they are, checked against the sensor."""
+def resolve_filters(filters: Sequence[str | Filter], belief: Belief, log: str | None = None) -> list[Filter]:
+    """Filters by name or as they are, checked against the sensor, of the log in a folder or of a scenario."""
     instances = [get_filter(f) if isinstance(f, str) else f for f in filters]
     if not instances:
         raise InputError(f"no filter given; known: {', '.join(filter_names())}")
@@ -194,6 +196,7 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
         raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
     model = belief.sensor.model
     for filter_ in instances:
+        require_name(name_of(filter_), "filter")
         error_of(filter_)
         sensors = getattr(filter_, "sensors", None)
         if sensors is not None and model not in sensors:
@@ -202,6 +205,11 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief) -> list[Fil
                 f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
                 f"filters that fit: {', '.join(fitting)}"
             )
+        for key in getattr(filter_, "needs", ()):
+            if getattr(belief.sensor, key) is None:
+                unit = f"{key}{UNITS.get(key, '')}"
+                place = f"key 'belief.sensor.{unit}'" if log is None else f"{log}/sensor.toml: key '{unit}'"
+                raise InputError(f"{place}: missing; filter '{name_of(filter_)}' needs it, so add it or leave it out")
     return instances
 
 

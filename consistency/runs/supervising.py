@@ -18,7 +18,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -32,6 +32,7 @@ except ImportError:  # Windows
 from consistency.errors import InputError
 from consistency.filters.record import Record
 from consistency.filters.stepping import reason_of, run_filter
+from consistency.runs.streams import AT_ONCE, Printed, open_files, redirect
 from consistency.scenario import Belief
 from consistency.types import Array, Estimates, Trial
 
@@ -78,17 +79,22 @@ class Task:
 
 @dataclass(frozen=True)
 class Reply:
-    """Estimates of a trial; or a run that was stopped from outside, as ``estimates`` say; or bad input."""
+    """Estimates of a trial; or a run that was stopped from outside, as ``estimates`` say; or bad input.
+
+    ``is_spent`` says that the process is no longer as the bench has made it.
+    """
 
     estimates: Estimates | None
     was_stopped: bool = False
     refusal: str = ""
+    is_spent: bool = False
 
 
 def supervise(link: Connection) -> None:
     """Take studies and trials from ``link`` and reply to each trial, until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     hosts: dict[str, _Host] = {}
+    printed: dict[str, Printed] = {}
     study: Study | None = None
     try:
         while study is not None or link.poll(IDLE):
@@ -96,24 +102,25 @@ def supervise(link: Connection) -> None:
             told: Study | Task | None = pickle.loads(message)
             if isinstance(told, Task):
                 assert study is not None
-                host = _host_for(told, study, hosts)
+                host = _host_for(told, study, hosts, printed.setdefault(told.guest, Printed(told.guest)))
                 link.send_bytes(pickle.dumps(host.run(told.trial, message, link)))
             else:
                 study = told
                 _end(hosts)
+                printed.clear()
     except (EOFError, OSError):
         pass
     finally:
         _end(hosts)
 
 
-def _host_for(task: Task, study: Study, hosts: dict[str, _Host]) -> _Host:
+def _host_for(task: Task, study: Study, hosts: dict[str, _Host], printed: Printed) -> _Host:
     """The process that has the filter, a new one where there is none that can take the trial."""
     host = hosts.get(task.guest)
     if host is None or not host.can_take(task.trial):
         if host is not None:
             host.end()
-        host = hosts[task.guest] = _Host(study, study.guests[task.guest], task.trial)
+        host = hosts[task.guest] = _Host(study, study.guests[task.guest], task.trial, printed)
     return host
 
 
@@ -126,17 +133,19 @@ def _end(hosts: dict[str, _Host]) -> None:
 class _Host:
     """A process with one filter in it, seen from its supervisor."""
 
-    def __init__(self, study: Study, guest: Guest, trial: Trial) -> None:
-        self.guest, self.timeout = guest, study.timeout
+    def __init__(self, study: Study, guest: Guest, trial: Trial, printed: Printed) -> None:
+        self.guest, self.timeout, self.printed, self.is_spent = guest, study.timeout, printed, False
         self.room = _Room(trial.steps, 2 * len(trial.landmark))
         self.link, end = _context.Pipe()
-        self.process = _context.Process(target=_host, args=(study, guest, self.room, end))
+        self.ear, mouth = _context.Pipe(duplex=False)
+        self.process = _context.Process(target=_host, args=(study, guest, self.room, end, mouth))
         self.process.start()
         end.close()
+        mouth.close()
 
     def can_take(self, trial: Trial) -> bool:
         fits = self.room.steps >= trial.steps and self.room.observations >= len(trial.landmark)
-        return fits and self.process.exitcode is None
+        return fits and not self.is_spent and self.process.exitcode is None
 
     def run(self, trial: Trial, message: bytes, parent: Connection) -> Reply:
         """Estimates of a trial, cut off where the process died or was killed at the time-out."""
@@ -147,12 +156,16 @@ class _Host:
                 self.link.send_bytes(message)
                 reason = "" if timeout is None else f"time-out after {timeout:g} s"
                 if (reply := self._says(parent, timeout)) is not None:
+                    self._listen()
                     whole: Reply = pickle.loads(reply)
+                    self.is_spent = whole.is_spent
                     return whole
             was_stopped = False
         except (EOFError, OSError):
             code = self._exit_code()
             reason, was_stopped = _reason(code), code is not None and -code in STOPPED
+        self._listen()
+        self.printed.end(died=True)
         self.end()
         estimates = record.estimates(guest.name, trial.run, guest.error, reason=reason, guarded=guest.guarded)
         return Reply(estimates, was_stopped)
@@ -161,15 +174,26 @@ class _Host:
         """What the process says, None if nothing in time; EOFError where it is dead, SystemExit where ``parent`` is."""
         until = np.inf if seconds is None else time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
-            ready = wait([self.link, parent], min(left, GLANCE))
+            ears = [] if self.ear.closed else [self.ear]
+            ready = wait([self.link, parent, *ears], min(left, GLANCE))
             if parent in ready:
                 raise SystemExit  # it writes nothing while it waits for a reply
-            if ready:
+            if self.ear in ready:
+                self._listen()
+            if self.link in ready:
                 said: bytes = self.link.recv_bytes()
                 return said
-            if self.process.exitcode is not None:
+            if not ready and self.process.exitcode is not None:
                 raise EOFError
         return None
+
+    def _listen(self) -> None:
+        """Take in what it has printed."""
+        if not self.ear.closed and self.ear.poll():
+            if text := os.read(self.ear.fileno(), AT_ONCE):
+                self.printed.add(text)
+            else:
+                self.ear.close()
 
     def _exit_code(self) -> int | None:
         """Of a process that is about to end; None where it goes on."""
@@ -181,7 +205,9 @@ class _Host:
 
     def end(self) -> None:
         """Kill it, with all processes that it has started."""
+        self.printed.end(died=False)
         self.link.close()
+        self.ear.close()
         with contextlib.suppress(ProcessLookupError, PermissionError, AttributeError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.kill()
@@ -221,10 +247,11 @@ def _reason(code: int | None) -> str:
 # --- in the process of a filter -----------------------------------------------------------------
 
 
-def _host(study: Study, guest: Guest, room: _Room, link: Connection) -> None:
-    """Work off trials with one filter until the supervisor closes the pipe."""
+def _host(study: Study, guest: Guest, room: _Room, link: Connection, mouth: Connection) -> None:
+    """Work off trials with one filter until the supervisor closes the pipe; what is printed goes to ``mouth``."""
     _settle(study)
-    own_pid = os.getpid()
+    redirect(mouth)
+    own_pid, files = os.getpid(), open_files(link)
     with contextlib.suppress(Exception):
         pickle.loads(guest.pickled)  # what it imports takes no time of the first trial
     while True:
@@ -243,7 +270,10 @@ def _host(study: Study, guest: Guest, room: _Room, link: Connection) -> None:
         for stream in (sys.stdout, sys.stderr):  # the process will be killed, not ended
             with contextlib.suppress(Exception):
                 stream.flush()
-        link.send_bytes(pickle.dumps(reply))
+        if (now := open_files(link))[-1] != files[-1]:
+            time.sleep(LOADING)  # to be killed: what has the number of the pipe may be a file of the filter
+            os._exit(1)
+        link.send_bytes(pickle.dumps(replace(reply, is_spent=now != files)))
 
 
 def _run(guest: Guest, trial: Trial, belief: Belief, record: Record) -> Estimates:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import functools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -55,6 +56,7 @@ REPEATED = {"t", "dt"}  # floating-point columns of few different values
 ROWS = 65_536  # of a row group, and of a batch that is read
 WHOLE = 2**53  # beyond it a floating-point number counts no more
 TYPES = {"str": pa.string(), "int64": pa.int64(), "float64": pa.float64()}
+NO_NUMBERS = (bool, np.bool_, datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
 
 Columns = dict[str, Array]  # columns of a table by name, equally long
 
@@ -270,10 +272,17 @@ def _require_text(path: Path, names: Any, first: int = 0) -> None:
         raise InputError(f"{path}: a column of text, row {row}: nothing there")
 
 
+def are_no_numbers(cells: pd.Series[Any]) -> Array:
+    """Which cells (N,) are truth values, dates or durations, which pandas would turn into numbers."""
+    if cells.dtype.kind != "O":
+        return np.full(len(cells), cells.dtype.kind in "bmM")
+    return np.fromiter((isinstance(cell, NO_NUMBERS) for cell in cells), bool, len(cells))
+
+
 def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
     """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
     with reading(path, f"column '{column.name}' cannot be read as numbers"):
-        if column.dtype.kind in "bmMc":
+        if column.dtype.kind == "c" or are_no_numbers(column).any():
             raise TypeError(column.dtype)
         values = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
     if column.name in NULLABLE:

@@ -11,7 +11,7 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from consistency.errors import InputError
-from consistency.reading import one_line, reading
+from consistency.reading import one_line, reading, require_name
 from consistency.scenario import Scenario
 from consistency.store.parquet import COLUMNS, read_batches, require_table
 
@@ -48,6 +48,8 @@ class _Manifest(BaseModel):
     def _each_once(cls, names: list[str]) -> list[str]:
         if len(set(names)) < len(names):
             raise ValueError("a name is there twice")
+        for name in names:
+            require_name(name, "its names")
         return names
 
 

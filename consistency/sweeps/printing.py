@@ -120,6 +120,8 @@ def notes_of(advice: Advice) -> list[str]:
         notes.append(f"taken from the map: {', '.join(advice.rig.assumed)}")
     if advice.unlike:
         notes.append(f"no cell of the map is like the rig in: {', '.join(advice.unlike)}")
+    if advice.lacking and advice.best is not None:
+        notes.append(f"its sweep is not finished: the nearest cell lacks {', '.join(advice.lacking)}")
     return notes
 
 
@@ -131,6 +133,10 @@ def sentences_of(advice: Advice) -> list[str]:
         if contradicted:
             names = ", ".join(f"{c.filter} ({c.verdict.status})" for c in contradicted if c.verdict is not None)
             return [f"No filter to trust: the map has one, but {plural(advice.runs, 'run')} of this rig find: {names}."]
+        if advice.lacking:
+            return [
+                f"No answer yet: of {advice.nearest.text} the map lacks {', '.join(advice.lacking)}. {_none_of(advice)}"
+            ]
         where = f" Nearest cell where one is consistent: {advice.elsewhere}." if advice.elsewhere else ""
         return [f"No filter of the map is consistent near this rig.{where}"]
     return [
@@ -138,6 +144,16 @@ def sentences_of(advice: Advice) -> list[str]:
         *([_confirmed(advice, best)] if best.verdict is not None else []),
         *(_contradiction(advice, c) for c in advice.candidates if c.sure == "no"),
     ]
+
+
+def _none_of(advice: Advice) -> str:
+    """What the map has, and how to have the rest."""
+    there, sweep = ", ".join(c.filter for c in advice.candidates), advice.regime.sweep
+    total = len(sweep.cells) * len(sweep.filters)
+    return (
+        f"Of those there ({there}) none is consistent. {advice.regime.missing} of its {total} results are missing; "
+        "finish the sweep: the same 'consistency sweep' goes on."
+    )
 
 
 def _why(advice: Advice, best: Candidate) -> str:

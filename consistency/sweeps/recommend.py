@@ -68,6 +68,12 @@ class Advice:
         return all(place.inside for place in self.places)
 
     @property
+    def lacking(self) -> tuple[str, ...]:
+        """Filters that the map, of a sweep that is not finished, does not have in the nearest cell."""
+        there = {candidate.filter for candidate in self.candidates}
+        return tuple(name for name in self.regime.sweep.filters if name not in there)
+
+    @property
     def best(self) -> Candidate | None:
         """The filter to take; None where none is to be trusted."""
         return next((candidate for candidate in self.candidates if candidate.trusted), None)

@@ -143,7 +143,7 @@ def tune(
     began = time.monotonic()
     world = load_scenario(world) if isinstance(world, str | Path) else world
     instance = get_filter(filter_) if isinstance(filter_, str) else filter_
-    resolve_filters([instance], world.belief)
+    resolve_filters([instance], world.belief, world.name if isinstance(world, Log) else None)
     parsed = groups_of(groups, world.belief)
     parts = parts_of(world, runs, seed)
     require_scorable(instance, by, parts.has_truth)

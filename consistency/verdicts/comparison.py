@@ -70,13 +70,21 @@ class Compared:
                 f"; its covariance is farther too large, unless rare runs with a large NEES are missing here: up to "
                 f"{100.0 * c.unseen:.2g} % of all runs may be of a kind that {c.runs} do not show"
             )
-        elif not c.worse and c.at_most < np.log(DETECT):
-            text += f"; farther off by x{np.exp(max(c.at_most, 0.0)):.3g} at most"
         elif not c.worse:
-            text += f"; {c.needed_runs(DETECT)} runs find a covariance farther off by x{DETECT:g} with power 0.95"
+            text += f"; {self._limit}"
+            if not c.at_most < np.log(DETECT):
+                text += f"; {c.needed_runs(DETECT)} runs find a covariance farther off by x{DETECT:g} with power 0.95"
         if any(self.failures):
             text += f"; failed runs {self.failures.a}, {self.failures.b} in the reference"
         return f"{text}. {self.note}".rstrip(". ") if self.note else text
+
+    @property
+    def _limit(self) -> str:
+        """How much farther off filter ``a`` may be that is not found worse."""
+        most = self.comparison.at_most
+        if most < 0.0:
+            return f"nearer to consistent, by x{np.exp(-most):.3g} at least"
+        return "no difference shown" + (f"; at most x{np.exp(most):.3g} farther off" if np.isfinite(most) else "")
 
     @property
     def _reference(self) -> str:

@@ -14,8 +14,9 @@ from consistency.diagnostics.blocks import by_runs, by_steps
 from consistency.diagnostics.skipping import Skip, Skipped, without_first
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.errors import InputError
+from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry.conventions import ADDITIVE, planar_error
-from consistency.reading import LARGEST_NUMBER
+from consistency.reading import LARGEST_NUMBER, one_line
 from consistency.store.parquet import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, Columns
 from consistency.store.results import JOINT, POSE, Tables
 from consistency.types import Array, Failure, Indices
@@ -194,12 +195,17 @@ def curves(results: Tables, filter_name: str, steps: int | None = None, maps: bo
             _fill(own, at, batch, OWN_COVARIANCE)
         if own_nees is not None:
             own_nees.reshape(-1)[at] = batch["own_nees"]
-    failures = tuple(Failure(filter_name, int(r), int(s), str(why)) for _, r, s, why in broken.itertuples(index=False))
+    failures = tuple(
+        Failure(filter_name, int(r), int(s), one_line(why, 2000)) for _, r, s, why in broken.itertuples(index=False)
+    )
     own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
     error = _errors(results, runs, pose, t) if results.has_truth else None
     _require_agreement(filter_name, runs, Errors(error, covariance, nees))
+    _require_all(filter_name, runs, "nees", nees, covariance if own is None else own)
     if own is not None:
         _require_agreement(filter_name, runs, Errors(own_error, own, own_nees))
+        _require_all(filter_name, runs, "own_nees", own_nees, own)
+    _require_nis(filter_name, runs, nis, nis_dof)
     return Curves(
         filter_name, runs, t, covariance, error, nees, nis, nis_dof, failures,
         optimal_gain=filter_name in results.manifest.get("optimal_gain", []),
@@ -247,6 +253,44 @@ def _require_agreement(filter_name: str, runs: Indices, errors: Errors) -> None:
             f"estimates of '{filter_name}', run {runs[row]}, step {step + 1}: the NEES is not that of the error and "
             "its covariance; the tables were changed or damaged; write them again"
         )
+
+
+def _require_all(filter_name: str, runs: Indices, column: str, nees: Array | None, covariance: Symmetric) -> None:
+    """Refuse a missing NEES from the first step on whose covariance, of the filter's own error, has full rank."""
+    if nees is None:
+        return
+    steps = np.isfinite(covariance.entry(0, 0)).sum(axis=1)  # with an estimate, of each run
+    first = by_runs(_first_number, nees)
+    missing = np.isfinite(nees).sum(axis=1) < steps - np.minimum(first, steps)
+    for row in np.flatnonzero((first > 0) & (steps > 0)):  # the last step without a NEES before those with one
+        last = min(int(first[row]), int(steps[row])) - 1
+        missing[row] |= definiteness(np.asarray(covariance[row, last])) == 1
+    if missing.any():
+        run = runs[int(np.argmax(missing))]
+        raise InputError(
+            f"estimates of '{filter_name}', run {run}: column '{column}' is null or NaN in a step whose covariance has "
+            "full rank; the tables were changed or damaged; write them again"
+        )
+
+
+def _first_number(values: Array) -> Array:
+    """Column of the first number in each row, the number of columns where none is."""
+    there = np.isfinite(values)
+    return np.where(there.any(axis=1), there.argmax(axis=1), values.shape[1]) if values.size else np.zeros(len(values))
+
+
+def _require_nis(filter_name: str, runs: Indices, nis: Array, nis_dof: Indices) -> None:
+    """Refuse a missing NIS in a step with degrees of freedom."""
+    missing = by_runs(_lacks_nis, nis, nis_dof)
+    if missing.any():
+        raise InputError(
+            f"estimates of '{filter_name}', run {runs[int(np.argmax(missing))]}: column 'nis' is null or NaN in a step "
+            "whose nis_dof is not 0; the tables were changed or damaged; write them again"
+        )
+
+
+def _lacks_nis(nis: Array, nis_dof: Indices) -> Array:
+    return np.asarray((np.isnan(nis) & (nis_dof > 0)).any(axis=1))
 
 
 def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: str = ADDITIVE) -> Array:

@@ -50,7 +50,7 @@ def bridged(found: Sequence[RelativeMotion | InputError], t: Array) -> list[Rela
     speed[good] = np.array([m.pose.vector for m in measured]) / dt[good, None]
     motions = dict(zip(np.flatnonzero(good).tolist(), measured, strict=True))
     for k, fault in faults.items():
-        around, share = _neighbours(good, t, k)
+        around, share = neighbours(good, t, k)
         missed = _missed(speed, around - k, share)
         if len(missed) < FEWEST:
             raise type(fault)(f"{fault} (too few motions around it were measured to bridge it)")
@@ -61,8 +61,8 @@ def bridged(found: Sequence[RelativeMotion | InputError], t: Array) -> list[Rela
     return [motions[k] for k in range(len(found))]
 
 
-def _neighbours(good: Array, t: Array, k: int) -> tuple[Indices, Array]:
-    """The measured motions next to motion k, and the share of each in its velocity."""
+def neighbours(good: Array, t: Array, k: int) -> tuple[Indices, Array]:
+    """The measured motions, ``good`` (T,), next to motion k at t (T + 1,), and the share of each in its velocity."""
     at = np.flatnonzero(good)
     i = int(np.searchsorted(at, k))
     around = at[max(i - 1, 0) : i + 1]

@@ -13,7 +13,14 @@ from consistency.types import Array, Indices
 from consistency.vision.consensus import squared_distances
 from consistency.vision.errors import ConsensusError, MatchError
 from consistency.vision.features import COUNT, grey, sift
-from consistency.vision.matching import EPIPOLAR_PX, RATIO, StereoFeatures, circular_matches, stereo_matches
+from consistency.vision.matching import (
+    EPIPOLAR_PX,
+    RATIO,
+    StereoFeatures,
+    circular_matches,
+    homogeneous,
+    stereo_matches,
+)
 from consistency.vision.pose import RelativePose
 from consistency.vision.propagation import registration_covariance, triangulation_covariance
 from consistency.vision.refinement import Refined, refine_reprojection
@@ -26,6 +33,7 @@ FEWEST = 8  # closed circles; below, RANSAC would agree with anything
 MISFIT = 5.0  # chi2/dof at most; 0.2 to 1.4 on good images, 8 on swapped ones
 FIRST_ORDER = 0.05  # relative uncertainty of a depth up to which first order holds (docs/front-end.md)
 DOMINATED = 0.5  # of the variance from points beyond: an unweighted registration is theirs
+ROUNDING = 1e-9  # relative, of a disparity: that of exact pixels may be less than it is
 REFITS = 5  # of the pose to its inliers, at most; two or three do
 Pair = tuple[Array, Array]
 
@@ -268,11 +276,28 @@ def noise(features: StereoFeatures, sigma_per_scale: float) -> Array:
 
 
 def usable(rig: StereoRig, uv: Array, min_disparity: float) -> Array:
-    """Matches (N, 4) in front of both cameras and nearer than the depth of ``min_disparity`` px, (N,) bool."""
+    """Matches (N, 4) in front of both cameras and nearer than the depth of ``min_disparity`` px, (N,) bool.
+
+    The disparity itself counts as well: off the epipolar line least squares makes a near point of a small disparity.
+    """
     good = triangulable(rig, uv)
-    depth = np.full(len(uv), np.inf)
-    depth[good] = triangulate(rig, uv[good])[:, 2]
-    return np.asarray(depth <= rig.K_left[0, 0] * rig.baseline / min_disparity)
+    good[good] = triangulate(rig, uv[good])[:, 2] <= rig.K_left[0, 0] * rig.baseline / min_disparity
+    good[good] = disparities(rig, uv[good]) >= min_disparity * (1.0 - ROUNDING)
+    return np.asarray(good)
+
+
+def disparities(rig: StereoRig, uv: Array) -> Array:
+    """Disparities (N,) of matches (N, 4) in cameras that are turned to have the baseline as their x axis, px.
+
+    The focal length is that of the left camera; in rectified images they are the differences of the columns.
+    """
+    x = rig.t / rig.baseline
+    y = np.cross([0.0, 0.0, 1.0], x)
+    y /= np.linalg.norm(y)
+    turn = np.stack([x, y, np.cross(x, y)])
+    left = homogeneous(uv[:, :2]) @ np.linalg.inv(rig.K_left).T @ turn.T
+    right = homogeneous(uv[:, 2:]) @ np.linalg.inv(rig.K_right).T @ rig.R.T @ turn.T
+    return np.asarray(rig.K_left[0, 0] * (left[:, 0] / left[:, 2] - right[:, 0] / right[:, 2]))
 
 
 def diagonal(sigma: Array) -> Array:

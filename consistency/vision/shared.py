@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.errors import InputError
 from consistency.types import Array
+from consistency.vision.bridging import neighbours
 from consistency.vision.motion import RelativeMotion, diagonal
 from consistency.vision.pose import RelativePose, cross_matrix
 from consistency.vision.refinement import refine_reprojection
@@ -66,7 +67,8 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
     """Derivative (n, 6, 11) of each motion's error by what is shared.
 
     An error is the difference of the translations (m) and the rotation vector of R R_true' (rad), in the first camera's
-    axes. For the rig's parameters the refinement of the inliers is repeated with another rig.
+    axes. For the rig's parameters the refinement of the inliers is repeated with another rig. A bridge errs by the rig
+    as the motions do that it is interpolated from.
 
     Parameters
     ----------
@@ -75,16 +77,20 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
     Raises
     ------
     InputError
-        A motion is a bridge, or the refinement with another rig fails.
+        Every motion is a bridge, or the refinement with another rig fails.
     """
     dt = np.diff(t)
     speed = np.array([_twist(m.pose) for m in motions]) / dt[:, None]
     rate = np.gradient(speed, 0.5 * (t[1:] + t[:-1]), axis=0) if len(motions) > 1 else np.zeros_like(speed)
-    J = np.empty((len(motions), 6, len(SHARED)))
+    J, measured = np.empty((len(motions), 6, len(SHARED))), np.array([not motion.fault for motion in motions], bool)
+    if not measured.any():
+        raise InputError("motions: all are bridges, and have no matches that could tell")
+    for k in np.flatnonzero(measured):
+        J[k, :, :RIG] = _by_rig(rig, motions[k])
+    for k in np.flatnonzero(~measured):
+        around, share = neighbours(measured, t, int(k))
+        J[k, :, :RIG] = np.tensordot(dt[k] * share / dt[around], J[around, :, :RIG], axes=1)
     for k, motion in enumerate(motions):
-        if motion.fault:
-            raise InputError(f"motion {k}: is a bridge, and has no matches that could tell; leave it out")
-        J[k, :, :RIG] = _by_rig(rig, motion)
         J[k, :3, RIG:-1] = cross_matrix(motion.pose.t)
         J[k, 3:, RIG:-1] = motion.pose.R - np.eye(3)
         J[k, :, -1] = rate[k] * dt[k]
@@ -105,37 +111,45 @@ def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
     InputError
         Fewer than 12 motions, or shapes that do not fit.
     """
-    n, prior = len(errors), np.array(list(SHARED.values()))
-    if errors.shape != (n, 6) or J.shape != (n, 6, len(prior)) or S.shape != (n, 6, 6):
+    n = len(errors)
+    if errors.shape != (n, 6) or J.shape != (n, 6, len(SHARED)) or S.shape != (n, 6, 6):
         raise InputError(f"errors, J, S: shapes {errors.shape}, {J.shape}, {S.shape} do not fit")
     if n < FEWEST:
         raise InputError(f"errors: of {n} motions, at least {FEWEST} are needed for a floor of six numbers")
 
-    def posterior(floor: Array) -> tuple[Array, Array, float, Array]:
-        """Mean and covariance of what is shared; minus twice the log-likelihood, and its derivative by log floor.
-
-        The errors have the covariance V = C + J Pi J', with C that of each motion alone and Pi the prior.
-        """
-        C = S + np.diag(floor**2)
-        W = np.linalg.inv(C)
-        WJ = W @ J
-        H = np.einsum("nia,nib->ab", J, WJ) + np.diag(prior**-2.0)
-        covariance = np.linalg.inv(H)
-        mean = covariance @ np.einsum("nia,ni->a", WJ, errors)
-        weighted = np.einsum("nij,nj->ni", W, errors - J @ mean)  # V^-1 e
-        diagonal = np.einsum("nii->ni", W) - np.einsum("nia,ab,nib->ni", WJ, covariance, WJ)  # of V^-1
-        volume = np.linalg.slogdet(C)[1].sum() + np.linalg.slogdet(H * np.outer(prior, prior))[1]
-        slope = 2.0 * floor**2 * (diagonal - weighted**2).sum(axis=0)
-        return mean, covariance, float((errors * weighted).sum() + volume), slope
-
     start = np.log(np.clip(errors.std(axis=0), 10.0 * LEAST, 0.1 * MOST))
     bounds = optimize.Bounds(np.full(6, np.log(LEAST)), np.full(6, np.log(MOST)))
     best = optimize.minimize(  # type: ignore[call-overload]  # the stubs do not know jac=True
-        lambda x: posterior(np.exp(x))[2:], start, jac=True, method="L-BFGS-B", bounds=bounds
+        lambda x: posterior(np.exp(x), errors, J, S)[2:], start, jac=True, method="L-BFGS-B", bounds=bounds
     )
     floor = np.exp(best.x)
-    mean, covariance, *_ = posterior(floor)
+    mean, covariance, *_ = posterior(floor, errors, J, S)
     return SharedError(mean, covariance, floor)
+
+
+def posterior(floor: Array, errors: Array, J: Array, S: Array) -> tuple[Array, Array, float, Array]:
+    """Mean and covariance of what is shared; minus twice the log-likelihood, and its derivative by log floor.
+
+    The errors (n, 6) have the covariance V = C + J Pi J', with C that of each motion alone and Pi the prior.
+
+    Parameters
+    ----------
+    floor : (6,), standard deviations
+    J : (n, 6, 11)
+    S : (n, 6, 6)
+    """
+    prior = np.array(list(SHARED.values()))
+    C = S + np.diag(floor**2)
+    W = np.linalg.inv(C)
+    WJ = W @ J
+    H = np.einsum("nia,nib->ab", J, WJ) + np.diag(prior**-2.0)
+    covariance = np.linalg.inv(H)
+    mean = covariance @ np.einsum("nia,ni->a", WJ, errors)
+    weighted = np.einsum("nij,nj->ni", W, errors - J @ mean)  # V^-1 e
+    diagonal = np.einsum("nii->ni", W) - np.einsum("nia,ab,nib->ni", WJ, covariance, WJ)  # of V^-1
+    volume = np.linalg.slogdet(C)[1].sum() + np.linalg.slogdet(H * np.outer(prior, prior))[1]
+    slope = 2.0 * floor**2 * (diagonal - weighted**2).sum(axis=0)
+    return mean, covariance, float((errors * weighted).sum() + volume), slope
 
 
 def _twist(pose: RelativePose) -> Array:

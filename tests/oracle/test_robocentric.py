@@ -373,7 +373,7 @@ def test_the_state_is_split_only_where_the_step_has_room() -> None:
 
 def test_a_belief_without_search_range_is_refused(small: Small) -> None:
     scenario = small("herath2007-stereo", belief__sensor__disparity=None)
-    with pytest.raises(cs.InputError, match=r"'parked-ekf-uvd' needs key 'belief.sensor.disparity_px'"):
+    with pytest.raises(cs.InputError, match=r"key 'belief.sensor.disparity_px': missing; filter 'parked-ekf-uvd'"):
         cs.run_trials(scenario, ["parked-ekf-uvd"], runs=1)
 
 

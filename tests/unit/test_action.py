@@ -263,6 +263,45 @@ def test_a_cell_of_the_summary_cannot_break_the_table(gate: ModuleType) -> None:
     assert line == "| test[a\\|b] | failed |  | 1 | &lt;img src=x> and \\`code\\` &amp; more |"
 
 
+def test_names_are_no_commands_of_the_runner(
+    gate: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A runner takes a line that begins with :: for a command, unless a mark has stopped that."""
+    hostile = "ekf\n::add-mask::x\r::warning::y\x1b[2J"
+    (tmp_path / "loud.py").write_text("import sys; print('::set-output name=a::b', file=sys.stderr); print('{}')")
+    call = f"import gate; assert gate.run('loud', {hostile!r}) == (0, '{{}}\\n')"
+    environment = os.environ | {"PYTHONPATH": f"{action.FOLDER}:{tmp_path}"}
+    together = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    log = subprocess.run([sys.executable, "-c", call], env=environment, **together, check=True).stdout
+    assert "::set-output" in log
+    assert commands(log) == []
+    monkeypatch.setattr(gate, "read_inputs", lambda: gate.Inputs(["tests"], [], [], "", "inconsistent", tmp_path))
+    monkeypatch.setattr(gate, "run_tests", lambda given: (False, [gate.Row(hostile, "failed", "", "1", hostile)]))
+    for name in ("GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+    assert gate.main() == 1
+    monkeypatch.setattr(gate, "read_inputs", lambda: (_ for _ in ()).throw(gate.Unusable(f"{hostile} of 5%0A")))
+    assert gate.main() == 2
+    assert "\x1b" not in (said := "".join(capfd.readouterr()))
+    assert commands(said) == [
+        "::error title=Consistency gate::not as it must be: tests; the summary has the verdicts",
+        "::error title=Consistency gate::ekf ::add-mask::x ::warning::y [2J of 5%250A",
+    ]
+
+
+def commands(log: str) -> list[str]:
+    """Those that the runner obeys, as its ActionCommandManager does."""
+    found, mark = [], ""
+    for line in map(str.strip, re.split("[\r\n]", log)):
+        if mark:
+            mark = "" if line == f"::{mark}::" else mark
+        elif line.startswith("::stop-commands::"):
+            mark = line.removeprefix("::stop-commands::")
+        elif line.startswith("::"):
+            found.append(line)
+    return found
+
+
 def test_options_that_compare_lacks_are_left_out(gate: ModuleType) -> None:
     options = ["--truth", "t.csv", "--detect", "2", "--tolerance=1.1", "--error", "so2"]
     assert gate.shared(options) == ["--truth", "t.csv", "--error", "so2"]

@@ -91,10 +91,11 @@ def test_notes_of_other_programs_change_nothing(files: Path) -> None:
     [
         (pa.array([2**60 + 1] * 117), r"column 'run', row 0: not a whole number"),
         (pa.array([True] * 117), r"column 'run' cannot be read as numbers \(bool\)"),
+        (pa.array([True, None] + [False] * 115), r"column 'run' cannot be read as numbers \(object\)"),
         (pa.array([[0]] * 117), r"column 'run'.*not a|column 'run' cannot be read as numbers"),
         (pa.array([0] * 117, pa.timestamp("ns")), r"column 'run' cannot be read as numbers"),
     ],
-    ids=["large", "bool", "list", "time"],
+    ids=["large", "bool", "bool with gaps", "list", "time"],
 )
 def test_a_column_of_runs_is_of_whole_numbers(files: Path, column: pa.Array, said: str) -> None:
     path = files / "results" / "truth.parquet"

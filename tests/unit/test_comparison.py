@@ -411,12 +411,27 @@ def test_runs_that_show_that_nothing_is_lost_are_enough(rng: np.random.Generator
     assert not c.worse
     assert c.at_most < 1e-9
     sentence = Compared("f", "f", compare(of_runs(rounded[:, 0]), of_runs(nees[:, 0])), (0, 0)).sentence
-    assert "farther off by x1 at most" in sentence
+    assert "no difference shown; at most x1 farther off" in sentence
     better = compare(of_runs(nees[:, 0]), of_runs(100.0 * nees[:, 0]))
     assert better.at_most < 0.0
-    assert "farther off by x1 at most" in Compared("f", "f", better, (0, 0)).sentence
+    sentence = Compared("f", "f", better, (0, 0)).sentence
+    assert f"; nearer to consistent, by x{np.exp(-better.at_most):.3g} at least" in sentence
+    assert "no difference" not in sentence
     with pytest.raises(InsufficientTrials):
         assert_not_worse(nees_a=rng.chisquare(3, (10, 1)), nees_b=rng.chisquare(3, (10, 1)), dof=3, false_alarm=1e-9)
+
+
+def test_what_few_runs_leave_open_is_said(rng: np.random.Generator) -> None:
+    c = compare(of_runs(rng.chisquare(3, 10)), of_runs(rng.chisquare(3, 10)))
+    assert not c.worse
+    assert c.at_most > np.log(1.5)
+    sentence = Compared("f", "g", c, (0, 0)).sentence
+    assert f"; no difference shown; at most x{np.exp(c.at_most):.3g} farther off; {c.needed_runs(1.5)} runs" in sentence
+    unlimited = Compared("f", "g", replace(c, at_most=np.inf), (0, 0)).sentence
+    assert "; no difference shown; " in unlimited
+    assert "at most" not in unlimited
+    worse = compare(of_runs(9.0 * rng.chisquare(3, 100)), of_runs(rng.chisquare(3, 100)))
+    assert "no difference" not in Compared("f", "g", worse, (0, 0)).sentence
 
 
 def test_the_end_of_a_session_plans_as_the_gate_did(rng: np.random.Generator) -> None:

@@ -140,6 +140,15 @@ def test_a_nees_that_no_number_holds_fails_any_filter(world: cs.Scenario) -> Non
         array[STEP - 1] = kept
 
 
+def test_names_and_reasons_stand_on_one_line(world: cs.Scenario, doomed: Control) -> None:
+    with pytest.raises(cs.InputError, match=r"filter: the name 'two\\nlines' has a control character"):
+        cs.run_trials(world, [Still("two\nlines")], runs=1)
+    exception = RuntimeError("one\n::error::two\x1b[2J\udc80")
+    failure = run_filter(Still("bad", raises(exception), doomed), cs.simulate(world, DOOMED), world.belief).failure
+    assert failure is not None
+    assert failure.reason == "RuntimeError: one ::error::two [2J\\udc80"
+
+
 @pytest.mark.parametrize("exception", [SystemExit("enough"), GeneratorExit("gone"), RuntimeError("x" * 10**6)])
 def test_what_a_filter_throws_is_a_result_in_any_process(
     world: cs.Scenario, doomed: Control, exception: BaseException
@@ -177,6 +186,75 @@ def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world: cs.Scenario
     assert results.truth is not None
     assert results.truth["run"].unique().tolist() == [DOOMED]
     assert results.failures[["run", "step"]].to_numpy().tolist() == [[DOOMED, STEP]]
+
+
+class Closes(Still):
+    """Says which process it is in, and closes its standard streams."""
+
+    def init(self, problem: Any) -> Any:
+        state = np.array([float(os.getpid()), float(self.kept[0] in dict(enumerate_files())), 0.0])
+        os.close(self.kept[0])
+        return state
+
+
+def enumerate_files() -> list[tuple[int, bool]]:
+    return [(int(name), True) for name in os.listdir("/proc/self/fd")]
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_process_that_closed_its_streams_is_replaced(world: cs.Scenario, number: int) -> None:
+    """Otherwise the next run would write into whatever file has the number then."""
+    results = cs.run_trials(world, [Closes("closes", kept=[number])], runs=RUNS, jobs=1)
+    assert len(results.failures) == 0
+    assert results.estimates.groupby("run")["x"].first().nunique() == RUNS
+    assert (results.estimates["y"] == 1.0).all()
+
+
+def takes_the_pipe(*_: Any) -> None:
+    """Puts a file of its own in the place of the pipe to the bench."""
+    os.closerange(3, 256)
+    for _ in range(64):
+        os.dup(2)
+
+
+def test_a_reply_goes_to_no_other_file(world: cs.Scenario, doomed: Control, capfd: pytest.CaptureFixture[str]) -> None:
+    results = cs.run_trials(world, [Still("bad", takes_the_pipe, doomed)], runs=RUNS, jobs=1)
+    reason = "its process closed its pipe to the bench"
+    assert results.failures[["run", "reason"]].to_numpy().tolist() == [[DOOMED, reason]]
+    assert "Estimates" not in "".join(capfd.readouterr())
+
+
+def shouts(self: Still, _: Any) -> None:
+    for number in range(20000):
+        print("out", number)
+        print("err", number, file=sys.stderr)
+    if self.kept:
+        sys.stdout.flush()
+        os.abort()
+
+
+@pytest.mark.usefixtures("no_supervisors")
+@pytest.mark.parametrize("dies", [False, True])
+def test_what_a_filter_prints_is_bounded(
+    world: cs.Scenario, doomed: Control, capfd: pytest.CaptureFixture[str], dies: bool
+) -> None:
+    loud = Still("loud", shouts, doomed, kept=[1] * dies)
+    calm = cs.run_trials(world, [loud, Prints("quiet")], runs=RUNS, jobs=1)
+    assert len(calm.failures) == dies
+    out, err = capfd.readouterr()
+    assert "out" not in out
+    assert err.count("filter 'loud' prints more than 16384 bytes; the rest is not shown\n") == 1
+    assert err.count("a word of quiet\n") == RUNS
+    assert "\nout 0\n" in f"\n{err}"
+    assert ("out 19999" in err) == dies
+    assert ("\nconsistency: the last that filter 'loud' printed:\n" in err) == dies
+    assert 16384 < len(err) < 16384 + 2048 + 1000
+
+
+class Prints(Still):
+    def init(self, problem: Any) -> Any:
+        print("a word of quiet")
+        return problem.start
 
 
 class Counts(Still):
@@ -346,14 +424,14 @@ cs.run_trials(world, [Mine()], runs=2, jobs=1)
 
 
 def test_a_filter_that_hangs_ends_with_the_study(tmp_path: Path) -> None:
-    """A script without a guard on ``__main__`` is killed: its standard output is closed when all its processes are."""
+    """A script without a guard on ``__main__`` is killed: its standard error is closed when all its processes are."""
     (tmp_path / "mine.py").write_text(SCRIPT)
-    process = subprocess.Popen([sys.executable, "mine.py"], cwd=tmp_path, stdout=subprocess.PIPE)
-    assert process.stdout is not None
+    process = subprocess.Popen([sys.executable, "mine.py"], cwd=tmp_path, stderr=subprocess.PIPE)
+    assert process.stderr is not None
     with process:
-        assert process.stdout.readline() == b"here\n"
+        assert process.stderr.readline() == b"here\n"
         process.kill()
-        reader = threading.Thread(target=process.stdout.read, daemon=True)
+        reader = threading.Thread(target=process.stderr.read, daemon=True)
         reader.start()
         reader.join(30.0)
         assert not reader.is_alive()
@@ -412,7 +490,8 @@ def test_a_process_that_is_spawned(world: cs.Scenario, doomed: Control, monkeypa
     study = Isolation([bad], world.belief, LONG)._study
     trials = [cs.simulate(world, run) for run in (DOOMED + 1, DOOMED)]
     near, far = multiprocessing.Pipe()
-    host = supervising._Host(study, study.guests["bad"], max(trials, key=lambda trial: len(trial.landmark)))
+    longest = max(trials, key=lambda trial: len(trial.landmark))
+    host = supervising._Host(study, study.guests["bad"], longest, supervising.Printed("bad"))
     for trial in trials:
         reply = host.run(trial, pickle.dumps(supervising.Task("bad", trial)), far)
         assert reply.estimates is not None

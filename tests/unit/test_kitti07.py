@@ -245,3 +245,24 @@ def test_the_noise_of_the_twin_is_what_the_filter_believes() -> None:
     whitened = (quiet.z - loud.z) / belief.sensor.sigma / np.sqrt(2)
     assert np.abs(whitened.var(axis=0) - 1).max() < 5 * np.sqrt(2 / len(whitened))
     assert np.hypot(*(loud.truth - trial.truth)[-1, :2]) < 1.0  # the unicycle model fits the drive
+
+
+def test_consistency_bought_by_a_larger_error_is_no_improvement() -> None:
+    def of(nees: float, largest: float) -> object:
+        return experiment.Measured(nees, 0, np.ones(3), [0, 0, 0], 1.0, 1.0, 0.1, 1.0, largest)
+
+    cut = [of(3.0, 7.0), of(15.0, 20.0)]
+    assert experiment.are_better(cut, of(329.0, 58.0))
+    assert experiment.are_better(cut, of(30.0, 20.0))
+    assert not experiment.are_better(cut, of(329.0, 19.0))
+    assert not experiment.are_better(cut[::-1], of(29.0, 58.0))
+
+
+def test_the_log_says_which_disparities_are_reported(tmp_path: Path) -> None:
+    """A filter that allows for the search range takes it from sensor.toml."""
+    data = recording({0: moving(30), 1: moving(30, u=150.0)}, 30)
+    trial, belief = conversion.log_of(data)
+    assert belief.sensor.disparity == (conversion.MIN_DISPARITY, 1226.0)
+    write_log(tmp_path / "log", [trial], belief, None, manifest_of(kind="log", runs=1))
+    assert "disparity = [" in (tmp_path / "log/sensor.toml").read_text()
+    assert read_log(tmp_path / "log").belief.sensor.disparity == (8.0, 1226.0)

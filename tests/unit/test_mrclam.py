@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import shutil
 import sys
 from pathlib import Path
 
@@ -77,8 +79,20 @@ def test_the_log_is_the_drive_after_the_calibration(folder: Path) -> None:
     assert np.abs(np.diff(driven) - trial.controls[:, 2] * conversion.DT).max() < 2e-3
 
 
+def test_files_may_be_gzipped_or_not(folder: Path, tmp_path: Path) -> None:
+    for path in folder.iterdir():
+        unpacked = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+        (tmp_path / path.name.removesuffix(".gz")).write_bytes(unpacked)
+    packed, plain = (conversion.read_robot(at, 1) for at in (folder, tmp_path))
+    for name in ("odometry", "measurements", "truth", "landmarks"):
+        np.testing.assert_array_equal(getattr(packed, name), getattr(plain, name))
+    shutil.copy(folder / "Robot1_Odometry.dat.gz", tmp_path)
+    with pytest.raises(cs.InputError, match=r"Odometry.dat.gz: stands beside Robot1_Odometry.dat; take one"):
+        conversion.read_robot(tmp_path, 1)
+
+
 def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(cs.InputError, match=r"Robot2_Odometry.dat.gz: is missing; it must be a file of UTIAS MRCLAM"):
+    with pytest.raises(cs.InputError, match=r"Robot2_Odometry.dat: is missing; it must be a file of UTIAS MRCLAM"):
         conversion.read_robot(folder, 2)
     experiment = sibling(str(SCRIPTS / "e15_mrclam.py"), "e15_mrclam")
     with pytest.raises(cs.InputError, match="holds no folder MRCLAM_DatasetN"):

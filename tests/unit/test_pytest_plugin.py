@@ -239,6 +239,42 @@ def test_the_marker_plans_and_is_asked(session: pytest.Pytester) -> None:
     assert session.runpytest("--markers").ret == 0
 
 
+def test_the_marker_that_plans_enough_runs_is_named(session: pytest.Pytester) -> None:
+    """Of a gate with an error of fewer dimensions than the fixture has planned for."""
+    make(
+        session,
+        "def few(n, runs, **more):\n"
+        "    nees = np.random.default_rng(1).chisquare(n, (runs // 8, 1))\n"
+        "    with pytest.raises(InsufficientTrials) as info:\n"
+        "        assert_consistent(nees=nees, dof=n, false_alarm=1e-12, **more)\n"
+        "    return str(info.value)\n"
+        "def test_one(consistency_runs):\n"
+        f"    assert 'with @pytest.mark.consistency(dof=1) at this test it gives {gate_runs(1, 1.5, 1e-3, 0.95)} runs' "
+        "in few(1, consistency_runs)\n"
+        f"    assert 'consistency(dof=2) at this test it gives {gate_runs(2, 1.5, 1e-3, 0.95)} runs' "
+        "in few(2, consistency_runs)\n"
+        "    assert '@pytest.mark' not in few(3, consistency_runs)\n"
+        "    assert '@pytest.mark' not in few(4, consistency_runs // 4)\n"
+        "@pytest.mark.consistency(dof=1)\n"
+        "def test_marked(consistency_runs):\n"
+        "    assert '@pytest.mark' not in few(1, consistency_runs)\n"
+        "@pytest.mark.consistency(detect=2.0)\n"
+        "def test_detect(consistency_runs):\n"
+        f"    assert 'it gives {gate_runs(1, 2.0, 1e-3, 0.95)} runs' in few(1, consistency_runs, detect=2.0)\n"
+        "def test_unasked():\n"
+        "    assert '@pytest.mark' not in few(1, 100)\n",
+    )
+    session.runpytest().assert_outcomes(passed=4)
+    make(
+        session,
+        "def test_given(consistency_runs):\n"
+        "    with pytest.raises(InsufficientTrials) as info:\n"
+        "        assert_consistent(nees=np.ones((consistency_runs, 1)), dof=1, false_alarm=1e-12)\n"
+        "    assert '@pytest.mark' not in str(info.value)\n",
+    )
+    session.runpytest("--consistency-runs=5").assert_outcomes(passed=1)
+
+
 def test_runs_from_the_command_line(session: pytest.Pytester) -> None:
     make(
         session,

@@ -164,7 +164,27 @@ def test_no_filter_to_trust_names_the_nearest_cell_with_one() -> None:
         "range of landmarks 5 m, density of landmarks ×1, noise of the odometry ×1: ukf-uvd."
     ]
     nowhere = advise(made(lambda *_: result("biased")))
+    assert nowhere.lacking == ()
     assert sentences_of(nowhere) == ["No filter of the map is consistent near this rig."]
+
+
+def test_a_map_that_is_not_finished_says_what_is_missing(regime: Regime) -> None:
+    """The sweep was interrupted before the second filter was in the nearest cell: none is not known yet."""
+    bad = made(lambda *_: result("biased"))
+    *_, second = bad.sweep.filters
+    here = advise(bad).nearest
+    part = replace(bad, results={k: v for k, v in bad.results.items() if k != (here.number, second)})
+    [answer] = sentences_of(advise(part))
+    assert answer == (
+        f"No answer yet: of {here.text} the map lacks {second}. Of those there "
+        f"({', '.join(c.filter for c in advise(part).candidates)}) none is consistent. 1 of its {len(bad.results)} "
+        "results are missing; finish the sweep: the same 'consistency sweep' goes on."
+    )
+    good = replace(regime, results={k: v for k, v in regime.results.items() if k != (here.number, "ukf-uvd")})
+    advice = advise(good)
+    lacking = "its sweep is not finished: the nearest cell lacks ukf-uvd"
+    assert advice.best is not None
+    assert lacking in notes_of(advice)
 
 
 @pytest.fixture

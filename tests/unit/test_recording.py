@@ -860,6 +860,32 @@ BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
         ("a.npz",),
         "'covariances' has shape (1, 3, 2, 2), needs (2, 3, 2, 2)",
     ),
+    "truth values": (
+        csv(lambda table: table.assign(P_xx=True)),
+        EST,
+        "est.csv, line 2: column 'P_xx': a truth value or a date, which is to be written as a number (True)",
+    ),
+    "truth values with gaps": (
+        csv(lambda table: table.assign(P_xx=[np.nan] * 3 + [False] * 12)),
+        EST,
+        "est.csv, line 5: column 'P_xx': a truth value or a date",
+    ),
+    "truth values of the truth": (csv(None, lambda table: table.assign(x=False)), EST, "truth.csv, line 2: column 'x'"),
+    "name of two lines": (
+        lambda at: poses()[0].assign(filter="a\n::error::b").to_parquet(at / "est.parquet"),
+        ("est.parquet", "--truth", "est.parquet"),
+        r"est.parquet: column 'filter': the name 'a\n::error::b' has a control character; rename it",
+    ),
+    "file of two lines": (
+        lambda at: write(at)[0].rename(at / "est\x1b[2J.csv"),
+        ("est\x1b[2J.csv", "--truth", "truth.csv"),
+        r"file: the name 'est\x1b[2J.csv' has a control character",
+    ),
+    "dates": (
+        lambda at: poses()[0].assign(t=pd.Timestamp("2024-01-01 00:00:07")).to_parquet(at / "est.parquet"),
+        ("est.parquet", "--truth", "est.parquet"),
+        "est.parquet, row 0: column 't': a truth value or a date, which is to be written as a number (2024-01-01",
+    ),
     "npz symmetry": (
         npz(errors=ERRORS, covariances=np.tile(ASYMMETRIC, (2, 3, 1, 1))),
         ("a.npz",),

@@ -170,8 +170,29 @@ def test_one_command_writes_page_paper_and_numbers(archive: Path, capsys: pytest
     assert verdict.reasons[0].split(",")[0] in (out / "report.html").read_text()
     assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
     assert main(["analyse", str(archive), "--report", str(out)]) == 2
-    assert "exists already; choose another folder or add --overwrite" in capsys.readouterr().err
+    refused = capsys.readouterr()  # below the verdict
+    assert refused.out == printed.split(str(out))[0]
+    assert refused.err.endswith("exists already; choose another folder or add --overwrite\n")
+    assert main(["analyse", str(archive), "--report", str(out), "--json"]) == 2
+    assert set(json.loads(capsys.readouterr().out)) == {"mine"}
     assert main(["analyse", str(archive), "--report", str(out), "--overwrite"]) == 0
+
+
+def test_a_verdict_that_fails_counts_before_a_report_that_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    errors = np.random.default_rng(5).normal(0.0, 3.0, (60, 1, 2))
+    np.savez(tmp_path / "bad.npz", errors=errors, covariances=np.broadcast_to(np.eye(2), (60, 1, 2, 2)))
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    command = ["analyse", str(tmp_path / "bad.npz"), "--report", str(taken)]
+    for more, status in (([], 2), (["--fail-on", "inconsistent"], 1), (["--fail-on", "inconsistent", "--json"], 1)):
+        assert main([*command, *more]) == status
+        out, err = capsys.readouterr()
+        assert "overconfident" in out
+        assert f"consistency: --report {taken}: exists already" in err
+        assert "--json" not in more or json.loads(out)["bad"]["status"] == "overconfident"
+    assert not list(taken.iterdir())
 
 
 def test_what_a_report_is_not_for(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -94,10 +94,49 @@ def test_a_changed_table_is_refused(folder: Path, name: str, edit: Edit, said: s
         cs.read_results(folder)
 
 
+def singular_start(table: pd.DataFrame) -> pd.DataFrame:
+    """Each run begins as those of the bench do: known exactly, without a NEES."""
+    names = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]
+    table.loc[table["step"] == 1, names] = 0.0
+    table.loc[table["step"] == 1, "nees"] = np.nan
+    return table
+
+
+NUMBERS: list[tuple[Edit, str]] = [
+    (value("filter == 'one' and run == 3", "nees", np.nan), r"'one', run 3: column 'nees' is null or NaN"),
+    (value("filter == 'one' and run == 8 and step == 7", "nees", None), r"'one', run 8: column 'nees'"),
+    (value("filter == 'one' and run == 2 and step == 12", "nees", np.nan), r"'one', run 2: column 'nees'"),
+    (value("filter == 'one' and run == 2 and step == 2", "nees", np.nan), r"'one', run 2: column 'nees'"),
+    (value("filter == 'one' and run == 5 and step < 9", "nees", np.nan), r"'one', run 5: column 'nees'"),
+    (value("filter == 'one' and run == 4 and step == 6", "nis", np.nan), r"'one', run 4: column 'nis' is null"),
+]
+
+
+@pytest.mark.parametrize(("edit", "said"), NUMBERS)
+def test_a_missing_nees_or_nis_is_refused(folder: Path, edit: Edit, said: str) -> None:
+    """A run without a NEES would otherwise count as one that was never judged."""
+    change(folder, "estimates", singular_start)
+    assert set(cs.analyse(cs.read_results(folder))) == {"one", "two"}
+    change(folder, "estimates", edit)
+    with pytest.raises(cs.InputError, match=said):
+        cs.analyse(cs.read_results(folder), ["one"])
+
+
+def test_a_run_that_is_never_uncertain_has_no_nees(folder: Path) -> None:
+    def exact(table: pd.DataFrame) -> pd.DataFrame:
+        table.loc[table["run"] == 3, [*(name for name in table if name.startswith("P_")), "nis_dof"]] = 0.0
+        table.loc[table["run"] == 3, ["nees", "nis"]] = np.nan
+        return table.astype({"nis_dof": int})
+
+    change(folder, "estimates", exact)
+    assert cs.analyse(cs.read_results(folder), ["one"])["one"].runs == RUNS
+
+
 MANIFESTS: list[tuple[dict[str, Any], str]] = [
     ({"filters": "one"}, r"key 'filters': Input should be a valid list"),
     ({"filters": []}, r"key 'filters': "),
     ({"filters": ["one", "one"]}, r"key 'filters': .*a name is there twice"),
+    ({"filters": ["one", "two\u2028"]}, r"key 'filters': .*the name 'two\\u2028' has a control character"),
     ({"filters": ["one"]}, r"failures\.parquet: 'two' is no filter"),
     ({"filters": ["one", "two", "three"]}, r"run 0 of 'three' is missing"),
     ({"complete": "yes"}, r"key 'complete'"),

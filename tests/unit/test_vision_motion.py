@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rigs import MOTION, RIG
+from scipy.spatial.transform import Rotation
 
 from consistency.types import Array
-from consistency.vision import triangulate, triangulation_covariance
-from consistency.vision.motion import ESTIMATORS, Settings, estimate_motion
+from consistency.vision import StereoRig, triangulate, triangulation_covariance
+from consistency.vision.motion import ESTIMATORS, Settings, disparities, estimate_motion, usable
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 EQUATIONS = {"reprojection": 5, "svd": 3, "horn": 3}  # of a point: eight pixels less its position, or three coordinates
@@ -60,3 +61,21 @@ def test_chi2_of_a_registration_by_hand(rng: np.random.Generator, estimator: str
         e = p0 - found.pose.apply(p1[None])[0]
         chi2 += e @ np.linalg.solve(C0 + found.pose.R @ C1 @ found.pose.R.T, e)
     assert found.chi2 == pytest.approx(chi2)
+
+
+def test_a_small_disparity_off_the_epipolar_line_is_not_near() -> None:
+    """Least squares puts a match of 0.1 px whose rows differ by 1 px at the depth of 10 px."""
+    K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+    shifted = K.copy()
+    shifted[0, 2] += 20.0
+    rectified = StereoRig(K, shifted, np.eye(3), np.array([0.54, 0.0, 0.0]), (1200, 360))
+    turn = Rotation.from_rotvec([0.01, -0.05, 0.02]).as_matrix()
+    turned = StereoRig(K, 1.1 * K - np.diag([0.0, 0.0, 0.1]), turn, np.array([0.5, 0.02, -0.05]), (1200, 360))
+    for rig in (rectified, turned):
+        depth = 700.0 * rig.baseline / np.array([40.0, 2.5, 1.5, 0.1])
+        pixels = rig.project(depth[:, None] * np.array([0.1, 0.05, 1.0]))
+        np.testing.assert_allclose(disparities(rig, pixels), [40.0, 2.5, 1.5, 0.1], rtol=0.03)
+        assert usable(rig, pixels, 2.0).tolist() == [True, True, False, False]
+        off = pixels + np.array([0.0, 0.0, 0.0, 1.0])
+        assert triangulate(rig, off)[3, 2] < 700.0 * rig.baseline / 5.0  # negative control
+        assert usable(rig, off, 2.0).tolist() == [True, True, False, False]

@@ -6,13 +6,16 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
+from consistency.errors import InputError
 from consistency.types import Array
 from consistency.vision import RelativePose, StereoRig, refine_reprojection
+from consistency.vision.bridging import bridged
 from consistency.vision.motion import RelativeMotion, diagonal
-from consistency.vision.shared import FEWEST, RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
+from consistency.vision.shared import FEWEST, RIG, SHARED, SharedError, fit_shared, perturbed, posterior, sensitivities
 
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
 ROTATED = Rotation.from_rotvec([0.01, -0.02, 0.005]).as_matrix()
@@ -85,11 +88,29 @@ def test_a_late_clock_errs_by_the_change_of_the_motion(rng: np.random.Generator)
     np.testing.assert_allclose(0.01 * J[:, 2, -1], 0.01, rtol=0.01)
 
 
-def test_a_bridge_tells_nothing(rng: np.random.Generator) -> None:
-    motions = drive(rng)
-    motions[1] = dataclasses.replace(motions[1], fault="dark")
-    with pytest.raises(cs.InputError, match="motion 1: is a bridge"):
-        sensitivities(TURNED, motions, 0.1 * np.arange(4.0))
+def test_a_bridge_errs_as_its_neighbours_do(rng: np.random.Generator) -> None:
+    """Measured with another rig and bridged again, by the rule of ``bridged``; small turns, to 1 % of the largest."""
+    t = np.cumsum([0.0, 0.1, 0.15, 0.1, 0.15, *np.full(8, 0.1)])
+    motions, change = drive(rng, 12), 0.01 * PRIOR[:RIG]
+    found = [InputError("dark") if k in (0, 3) else each for k, each in enumerate(motions)]
+    before = bridged(found, t)
+    J = sensitivities(TURNED, before, t)
+    wrong = [each if isinstance(each, InputError) else remeasured(each, change) for each in found]
+    for k in (0, 3):
+        error = difference(bridged(wrong, t)[k].pose, before[k].pose)
+        expected = J[k, :, :RIG] @ change
+        np.testing.assert_allclose(error, expected, atol=0.02 * np.abs(expected).max())
+        assert np.abs(expected).max() > 1e-6
+        np.testing.assert_array_equal(J[k, 3:, RIG:-1], before[k].pose.R - np.eye(3))
+    with pytest.raises(InputError, match="all are bridges"):
+        sensitivities(TURNED, [dataclasses.replace(m, fault="dark") for m in motions], t)
+
+
+def remeasured(m: RelativeMotion, change: Array) -> RelativeMotion:
+    """The same pixels, with a rig that is ``change`` (7,) off."""
+    S = diagonal(m.sigma0)
+    pose = refine_reprojection(perturbed(TURNED, change), m.uv0, m.uv1, m.pose, S, robust="cauchy").pose
+    return dataclasses.replace(m, pose=pose)
 
 
 def simulated(rng: np.random.Generator, n: int, J: Array | None = None) -> tuple[Array, Array, Array, Array, Array]:
@@ -100,6 +121,27 @@ def simulated(rng: np.random.Generator, n: int, J: Array | None = None) -> tuple
     S = np.tile(np.diag(np.full(6, 1e-4) ** 2), (n, 1, 1))
     errors = J @ theta + floor * rng.normal(size=(n, 6)) + 1e-4 * rng.normal(size=(n, 6))
     return errors, J, S, theta, floor
+
+
+def test_the_likelihood_is_that_of_all_errors_together(rng: np.random.Generator) -> None:
+    """By the dense covariance of 5 motions; mean and covariance by regression; the slope by central differences."""
+    errors, J, S, _, floor = simulated(rng, 5, J=1e-2 * rng.normal(size=(5, 6, len(PRIOR))))
+    S = S * rng.uniform(0.5, 2.0, (5, 1, 1)) + 1e-9
+    rows, Pi = J.reshape(30, -1), np.diag(PRIOR**2)
+
+    def minus_twice(log_floor: Array) -> float:
+        V = block_diag(*(S + np.diag(np.exp(2.0 * log_floor)))) + rows @ Pi @ rows.T
+        return float(np.linalg.slogdet(V)[1] + errors.ravel() @ np.linalg.solve(V, errors.ravel()))
+
+    mean, covariance, value, slope = posterior(floor, errors, J, S)
+    assert value == pytest.approx(minus_twice(np.log(floor)), rel=1e-9)
+    steps = 1e-5 * np.eye(6)
+    by_differences = [(minus_twice(np.log(floor) + h) - minus_twice(np.log(floor) - h)) / 2e-5 for h in steps]
+    np.testing.assert_allclose(slope, by_differences, rtol=1e-5, atol=1e-5)
+    V = block_diag(*(S + np.diag(floor**2))) + rows @ Pi @ rows.T
+    gain = Pi @ rows.T @ np.linalg.inv(V)
+    np.testing.assert_allclose(mean, gain @ errors.ravel(), rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(covariance, Pi - gain @ rows @ Pi, rtol=1e-4, atol=1e-9)
 
 
 def test_shared_errors_and_floor_are_found(rng: np.random.Generator) -> None:

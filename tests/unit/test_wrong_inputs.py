@@ -118,16 +118,6 @@ WRONG: dict[str, tuple[Make, tuple[str, ...], str]] = {
     "innovations of what": (csv(), (*EST, "--innovations", "white"), "--innovations must be 'optimal', got 'white'"),
     "overwrite nothing": (csv(), (*EST, "--overwrite"), "--overwrite goes with --report"),
     "unknown option": (csv(), (*EST, "--units", "deg"), "No such option: --units"),
-    "report in a place that is taken": (
-        folder_named("look"),
-        (*LINE, "--report", "look"),
-        "--report look: exists already",
-    ),
-    "report over what is none": (
-        folder_named("look"),
-        (*LINE, "--report", "look", "--overwrite"),
-        "look: is not an output folder of this bench",
-    ),
     "offset no number": (csv(), (*EST, "--time-offset", "soon"), "--time-offset soon: must be a number of seconds"),
     "offset not finite": (csv(), (*EST, "--time-offset", "nan"), "--time-offset nan: must be a number of seconds"),
     "offset without truth": (csv(), ("est.csv", "--time-offset", "1"), "--time-offset needs --truth"),

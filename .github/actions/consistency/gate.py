@@ -11,6 +11,8 @@ import shlex
 import subprocess
 import sys
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,11 +73,31 @@ def read_inputs() -> Inputs:
     return given
 
 
+def plain(text: str) -> str:
+    """Text on one line, without control characters."""
+    return " ".join("".join(char if char.isprintable() else " " for char in text).split())
+
+
+@contextmanager
+def no_commands() -> Iterator[None]:
+    """What goes to the log inside is no workflow command of the runner, whatever a line begins with."""
+    mark = uuid.uuid4().hex
+    print(f"::stop-commands::{mark}", flush=True)
+    try:
+        yield
+    finally:
+        print(f"::{mark}::", flush=True)
+
+
 def run(*words: str, capture: bool = True) -> tuple[int, str]:
-    """Exit status of a Python module, and its output unless that goes to the log, as what it says on stderr does."""
-    print("+", shlex.join(words), flush=True)
-    pipe = subprocess.PIPE if capture else None
-    done = subprocess.run([sys.executable, "-m", *words], stdout=pipe, text=True, check=False)
+    """Exit status of a Python module, and its output unless that goes to the log, as what it says on stderr does.
+
+    Only a module whose output goes to the log, which is pytest, may give the runner commands.
+    """
+    with no_commands() if capture else nullcontext():
+        print("+", plain(shlex.join(words)), flush=True)
+        pipe = subprocess.PIPE if capture else None
+        done = subprocess.run([sys.executable, "-m", *words], stdout=pipe, text=True, check=False)
     return done.returncode, done.stdout or ""
 
 
@@ -156,8 +178,9 @@ def markdown(verdict: str, rows: list[Row], why: str = "") -> str:
     """The summary of the job."""
 
     def cell(text: str) -> str:
-        for plain, escaped in (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("`", "\\`"), ("\n", " ")):
-            text = text.replace(plain, escaped)
+        text = plain(text)
+        for char, escaped in (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("`", "\\`")):
+            text = text.replace(char, escaped)
         return text
 
     lines = [f"## Consistency: {verdict}", "", *([cell(why), ""] if why else [])]
@@ -204,14 +227,15 @@ def main() -> int:
             passed["no worse"], found = compare(given, *given.estimates)
             rows += found
     except Unusable as error:
-        print(f"::error title=Consistency gate::{error}")
+        print(f"::error title=Consistency gate::{plain(str(error)).replace('%', '%25')}")
         finish("unusable", rows, str(error))
         return 2
     tolerated = "consistent" if given.fail_on == "worse" else ""
     failed = [name for name, good in passed.items() if not good and name != tolerated]
     finish("fail" if failed else "pass", rows)
-    for row in rows:
-        print(": ".join(row[:2]), "-", row.why)
+    with no_commands():
+        for row in rows:
+            print(plain(f"{row.what}: {row.verdict} - {row.why}"))
     if failed:
         print(f"::error title=Consistency gate::not as it must be: {', '.join(failed)}; the summary has the verdicts")
     return 1 if failed and given.fail_on != "nothing" else 0

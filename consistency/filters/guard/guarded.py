@@ -15,7 +15,7 @@ from consistency.protocols import Filter, Problem
 from consistency.scenario import GuardSettings
 from consistency.types import Array, Control, Gaussian, Info, Observation
 
-DECLARED = ("sensors", "error", "realisable", "uvd")  # of a filter, that its guarded form declares as well
+DECLARED = ("sensors", "needs", "error", "realisable", "uvd")  # of a filter, that its guarded form declares as well
 ASKED = ("map", "joint", "own_covariance")  # optional methods of a state
 
 

@@ -109,6 +109,7 @@ class RobotCentredKalman:
 
     def __init__(self, name: str, which: Corrections) -> None:
         self.name, self.which = name, which
+        self.needs = ("disparity",) if which.truncation else ()
 
     def init(self, problem: Problem) -> CentredState:
         sensor = problem.belief.sensor

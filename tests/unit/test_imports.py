@@ -20,6 +20,7 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
     "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0, "store.machine": 0, "store.stopping": 0,
+    "store.ending": 1,
     "geometry": 1, "reading": 1,
     "models": 2,
     "scenario": 3,

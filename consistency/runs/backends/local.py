@@ -15,6 +15,7 @@ from consistency.runs.work import Outcomes, Work
 from consistency.store.results import Outcome
 
 AHEAD = 2  # runs that wait for each worker, so that none waits for them
+GLANCE = 0.1  # s between looks, for a signal that another thread was given
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def _in_threads(work: Work, runs: Sequence[int], workers: int) -> Outcomes:
                 waiting |= {pool.submit(work, run) for run in islice(todo, AHEAD * workers - len(waiting))}
                 if not waiting:
                     break
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                done, waiting = wait(waiting, GLANCE, FIRST_COMPLETED)
                 ready = sorted(done, key=_failed, reverse=True)  # what is finished counts, whatever ends the rest
                 del done  # an outcome that was handed on is kept by nobody here
                 while ready:

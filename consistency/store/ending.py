@@ -54,8 +54,8 @@ def supervised(work: Callable[[], Any]) -> Any:
     try:
         return work()
     except SystemExit as end:
-        if end.code in [128 + number for number in numbers]:  # threads may still compile, which nobody waits for
-            _leave(int(end.code))
+        if isinstance(end.code, int) and end.code - 128 in numbers:  # threads may compile, which nobody waits for
+            _leave(end.code)
         raise
 
 
@@ -93,7 +93,7 @@ def _leave(status: int) -> NoReturn:
 # --- in the parent -------------------------------------------------------------------------------
 
 
-def _wait(child: int, numbers: list[int], mask: set[signal.Signals]) -> NoReturn:
+def _wait(child: int, numbers: list[int], mask: set[int | signal.Signals]) -> NoReturn:
     """Pass signals on until the child has ended, and end as it did, or as the first signal demands."""
     if IS_LINUX:
         _prctl(PR_SET_CHILD_SUBREAPER, 1)

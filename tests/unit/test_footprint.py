@@ -62,7 +62,9 @@ def test_maps_of_filters_before_are_held(linear: cs.Scenario) -> None:
     assert two == arrays + max(2 * one.joint + one.scoring, one.joint + one.working)
 
 
-def test_workers_that_have_room(linear: cs.Scenario, has: Callable[[float], None], capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+def test_workers_that_have_room(
+    linear: cs.Scenario, has: Callable[[float], None], capsys: pytest.CaptureFixture[str]
+) -> None:
     trial, filters = cs.simulate(linear), [compiled("kf")]
     needed = trial_bytes(filters, trial, linear.belief)
     has(20 * needed)
@@ -74,9 +76,7 @@ def test_workers_that_have_room(linear: cs.Scenario, has: Callable[[float], None
     has(needed)
     assert workers_that_fit(filters, [trial], linear.belief, 8) == 1
     has(needed - 1)
-    with pytest.raises(
-        InputError, match=r"takes about 0\.0 GiB, and there are 0\.0 GiB; take fewer landmarks or steps"
-    ):
+    with pytest.raises(InputError, match=r"about 0\.0 GiB, and there are 0\.0 GiB; take fewer landmarks or steps"):
         workers_that_fit(filters, [trial], linear.belief, 8)
 
 

@@ -1,5 +1,20 @@
-"""``python -m consistency``."""
+"""``python -m consistency`` and the command ``consistency``: the command line, in a process that can be ended."""
 
-from consistency.cli import main
+from typing import Any
 
-main()
+from consistency.store.ending import supervised
+
+
+def main() -> Any:
+    """Entry point; what takes time to import is imported where a signal can end it."""
+    return supervised(_command)
+
+
+def _command() -> Any:
+    from consistency.cli import main
+
+    return main()
+
+
+if __name__ == "__main__":
+    main()

@@ -278,7 +278,7 @@ def run(
         done = stop.results.manifest["finished_runs"]
         kept = f"{done} finished runs are in {out}; add --resume to the same command to go on"
         say(f"stopped: {kept}" if done else "stopped before a run was finished; nothing written")
-        raise typer.Exit(stop.status) from None
+        sys.exit(stop.status)
     print_verdicts(verdicts or analyse(results))
     print(f"results in {out}; next: consistency report {out}")
 
@@ -648,22 +648,33 @@ def monitor(
 
 
 def main(arguments: list[str] | None = None) -> Any:
-    """Entry point: unusable input ends in one line and exit status 2; SIGTERM and SIGHUP are taken as Ctrl-C."""
+    """Entry point: unusable input ends in one line and exit status 2; SIGTERM and SIGHUP are taken as Ctrl-C.
+
+    Without ``arguments``, as a command, in a child of this process, see :mod:`consistency.store.ending`.
+    """
+    from consistency.store.ending import supervised
+
+    return supervised(_command) if arguments is None else _command(arguments)
+
+
+def _command(arguments: list[str] | None = None) -> Any:
     from consistency.store.stopping import STOPS, stoppable
 
     _open_closed_streams()
     with stoppable(also=STOPS) as stop:
         try:
             status = app(arguments, standalone_mode=False)
+            if stop.number is not None:  # typer has an exit status of its own for KeyboardInterrupt
+                raise KeyboardInterrupt
             sys.stdout.flush()
             sys.exit(status)
         except MemoryError:
             _end("not enough memory; take fewer steps, landmarks or runs", 2)
         except InputError as error:
-            _end(str(error), 2)
+            _end(_line(str(error)), 2)
         except UsageError as error:
             command = getattr(getattr(error, "ctx", None), "command_path", "consistency")
-            _end(f"{error.format_message()} See: {command} --help", 2)
+            _end(_line(f"{error.format_message()} See: {command} --help"), 2)
         except (BrokenPipeError, SystemExit) as error:  # libraries end with status 1, which is a verdict's here
             if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
                 raise
@@ -673,16 +684,25 @@ def main(arguments: list[str] | None = None) -> Any:
             if error.filename is None and error.errno not in FULL:
                 raise
             fault = "output cannot be written" if error.filename is None else f"{error.filename}: cannot be used"
-            _end(f"{fault} ({error.strerror})", 2)
+            _end(_line(f"{fault} ({error.strerror})"), 2)
         except (KeyboardInterrupt, Abort):
             _end("stopped", stop.status)
+        except Exception:
+            if stop.number is None:
+                raise
+            _end("stopped", stop.status)  # and who was called took it for an error of its own
+
+
+def _line(sentence: str) -> str:
+    from consistency.reading import one_line
+
+    return one_line(sentence, 4000)
 
 
 def _end(sentence: str, status: int) -> NoReturn:
-    from consistency.reading import one_line
     from consistency.terminal.progress import say
 
-    say(f"consistency: {one_line(sentence, 4000)}")
+    say(f"consistency: {sentence}")
     try:
         sys.stdout.flush()
     except OSError:

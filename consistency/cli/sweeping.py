@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -64,7 +65,7 @@ def sweep(
                 folder, missing = run_sweep(plan, out, *_share(share), jobs, overwrite, place)
             except KeyboardInterrupt:
                 say(f"stopped: what is finished is in {out}; the same command goes on")
-                raise typer.Exit(stop.status) from None
+                sys.exit(stop.status)
         if missing:
             print(f"this share is done; {missing} of the whole sweep are missing in {out}")
             return

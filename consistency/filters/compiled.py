@@ -16,7 +16,7 @@ from consistency.errors import InputError
 from consistency.filters.guard.guarded import Guarded
 from consistency.filters.guard.parts import guard_part
 from consistency.filters.kernel.dispatch import fits, require_fitting
-from consistency.filters.kernel.gain import REASONS
+from consistency.filters.kernel.gain import HALTED, REASONS
 from consistency.filters.kernel.loop import Outcome, trial_kernel
 from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
 from consistency.filters.plain_sensors import bias_at, sensor_noise
@@ -25,7 +25,7 @@ from consistency.filters.upkeep.parking import Parking
 from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Problem, Truth
 from consistency.scenario import Belief, GuardSettings
-from consistency.types import Array, Control, Estimates, Failure, Gaussian, Info, Map, Observation, Trial
+from consistency.types import Array, Control, Estimates, Failure, Gaussian, Indices, Info, Map, Observation, Trial
 
 _lock = threading.Lock()
 _inside: list[Any] = []  # the limit in force, once for every trial that is running
@@ -48,6 +48,10 @@ def one_blas_thread() -> Iterator[None]:
             limit = _inside.pop()
             if not _inside:
                 limit.restore_original_limits()
+
+
+class Halted(Exception):
+    """A trial that was given up while it was done."""
 
 
 class Compiled:
@@ -127,20 +131,24 @@ class Compiled:
         """Compile what ``run`` needs on this trial, or load it from disk."""
         trial_kernel.compile(*self._arguments(trial, belief))
 
-    def run(self, trial: Trial, belief: Belief) -> Estimates:
+    def run(self, trial: Trial, belief: Belief, halt: Indices | None = None) -> Estimates:
         """Estimates of all steps of ``trial``.
+
+        Once ``halt`` (1,) is not 0, the trial is given up before its next step.
 
         Raises
         ------
         InputError
             The trial lacks what the filter needs.
+        Halted
+            The trial was given up.
         """
-        arguments = self._arguments(trial, belief)
-        try:
-            with one_blas_thread():
-                out: Outcome = trial_kernel(*arguments)
-        except SystemError as error:  # Ctrl-C in the main thread comes out of a kernel like this
-            raise KeyboardInterrupt from error
+        halt = np.zeros(1, np.int64) if halt is None else halt
+        arguments = self._arguments(trial, belief, halt)
+        with one_blas_thread():
+            out: Outcome = trial_kernel(*arguments, stop=lambda: halt.fill(1))
+        if out.code == HALTED:
+            raise Halted(f"'{self.name}' was told to stop in step {out.step}")
         failure = Failure(self.name, trial.run, out.step, REASONS[out.code]) if out.step else None
         own = None if self.error == ADDITIVE else out.own
         labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
@@ -150,7 +158,7 @@ class Compiled:
             None if self.guard is None else out.rejected, out.log_det,
         )  # fmt: skip
 
-    def _arguments(self, trial: Trial, belief: Belief) -> tuple[Slam, Data, int]:
+    def _arguments(self, trial: Trial, belief: Belief, halt: Indices | None = None) -> tuple[Slam, Data, int]:
         problem = problem_for(self, trial, belief)
         slam = self.parts(problem, np.array(trial.controls, float))
         z, R = sensor_noise(trial.z, belief.sensor, converted=belief.sensor.model == "uvd" and not self.uvd)
@@ -160,7 +168,8 @@ class Compiled:
             np.array(a, float, order="C") for a in (trial.controls, z, R, shift, trial.start)
         )
         first, landmark = (np.array(a, np.int64, order="C") for a in (trial.first, trial.landmark))
-        data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks)
+        halt = np.zeros(1, np.int64) if halt is None else halt
+        data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks, halt)
         r, w = robot_width(slam.motion), landmark_width(slam.landmark)
         slam = self._with_upkeep(slam, r + w * trial.n_landmarks)
         if self.guard is not None:

@@ -13,13 +13,14 @@ from collections.abc import Iterator, Sequence
 from multiprocessing import current_process
 from typing import Any
 
+import numpy as np
 from joblib.externals.loky.backend import get_context
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.errors import InputError
 from consistency.filters.compiled import Compiled
 from consistency.filters.record import Record
-from consistency.filters.stepping import error_of, name_of, reason_of, rejects, run_filter
+from consistency.filters.stepping import error_of, name_of, reason_of, rejects
 from consistency.protocols import Filter
 from consistency.runs.supervising import Guest, Reply, Study, Task, supervise
 from consistency.scenario import Belief
@@ -66,17 +67,18 @@ class Isolation:
         self._study = Study(self._guests, belief, timeout, memory, tuple(sys.path), _folder())
         self._free: list[_Supervisor] = []
         self._busy: set[_Supervisor] = set()
-        self._is_open = False
+        self._is_open, self._halt = False, np.zeros(1, np.int64)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Isolation, (self.filters, self.belief, self._study.timeout, self._study.memory)
 
     def __enter__(self) -> Isolation:
-        self._is_open = True
+        self._is_open, self._halt = True, np.zeros(1, np.int64)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Kill the processes that work; supervisors that do not are kept for a later study."""
+        """End compiled trials before their next step and kill processes that work; idle supervisors are kept."""
+        self._halt[0] = 1
         with _lock:
             self._is_open = False
             for supervisor in self._busy:  # whose thread waits for a reply
@@ -95,7 +97,9 @@ class Isolation:
             A filter needs what the trial does not have.
         """
         return [
-            run_filter(filter_, trial, self.belief) if isinstance(filter_, Compiled) else self._apart(filter_, trial)
+            filter_.run(trial, self.belief, self._halt)
+            if isinstance(filter_, Compiled)
+            else self._apart(filter_, trial)
             for filter_ in self.filters
         ]
 

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from consistency.filters.stepping import name_of
 from consistency.protocols import Filter, WholeTrial
+from consistency.runs.footprint import workers_that_fit
 from consistency.runs.isolating import Isolation
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import require_landmarks_in_view
@@ -74,6 +75,14 @@ class Work:
     @property
     def filters(self) -> list[Filter]:
         return self.isolation.filters
+
+    def room_for(self, run: int, workers: int) -> int:
+        """As many of ``workers`` as have memory for a run; raises InputError where not even one has.
+
+        The runs of a scenario are alike, so that ``run`` speaks for all; of a log all are looked at.
+        """
+        trials = list(self.trials.trials.values()) if isinstance(self.trials, Recorded) else [self.trials(run)]
+        return workers_that_fit(self.isolation.compiled, trials, self.isolation.belief, workers)
 
     def compile(self, run: int) -> None:
         """Compile what a run needs and is not yet compiled, and say so."""

@@ -194,6 +194,10 @@ def test_other_versions_are_refused(work: Work, name: str) -> None:
         next(in_batches(Older(), Batches(range(RUNS), 1.0), work))
 
 
+def test_all_that_the_bits_depend_on_is_compared() -> None:
+    assert set(remote.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
+
+
 def test_differing_machines_are_said_once(work: Work, capsys: pytest.CaptureFixture[str]) -> None:
     class Mixed(Fake):
         def events(self) -> list[Event]:

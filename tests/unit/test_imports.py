@@ -20,6 +20,7 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
     "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0, "store.machine": 0, "store.stopping": 0,
+    "store.ending": 1,
     "geometry": 1, "reading": 1,
     "models": 2,
     "scenario": 3,
@@ -29,7 +30,8 @@ RANK = {
     "store.results": 6, "store.log": 7,
     "imaging": 6,
     "recording": 7,
-    "runs.streams": 5, "runs.supervising": 6, "runs.gather": 7, "runs.isolating": 7, "runs.resuming": 7, "runs.work": 8,
+    "runs.streams": 5, "runs.supervising": 6, "runs.footprint": 6,
+    "runs.gather": 7, "runs.isolating": 7, "runs.resuming": 7, "runs.work": 8,
     "runs.backends": 9, "runs.campaign": 9, "runs.montecarlo": 10,
     "frontend": 8,
     "verdicts.curves": 7, "verdicts.judge": 10, "verdicts.monitoring": 10, "verdicts.comparison": 11,

@@ -454,14 +454,3 @@ def test_a_broken_covariance_is_a_failed_run(xyz: cs.Scenario, covariance: Any, 
 
     results = cs.run_trials(xyz, [Broken()], runs=1, jobs=1)
     assert results.failures[["step", "reason"]].to_numpy().tolist() == [[1, f"the {reason}"]]
-
-
-def test_ctrl_c_inside_a_kernel_is_ctrl_c(xyz: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Numba turns it into a SystemError; nothing may take that for a broken filter."""
-
-    def kernel(*_: Any) -> Any:
-        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
-
-    monkeypatch.setattr("consistency.filters.compiled.trial_kernel", kernel)
-    with pytest.raises(KeyboardInterrupt):
-        cs.get_filter("ekf-xyz").run(cs.simulate(xyz), xyz.belief)

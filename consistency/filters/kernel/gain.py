@@ -28,7 +28,7 @@ from consistency.filters.kernel.slam import (
 from consistency.filters.kernel.work import Work
 from consistency.types import Array
 
-NOT_FINITE, INNOVATION, POSE = 1, 2, 3
+NOT_FINITE, INNOVATION, POSE, HALTED = 1, 2, 3, 4
 REASONS = {
     NOT_FINITE: "the estimate is not finite",
     INNOVATION: "the innovation covariance is not positive definite",

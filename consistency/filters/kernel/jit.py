@@ -15,6 +15,7 @@ import numba
 from filelock import FileLock
 from numba.extending import register_jitable
 
+from consistency.filters.kernel.apart import apart
 from consistency.filters.kernel.dispatch import INNER, OPTIONS, PACKAGE, Function, outside_files
 from consistency.filters.kernel.kept import LOCK, clear, is_damaged, is_whole, mark
 
@@ -64,17 +65,22 @@ class Kernel:
 
     Each signature has a folder of its own in the cache, named by the sources too of parts from outside the package
     (of a test, or of a user). One process compiles a signature; those that waited for it read what it has kept.
+    Nothing of this is done in the main thread, see :mod:`consistency.filters.kernel.apart`; where that is told to end,
+    ``stop`` is called.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
         self._entries: dict[Any, tuple[Any, Path]] = {}
 
-    def __call__(self, *args: Any) -> Any:
-        return self.compile(*args)(*args)
+    def __call__(self, *args: Any, stop: Callable[[], None] = lambda: None) -> Any:
+        return apart(lambda: self._compiled(*args)(*args), stop=stop)
 
     def compile(self, *args: Any) -> Callable[..., Any]:
         """The entry, compiled for these arguments or loaded from disk."""
+        return apart(self._compiled, *args)
+
+    def _compiled(self, *args: Any) -> Callable[..., Any]:
         signature = _signature(args)
         entry, folder = self._entry(signature)
         if not entry.overloads:

@@ -9,7 +9,7 @@ import numpy as np
 from consistency.filters.guard import open as _open  # noqa: F401, registers the bodies of a filter without a guard
 from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
 from consistency.filters.kernel.covariance import begin_landmark
-from consistency.filters.kernel.gain import NOT_FINITE, POSE
+from consistency.filters.kernel.gain import HALTED, NOT_FINITE, POSE
 from consistency.filters.kernel.jit import Kernel, inner
 from consistency.filters.kernel.lending import keep, lend
 from consistency.filters.kernel.linalg import definiteness_with
@@ -53,7 +53,7 @@ class Outcome(NamedTuple):
     nis_dof: Indices  # (T,)
     log_det: Array  # (T,), of S
     step: int  # of the failure, or 0
-    code: int  # of REASONS, or 0
+    code: int  # of REASONS, HALTED, or 0
     points: Array  # (n_landmarks, 3), landmarks in the world after the last step, NaN where none was seen
     spread: Array  # (n_landmarks, 3, 3), and their covariances
     joint: Array  # (3 + 3 K, 3 + 3 K), covariance of the robot and the K landmarks of these, additive errors
@@ -273,6 +273,9 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     state = State(memory.x, memory.P, r, 0, memory.active)  # of a step: the whole, unless it has a base
     full_rank, step, code = False, 0, 0
     for k in range(T):
+        if data.halt[0] != 0:
+            step, code = k + 1, HALTED
+            break
         labels = data.landmark[data.first[k] : data.first[k + 1]]
         whole, state = prepare(slam.covariance, slam, whole, state, labels, local)
         state, code, m, nis, log_det = _step(slam, state, data, k, local, work, watch)

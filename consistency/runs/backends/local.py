@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 
 import joblib
@@ -15,9 +16,10 @@ from consistency.runs.work import Outcomes, Work
 from consistency.store.results import Outcome
 
 AHEAD = 2  # runs that wait for each worker, so that none waits for them
+GLANCE = 0.1  # s between looks, for a signal that another thread was given
 
 
-@dataclass(frozen=True)
+@dataclass
 class Local:
     """Threads: compiled filters release the GIL, and who waits for the process of another filter does.
 
@@ -33,16 +35,27 @@ class Local:
 
     jobs: int = -1
 
+    _room: int = field(default=sys.maxsize, init=False, repr=False, compare=False)  # workers that have memory
+
     def __post_init__(self) -> None:
         worker_count(self.jobs)
 
     def prepare(self, work: Work, run: int, /) -> None:
-        """See :class:`consistency.runs.work.Backend`."""
+        """See :class:`consistency.runs.work.Backend`.
+
+        Raises
+        ------
+        InputError
+            A run takes more memory than there is.
+        """
+        workers = worker_count(self.jobs)
+        fitting = work.room_for(run, workers)
+        self._room = fitting if self.jobs == -1 else workers
         work.compile(run)
 
     def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
         """See :class:`consistency.runs.work.Backend`."""
-        workers = min(worker_count(self.jobs), len(runs))
+        workers = min(worker_count(self.jobs), len(runs), self._room)
         with one_blas_thread():
             if workers > 1:
                 yield from _in_threads(work, runs, workers)
@@ -60,7 +73,7 @@ def _in_threads(work: Work, runs: Sequence[int], workers: int) -> Outcomes:
                 waiting |= {pool.submit(work, run) for run in islice(todo, AHEAD * workers - len(waiting))}
                 if not waiting:
                     break
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                done, waiting = wait(waiting, GLANCE, FIRST_COMPLETED)
                 ready = sorted(done, key=_failed, reverse=True)  # what is finished counts, whatever ends the rest
                 del done  # an outcome that was handed on is kept by nobody here
                 while ready:

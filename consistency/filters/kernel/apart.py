@@ -1,0 +1,49 @@
+"""Compiled code in a thread that takes no signals; standard library only.
+
+Python's handlers run in the main thread. One that raises where Numba turns arguments into machine values, or results
+back, finds code that expects no exception, and Python crashes.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+Result = TypeVar("Result")
+GLANCE = 0.1  # s between looks, for a signal that another thread was given
+PATIENCE = 0.5  # s for what was told to stop
+
+
+def apart(call: Callable[..., Result], *args: Any, stop: Callable[[], None] = lambda: None) -> Result:
+    """``call(*args)``, from the main thread in a thread of its own, for which it waits.
+
+    Where a handler of a signal raises meanwhile, ``stop`` is called and the exception goes on; the thread ends when
+    it can.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return call(*args)
+    left: list[Result] = []
+    errors: list[BaseException] = []
+    working = threading.Lock()
+    working.acquire()
+
+    def work() -> None:
+        try:
+            left.append(call(*args))
+        except BaseException as error:
+            errors.append(error)
+        finally:
+            working.release()
+
+    try:
+        threading.Thread(target=work, daemon=True).start()
+        while not working.acquire(timeout=GLANCE):
+            pass
+    except BaseException:
+        stop()
+        working.acquire(timeout=PATIENCE)
+        raise
+    if errors:
+        raise errors[0]
+    return left[0]

@@ -40,12 +40,17 @@ def read(path: Path, tell: bool = False) -> bytes | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        return _refused(f"{path}: {error.strerror}; code is compiled for this process", tell)
-    if not content:
-        return _refused(f"{path}: somebody else may write there; code is compiled for this process", tell)
-    payload = content[_DIGEST:]
-    if hashlib.sha256(payload).digest() != content[:_DIGEST]:
-        return _refused(f"{path}: compiled code is damaged there; it is compiled anew", tell)
+        refusal = f"{error.strerror}; code is compiled for this process"
+    else:
+        payload, refusal = content[_DIGEST:], ""
+        if not content:
+            refusal = "somebody else may write there; code is compiled for this process"
+        elif hashlib.sha256(payload).digest() != content[:_DIGEST]:
+            refusal = "compiled code is damaged there; it is compiled anew"
+    if refusal:
+        if tell:
+            _say(f"{path}: {refusal}")
+        return None
     with suppress(OSError):  # used now
         os.utime(path)
     return payload
@@ -109,11 +114,6 @@ def _is_ours(*paths: Path) -> bool:
         status.st_uid in (0, os.getuid()) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
         for status in map(Path.stat, paths)
     )
-
-
-def _refused(sentence: str, tell: bool) -> None:
-    if tell:
-        _say(sentence)
 
 
 @cache

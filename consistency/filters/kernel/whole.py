@@ -14,13 +14,14 @@ from graphlib import TopologicalSorter
 from typing import Any
 
 import numba
-from numba.core import codegen, config
-from numba.core.compiler_lock import global_compiler_lock, require_global_compiler_lock
+from numba.core import codegen, compiler_lock, config
 from numba.core.registry import cpu_target
 
 TESTED = ("0.61", "0.68")  # lowest and highest series of Numba in which this was tried
 INNER_OPTIMISATION = 1  # level of the passes over a function by itself; the whole is optimised at Numba's level
 _Library: Any = codegen.JITCodeLibrary
+_config: Any = config  # untyped, like what follows
+_lock: Any = compiler_lock
 
 
 def is_supported() -> bool:
@@ -31,6 +32,8 @@ def is_supported() -> bool:
 
 class _Program(_Library):  # type: ignore[misc]
     """Library of the kernel, or of a function that Python may call, too: made as Numba does, of all parts at once."""
+
+    _linking_libraries: list[Any]
 
     def finalize(self) -> None:
         self._linking_libraries = [_Bare(each) for each in _closure(self._linking_libraries)]
@@ -54,13 +57,13 @@ class _Part(_Library):  # type: ignore[misc]
 
     def _optimize_functions(self, module: Any) -> None:
         module.data_layout = self._codegen._data_layout
-        level = min(INNER_OPTIMISATION, config.OPT)
+        level = min(INNER_OPTIMISATION, _config.OPT)
         for function in module.functions:
             passes, builder = self._codegen._function_pass_manager(opt=level)
             passes.run(function, builder)
 
     def finalize(self) -> None:
-        require_global_compiler_lock()
+        _lock.require_global_compiler_lock()
         self._raise_if_finalized()
         self._finalize_dynamic_globals()
         for library in _closure(self._linking_libraries):
@@ -108,7 +111,7 @@ def one_program(callable_too: Collection[str]) -> Iterator[None]:
     if not is_supported():
         yield
         return
-    with global_compiler_lock:
+    with _lock.global_compiler_lock:
         target: Any = cpu_target.target_context
         target.refresh()
         code, environments = target.codegen(), {}

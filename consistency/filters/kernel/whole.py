@@ -44,7 +44,7 @@ class _Bare:
     """A library as one link of a program: without the functions that it calls, which are linked beside it."""
 
     def __init__(self, library: Any) -> None:
-        self._library, self._reload_init = library, library._reload_init
+        self._library, self._reload_init = library, getattr(library, "_reload_init", set())
 
     def _get_module_for_linking(self) -> Any:
         return _Library._get_module_for_linking(self._library)
@@ -54,8 +54,12 @@ class _Part(_Library):  # type: ignore[misc]
     """Library of a function that only kernels call: neither optimised as a whole nor turned into machine code."""
 
     _standalone: Any = None
+    _reload_init: Any = frozenset()  # what Numba 0.61 does not have
 
     def _optimize_functions(self, module: Any) -> None:
+        if not hasattr(self._codegen, "_pass_builder"):  # before Numba 0.62 the level was not to be chosen
+            super()._optimize_functions(module)
+            return
         module.data_layout = self._codegen._data_layout
         level = min(INNER_OPTIMISATION, _config.OPT)
         for function in module.functions:
@@ -67,7 +71,7 @@ class _Part(_Library):  # type: ignore[misc]
         self._raise_if_finalized()
         self._finalize_dynamic_globals()
         for library in _closure(self._linking_libraries):
-            self._reload_init.update(library._reload_init)
+            self._reload_init |= getattr(library, "_reload_init", set())
             self._dynamic_globals.extend(library._dynamic_globals)
         self._finalized = True
 

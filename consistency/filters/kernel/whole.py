@@ -44,7 +44,8 @@ class _Bare:
     """A library as one link of a program: without the functions that it calls, which are linked beside it."""
 
     def __init__(self, library: Any) -> None:
-        self._library, self._reload_init = library, getattr(library, "_reload_init", set())
+        self._library = library
+        self._reload_init: Any = getattr(library, "_reload_init", set())
 
     def _get_module_for_linking(self) -> Any:
         return _Library._get_module_for_linking(self._library)

@@ -15,5 +15,5 @@ Number = TypeVar("Number", float, Array)  # what a model takes and gives: number
 
 def jitable(function: F) -> F:
     """Decorator: the function stays plain Python, and Numba compiles it where a kernel calls it."""
-    register_jitable(function)
+    register_jitable(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
     return function

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
-import sys
-import textwrap
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +9,6 @@ import pytest
 
 import consistency as cs
 from consistency.filters.compiled import problem_of
-from consistency.filters.kernel import jit
 from consistency.filters.kernel.dispatch import fits, generic, implement, part, require_fitting
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.methods.riekf import RightInvariant
@@ -129,127 +122,3 @@ def test_combinations_that_mean_nothing_are_refused(
     with pytest.raises(TypeError, match=message):
         require_fitting(slam._replace(**changes))
     assert not fits(slam._replace(**changes))
-
-
-SCRIPT = """
-import sys, time
-import numpy as np
-sys.path.insert(0, {folder!r})
-import kinds, rules
-from consistency.filters.kernel.dispatch import outside_files
-from consistency.filters.kernel.jit import Kernel
-
-kernel = Kernel(rules.total)
-ready = 0
-for name in sys.argv[1].split():
-    rule = getattr(kinds, name)()
-    ready += kernel.is_ready(rule, 10)
-    assert kernel(rule, 10) == {{"Single": 10.0, "Triple": 30.0}}[name]
-    assert kernel.is_ready(rule, 10)
-assert [path.name for path in outside_files()] == ["kinds.py", "rules.py"]
-print(kernel.loaded, ready)
-"""
-KINDS = """
-from typing import NamedTuple
-from consistency.filters.kernel.dispatch import part
-
-@part()
-class Single(NamedTuple):
-    pass
-
-@part()
-class Triple(NamedTuple):
-    pass
-"""
-RULES = """
-from typing import NamedTuple
-from consistency.filters.kernel.dispatch import generic, implement
-from kinds import Single, Triple
-
-@generic()
-def one(rule: NamedTuple) -> float:
-    raise NotImplementedError
-
-@implement(one, Single)
-def one_single(rule: Single) -> float:
-    return 1.0
-
-@implement(one, Triple)
-def one_triple(rule: Triple) -> float:
-    return 3.0
-
-def total(rule, n):
-    result = 0.0
-    for _ in range(n):
-        result += one(rule)
-    return result
-"""
-
-
-@pytest.fixture
-def script(tmp_path: Path) -> Path:
-    (tmp_path / "kinds.py").write_text(textwrap.dedent(KINDS), encoding="utf-8")
-    (tmp_path / "rules.py").write_text(textwrap.dedent(RULES), encoding="utf-8")
-    path = tmp_path / "uses_rules.py"
-    path.write_text(textwrap.dedent(SCRIPT.format(folder=str(tmp_path))), encoding="utf-8")
-    return path
-
-
-def started(script: Path, order: str) -> subprocess.Popen[str]:
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(script.parent / "cache")}
-    return subprocess.Popen([sys.executable, script, order], env=environment, stdout=subprocess.PIPE, text=True)
-
-
-def loaded(process: subprocess.Popen[str], known: bool = False) -> int:
-    """Kernels read from disk; ``known`` demands that just these were ready beforehand."""
-    out, _ = process.communicate(timeout=120)
-    assert process.returncode == 0
-    from_disk, ready = map(int, out.split())
-    assert ready == from_disk or not known
-    return from_disk
-
-
-def hits(process: subprocess.Popen[str]) -> int:
-    return loaded(process, known=True)
-
-
-def test_another_order_in_another_process_hits_the_cache(script: Path) -> None:
-    assert hits(started(script, "Single Triple")) == 0
-    assert hits(started(script, "Triple Single")) == 2
-
-
-@pytest.mark.parametrize("name", ["kinds.py", "rules.py"])
-def test_an_edited_part_outside_the_package_is_compiled_anew(script: Path, name: str) -> None:
-    assert hits(started(script, "Single")) == 0
-    edited = script.parent / name
-    edited.write_text(edited.read_text(encoding="utf-8") + "\n# edited\n", encoding="utf-8")
-    assert hits(started(script, "Single")) == 0
-
-
-def test_of_four_processes_that_start_at_once_one_compiles(script: Path) -> None:
-    found = [loaded(process) for process in [started(script, "Single Triple") for _ in range(4)]]
-    assert sorted(found)[-1] == 2
-    assert sum(found) == 6, "each of the two kernels is compiled once, and loaded by the other three"
-
-
-def test_the_key_of_the_cache_covers_every_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Text and time of each file, and the place of the package."""
-    package, outside = tmp_path / "package", tmp_path / "rules.py"
-    sources = [package / name for name in ("models/point.py", "filters/plain.py", "filters/kernel/gain.py")]
-    for path in (*sources, outside):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("before", encoding="utf-8")
-    monkeypatch.setattr(jit, "PACKAGE", package)
-    keys = [jit._digest([outside])]
-    assert jit._digest([outside]) == keys[0]
-    for path in (*sources, outside):
-        time = path.stat().st_mtime_ns
-        path.write_text("after", encoding="utf-8")
-        os.utime(path, ns=(time, time))
-        keys.append(jit._digest([outside]))
-        os.utime(path, ns=(time, time + 10**9))
-        keys.append(jit._digest([outside]))
-    shutil.copytree(package, tmp_path / "another")
-    monkeypatch.setattr(jit, "PACKAGE", tmp_path / "another")
-    keys.append(jit._digest([outside]))
-    assert len(set(keys)) == 10

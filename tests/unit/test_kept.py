@@ -1,13 +1,15 @@
-"""Compiled code on disk: what is damaged is compiled anew, is never loaded, and fails no run."""
+"""Compiled code on disk: what is damaged or not ours is compiled anew, is never loaded, and fails no run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from consistency.filters.kernel import jit, kept
+from consistency.filters.kernel import jit, kept, whole
 
 
 def total(n: int) -> float:
@@ -17,13 +19,12 @@ def total(n: int) -> float:
     return result
 
 
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where kernels of this test are kept."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    jit._cache_folder.cache_clear()
-    yield tmp_path / "cache"
-    jit._cache_folder.cache_clear()
+    kept._say.cache_clear()
+    return tmp_path / "cache"
 
 
 def use() -> tuple[bool, int]:
@@ -35,8 +36,8 @@ def use() -> tuple[bool, int]:
     return ready, kernel.loaded
 
 
-def file_of(cache: Path, suffix: str) -> Path:
-    (path,) = cache.rglob(f"*{suffix}")
+def code_in(cache: Path) -> Path:
+    (path,) = cache.rglob(f"*{kept.SUFFIX}")
     return path
 
 
@@ -50,56 +51,56 @@ def flip(path: Path) -> None:
     path.write_bytes(content)
 
 
-def empty(path: Path) -> None:
-    path.write_bytes(b"")
+def flip_digest(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[3] ^= 1
+    path.write_bytes(content)
 
 
-def make_folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
+def open_to_all(path: Path) -> None:
+    path.chmod(0o666)
 
 
-@pytest.mark.parametrize(
-    ("suffix", "damage"),
-    [(".nbi", truncate), (".nbi", empty), (".nbc", flip), (".nbc", make_folder), (kept.MARK, flip),
-     (".nbc", Path.unlink)],
-    ids=["index cut", "index empty", "code flipped", "code a folder", "list flipped", "code gone"],
-)  # fmt: skip
+@pytest.mark.parametrize("damage", [truncate, flip, flip_digest, open_to_all])
 def test_damaged_code_is_compiled_anew_and_said_once(
-    cache: Path, capsys: pytest.CaptureFixture[str], suffix: str, damage: Callable[[Path], None]
+    cache: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None]
 ) -> None:
     assert use() == (False, 0)
-    damage(file_of(cache, suffix))
+    damage(code_in(cache))
     assert capsys.readouterr().err == ""
     assert use() == (False, 0)
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "compiled anew" in said
+    assert ("somebody else" if damage is open_to_all else "compiled anew") in said
     assert use() == (True, 1)
     assert capsys.readouterr().err == ""
 
 
-def test_code_that_was_never_finished_is_not_loaded(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A process that was killed while it wrote leaves no list."""
+def test_an_empty_file_is_not_loaded(cache: Path) -> None:
     use()
-    file_of(cache, kept.MARK).unlink()
-    truncate(file_of(cache, ".nbc"))
+    code_in(cache).write_bytes(b"")
     assert use() == (False, 0)
     assert use() == (True, 1)
-    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owners on this system")
+def test_code_of_another_owner_is_neither_loaded_nor_overwritten(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    use()
+    before = code_in(cache).read_bytes()
+    monkeypatch.setattr(os, "getuid", lambda: code_in(cache).stat().st_uid + 1)
+    if code_in(cache).stat().st_uid == 0:  # root is trusted: make the owner somebody else
+        for path in (code_in(cache).parent, code_in(cache)):
+            os.chown(path, 12345, -1)
+    assert use() == (False, 0)
+    assert "somebody else may write there" in capsys.readouterr().err
+    assert code_in(cache).read_bytes() == before
 
 
 def test_a_cache_that_cannot_be_written_fails_nothing(cache: Path) -> None:
     cache.write_text("a file where the cache would be", encoding="utf-8")
     assert use() == (False, 0)
-
-
-def test_damage_that_cannot_be_removed_fails_nothing(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use()
-    flip(file_of(cache, ".nbc"))
-    monkeypatch.setattr(jit, "clear", lambda folder: False)
-    assert use() == (False, 0)
-    assert not kept.is_whole(file_of(cache, kept.MARK).parent)
 
 
 def test_code_that_cannot_be_kept_serves_its_process(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,6 +109,26 @@ def test_code_that_cannot_be_kept_serves_its_process(cache: Path, monkeypatch: p
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile._save_data", full)
+    monkeypatch.setattr(Path, "replace", full)
     assert use() == (False, 0)
-    assert not list(cache.rglob(kept.MARK))
+    assert [path.suffix for path in (cache / "filter-consistency").iterdir()] == [".lock"]
+
+
+def test_what_was_not_used_for_longest_is_removed_first(tmp_path: Path) -> None:
+    for age, name in enumerate("abcd"):
+        path = tmp_path / f"{name}{kept.SUFFIX}"
+        path.write_bytes(bytes(100))
+        os.utime(path, (1e9 - age, 1e9 - age))
+    unfinished, stale = tmp_path / ".new", tmp_path / ".old"
+    for path, time in ((unfinished, 1e9), (stale, 1e9 - 2e5)):
+        path.write_bytes(b"")
+        os.utime(path, (time, time))
+    kept.prune(tmp_path, most=250)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".new", "a.kernel", "b.kernel"]
+
+
+def test_an_untried_numba_compiles_as_it_does(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(whole, "numba", SimpleNamespace(__version__="99.1"))
+    assert not whole.is_supported()
+    assert use() == (False, 0)
+    assert use() == (True, 1)

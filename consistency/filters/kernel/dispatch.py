@@ -12,17 +12,15 @@ in the same way, so ``part`` refuses the second.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from functools import wraps
-from pathlib import Path
 from typing import Any, TypeVar
 
+from numba import njit
 from numba.extending import overload
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 INNER: dict[str, Any] = OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-PACKAGE = Path(__file__).parents[2]
 
 _overload: Callable[..., Any] = overload
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -33,7 +31,7 @@ _parts: dict[str, type] = {}
 _needs: dict[type, dict[str, frozenset[str]]] = {}
 _bodies: dict[Any, Bodies] = {}
 _named_bodies: dict[str, Callable[..., Any]] = {}
-_files: set[Path] = set()  # of parts and bodies outside the package, which the cache must know too
+_routines: set[Any] = set()
 
 
 def part(**needs: str) -> Callable[[Part], Part]:
@@ -60,7 +58,6 @@ def part(**needs: str) -> Callable[[Part], Part]:
             )
         _parts[cls.__name__] = cls
         _needs[cls] = {role: frozenset(names.split()) for role, names in needs.items()}
-        _remember_file(cls)
         return cls
 
     return register
@@ -108,10 +105,26 @@ def implement(function: Callable[..., Any], *classes: type) -> Callable[[Functio
             raise TypeError(f"'{function.__name__}' has a body for {_named(classes)} already")
         _named_bodies[name] = body
         _bodies[function][classes] = body
-        _remember_file(body)
         return body
 
     return register
+
+
+def routine(function: Function) -> Function:
+    """Decorator of a function that calls machine code, such as BLAS: compiled where Python calls it, too."""
+    compiled: Any = njit(**OPTIONS)(function)
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        return compiled(*args)
+
+    def choose(*args: Any) -> Any:
+        return function
+
+    _overload(call, strict=False, jit_options=INNER)(choose)
+    _routines.add(call)
+    called: Any = call
+    return called
 
 
 def require_fitting(parts: Any) -> None:
@@ -124,7 +137,7 @@ def require_fitting(parts: Any) -> None:
     """
     for role, value in zip(parts._fields, parts, strict=True):
         cls = type(value)
-        if _parts.get(cls.__name__) is not cls:
+        if not is_part(cls):
             raise TypeError(f"{role}: '{cls.__name__}' is no registered part")
         for other, names in _needs[cls].items():
             chosen = type(getattr(parts, other)).__name__
@@ -143,9 +156,19 @@ def fits(parts: Any) -> bool:
     return True
 
 
-def outside_files() -> list[Path]:
-    """Sources of parts and bodies that lie outside the package, sorted."""
-    return sorted(_files)
+def is_part(cls: type) -> bool:
+    """Whether a class is a registered part."""
+    return _parts.get(cls.__name__) is cls
+
+
+def is_routine(function: Any) -> bool:
+    """Whether a function is a :func:`routine`: plain Python around the function that kernels are made of."""
+    return function in _routines
+
+
+def bodies_of(function: Any) -> Bodies | None:
+    """Bodies of a generic function by the types that choose them; None for any other function."""
+    return _bodies.get(function)
 
 
 def _body(stub: Any, bodies: Bodies, classes: tuple[Any, ...]) -> Callable[..., Any]:
@@ -160,9 +183,3 @@ def _named(classes: tuple[Any, ...]) -> str:
 
 def _known(bodies: Bodies) -> str:
     return ", ".join(sorted(_named(classes) for classes in bodies)) or "none"
-
-
-def _remember_file(thing: Any) -> None:
-    path = Path(inspect.getfile(thing)).resolve()
-    if not path.is_relative_to(PACKAGE):
-        _files.add(path)

@@ -14,17 +14,18 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from multiprocessing import current_process
+from pathlib import Path
 
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.errors import InputError
 from consistency.filters.compiled import one_blas_thread
-from consistency.filters.kernel.dispatch import PACKAGE
 from consistency.runs.isolating import dismiss
 from consistency.runs.work import Work
 from consistency.store.machine import this_machine
 from consistency.store.results import Outcome
 
+PACKAGE = Path(__file__).parents[2]
 DECIDING = ("numpy", "scipy", "numba")  # packages whose versions the bits depend on
 ROOMS = ("geometry", "models", "scenario", "simulation", "filters")  # and our own sources
 

@@ -85,10 +85,10 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
     J, measured = np.empty((len(motions), 6, len(SHARED))), np.array([not motion.fault for motion in motions], bool)
     if not measured.any():
         raise InputError("motions: all are bridges, and have no matches that could tell")
-    for k in np.flatnonzero(measured):
+    for k in np.flatnonzero(measured).tolist():
         J[k, :, :RIG] = _by_rig(rig, motions[k])
-    for k in np.flatnonzero(~measured):
-        around, share = neighbours(measured, t, int(k))
+    for k in np.flatnonzero(~measured).tolist():
+        around, share = neighbours(measured, t, k)
         J[k, :, :RIG] = np.tensordot(dt[k] * share / dt[around], J[around, :, :RIG], axes=1)
     for k, motion in enumerate(motions):
         J[k, :3, RIG:-1] = cross_matrix(motion.pose.t)

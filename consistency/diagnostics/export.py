@@ -194,7 +194,7 @@ def figures(v: Verdict) -> list[tuple[str, str]]:
         value, low, high = s.inflation
         rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], truth over stated"))
         if (worst := v.worst_axis) is not None:
-            rows.append(("worst axis", f"{worst[0]} {plain(worst[1])}"))
+            rows.append(("worst axis", f"{worst[0]}, {plain(worst[1])}"))
         if s.within is not None:
             rows.append(("within the log", f"{plain(s.within.ratio)}, if errors decorrelate as within it"))
         ends = f"[{short(1 / shown.factor)}, {short(shown.factor)}]"

@@ -152,7 +152,7 @@ def _no_fault(v: Verdict) -> str:
 
 def _worst_axis(v: Verdict) -> str:
     worst = v.worst_axis
-    return "" if worst is None else f" (worst axis: {worst[0]} {plain(worst[1])})"
+    return "" if worst is None else f" (worst axis: {worst[0]}, {plain(worst[1])})"
 
 
 def _lost(v: Verdict) -> str:
@@ -204,7 +204,7 @@ def _level(v: Verdict) -> list[str]:
     tolerated = [a.question for a in v.answers if a.tolerated]
     lines = [text]
     if v.faults and (worst := v.worst_axis) is not None:
-        lines.append(f"covariance ratio of the worst axis: {worst[0]} {plain(worst[1])}; of all {plain(s.inflation)}")
+        lines.append(f"covariance ratio of the worst axis: {worst[0]}, {plain(worst[1])}; of all {plain(s.inflation)}")
     if v.lost is not None and (v.lost.count or v.settings.lost is not None):
         lines.append(
             f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "

@@ -91,7 +91,7 @@ def _below(verdicts: dict[str, Verdict]) -> list[str]:
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
     if worst := [(name, *v.worst_axis) for name, v in verdicts.items() if v.worst_axis is not None]:
-        texts = "; ".join(f"{name} {axis} {ratio_text(ratio)}" for name, axis, ratio in worst)
+        texts = "; ".join(f"{name} {axis}, {ratio_text(ratio)}" for name, axis, ratio in worst)
         lines.append(f"ratio of the worst axis: {texts}")
     maps = {name: v.map for name, v in verdicts.items() if v.map is not None and v.map.landmarks}
     if maps:

@@ -453,7 +453,7 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(folder, l
     assert kf.innovations_judged
     found = kf.verdict.innovations
     low, high = found.interval
-    assert verdicts.row(kf)[9] == f"{found.ratio:.3f}"
+    assert verdicts.row(kf)[10] == f"{found.ratio:.3f}"
     assert further.row(kf)[-1] == f"{found.ratio:.3f} ({low:.3f} to {high:.3f})"
     assert innovations.lags(kf).bound == found.bound
     np.testing.assert_array_equal(innovations.lags(kf).values, found.autocorrelation)

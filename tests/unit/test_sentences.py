@@ -52,9 +52,9 @@ def test_the_worst_axis_stands_beside_the_whole(rng: np.random.Generator, capsys
     name, interval = verdict.worst_axis or ("", Interval(0.0, 0.0, 0.0))
     assert name == "heading"
     assert interval.value == pytest.approx(ratio)
-    beside = f"worst axis: heading {ratio:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+    beside = f"worst axis: heading, {ratio:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
     assert f"({beside})" in verdict.reasons[0]
-    assert re.search(rf"worst axis +heading {ratio:.2f} \[", text(verdict))
+    assert re.search(rf"worst axis +heading, {ratio:.2f} \[", text(verdict))
     assert verdict.statistics["worst_axis"] == "heading"
     assert verdict.statistics["worst_axis_ratio"] == tuple(interval)
     print_verdicts({"f": verdict})
@@ -69,7 +69,7 @@ def test_the_worst_axis_of_a_fault_is_to_its_side(rng: np.random.Generator) -> N
         verdict = judged(independent(rng, 60, 10, 3) * np.sqrt(factor * np.array([1.2, 1.0, 0.83])))
         assert verdict.status == status
         assert (verdict.worst_axis or ("",))[0] == name
-        assert any(line.startswith(f"covariance ratio of the worst axis: {name} ") for line in verdict.reasons)
+        assert any(line.startswith(f"covariance ratio of the worst axis: {name}, ") for line in verdict.reasons)
 
 
 def test_a_small_axis_may_be_the_worst(rng: np.random.Generator) -> None:

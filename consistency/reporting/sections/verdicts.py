@@ -127,7 +127,7 @@ def inflation(track: Estimator) -> str:
 def worst_axis(track: Estimator) -> str:
     """Axis whose ratio of true to stated covariance is farthest from 1, and that ratio."""
     worst = track.verdict.worst_axis
-    return "–" if worst is None else f"{worst[0]} {plain(worst[1])}"
+    return "–" if worst is None else f"{worst[0]}, {plain(worst[1])}"
 
 
 def shown_inside(track: Estimator) -> str:

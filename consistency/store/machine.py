@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_info
 
 NOT_OURS = ("opencv",)  # brings a BLAS of its own, with which no run is computed
 
+
 @functools.cache
 def _found() -> tuple[tuple[str, str], ...]:
     libraries = [library for library in threadpool_info() if library["user_api"] == "blas"]

@@ -131,6 +131,14 @@ def planar(folder: Path) -> None:
     table(folder / "truth.csv", [key | dict.fromkeys(names, 0.0) for key in keys])
 
 
+def started(folder: Path) -> None:
+    """est.csv, new.csv and old.csv of one truth.csv, and a folder of results."""
+    planar(folder)
+    for name in ("est.csv", "new.csv", "old.csv"):
+        shutil.copy(folder / "poses.csv", folder / name)
+    results("results")(folder)
+
+
 def kitti(folder: Path) -> None:
     """A drive as truth, and estimates at the first pose all the time."""
     import drives
@@ -243,6 +251,7 @@ PREPARE: dict[str, list[Callable[[Path], None]]] = {
     "docs/files.md TUM trajectories": [trajectories],
     "docs/files.md Another world frame: `--align`": [trajectories],
     "docs/files.md Tables: .csv and .parquet": [planar],
+    "docs/files.md Without the first steps: `--skip`": [started],
     "docs/files.md OpenVINS": [openvins],
     "docs/files.md KITTI": [kitti],
     "docs/files.md Logs": [log("LOG")],

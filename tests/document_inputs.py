@@ -118,13 +118,13 @@ def table(at: Path, rows: list[dict[str, float]]) -> None:
         writer.writerows(rows)
 
 
-def planar(folder: Path) -> None:
+def planar(folder: Path, steps: int = 20) -> None:
     """poses.csv and truth.csv: x, y, heading of 30 runs."""
     rng, sigma = RNG, np.array([0.1, 0.1, 0.02])
     variances = dict(zip(("P_xx", "P_yy", "P_hh"), sigma**2, strict=True)) | dict.fromkeys(
         ("P_xy", "P_xh", "P_yh"), 0.0
     )
-    keys = [{"run": run, "step": step, "t": 0.1 * step} for run in range(30) for step in range(1, 21)]
+    keys = [{"run": run, "step": step, "t": 0.1 * step} for run in range(30) for step in range(1, steps + 1)]
     names = ("x", "y", "heading")
     own = [key | dict(zip(names, sigma * rng.normal(size=3), strict=True)) | variances for key in keys]
     table(folder / "poses.csv", own)
@@ -133,7 +133,7 @@ def planar(folder: Path) -> None:
 
 def started(folder: Path) -> None:
     """est.csv, new.csv and old.csv of one truth.csv, and a folder of results."""
-    planar(folder)
+    planar(folder, 60)
     for name in ("est.csv", "new.csv", "old.csv"):
         shutil.copy(folder / "poses.csv", folder / name)
     results("results")(folder)

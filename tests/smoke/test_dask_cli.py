@@ -44,9 +44,7 @@ def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(fresh: Path, to_all
     assert status == 130, error
     assert "Traceback" not in error
     assert not remaining(process.pid)
-    assert re.search(
-        r"finished runs are (in out; add|kept where there are any: .*) --resume", error
-    )  # or ended in time
+    assert re.search(r"finished runs are (in out; add|kept where there are any: .*) --resume", error)
     resume(fresh)
 
 

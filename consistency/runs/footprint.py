@@ -67,11 +67,7 @@ def _working(slam: Slam, data: Data, size: int) -> int:
     T, labels, r = len(data.controls), data.n_landmarks, robot_width(slam.motion)
     spare = spare_width(slam.covariance, T, labels)
     outcome = T * (r + 2 * r * r + 3) + 12 * labels
-    try:
-        work = touched(slam, data, size, spare)
-    except MemoryError:  # which takes by the square of the state
-        return 16 * _working(slam, data, size // 4)
-    return work + NUMBER * ((size + spare) ** 2 + outcome)
+    return touched(slam, data, size, spare) + NUMBER * ((size + spare) ** 2 + outcome)
 
 
 def _size_of(value: Any) -> int:

@@ -6,16 +6,15 @@ to those of the base. What that comes to follows from which landmarks are seen w
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from consistency.filters.kernel.local_state import Factors
+from consistency.filters.kernel.local_state import Factors, make_factors
 from consistency.filters.kernel.slam import (
     Data,
     Slam,
     landmark_width,
-    make_local,
     make_room,
     make_watch,
     observed_width,
@@ -50,22 +49,37 @@ def half(n: int) -> int:
 def touched(slam: Slam, data: Data, size: int, spare: int) -> int:
     """Bytes of work arrays that are written to; the state grows to ``size`` variables and up to ``spare`` more."""
     r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
-    local: Any = make_local(slam.covariance, r, w, size + spare, len(data.controls), data.n_landmarks)
+    local = _tally(slam, r, w, size + spare)
     reach = _reach(slam, data, r, w, size + spare, local)
     gathered, a, b = s * reach.seen, reach.active, reach.base
-    room = make_room(slam.update, r, w, s, reach.back, size + spare)
-    most = int(np.diff(data.first).max(initial=1))
-    watch = make_watch(slam.guard, s, most, len(data.landmark), data.n_landmarks)
     # S; A and rows; then of the active part P, Phi, Psi, and of the whole rows and owed
     numbers = half(gathered) + reach.cells * s // w + reach.cells
     numbers += a * a + a * b + half(b) + (a + b) * (size + spare)
-    return NUMBER * numbers + sum(np.asarray(array).nbytes for array in (*room, *watch))
+    most = int(np.diff(data.first).max(initial=1))
+    return NUMBER * numbers + _beside(slam, data, (r, w, s), reach.back, most, size + spare)
 
 
-def _reach(slam: Slam, data: Data, r: int, w: int, size: int, local: Any) -> Reach:
+def _tally(slam: Slam, r: int, w: int, size: int) -> Factors:
+    """What local updating counts with, and the active part for which there is room, as its ``make_local`` has it."""
+    is_local = isinstance(slam.covariance, Local | Parking) and size >= slam.covariance.start
+    return make_factors(r, r, 1)._replace(x=np.empty(max(size // (2 * w), 1) * w if is_local else r))
+
+
+def _beside(slam: Slam, data: Data, widths: tuple[int, int, int], back: int, most: int, size: int) -> int:
+    """Bytes of what the update alone needs for ``back`` landmarks, and the guard for ``most``."""
+    r, w, s = widths
+    try:
+        room = make_room(slam.update, r, w, s, back, size)
+        watch = make_watch(slam.guard, s, most, len(data.landmark), data.n_landmarks)
+    except MemoryError:  # which takes by the square of these
+        return 16 * _beside(slam, data, widths, back // 4, most // 4, size // 4)
+    return sum(np.asarray(array).nbytes for array in (*room, *watch))
+
+
+def _reach(slam: Slam, data: Data, r: int, w: int, size: int, local: Factors) -> Reach:
     """As the trial keeps its state, step by step."""
     if isinstance(slam.covariance, Parking):
-        return _parked(slam.covariance, data, size, local.factors)
+        return _parked(slam.covariance, data, size, local)
     reach, known, active, n, b = Reach(), set[int](), set[int](), 0, 0
     for k in range(len(data.controls)):
         labels = data.landmark[data.first[k] : data.first[k + 1]].tolist()

@@ -160,7 +160,7 @@ def parts(linear: cs.Scenario) -> Slam:
 
 def test_rows_are_touched_for_what_is_known(parts: Slam) -> None:
     data = seen([[0, 1, 2], [1], [0, 2, 3, 4], [0, 1, 2]])
-    reach = touched._reach(parts, data, 3, 3, 18, None)
+    reach = touched._reach(parts, data, 3, 3, 18, touched._tally(parts, 3, 3, 18))
     assert reach == (3, 3, 18, 12 * 18, 0, 0), "in the last step, with three of the five that are known"
     S, rows = touched.half(9), 12 * 18
     assert touched.touched(parts, data, 18, 0) == 8 * (S + 2 * rows)
@@ -177,7 +177,8 @@ def test_a_local_base_grows_until_it_is_due(parts: Slam) -> None:
     slam = parts._replace(covariance=Locally(60))
     every = list(range(40))
     data = seen([every, [0, 1], [2, 1], [2, 3], [3, 40]])
-    local = make_local(slam.covariance, 3, 3, 126, 5, 41)
+    local = touched._tally(slam, 3, 3, 126)
+    assert len(local.x) == len(make_local(slam.covariance, 3, 3, 126, 5, 41).x)
     reach = touched._reach(slam, data, 3, 3, 126, local)
     assert (reach.base, reach.active) == (15, 15), "the robot and four landmarks; what is new is active after the step"
     assert reach.width == 30
@@ -185,7 +186,7 @@ def test_a_local_base_grows_until_it_is_due(parts: Slam) -> None:
     numbers = touched.half(6) + 2 * 9 * 30 + a * a + a * b + touched.half(b) + (a + b) * 126
     assert touched.touched(slam, data, 126, 0) == 8 * numbers
     dense = seen([every, every, every])
-    assert touched._reach(slam, dense, 3, 3, 123, make_local(slam.covariance, 3, 3, 123, 3, 40)).base == 0
+    assert touched._reach(slam, dense, 3, 3, 123, touched._tally(slam, 3, 3, 123)).base == 0
 
 
 def test_parked_landmarks_are_left_alone() -> None:
@@ -197,3 +198,14 @@ def test_parked_landmarks_are_left_alone() -> None:
     assert reach.width == 3 + 3 * 40 + 3, "all of it, with a clone, before the others are parked"
     still = touched._parked(parking._replace(every=0), data, 126, factors)
     assert (still.back, still.base, still.width) == (0, 0, 123)
+
+
+def test_arrays_that_cannot_be_made_count_by_the_square(parts: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
+    def watch(guard: object, s: int, m: int, rows: int, n_landmarks: int) -> list[np.ndarray]:
+        if m > 10:
+            raise MemoryError
+        return [np.zeros((m, m))]
+
+    monkeypatch.setattr(touched, "make_watch", watch)
+    data = seen([list(range(40))])
+    assert touched.touched(parts, data, 123, 0) == 16 * 8 * 100

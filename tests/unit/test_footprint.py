@@ -196,6 +196,10 @@ def test_parked_landmarks_are_left_alone() -> None:
     reach = touched._parked(parking, data, 126, factors)
     assert (reach.seen, reach.back, reach.base) == (3, 1, 12)
     assert reach.width == 3 + 3 * 40 + 3, "all of it, with a clone, before the others are parked"
+    again = touched._parked(parking, seen([list(range(40)), *[[0, 1, 2]] * 12, [5, 6, 7, 8, 0]]), 126, factors)
+    assert (again.seen, again.back, again.cells) == (5, 4, 12 * 126), "the active part and its base are narrow"
+    often = seen([list(range(40)), *[[0, 1]] * 3, [0, 2]])
+    assert [touched._parked(parking._replace(unseen=n), often, 126, factors).back for n in (1, 2, 3)] == [1, 1, 0]
     still = touched._parked(parking._replace(every=0), data, 126, factors)
     assert (still.back, still.base, still.width) == (0, 0, 123)
 

@@ -19,19 +19,15 @@ from consistency.filters.compiled import Compiled
 from consistency.filters.kernel.slam import (
     Data,
     Slam,
-    landmark_width,
-    make_local,
-    make_watch,
     observed_width,
     robot_width,
     spare_width,
 )
-from consistency.filters.kernel.work import make_work
+from consistency.runs.touched import NUMBER, touched
 from consistency.scenario import Belief
 from consistency.terminal.progress import say
 from consistency.types import Trial
 
-NUMBER = 8  # bytes
 COPIES = 2  # of the joint covariance where a map is scored: as it is, and in the filter's own error
 FACTORS = 2  # its Cholesky factor, and LAPACK's copy; of the plane alone where that is all that is seen
 WORTH_SAYING = 0.1  # of the memory that there is
@@ -67,20 +63,11 @@ def trial_bytes(filters: Sequence[Compiled], trial: Trial, belief: Belief) -> in
 
 
 def _working(slam: Slam, data: Data, size: int) -> int:
-    """What ``run_trial`` allocates; its functions make the same arrays in Python, whose pages nobody touches."""
-    T, labels, seen = len(data.controls), data.n_landmarks, int(np.diff(data.first).max(initial=1))
-    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
-    n = size + spare_width(slam.covariance, T, labels)
+    """What ``run_trial`` writes to: covariance and outcome, which it fills, and a part of what it works with."""
+    T, labels, r = len(data.controls), data.n_landmarks, robot_width(slam.motion)
+    spare = spare_width(slam.covariance, T, labels)
     outcome = T * (r + 2 * r * r + 3) + 12 * labels
-    try:
-        parts = (
-            make_work(slam, n, seen, T, labels),
-            make_local(slam.covariance, r, w, n, T, labels),
-            make_watch(slam.guard, s, seen, len(data.landmark), labels),
-        )
-    except MemoryError:  # which takes by the square of the state
-        return 16 * _working(slam, data, size // 4)
-    return _size_of(parts) + NUMBER * (n * (n + 1) + outcome)
+    return touched(slam, data, size, spare) + NUMBER * ((size + spare) ** 2 + outcome)
 
 
 def _size_of(value: Any) -> int:
@@ -93,14 +80,25 @@ def _size_of(value: Any) -> int:
 
 
 def memory_here() -> int:
-    """Bytes that this process may use: of the machine, its control group (Linux) and ``ulimit``, the least."""
+    """Bytes that this process may use: of the machine, its control group (Linux) and what ``ulimit`` leaves."""
     limits = [NO_LIMIT, *_of_groups()]
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     if resource is not None:
-        kinds = (resource.RLIMIT_AS, resource.RLIMIT_DATA)
-        limits += [soft for soft, _ in map(resource.getrlimit, kinds) if soft != resource.RLIM_INFINITY]
+        for kind, name in ((resource.RLIMIT_AS, "VmSize"), (resource.RLIMIT_DATA, "VmData")):
+            soft, _ = resource.getrlimit(kind)
+            if soft != resource.RLIM_INFINITY:
+                limits.append(max(soft - _taken(name), 0))
     return min(limits)
+
+
+def _taken(name: str, status: Path = Path("/proc/self/status")) -> int:
+    """Bytes that this process has already, as Linux counts them for a limit; 0 where it is not known."""
+    try:
+        lines = status.read_text(encoding="ascii", errors="replace").splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith(name))
+    except (OSError, StopIteration):
+        return 0
 
 
 def _of_groups(proc: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> list[int]:

@@ -57,6 +57,23 @@ def test_ctrl_c_does_not_wait_for_the_call(looks: bool) -> None:
     over.set()
 
 
+@pytest.mark.usefixtures("ctrl_c")
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_what_cannot_be_stopped_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    over = threading.Event()
+
+    def work() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        over.wait(20.0)
+
+    monkeypatch.setattr("consistency.filters.kernel.apart.PATIENCE", 20.0)
+    begin = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        apart(work)
+    assert time.monotonic() - begin < 5.0
+    over.set()
+
+
 def test_a_trial_that_was_given_up(linear: cs.Scenario) -> None:
     filter_ = cs.get_filter("kf")
     assert isinstance(filter_, Compiled)

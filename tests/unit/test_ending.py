@@ -115,3 +115,30 @@ def test_a_program_with_handlers_of_its_own_is_not_supervised() -> None:
     finally:
         signal.signal(signal.SIGTERM, before)
     assert here == [os.getpid()]
+
+
+def test_a_program_that_was_stopped_ends_soon_and_flushes_what_is_open(tmp_path: Path) -> None:
+    program = """if True:
+        import atexit, gc, signal, sys
+        from consistency.store.stopping import stoppable
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        class Cycle: pass
+        held = Cycle()
+        held.own, held.file = held, open(sys.argv[1], "w")
+        held.file.write("all of it")
+        for _ in range(2):
+            try:
+                with stoppable():
+                    signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                pass
+        assert gc.get_freeze_count() == 0
+        del held
+        gc.disable()
+        atexit._run_exitfuncs()
+        assert gc.get_freeze_count() > 1000
+    """
+    words = [sys.executable, "-c", program, str(tmp_path / "file")]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert (tmp_path / "file").read_text() == "all of it"
+    assert done.stderr == ""

@@ -30,7 +30,7 @@ RANK = {
     "store.results": 6, "store.log": 7,
     "imaging": 6,
     "recording": 7,
-    "runs.streams": 5, "runs.supervising": 6, "runs.footprint": 6,
+    "runs.streams": 5, "runs.supervising": 6, "runs.touched": 6, "runs.footprint": 7,
     "runs.gather": 7, "runs.isolating": 7, "runs.resuming": 7, "runs.work": 8,
     "runs.backends": 9, "runs.campaign": 9, "runs.montecarlo": 10,
     "frontend": 8,

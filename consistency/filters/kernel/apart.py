@@ -15,11 +15,11 @@ GLANCE = 0.1  # s between looks, for a signal that another thread was given
 PATIENCE = 0.5  # s for what was told to stop
 
 
-def apart(call: Callable[..., Result], *args: Any, stop: Callable[[], None] = lambda: None) -> Result:
+def apart(call: Callable[..., Result], *args: Any, stop: Callable[[], None] | None = None) -> Result:
     """``call(*args)``, from the main thread in a thread of its own, for which it waits.
 
-    Where a handler of a signal raises meanwhile, ``stop`` is called and the exception goes on; the thread ends when
-    it can.
+    Where a handler of a signal raises meanwhile, ``stop`` is called, if it is given, and the exception goes on; the
+    thread ends when it can.
     """
     if threading.current_thread() is not threading.main_thread():
         return call(*args)
@@ -41,8 +41,9 @@ def apart(call: Callable[..., Result], *args: Any, stop: Callable[[], None] = la
         while not working.acquire(timeout=GLANCE):
             pass
     except BaseException:
-        stop()
-        working.acquire(timeout=PATIENCE)
+        if stop is not None:
+            stop()
+            working.acquire(timeout=PATIENCE)
         raise
     if errors:
         raise errors[0]

@@ -236,13 +236,13 @@ def test_a_limit_on_the_size_of_files(fresh: Path) -> None:
 def test_three_processes_on_one_place(fresh: Path) -> None:
     first = begin(fresh)
     wait_for(working(fresh), first)
-    os.kill(first.pid, signal.SIGSTOP)
+    os.killpg(first.pid, signal.SIGSTOP)  # as a terminal does
     for options in ((), ("--overwrite",), ("--resume",)):
         other = begin(fresh, *options)
         _, error = other.communicate(timeout=300)
         assert other.returncode == 2
         assert "another process is at work on it" in one_sentence(error)
-    os.kill(first.pid, signal.SIGCONT)
+    os.killpg(first.pid, signal.SIGCONT)
     assert end(first)[0] == 0
     require_same(fresh)
 

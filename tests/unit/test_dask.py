@@ -104,6 +104,21 @@ def test_a_worker_that_is_killed_loses_nothing(
     require_same(run_trials(world, filters, RUNS, SEED, out=tmp_path / "out", backend=backend).folder, whole.folder)
 
 
+def test_a_result_that_died_with_the_last_worker_is_not_waited_for(world: cs.Scenario, tmp_path: Path) -> None:
+    work = Work(Simulated(world, SEED), Isolation([cs.get_filter("kf")], world.belief))
+    with Cluster(tmp_path, workers=1) as cluster:
+        engine = dask._Engine({"address": cluster.address}, work, 20.0)
+        engine._wait = 1.0  # from here on: the worker has been found
+        engine.submit([dask.Batch(range(2))])
+        ((_, future),) = engine._sent.values()
+        assert future is not None
+        assert engine._ended.get(timeout=60) == future.key
+        engine._ended.put(future.key)  # finished, and nobody has asked for what it left
+        cluster.kill_workers()
+        with pytest.raises(cs.InputError, match=f"^the scheduler {cluster.address} has had no worker for 1 s$"):
+            assert not any(engine.events() for _ in range(100))
+
+
 @dataclass(frozen=True)
 class Deadly:
     """Trials of which some kill whoever simulates them, but for one process."""

@@ -179,7 +179,11 @@ class _Engine:
         error = future.exception() if future.status == "error" else None
         if error is not None and not isinstance(error, KilledWorker):
             raise _told(error) from error
-        part: Part | None = None if error is not None else future.result()
+        try:
+            part: Part | None = None if error is not None else future.result(self._wait)
+        except TimeoutError:  # the worker that had it is dead: who does it again says so, or nobody is left
+            self._ended.put(key)
+            return []
         del self._sent[key]
         if part is None:
             return [(batch, Lost("its worker died, and so did those that tried it again"))]

@@ -29,7 +29,7 @@ from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places
 from consistency.recording.windows import relative_of
 from consistency.types import Array
-from consistency.verdicts.judge import analyse_recordings
+from consistency.verdicts.files import analyse_recordings
 
 DT, SPEED = 0.1, 1.5  # s, m/s
 TURN = 0.03  # rad a step, and its spread

@@ -133,7 +133,7 @@ class Gates:
     def _keep(self, item: pytest.Item, entry: Entry) -> None:
         item.user_properties.append(to_property(entry))
         if self.path is not None and self.path.suffix.lower() == ".json":
-            from consistency.store.storage import plain
+            from consistency.store.provenance import plain
 
             self.statistics.append(plain(entry.statistics))
 

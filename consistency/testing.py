@@ -19,7 +19,7 @@ from consistency.gating.wording import fault_text, few_to_compare, undecided_tex
 
 if TYPE_CHECKING:
     from consistency.store.results import Results
-    from consistency.verdicts.comparison import Baseline
+    from consistency.verdicts.baselines import Baseline
 
 
 class ConsistencyError(AssertionError):

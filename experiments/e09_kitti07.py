@@ -30,8 +30,9 @@ from consistency.models.motion import dead_reckoning
 from consistency.runs.findings import command_line, sibling
 from consistency.runs.montecarlo import run_log
 from consistency.store.log import Log, write_log
+from consistency.store.provenance import manifest_of
 from consistency.store.results import Results, joined
-from consistency.store.storage import manifest_of, require_free
+from consistency.store.storage import require_free
 from consistency.terminal.table import print_findings
 from consistency.types import Array, Trial
 from consistency.verdicts.curves import curves

@@ -24,7 +24,8 @@ import consistency as cs
 from consistency.runs.findings import command_line, sibling
 from consistency.runs.montecarlo import run_log
 from consistency.store.log import Log, write_log
-from consistency.store.storage import manifest_of, require_free
+from consistency.store.provenance import manifest_of
+from consistency.store.storage import require_free
 from consistency.terminal.table import print_findings
 from consistency.verdicts.curves import Curves, curves
 

@@ -25,7 +25,8 @@ from consistency.frontend.tum import trajectory_text
 from consistency.runs.findings import command_line, sibling
 from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.store.log import write_log
-from consistency.store.storage import manifest_of, require_free
+from consistency.store.provenance import manifest_of
+from consistency.store.storage import require_free
 from consistency.types import Array, Trial
 from consistency.vision.sequence import read_table
 

@@ -288,7 +288,7 @@ def names_of(page: str, folder: Path) -> dict[str, Any]:
     world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     if page == "docs/gates.md":
         from consistency.testing import assert_not_worse
-        from consistency.verdicts.comparison import write_baseline
+        from consistency.verdicts.baselines import write_baseline
 
         done = cs.run_trials(world, ["ekf-uvd", "ekf-xyz"], runs=60, seed=5, jobs=1)
         write_baseline(done, folder / "baseline.json")

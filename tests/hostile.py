@@ -24,8 +24,8 @@ import consistency as cs
 from consistency.cli import main
 from consistency.recording.kitti import read_drive
 from consistency.store.log import read_log
+from consistency.store.provenance import manifest_of
 from consistency.store.results import Rejected, failures_table, rejections_table
-from consistency.store.storage import manifest_of
 from consistency.types import Failure
 
 RUNS, STEPS, LANDMARKS = 9, 12, 5

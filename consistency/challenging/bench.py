@@ -14,13 +14,14 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.filters.compiled import one_blas_thread
 from consistency.protocols import Filter
+from consistency.reading.columns import POSE
 from consistency.runs.backends.local import worker_count
 from consistency.runs.isolating import Isolation
 from consistency.runs.work import compile_for
 from consistency.scenario import Scenario
 from consistency.simulation import require_landmarks_in_view
 from consistency.simulation.world import World
-from consistency.store.results import POSE, outcome_of
+from consistency.store.results import outcome_of
 
 WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not
 PATIENCE = 60.0  # s beyond the end of the search, after which a trial of a filter that is not compiled is killed

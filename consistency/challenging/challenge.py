@@ -20,10 +20,11 @@ from consistency.errors import InputError
 from consistency.filters import get_filter
 from consistency.filters.stepping import name_of
 from consistency.protocols import Filter
+from consistency.reading.columns import POSE
 from consistency.runs.montecarlo import resolve_filters, run_trials
 from consistency.scenario import Scenario, load_scenario
-from consistency.store.results import POSE
-from consistency.verdicts.judge import analyse, refused
+from consistency.verdicts.judge import analyse
+from consistency.verdicts.options import refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
 SIZE_QUESTIONS = (*SCALE, "outliers")  # what a confirmation needs a fault in: errors that are too large

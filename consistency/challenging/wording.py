@@ -12,7 +12,7 @@ from consistency.diagnostics.wording import p_text
 from consistency.errors import InputError
 from consistency.scenario import scenario_text
 from consistency.store.atomic import write_whole
-from consistency.store.storage import plain
+from consistency.store.provenance import plain
 
 
 def lines(outcome: Challenge, out: Path) -> list[str]:

@@ -19,7 +19,7 @@ from consistency.scenario import PicturedSensor
 from consistency.scenario.effects.bias_map import BiasMap
 from consistency.scenario.effects.disparity_growth import DisparityGrowth
 from consistency.store.atomic import write_whole
-from consistency.store.storage import plain
+from consistency.store.provenance import plain
 from consistency.types import Array
 
 

@@ -322,12 +322,9 @@ def analyse(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
 ) -> None:
     """Judge results, or files of another estimator: consistent, overconfident, conservative, undecided ..., and why."""
-    from consistency.reporting import write_file_reports
-    from consistency.store.results import open_results
-    from consistency.store.storage import require_free
     from consistency.terminal.table import print_verdicts, verdicts_json
-    from consistency.verdicts.judge import analyse as judge_results
-    from consistency.verdicts.judge import analyse_recordings, settings_of, skip_asked
+    from consistency.verdicts.files import analyse_recordings
+    from consistency.verdicts.options import settings_of, skip_asked
 
     if fail_on not in (None, "inconsistent"):
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
@@ -344,6 +341,9 @@ def analyse(
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None:
+            from consistency.reporting import write_file_reports
+            from consistency.store.storage import require_free
+
             try:
                 require_free(report, overwrite, "verdict", "--report")
                 data = verdicts_json(verdicts)
@@ -351,6 +351,9 @@ def analyse(
             except InputError as error:
                 refused = error
     else:
+        from consistency.store.results import open_results
+        from consistency.verdicts.judge import analyse as judge_results
+
         results = open_results(path)
         if report is not None:
             raise InputError(f"--report: is for files of another estimator; for {path} use 'consistency report {path}'")
@@ -404,12 +407,8 @@ def plan(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
-    from consistency.runs.montecarlo import run_trials
-    from consistency.scenario import load_scenario
-    from consistency.store.results import open_results
     from consistency.terminal.table import print_plan
-    from consistency.verdicts.judge import pilots_of
-    from consistency.verdicts.judge import plan as plan_runs
+    from consistency.verdicts.options import plan as plan_runs
 
     if scenario is not None and like is not None:
         raise InputError("give either a SCENARIO for a pilot or --like RESULTS")
@@ -419,8 +418,15 @@ def plan(
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
     pilots = None
     if like is not None:
+        from consistency.store.results import open_results
+        from consistency.verdicts.judge import pilots_of
+
         pilots = pilots_of(open_results(like), filters)
     elif scenario is not None:
+        from consistency.runs.montecarlo import run_trials
+        from consistency.scenario import load_scenario
+        from consistency.verdicts.judge import pilots_of
+
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost)  # refuse before the work
         pilots = pilots_of(run_trials(load_scenario(scenario), filters or [], pilot_runs, seed), filters)
     planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost)
@@ -451,14 +457,9 @@ def compare(
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
     from consistency.terminal.table import comparisons_json, print_comparisons
-    from consistency.verdicts.comparison import (
-        baseline_of_files,
-        compare_filters,
-        compare_with,
-        is_baseline,
-        read_baseline,
-    )
-    from consistency.verdicts.judge import skip_asked
+    from consistency.verdicts.baselines import baseline_of_files, is_baseline, read_baseline
+    from consistency.verdicts.comparison import compare_filters, compare_with
+    from consistency.verdicts.options import skip_asked
 
     if fail_on not in (None, "worse"):
         raise InputError(f"--fail-on must be 'worse', got '{fail_on}'")
@@ -501,14 +502,16 @@ def baseline(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Keep what a later 'compare' needs of results, one row a run."""
-    from consistency.store.results import open_results
-    from consistency.verdicts.comparison import baseline_of, baseline_of_files, write_baseline
+    from consistency.verdicts.baselines import baseline_of_files, write_baseline
 
     if files.are(path):
         recordings = files.read(path)
         write_baseline(baseline_of_files(recordings, str(path), files.truth, skip), out, overwrite)
         tell_notes(recordings)
     else:
+        from consistency.store.results import open_results
+        from consistency.verdicts.baselines import baseline_of
+
         write_baseline(baseline_of(open_results(path), str(path), skip), out, overwrite)
     print(f"baseline in {out}; next: consistency compare NEW {out}")
 
@@ -529,7 +532,7 @@ def report(
 ) -> None:
     """Write a report of results as one offline HTML file and a PDF."""
     from consistency.reporting import require_pages, write_file_pages, write_reports
-    from consistency.verdicts.judge import analyse_recordings
+    from consistency.verdicts.files import analyse_recordings
 
     estimates = files.are(path)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"

@@ -52,7 +52,7 @@ def tune(
     from consistency.terminal.table import print_verdicts
     from consistency.tuning.tune import tune as tune_filter
     from consistency.tuning.wording import KIND, as_data, lines, verdicts, write
-    from consistency.verdicts.judge import settings_of
+    from consistency.verdicts.options import settings_of
 
     if fail_on not in (None, "inconsistent"):
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")

@@ -290,9 +290,9 @@ def _correlation(error: Array, covariance: Symmetric, counted: Array) -> tuple[t
         part = np.empty((len(e), len(half)))
         for k, (i, j) in enumerate(half):
             part[:, k] = P.entry(i, j)[counted[here]] / (sigma[i] * sigma[j])
-        stated[*half.T] += part.sum(axis=0) / count
+        stated[tuple(half.T)] += part.sum(axis=0) / count
         second += e.T @ e / count
-    stated[*half.T[::-1]] = stated[*half.T]
+    stated[tuple(half.T[::-1])] = stated[tuple(half.T)]
     scale = np.sqrt(np.diag(second))
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.nan_to_num(second / np.outer(scale, scale) - stated)

@@ -13,7 +13,8 @@ from consistency.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of
 from consistency.frontend.truth import find_truth, missing_of_drive, read_truth
 from consistency.frontend.tum import covariance_text, motions_text, trajectory_text
 from consistency.store.log import View, write_log
-from consistency.store.storage import manifest_of, require_free, write_folder
+from consistency.store.provenance import manifest_of
+from consistency.store.storage import require_free, write_folder
 from consistency.types import Array
 from consistency.vision.features import opencv
 from consistency.vision.matching import is_rectified

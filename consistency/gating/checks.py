@@ -138,7 +138,8 @@ def of_results(
     ValueError
         No results, no such filter, or more than one to choose from; ``skip`` leaves nothing.
     """
-    from consistency.store.results import POSE, Results
+    from consistency.reading.columns import POSE
+    from consistency.store.results import Results
     from consistency.verdicts.curves import curves
     from consistency.verdicts.judge import evidence_of
 

@@ -15,7 +15,7 @@ from consistency.gating.checks import Arrays, Candidate, evidence, of_results
 
 if TYPE_CHECKING:
     from consistency.store.results import Results
-    from consistency.verdicts.comparison import Baseline
+    from consistency.verdicts.baselines import Baseline
 
 
 NONE_FAILED = FailedRuns(0, 0)
@@ -106,8 +106,8 @@ def of_filters(
     ValueError
         No such filter, nothing to compare with, or a baseline that cannot be read.
     """
-    from consistency.store.results import POSE
-    from consistency.verdicts.comparison import Baseline, baseline_of, read_baseline, require_skip
+    from consistency.reading.columns import POSE
+    from consistency.verdicts.baselines import Baseline, baseline_of, read_baseline, require_skip
 
     if reference is None and than is None:
         raise ValueError("than: name the filter to compare with, or give other results as reference")

@@ -15,7 +15,8 @@ from consistency.diagnostics.wording import plural
 from consistency.errors import InputError
 from consistency.recording import Recording, read_recordings
 from consistency.store.atomic import write_whole
-from consistency.verdicts.judge import analyse_recordings, settings_of, skip_asked
+from consistency.verdicts.files import analyse_recordings
+from consistency.verdicts.options import settings_of, skip_asked
 
 if TYPE_CHECKING:
     from consistency.reporting.drawing import Sheet

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-from pydantic import ValidationError
 
 from consistency.errors import InputError
 
@@ -22,8 +19,7 @@ HUGE = 1e30  # m, s or px; what is measured is smaller, and a NEES of such numbe
 MOST_DOF = 2.0**31  # degrees of freedom in a step, whose sums then are exact
 LARGEST_NUMBER = HUGE**2  # that a filter may say, or a NEES be; sums of squares of such numbers are finite
 DEEPEST = 64  # parts of a dotted key
-_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_DEEP = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}")
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""  # its possessive quantifiers need Python 3.11
 UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # categories of Unicode: control, surrogate, ends of lines and paragraphs
 _SHOWN = 160  # characters of a parser's own words
 
@@ -51,12 +47,16 @@ def reading(path: Path | str, refusal: str = "cannot be read, damaged or cut sho
         raise InputError(f"{path}: {refusal} (nested too deep)") from None
     except MemoryError:
         raise InputError(f"{path}: {refusal} (it would take more memory than there is)") from None
-    except ValidationError as error:
-        first = error.errors(include_input=False, include_url=False)[0]
-        place = one_line(".".join(map(str, first["loc"])))
-        raise InputError(f"{path}: {refusal} (key '{place}': {one_line(first['msg'])})") from None
     except Exception as error:
-        raise InputError(f"{path}: {refusal} ({one_line(error) or type(error).__name__})") from None
+        raise InputError(f"{path}: {refusal} ({_said(error)})") from None
+
+
+def _said(error: Any) -> str:
+    """What a parser says; pydantic's first complaint, with its key."""
+    if type(error).__name__ != "ValidationError" or not hasattr(error, "errors"):
+        return one_line(error) or type(error).__name__
+    first = error.errors(include_input=False, include_url=False)[0]
+    return f"key '{one_line('.'.join(map(str, first['loc'])))}': {one_line(first['msg'])}"
 
 
 def one_line(value: object, longest: int = _SHOWN) -> str:
@@ -116,7 +116,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as nested tables; raises :class:`InputError`."""
     text = read_text(path, "not valid TOML")
     with reading(path, "not valid TOML"):
-        if _DEEP.search(text):  # the parser would take memory by the square of their number
+        import tomllib  # which Python 3.10 lacks
+
+        if re.search(
+            rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}", text
+        ):  # the parser would take memory by the square of their number
             raise InputError(f"{path}: not valid TOML (a key of more than {DEEPEST} parts)")
         return tomllib.loads(text)
 

@@ -53,6 +53,8 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
     named. Where it is off by less, a guess is named with which everything is as the covariance says, and no simple
     fault of a filter explains as much (:mod:`consistency.recording.fits`).
     """
+    if not runs:
+        return []
     some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
     if _same(some):
         return [

@@ -9,7 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from consistency.errors import InputError
@@ -77,7 +76,7 @@ def drive_sheet(folder: Path, body: str | None = None) -> Sheet:
     lines = read_drive(folder, body)
     ahead = Rotation.from_quat(lines.values[:, 4:]).apply([1.0, 0.0, 0.0])
     columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
-    return Sheet(folder, pd.DataFrame(columns), lines.line, "packet")
+    return Sheet(folder, columns, lines.line, "packet")
 
 
 def mercator(place: Array) -> Array:

@@ -56,9 +56,9 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
             raise InputError(f"--filter {filter_name}: does not go with {path}")
         return _of_archive(path, run)
     sheet = read_sheet(path)
-    _require_columns(str(path), [str(column) for column in sheet.data.columns])
+    _require_columns(str(path), list(sheet.data))
     sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
-    return _of_sheet(str(sheet.data["filter"].iloc[0]) if "filter" in sheet else path.stem, sheet)
+    return _of_sheet(str(sheet.data["filter"][0]) if "filter" in sheet else path.stem, sheet)
 
 
 def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
@@ -111,7 +111,7 @@ def _of_one(sheet: Sheet, column: str, choice: str | int | None) -> Sheet:
         if choice is not None:
             raise InputError(f"--{column} {choice}: {sheet.path} has no column '{column}'")
         return sheet
-    values = sheet.data[column].astype(str).to_numpy() if column == "filter" else sheet.numbers(column, whole=True)
+    values = sheet.texts(column) if column == "filter" else sheet.numbers(column, whole=True)
     there = [str(v) if column == "filter" else int(v) for v in dict.fromkeys(values.tolist())]
     return sheet.rows(values == choose(sheet.path, column, there, choice))
 
@@ -119,7 +119,7 @@ def _of_one(sheet: Sheet, column: str, choice: str | int | None) -> Sheet:
 def _of_sheet(name: str, sheet: Sheet) -> NisLog:
     key = next((column for column in ("step", "t") if column in sheet), None)
     if key is not None:
-        sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet.data), int), key))
+        sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
     nis = sheet.numbers("nis")
     dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
     step = sheet.numbers("step") if "step" in sheet else np.arange(1.0, len(nis) + 1)

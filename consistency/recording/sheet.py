@@ -2,38 +2,68 @@
 
 from __future__ import annotations
 
-import io
+import csv
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
-import pandas as pd
 
 from consistency.errors import InputError
 from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading, require_name
 from consistency.recording.text import Block, blocks
-from consistency.store.parquet import are_no_numbers, read_frame
 from consistency.types import Array, Indices
+
+Column = Array  # (N,), floats with NaN where a cell is empty; or objects, text for one, with None there
+EMPTY = frozenset(
+    [
+        "#N/A",
+        "#N/A N/A",
+        "#NA",
+        "-1.#IND",
+        "-1.#QNAN",
+        "-NaN",
+        "-nan",
+        "1.#IND",
+        "1.#QNAN",
+        "<NA>",
+        "N/A",
+        "NA",
+        "NULL",
+        "NaN",
+        "None",
+        "n/a",
+        "nan",
+        "null",
+        "",
+    ]
+)  # what pandas and R write for no value
+WHOLE = 2.0**53  # up to which floats hold every whole number
+TRUTHS = {text: value for value in (True, False) for text in (str(value), str(value).lower(), str(value).upper())}
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table and where each of its rows stands in the file."""
+    """A table of N rows, and where each of them stands in the file."""
 
     path: Path
-    data: pd.DataFrame
+    data: dict[str, Column]
     line: Indices  # (N,), line of a text file, row of a Parquet file
     unit: str  # line | row
 
     def __contains__(self, column: str) -> bool:
-        return column in self.data.columns
+        return column in self.data
+
+    def __len__(self) -> int:
+        return len(self.line)
 
     @property
     def columns(self) -> str:
         """The names of the first columns, for messages."""
-        names = [str(name) for name in self.data.columns]
+        names = list(self.data)
         return ", ".join(names[:12]) + ", …" * (len(names) > 12)
 
     def place(self, row: int) -> str:
@@ -42,25 +72,33 @@ class Sheet:
     def numbers(self, column: str, finite: bool = False, whole: bool = False) -> Array:
         """A column as floats, NaN where empty; refused where it is text, or not finite or whole as asked for."""
         cells = self.data[column]
-        with reading(self.path, f"column '{column}' cannot be read as numbers"):
-            values: Array = pd.to_numeric(cells, errors="coerce").to_numpy(float, na_value=np.nan)
-            values = bounded(values)
-            other = are_no_numbers(cells)
-            bad = other | np.isnan(values) & ~cells.isna().to_numpy()
-        what = "a truth value or a date, which is to be written as a number" if other.any() else "not a number"
+        values = bounded(cells if cells.dtype.kind == "f" else np.array([_number(cell) for cell in cells], float))
+        bad = np.isnan(values) & ~self.empty(column)
+        other = not all(isinstance(cell, str) for cell in cells[bad])
+        what = "a truth value or a date, which is to be written as a number" if other else "not a number"
         if not bad.any() and (finite or whole):
             bad, what = ~np.isfinite(values), "not a finite number"
         if not bad.any() and whole:
             bad, what = values != np.round(values), "not a whole number"
+        if not bad.any() and whole:
+            bad, what = np.abs(values) > WHOLE, "a number too large to be counted exactly"
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
-            raise InputError(f"{self.place(row)}: column '{column}': {what} ({one_line(cells.iloc[row], 60)})")
+            raise InputError(f"{self.place(row)}: column '{column}': {what} ({one_line(cells[row], 60)})")
         return values
 
     def rows(self, keep: Array) -> Sheet:
         """The rows of a mask or of indices."""
-        index = np.arange(len(self.data))[keep]
-        return Sheet(self.path, self.data.iloc[index], self.line[index], self.unit)
+        return Sheet(self.path, {name: cells[keep] for name, cells in self.data.items()}, self.line[keep], self.unit)
+
+    def texts(self, column: str) -> Array:
+        """A column as text, (N,)."""
+        return np.array([str(cell) for cell in self.data[column]], object)
+
+    def empty(self, column: str) -> Array:
+        """Which cells of a column are empty, (N,)."""
+        cells = self.data[column]
+        return np.isnan(cells) if cells.dtype.kind == "f" else np.array([cell is None for cell in cells], bool)
 
 
 @dataclass(frozen=True)
@@ -120,27 +158,31 @@ def are_dof(values: Array) -> Array:
 def read_sheet(path: Path) -> Sheet:
     """A CSV file (comma, semicolon or tab; # comments) or a Parquet file."""
     sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
-    if sheet.data.empty:
+    if not len(sheet):
         raise InputError(f"{path}: holds no row")
     if "filter" in sheet:
-        for name in sheet.data["filter"].dropna().unique():
-            require_name(str(name), f"{path}: column 'filter'")
+        empty = np.flatnonzero(sheet.empty("filter"))
+        if len(empty):
+            raise InputError(f"{sheet.place(int(empty[0]))}: column 'filter' is empty")
+        for name in dict.fromkeys(sheet.texts("filter")):
+            require_name(name, f"{path}: column 'filter'")
     return sheet
 
 
 def _read_parquet(path: Path) -> Sheet:
     if not is_file(path):
         raise InputError(f"{path}: no such file")
-    data = read_frame(path, "cannot be read as Parquet")
-    names = [str(name) for name in data.columns]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"{path}: column '{one_line(twice[0])}' is there twice")
-    return Sheet(path, data, np.arange(len(data)), "row")
+    try:
+        from consistency.store.parquet import read_columns
+    except ImportError as error:
+        raise InputError(f"{path}: Parquet needs {error.name}: pip install pandas pyarrow") from None
+    columns, rows = read_columns(path, "cannot be read as Parquet")
+    return Sheet(path, columns, np.arange(rows), "row")
 
 
 def _read_csv(path: Path) -> Sheet:
     names: list[str] = []
-    separator, tables, line = ",", list[pd.DataFrame](), list[Indices]()
+    separator, tables, line = ",", list[dict[str, Column]](), list[Indices]()
     for block in blocks(path):
         if not names:
             lines = block.lines()
@@ -157,7 +199,9 @@ def _read_csv(path: Path) -> Sheet:
         raise InputError(f"{path}: is empty")
     if not tables:
         raise InputError(f"{path}: holds no row under its header")
-    return Sheet(path, pd.concat(tables, ignore_index=True), np.concatenate(line), "line")
+    return Sheet(
+        path, {name: _joined([table[name] for table in tables]) for name in names}, np.concatenate(line), "line"
+    )
 
 
 def _header(path: Path, line: str) -> tuple[list[str], str]:
@@ -172,7 +216,7 @@ def _header(path: Path, line: str) -> tuple[list[str], str]:
 
 def _rows(
     path: Path, lines: list[tuple[int, str]], names: list[str], separator: str
-) -> tuple[pd.DataFrame, Indices] | None:
+) -> tuple[dict[str, Column], Indices] | None:
     """Rows of a table from its lines, and their numbers; None without any."""
     for number, line in lines:
         fields = line.count(separator) + 1
@@ -180,28 +224,79 @@ def _rows(
             raise InputError(f"{path}, line {number}: has {fields} columns, the header has {len(names)}")
     if not lines:
         return None
-    data = _parsed(path, io.StringIO("\n".join(line for _, line in lines)), names, separator)
-    if len(data) != len(lines):
-        raise InputError(f"{path}: cannot be read as CSV (a quoted field goes over several lines)")
-    return data, np.array([number for number, _ in lines])
+    numbers = [number for number, _ in lines]
+    return _columns(_cells(path, lines, separator, len(names)), names), np.array(numbers)
 
 
-def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[pd.DataFrame, Indices] | None:
+def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[str, Column], Indices] | None:
     """The same of a block that every line of is a row; None where that has to be looked at."""
-    if len(names) == 1 or not block.plain or b"\n\t" in block.data or block.data[:1] == b"\t":
+    if len(names) == 1 or not block.plain or (block.count_of(separator.encode()) != len(names) - 1).any():
         return None
-    if (block.count_of(separator.encode()) != len(names) - 1).any():
-        return None
-    data = _parsed(block.path, io.BytesIO(block.data), names, separator)
-    return (data, block.first + np.arange(block.count)) if len(data) == block.count else None
+    numbers = block.first + np.arange(block.count)
+    found = None if "filter" in names else block.numbers(separator.encode())
+    if found is not None and found[0].shape == (block.count, len(names)):
+        return dict(zip(names, found[0].T, strict=True)), numbers
+    return _columns([line.split(separator) for line in block.text.splitlines()], names), numbers
 
 
-def _parsed(path: Path, file: io.StringIO | io.BytesIO, names: list[str], separator: str) -> pd.DataFrame:
-    with reading(path, "cannot be read as CSV"):
-        return pd.read_csv(
-            file, sep=separator, header=None, names=names, index_col=False, skipinitialspace=True,
-            float_precision="round_trip", low_memory=False, dtype={"filter": str} if "filter" in names else None,
-        )  # fmt: skip
+def _cells(path: Path, lines: list[tuple[int, str]], separator: str, width: int) -> list[list[str]]:
+    """The fields of lines, out of their quotes where they are in some."""
+    rows = []
+    for number, line in lines:
+        fields = line.split(separator)
+        if '"' in line:
+            if line.count('"') % 2:
+                raise InputError(
+                    f"{path}: cannot be read as CSV (line {number}: a quoted field goes over several lines)"
+                )
+            with reading(path, f"line {number} cannot be read as CSV"):
+                (fields,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        if len(fields) != width:
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns, the header has {width}")
+        rows.append(fields)
+    return rows
+
+
+def _columns(rows: list[list[str]], names: list[str]) -> dict[str, Column]:
+    """Columns of floats where all cells are numbers or empty; of text or truth values else."""
+    columns = (map(str.lstrip, cells) for cells in zip(*rows, strict=True))
+    return {name: _column(list(cells), name == "filter") for name, cells in zip(names, columns, strict=True)}
+
+
+def _column(cells: list[str], is_text: bool) -> Column:
+    filled: list[Any] = [None if cell in EMPTY else cell for cell in cells]
+    if not is_text:
+        values = np.array([_number(cell) for cell in filled], float)
+        if all(cell is None for cell in itertools.compress(filled, np.isnan(values))):
+            return values
+        if all(cell is None or cell in TRUTHS for cell in filled):
+            filled = [TRUTHS.get(cell) for cell in cells]
+    return np.array(filled, object)
+
+
+def _number(cell: object) -> float:
+    """A cell as a number; NaN where it is empty or none."""
+    if isinstance(cell, str):
+        if "_" in cell or not cell.isascii():  # numbers to Python alone
+            return math.nan
+        try:
+            return float(cell)
+        except ValueError:
+            return math.nan
+    return float(cell) if isinstance(cell, int | float | np.number) and not isinstance(cell, bool) else math.nan
+
+
+def _joined(parts: list[Column]) -> Column:
+    """Parts of a column below each other, as objects where one of them is."""
+    if any(part.dtype.kind == "O" for part in parts):
+        parts = [part if part.dtype.kind == "O" else _objects(part) for part in parts]
+    return np.concatenate(parts)
+
+
+def _objects(values: Array) -> Column:
+    cells = values.astype(object)
+    cells[np.isnan(values)] = None
+    return cells
 
 
 def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:

@@ -12,6 +12,7 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
+from consistency.reading.columns import COVARIANCE, OWN_COVARIANCE
 from consistency.recording.alignment import Aligned, clocks_and_frames
 from consistency.recording.hints import hints
 from consistency.recording.interpolation import Manifold, truth_at
@@ -32,7 +33,6 @@ from consistency.recording.record import (
 from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places, Sheet, are_dof, read_sheet
 from consistency.recording.windows import Relative
-from consistency.store.parquet import COVARIANCE, OWN_COVARIANCE
 from consistency.types import Array, Indices
 
 POSE = ("x", "y", "heading")
@@ -67,18 +67,15 @@ def read_tables(
     other = None
     if truth is not None:
         other = drive_sheet(truth, body) if is_drive(truth) else read_sheet(truth)
-    if other is None and not {"nis", "nis_dof"} <= set(sheet.data.columns):
+    if other is None and not {"nis", "nis_dof"} <= set(sheet.data):
         raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
     key = _key(sheet, other, max_dt, time_offset)
     names = [estimates.stem]
     if "filter" in sheet:
-        empty = np.flatnonzero(sheet.data["filter"].isna())
-        if len(empty):
-            raise InputError(f"{sheet.place(int(empty[0]))}: column 'filter' is empty")
-        names = [str(name) for name in sheet.data["filter"].unique()]
+        names = list(dict.fromkeys(sheet.texts("filter")))
     recordings = []
     for name in names:
-        own = sheet.rows((sheet.data["filter"].astype(str) == name).to_numpy()) if "filter" in sheet else sheet
+        own = sheet.rows(sheet.texts("filter") == name) if "filter" in sheet else sheet
         recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset, relative, align))
     return recordings
 
@@ -132,7 +129,7 @@ def _recording(
     relative: Relative | None,
     align: str | None,
 ) -> Recording:
-    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet.data), int)
+    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
     order = row_order(sheet, runs, key)
     sheet, runs = sheet.rows(order), runs[order]
     keys = sheet.numbers(key, finite=True)
@@ -225,7 +222,7 @@ def _stretches(
 
 def _cross(sheet: Sheet) -> Array | None:
     """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
-    out, missing = np.empty((len(sheet.data), 3, 3)), []
+    out, missing = np.empty((len(sheet), 3, 3)), []
     for (i, a), (j, b) in itertools.product(enumerate(POSE), repeat=2):
         names = f"C_{a[0]}{b[0]}", f"C_{a}_{b}"
         there = [name for name in names if name in sheet]
@@ -400,19 +397,19 @@ def _exact_start(steps: Array, covariance: Array) -> Array:
 
 def _has_own(sheet: Sheet) -> bool:
     """Whether the rows are of a filter of the bench that states the covariance of an error of its own."""
-    return all(name in sheet and bool(sheet.data[name].notna().any()) for name in OWN_COVARIANCE)
+    return all(name in sheet and not sheet.empty(name).all() for name in OWN_COVARIANCE)
 
 
 def _covariance(sheet: Sheet, axes: tuple[str, ...], own: bool = False) -> Array:
     """(N, n, n) from the upper triangle; a lower triangle beside it must agree. ``own``: of the columns own_P_*."""
     _require(sheet, axes)
     if own:
-        P = np.empty((len(sheet.data), 3, 3))
+        P = np.empty((len(sheet), 3, 3))
         for name, (i, j) in OWN_COVARIANCE.items():
             P[:, i, j] = P[:, j, i] = sheet.numbers(name)
         return P
     n = len(axes)
-    out = np.empty((len(sheet.data), n, n))
+    out = np.empty((len(sheet), n, n))
     for i in range(n):
         for j in range(i, n):
             upper = [f"P_{axes[i]}_{axes[j]}", *([OWN_NAMES[axes[i], axes[j]]] if axes == POSE else [])]

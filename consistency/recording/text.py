@@ -18,7 +18,7 @@ BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as
 REFUSAL = "not a text file; known are .csv, .parquet, .npz, and .txt or .tum"
 BOM = b"\xef\xbb\xbf"
 SPECIAL = b'"#\x0b\x0c\x1c\x1d\x1e'  # quotes, comments, and what str.splitlines takes for the end of a line
-IS_SPACE = np.isin(np.arange(256), np.frombuffer(b" ,\t\r\n", np.uint8))
+IS_SPACE = np.isin(np.arange(256), np.frombuffer(b" \t\r\n", np.uint8))
 NEWLINE = ord("\n")
 
 
@@ -57,14 +57,15 @@ class Block:
         """How often a character is in each line of a plain block."""
         return self._per_line(np.frombuffer(self.data, np.uint8) == ord(character))
 
-    def numbers(self) -> tuple[Array, Indices] | None:
-        """Rows of numbers (N, columns), commas taken as spaces, and the numbers (N,) of their lines.
+    def numbers(self, separator: bytes = b",") -> tuple[Array, Indices] | None:
+        """Rows of numbers (N, columns), separators taken as spaces, and the numbers (N,) of their lines.
 
         None where it holds anything else, or lines of unequal length: it is to be read line by line then.
         """
-        if not self.plain:
+        if not self.plain or b"_" in self.data:
             return None
-        space = IS_SPACE[np.frombuffer(self.data, np.uint8)]
+        data = self.data.replace(separator, b" ")
+        space = IS_SPACE[np.frombuffer(data, np.uint8)]
         begins = ~space
         begins[1:] &= space[:-1]
         fields = self._per_line(begins)
@@ -72,7 +73,7 @@ class Block:
         if not len(full) or (fields[full] != fields[full[0]]).any():
             return None
         try:
-            values = np.fromiter(map(float, self.data.replace(b",", b" ").split()), float)
+            values = np.fromiter(map(float, data.split()), float)
         except ValueError:
             return None
         return values.reshape(len(full), -1), self.first + full

@@ -91,7 +91,7 @@ def write_file_pages(
 ) -> None:
     """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
     from consistency.reporting.files import compose_files
-    from consistency.store.storage import manifest_of
+    from consistency.store.provenance import manifest_of
 
     _write_document(compose_files(records, judged, title, manifest_of(kind="verdict", source=title)), html, pdf)
 
@@ -126,7 +126,8 @@ def write_sensor_reports(of: Characterisation, folder: Path, data: str, overwrit
         The folder exists or cannot be written.
     """
     from consistency.reporting.sensor import compose_sensor
-    from consistency.store.storage import manifest_of, write_folder
+    from consistency.store.provenance import manifest_of
+    from consistency.store.storage import write_folder
 
     manifest = manifest_of(kind="characterisation", source=of.source)
     document = compose_sensor(of, manifest)
@@ -160,7 +161,8 @@ def write_file_reports(
         The folder exists or cannot be written.
     """
     from consistency.reporting.files import compose_files
-    from consistency.store.storage import manifest_of, write_folder
+    from consistency.store.provenance import manifest_of
+    from consistency.store.storage import write_folder
 
     manifest = manifest_of(kind="verdict", source=title)
     document = compose_files(records, judged, title, manifest)

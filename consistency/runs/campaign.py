@@ -15,9 +15,9 @@ from consistency.protocols import Filter
 from consistency.runs.gather import Gathered, SoFar
 from consistency.runs.resuming import Place
 from consistency.runs.work import Backend, Work
+from consistency.store.provenance import manifest_of
 from consistency.store.results import Results, StoredResults
 from consistency.store.stopping import Stop, stoppable
-from consistency.store.storage import manifest_of
 from consistency.terminal.progress import progress
 
 

@@ -21,8 +21,9 @@ from consistency.reading import read_json, reading
 from consistency.runs.backends.local import worker_count
 from consistency.runs.montecarlo import run_trials
 from consistency.scenario import Scenario, data_folder, load_scenario
+from consistency.store.provenance import manifest_of
 from consistency.store.results import Results, joined
-from consistency.store.storage import manifest_of, require_free, write_folder
+from consistency.store.storage import require_free, write_folder
 from consistency.terminal.progress import quiet, say
 from consistency.terminal.table import print_findings
 from consistency.types import OURS as OURS

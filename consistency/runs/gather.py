@@ -15,9 +15,10 @@ import numpy as np
 import pandas as pd
 
 from consistency.errors import InputError
+from consistency.reading.columns import COLUMNS
 from consistency.store.journal import Journal
 from consistency.store.machine import this_machine
-from consistency.store.parquet import COLUMNS, Columns, Writer, write_table
+from consistency.store.parquet import Columns, Writer, write_table
 from consistency.store.results import (
     MAP_NUMBERS,
     NUMBERS,

@@ -26,8 +26,9 @@ from consistency.scenario.tables import UNITS
 from consistency.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.store.journal import Journal
 from consistency.store.log import Log, write_log
+from consistency.store.provenance import manifest_of
 from consistency.store.results import Results, StoredResults, Tables
-from consistency.store.storage import manifest_of, require_free
+from consistency.store.storage import require_free
 from consistency.store.tables import require_format
 
 

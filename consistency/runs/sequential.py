@@ -11,16 +11,18 @@ from typing import Any
 from consistency.diagnostics import Design, Verdict, look, sequential_design, speaks
 from consistency.errors import InputError
 from consistency.protocols import Filter
+from consistency.reading.columns import POSE
 from consistency.runs.backends.local import Local
 from consistency.runs.campaign import Campaign
 from consistency.runs.montecarlo import studied
 from consistency.runs.work import Backend
 from consistency.scenario import Scenario
 from consistency.store.journal import Journal
-from consistency.store.results import POSE, Results, StoredResults, Tables
+from consistency.store.results import Results, StoredResults, Tables
 from consistency.terminal.progress import say
 from consistency.verdicts.curves import Curves, curves
-from consistency.verdicts.judge import beside, evidence_of, refused
+from consistency.verdicts.judge import beside, evidence_of
+from consistency.verdicts.options import refused
 
 
 def run_until_decided(

@@ -15,6 +15,7 @@ import tomli_w
 
 from consistency.errors import InputError
 from consistency.reading import reading
+from consistency.reading.columns import COLUMNS, POSE
 from consistency.scenario import (
     Belief,
     BelievedMotion,
@@ -27,8 +28,7 @@ from consistency.scenario import (
     toml_text,
 )
 from consistency.scenario.tables import SIGMA_UNITS
-from consistency.store.parquet import COLUMNS
-from consistency.store.results import POSE, controls_table, observations_table, truth_of
+from consistency.store.results import controls_table, observations_table, truth_of
 from consistency.store.storage import write_folder
 from consistency.store.tables import read_table_file, require_format, table_file
 from consistency.types import Array, Indices, Trial

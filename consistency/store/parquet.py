@@ -16,33 +16,9 @@ import pyarrow.parquet as pq
 
 from consistency.errors import InputError
 from consistency.reading import HUGE, LARGEST_NUMBER, MOST_DOF, is_file, one_line, reading, require_room
+from consistency.reading.columns import COLUMNS, OWN_COVARIANCE
 from consistency.types import Array
 
-COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xh": (0, 2), "P_yy": (1, 1), "P_yh": (1, 2), "P_hh": (2, 2)}
-OWN_COVARIANCE = {f"own_{name}": place for name, place in COVARIANCE.items()}  # of a filter's own error
-POINT_COVARIANCE = {"P_xx": (0, 0), "P_xy": (0, 1), "P_xz": (0, 2), "P_yy": (1, 1), "P_yz": (1, 2), "P_zz": (2, 2)}
-COLUMNS: dict[str, dict[str, str]] = {
-    "landmarks": {"landmark": "int64", "x": "float64", "y": "float64", "z": "float64"},
-    "truth": {"run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64", "heading": "float64"},
-    "controls": {"run": "int64", "step": "int64", "dt": "float64", "v": "float64", "omega": "float64"},
-    "observations": {
-        "run": "int64", "step": "int64", "landmark": "int64", "z0": "float64", "z1": "float64",
-    },
-    "estimates": {
-        "filter": "str", "run": "int64", "step": "int64", "t": "float64", "x": "float64", "y": "float64",
-        "heading": "float64", **dict.fromkeys(COVARIANCE, "float64"), "nees": "float64", "nis": "float64",
-        "nis_dof": "int64",
-    },
-    "failures": {"filter": "str", "run": "int64", "step": "int64", "reason": "str"},
-    "rejections": {
-        "filter": "str", "run": "int64", "offered": "int64", "spurious": "int64", "rejected": "int64",
-        "rejected_spurious": "int64",
-    },
-    "map": {
-        "filter": "str", "run": "int64", "landmark": "int64", "x": "float64", "y": "float64", "z": "float64",
-        **dict.fromkeys(POINT_COVARIANCE, "float64"), "nees": "float64",
-    },
-}  # fmt: skip
 OPTIONAL = {  # columns of a table that may be missing
     "observations": {"z2": "float64", "source": "int64"},  # z2 by sensors of three values
     "estimates": dict.fromkeys([*OWN_COVARIANCE, "own_nees"], "float64"),
@@ -228,6 +204,30 @@ def read_frame(path: Path, refusal: str) -> pd.DataFrame:
     with reading(path, refusal):
         table: pd.DataFrame = _plain(file.read()).to_pandas()
         return table
+
+
+def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
+    """The same as arrays, floats with NaN where a cell is empty, or objects with None there; and the number of rows.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or has a name of a column twice.
+    """
+    frame = read_frame(path, refusal)
+    names = [str(name) for name in frame.columns]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"{path}: column '{one_line(twice[0])}' is there twice")
+    with reading(path, refusal):
+        return {name: _cells(frame.iloc[:, k]) for k, name in enumerate(names)}, len(frame)
+
+
+def _cells(column: pd.Series[Any]) -> Array:
+    if column.name != "filter" and column.dtype.kind != "c" and not are_no_numbers(column).any():
+        values: Array = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
+        if (np.isnan(values) <= column.isna()).all():
+            return values
+    return column.astype(object).where(column.notna(), None).to_numpy()
 
 
 def _plain(table: Any) -> Any:

@@ -21,24 +21,13 @@ from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry import pose_error
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error, planar_map_error
 from consistency.reading import LARGEST_NUMBER
+from consistency.reading.columns import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
 from consistency.scenario import Scenario, explain
-from consistency.store.parquet import (
-    COLUMNS,
-    COVARIANCE,
-    OPTIONAL,
-    OWN_COVARIANCE,
-    POINT_COVARIANCE,
-    Columns,
-    columns_of,
-    read_batches,
-    read_parquet,
-    require_table,
-)
+from consistency.store.parquet import OPTIONAL, Columns, columns_of, read_batches, read_parquet, require_table
 from consistency.store.soundness import require_manifest, require_rows
 from consistency.store.storage import read_manifest, require_unchanged, write_folder
 from consistency.types import Array, Estimates, Failure, Indices, Map, Trial
 
-POSE = ["x", "y", "heading"]
 NUMBERS = [column for column in COLUMNS["estimates"] if column != "filter"]
 OWN_NUMBERS = [*NUMBERS, *OPTIONAL["estimates"]]  # of a filter whose error is not the additive one
 JOINT = "joint_nees"  # of a landmark, given the pose and the landmarks above it in the map of its run

@@ -12,8 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from consistency.errors import InputError
 from consistency.reading import one_line, reading, require_name
+from consistency.reading.columns import COLUMNS
 from consistency.scenario import Scenario
-from consistency.store.parquet import COLUMNS, read_batches, require_table
+from consistency.store.parquet import read_batches, require_table
 
 AGAIN = "the folder was changed or damaged; write it again"
 Whole = Annotated[int, Field(ge=0, lt=2**53)]

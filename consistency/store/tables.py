@@ -11,7 +11,8 @@ import pyarrow.csv as pa_csv
 
 from consistency.errors import InputError
 from consistency.reading import is_file, reading, require_room
-from consistency.store.parquet import COLUMNS, OPTIONAL, check_column, read_parquet, require_table
+from consistency.reading.columns import COLUMNS
+from consistency.store.parquet import OPTIONAL, check_column, read_parquet, require_table
 
 FORMATS = ("parquet", "csv")
 DAMAGED = "cannot be read as CSV; needs a header, and in each row as many numbers, with commas between them"

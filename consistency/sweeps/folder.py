@@ -18,7 +18,8 @@ from consistency.reading import reading
 from consistency.scenario import Scenario
 from consistency.store.atomic import write_whole
 from consistency.store.journal import Journal, Unfinished
-from consistency.store.storage import manifest_of, read_manifest, write_folder
+from consistency.store.provenance import manifest_of
+from consistency.store.storage import read_manifest, write_folder
 from consistency.sweeps.axes import Axis
 from consistency.sweeps.cell import CellResult, Outcome, plain_numbers, result_from
 from consistency.sweeps.plan import MOST_CELLS, Cell, Rule, Sweep

@@ -20,10 +20,10 @@ from consistency.diagnostics import Settings
 from consistency.errors import InputError
 from consistency.filters import get_filter
 from consistency.reading import HUGE
+from consistency.reading.columns import POSE
 from consistency.runs.montecarlo import resolve_filters
 from consistency.runs.sequential import plan_of
 from consistency.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
-from consistency.store.results import POSE
 from consistency.sweeps.axes import QUANTITIES, Axis, leaves, require_key, with_changes
 
 MOST_CELLS = 20_000  # each is a scenario in memory, and a folder

@@ -11,7 +11,7 @@ from rich.table import Table as RichTable
 
 from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import plural, short
-from consistency.store.storage import plain
+from consistency.store.provenance import plain
 from consistency.sweeps.cell import CellResult, plain_numbers
 from consistency.sweeps.recommend import OPEN, Advice, Candidate
 from consistency.sweeps.regime import Regime

@@ -16,7 +16,7 @@ from consistency.errors import InputError
 from consistency.reading import read_json, reading
 from consistency.scenario import data_folder
 from consistency.store.atomic import write_whole
-from consistency.store.storage import SCHEMA_VERSION, manifest_of
+from consistency.store.provenance import SCHEMA_VERSION, manifest_of
 from consistency.sweeps.cell import CellResult, plain_numbers, result_from
 from consistency.sweeps.folder import SweepFolder, describe, open_sweep, sweep_from
 from consistency.sweeps.plan import Cell, Sweep

@@ -19,7 +19,7 @@ from consistency.diagnostics.monitor import CAVEAT, accepted_scales
 from consistency.diagnostics.wording import percent, short
 from consistency.diagnostics.wording import plain as ratio_text
 from consistency.geometry.conventions import ADDITIVE, PLANAR
-from consistency.store.storage import plain
+from consistency.store.provenance import plain
 from consistency.types import Finding, outcome
 from consistency.verdicts.comparison import Compared
 from consistency.verdicts.monitoring import Watched

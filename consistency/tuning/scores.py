@@ -10,7 +10,8 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.filters.stepping import name_of, rejects
 from consistency.protocols import Filter
-from consistency.store.results import POSE, outcome_of
+from consistency.reading.columns import POSE
+from consistency.store.results import outcome_of
 from consistency.types import Array, Estimates, Trial
 
 BY = ("innovations", "nees")

@@ -14,7 +14,8 @@ from consistency.diagnostics.wording import short
 from consistency.scenario import Belief, scenario_text, toml_text
 from consistency.scenario.tables import SIGMA_UNITS
 from consistency.store.log import Log, sensor_text
-from consistency.store.storage import manifest_of, plain, write_folder
+from consistency.store.provenance import manifest_of, plain
+from consistency.store.storage import write_folder
 from consistency.tuning.fit import LIMIT
 from consistency.tuning.groups import sigma_by_channel
 from consistency.tuning.parts import with_belief

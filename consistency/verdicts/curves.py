@@ -17,8 +17,9 @@ from consistency.errors import InputError
 from consistency.filters.kernel.linalg import definiteness
 from consistency.geometry.conventions import ADDITIVE, planar_error
 from consistency.reading import LARGEST_NUMBER, one_line
-from consistency.store.parquet import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, Columns
-from consistency.store.results import JOINT, POSE, Tables
+from consistency.reading.columns import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
+from consistency.store.parquet import Columns
+from consistency.store.results import JOINT, Tables
 from consistency.types import Array, Failure, Indices
 
 

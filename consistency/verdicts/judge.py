@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,68 +16,22 @@ from consistency.diagnostics import (
     Settings,
     Verdict,
     follow,
-    gate_runs,
     judge,
-    lost_runs,
     map_score,
-    pilot_plan,
     rejection_score,
-    required_runs,
     sequential_design,
 )
-from consistency.diagnostics.questions import SHARES
 from consistency.diagnostics.scale import FEW
-from consistency.diagnostics.skipping import Skip, skip_of
+from consistency.diagnostics.skipping import Skip
 from consistency.diagnostics.symmetric import Symmetric
-from consistency.diagnostics.wording import plain
 from consistency.errors import InputError
-from consistency.recording import Recording
-from consistency.store.results import POSE, Tables
+from consistency.reading.columns import POSE
+from consistency.store.results import Tables
 from consistency.types import Array, Indices
 from consistency.verdicts.curves import Curves, Ends, Landmarks, curves, landmarks_of, run_means, steps_of
+from consistency.verdicts.options import settings_of, skip_asked
 
 POINT = ("x", "y", "z")
-POSES = {"heading", "yaw", "pitch", "roll"}  # what a pose has beside its position
-OPTION = {
-    "ratio": "detect",
-    "false_alarm": "false-alarm",
-    "max_runs": "max-runs",
-}  # of the plan, as the command calls it
-
-
-def settings_of(confidence: float | None = None, **given: Any) -> Settings:
-    """Settings of a verdict from the options of a command; those that are None keep their defaults.
-
-    Raises
-    ------
-    InputError
-        A value out of its range, or both a confidence and a false-alarm rate.
-    """
-    given = {name: value for name, value in given.items() if value is not None}
-    if confidence is not None:
-        if "false_alarm" in given:
-            raise InputError("--confidence is 1 less --false-alarm; give one of them")
-        if not 0.0 < confidence < 1.0:
-            raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
-        given["false_alarm"] = 1.0 - confidence
-    try:
-        return Settings(**given)
-    except ValueError as error:
-        raise refused(error) from None
-
-
-def skip_asked(given: str | float | Skip | None) -> Skip | None:
-    """The first steps or seconds that an option asks to leave out.
-
-    Raises
-    ------
-    InputError
-        It is neither a number of steps nor of seconds.
-    """
-    try:
-        return skip_of(given)
-    except ValueError as error:
-        raise refused(error) from None
 
 
 def analyse(
@@ -257,136 +211,11 @@ def beside(verdict: Verdict, c: Curves, design: Design, runs: int) -> Verdict:
     return with_map_score(verdict, c.landmarks, runs)
 
 
-def analyse_recordings(
-    recordings: Sequence[Recording],
-    filters: Sequence[str] | None = None,
-    settings: Settings | None = None,
-    optimal_gain: bool = False,
-) -> dict[str, Verdict]:
-    """A verdict for every recording, or for those named; raises as :func:`analyse`.
-
-    Parameters
-    ----------
-    optimal_gain : the filters declare one, so that their innovations are judged
-    """
-    settings = settings or Settings()
-    named = {recording.name: recording for recording in recordings}
-    verdicts = {}
-    for name in filters or named:
-        if name not in named:
-            raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
-        r = named[name]
-        if r.independent:
-            evidence = evidence_of_windows(r)
-        else:
-            evidence = Evidence(
-                name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
-                failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, spoilt=r.spoilt,
-                skipped=r.skipped, unseen=r.unseen,
-            )  # fmt: skip
-        verdict = _unshown(judge(evidence, settings), r.unshown)
-        first, *rest = verdict.reasons
-        verdicts[name] = replace(
-            verdict,
-            reasons=(f"{first}; {r.face}" if r.face else first, *rest, *_other_ways(verdict, r)),
-            convention=r.convention or None,
-            align=r.align if r.convention else None,
-            notes=tuple(r.notes),
-            left_out_steps=tuple(r.left_out_steps),
-        )
-    return verdicts
-
-
-def _unshown(verdict: Verdict, why: str) -> Verdict:
-    """Undecided, for that reason; as it was without one, or where a window failed."""
-    if not why or verdict.scale is None or verdict.status == "failed":
-        return verdict
-    scale = replace(verdict.scale, equivalence=replace(verdict.scale.equivalence, p_value=float("nan"), runs=None))
-    ratio = f"the covariance ratio would be {plain(scale.inflation)} if they are, reported and not judged"
-    reasons = (f"undecided: {why}; {ratio}", *verdict.reasons[1:])
-    return replace(verdict, status="undecided", scale=scale, reasons=reasons)
-
-
-def _other_ways(verdict: Verdict, r: Recording) -> list[str]:
-    """What else would decide on a single log of poses."""
-    if (
-        verdict.status != "undecided"
-        or len(r.runs) != 1
-        or r.window is not None
-        or not (r.convention and POSES & set(r.axes))
-    ):
-        return []
-    return [
-        "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "
-        "or poses with cross-covariances (docs/files.md)"
-    ]
-
-
-def evidence_of_windows(r: Recording) -> Evidence:
-    """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
-    assert r.error is not None
-    assert r.covariance is not None
-    assert r.nees is not None
-    runs, steps = r.error.shape[:2]
-    there = np.isfinite(r.nees)
-    number = np.arange(1, runs * steps + 1).reshape(runs, steps)
-    failures = [(int(np.flatnonzero(r.runs == f.run)[0]), f) for f in r.failures]
-    for row, f in failures:
-        there[row, f.step - 1] = True
-    return Evidence(
-        r.name, r.error[there][:, None], r.covariance[there][:, None], r.nees[there][:, None], r.dof,
-        failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures), axes=r.axes,
-        run_numbers=number[there], unit="window", spoilt=tuple(SHARES) if r.unshown else (), skipped=r.skipped,
-    )  # fmt: skip
-
-
-def plan(
-    dof: int,
-    detect: float,
-    false_alarm: float,
-    power: float,
-    allow: str | None = None,
-    pilots: Mapping[str, Curves] | None = None,
-    lost: float | None = None,
-) -> dict[str, Any]:
-    """Runs that a verdict takes (``runs``), those of one chi-square test (``one_step``), and the first looks.
-
-    Parameters
-    ----------
-    pilots : a few runs of each filter; ``like`` then has the runs that filters take whose steps depend on each other
-        as theirs do
-    lost : share of lost runs that is to be excluded
-
-    Raises
-    ------
-    InputError
-        A number out of its range, or pilots without truth.
-    """
-    if allow not in (None, "conservative"):
-        raise InputError(f"--allow must be 'conservative', got '{allow}'")
-    if pilots is not None and dof != len(POSE):
-        raise InputError(f"--dof {dof}: results of the bench have {len(POSE)} dimensions; leave it out")
-    try:
-        runs = gate_runs(dof, detect, false_alarm, power, allow, lost)
-        looks = list(itertools.takewhile(lambda n: n < runs, (n for n, spent in Design(dof).inspections() if spent)))
-        planned: dict[str, Any] = {
-            "dof": dof, "detect": detect, "false_alarm": false_alarm, "power": power, "allow": allow, "runs": runs,
-            "one_step": required_runs(dof, detect, false_alarm, power, two_sided=allow is None), "looks": looks,
-        }  # fmt: skip
-        planned |= {} if lost is None else {"lost": lost, "lost_runs": lost_runs(lost, power)}
-        if pilots is not None:
-            planned["like"] = {
-                name: vars(pilot_plan(_pilot_means(c), dof, c.t.size, detect, false_alarm, power, allow, lost))
-                for name, c in pilots.items()
-            }
-        return planned
-    except ValueError as error:
-        raise error if isinstance(error, InputError) else refused(error) from None
-
-
-def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str, Curves]:
-    """Results as pilots of :func:`plan`, of every filter or of those named."""
-    return {name: curves(results, name) for name in filters or results.filters}
+def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
+    """Results as pilots of :func:`consistency.verdicts.options.plan`, of every filter or of those named."""
+    return {
+        c.filter: (_pilot_means(c), c.t.size) for c in (curves(results, name) for name in filters or results.filters)
+    }
 
 
 def _pilot_means(c: Curves) -> Array:
@@ -398,9 +227,3 @@ def _pilot_means(c: Curves) -> Array:
     if len(means) < FEW:
         raise InputError(f"{c.filter}: a pilot needs at least {FEW} runs that did not fail, got {len(means)}")
     return np.asarray(means)
-
-
-def refused(error: ValueError) -> InputError:
-    """What a plan refuses, with the option of the command in place of the argument."""
-    name, rest = str(error).split(" ", 1)
-    return InputError(f"--{OPTION.get(name, name)} {rest}")

@@ -14,7 +14,6 @@ from consistency.diagnostics import Alarm, Monitor
 from consistency.errors import InputError
 from consistency.recording.nis import NisLog, checked_dof, choose, read_nis, stream_nis
 from consistency.recording.ulog import SUFFIX, read_ulog
-from consistency.store.results import open_results
 from consistency.types import Array
 
 OPTIMAL = "optimal"
@@ -117,6 +116,8 @@ def _updated(monitor: Monitor, place: str, nis: float, dof: float) -> Alarm | No
 
 
 def _of_results(folder: Path, filter_name: str | None, run: int | None) -> NisLog:
+    from consistency.store.results import open_results
+
     results = open_results(folder)
     name = choose(folder, "filter", results.filters, filter_name)
     run_number = choose(folder, "run", results.runs_of(name).tolist(), run)

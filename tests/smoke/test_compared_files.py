@@ -13,7 +13,7 @@ from command import consistency
 from consistency.cli import main
 from consistency.errors import InputError
 from consistency.recording import read_recordings
-from consistency.verdicts.comparison import baseline_of_files
+from consistency.verdicts.baselines import baseline_of_files
 
 OPTIONS = ("--truth", "truth.csv", "--state", "a,b")
 RUNS, STEPS = 24, 15

@@ -18,14 +18,15 @@ from consistency.diagnostics.export import map_text
 from consistency.diagnostics.records import MapScore
 from consistency.diagnostics.scale import ratio_interval
 from consistency.filters.stepping import run_filter, step_through
+from consistency.reading.columns import OWN_COVARIANCE
 from consistency.recording import read_recordings
 from consistency.runs.sequential import run_until_decided
-from consistency.store.parquet import OWN_COVARIANCE
 from consistency.store.results import open_results
 from consistency.terminal.table import print_verdicts, verdicts_json
-from consistency.verdicts.comparison import baseline_of
+from consistency.verdicts.baselines import baseline_of
 from consistency.verdicts.curves import curves, run_means
-from consistency.verdicts.judge import analyse, analyse_recordings, evidence_of, until_decided
+from consistency.verdicts.files import analyse_recordings
+from consistency.verdicts.judge import analyse, evidence_of, until_decided
 
 RUNS = 24
 KEYS = ["run", "step", "t", "x", "y", "heading"]

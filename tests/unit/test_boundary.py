@@ -19,7 +19,7 @@ import consistency as cs
 from consistency.recording import Recording, read_recordings
 from consistency.store.parquet import read_parquet
 from consistency.sweeps.plan import load_sweep
-from consistency.verdicts.comparison import read_baseline
+from consistency.verdicts.baselines import read_baseline
 
 
 def read(path: Path, **options: Path) -> Recording:

@@ -20,15 +20,8 @@ from consistency.gating.watch import Watch, watching
 from consistency.recording import read_recordings
 from consistency.testing import InsufficientTrials, assert_not_worse
 from consistency.types import Array
-from consistency.verdicts.comparison import (
-    Compared,
-    baseline_of,
-    baseline_of_files,
-    compare_filters,
-    compare_with,
-    read_baseline,
-    write_baseline,
-)
+from consistency.verdicts.baselines import baseline_of, baseline_of_files, read_baseline, write_baseline
+from consistency.verdicts.comparison import Compared, compare_filters, compare_with
 
 RATE = 1e-5  # false-failure rate of each statistical assertion below
 

@@ -14,7 +14,7 @@ from scripts import experiment
 import consistency as cs
 from consistency.models.stereo import project
 from consistency.store.log import read_log, write_log
-from consistency.store.storage import manifest_of
+from consistency.store.provenance import manifest_of
 from consistency.types import Array, Trial
 
 ROOT = Path(__file__).parents[2]

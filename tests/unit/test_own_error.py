@@ -16,9 +16,9 @@ from invariant import Invariant
 import consistency as cs
 from consistency.filters.stepping import run_filter
 from consistency.geometry.conventions import planar_error
+from consistency.reading.columns import OWN_COVARIANCE, POINT_COVARIANCE
 from consistency.runs.montecarlo import run_log, simulate_log
 from consistency.store.log import read_log
-from consistency.store.parquet import OWN_COVARIANCE, POINT_COVARIANCE
 from consistency.store.results import OWN_NUMBERS, joined, open_results, outcome_of
 from consistency.types import Array, Estimates, Failure, Map, Trial
 

@@ -20,8 +20,8 @@ from consistency.models import planar
 from consistency.runs.findings import sibling
 from consistency.simulation import draw_landmarks
 from consistency.store.log import read_log, write_log
+from consistency.store.provenance import manifest_of
 from consistency.store.results import is_flat
-from consistency.store.storage import manifest_of
 from consistency.types import Array
 
 Small = Callable[..., cs.Scenario]

@@ -31,7 +31,7 @@ from consistency.recording import (
 )
 from consistency.recording.record import associate, common_times, smallest_correlation
 from consistency.types import Array
-from consistency.verdicts.judge import analyse_recordings
+from consistency.verdicts.files import analyse_recordings
 
 ROOT = Path(__file__).parents[2]
 POSE_COLUMNS = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]

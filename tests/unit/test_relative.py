@@ -24,10 +24,11 @@ from consistency.notebook.records import Record
 from consistency.recording import Recording
 from consistency.recording.relative import Stretch, windows_of
 from consistency.recording.windows import Relative, relative_of, windows
-from consistency.store.storage import plain
+from consistency.store.provenance import plain
 from consistency.types import Array
-from consistency.verdicts.comparison import baseline_of_files, compare_with
-from consistency.verdicts.judge import analyse_recordings
+from consistency.verdicts.baselines import baseline_of_files
+from consistency.verdicts.comparison import compare_with
+from consistency.verdicts.files import analyse_recordings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import relative_poses as world

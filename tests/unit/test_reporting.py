@@ -22,6 +22,7 @@ from consistency.diagnostics.questions import DIRECTION, STEP
 from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import short
 from consistency.gating.report import STYLE
+from consistency.reading.columns import COVARIANCE
 from consistency.reporting import html, pdf, write_reports
 from consistency.reporting.answer import answer
 from consistency.reporting.blocks import Document
@@ -49,7 +50,6 @@ from consistency.reporting.sections import (
 from consistency.reporting.thin import thin
 from consistency.runs.findings import Finding
 from consistency.runs.montecarlo import run_log, simulate_log
-from consistency.store.parquet import COVARIANCE
 from consistency.store.results import read_results
 from consistency.types import Failure
 

@@ -17,7 +17,7 @@ from consistency.recording import read_recordings
 from consistency.reporting.blocks import Table, Text
 from consistency.reporting.drawing import Figure, Line
 from consistency.reporting.files import clock_of, compose_files, observed_coverage, record_figures, shown_run, unit_of
-from consistency.verdicts.judge import analyse_recordings
+from consistency.verdicts.files import analyse_recordings
 
 RUNS, STEPS = 30, 25
 

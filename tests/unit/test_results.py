@@ -17,8 +17,8 @@ import pytest
 from edited import accept_changes
 
 import consistency as cs
+from consistency.reading.columns import COLUMNS
 from consistency.runs.montecarlo import simulate_log
-from consistency.store.parquet import COLUMNS
 from consistency.store.storage import require_free
 from consistency.types import Control, Gaussian, Observation
 from consistency.verdicts.curves import curves

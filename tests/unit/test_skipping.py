@@ -19,7 +19,7 @@ from consistency.errors import InputError
 from consistency.recording import read_recordings
 from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse
 from consistency.types import Array
-from consistency.verdicts.comparison import baseline_of_files, read_baseline, write_baseline
+from consistency.verdicts.baselines import baseline_of_files, read_baseline, write_baseline
 from consistency.verdicts.curves import Curves, Errors
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))

@@ -15,7 +15,7 @@ from consistency.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.diagnostics.within import correlation_time, within
 from consistency.recording import read_recordings
 from consistency.types import Array
-from consistency.verdicts.judge import analyse_recordings
+from consistency.verdicts.files import analyse_recordings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from single_log import errors

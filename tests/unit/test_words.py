@@ -23,7 +23,7 @@ from scipy import stats
 from consistency.diagnostics import Evidence, Interval, Settings, Verdict, judge, outliers
 from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import off_by, p_text, plural, short
-from consistency.store.storage import plain
+from consistency.store.provenance import plain
 from consistency.types import Array, Failure
 
 SURE = 1e-5

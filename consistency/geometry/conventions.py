@@ -9,7 +9,7 @@ Filters of the bench and files of other estimators are judged by the errors that
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from consistency.geometry import pose_error, wrap
 from consistency.types import Array
@@ -158,9 +158,15 @@ def half_cotangent(angle: Array) -> Array:
 
 
 def _twist(shift: Array, turn: Rotation) -> Array:
-    """Log of SE(3) of N motions: (N, 3) and N rotations -> (N, 6), translation first."""
-    rotation_first = RigidTransform.from_components(shift, turn).as_exp_coords()
-    return np.roll(rotation_first, 3, axis=-1)
+    """Log of SE(3) of N motions: (N, 3) and N rotations -> (N, 6), translation first.
+
+    V(w)^-1 t = t - w x t / 2 + (1 - (|w|/2) cot(|w|/2)) w x (w x t) / |w|^2.
+    """
+    vector = turn.as_rotvec()
+    squared = np.square(vector).sum(axis=-1, keepdims=True)
+    share = (1.0 - half_cotangent(np.sqrt(squared))) / np.where(squared > 0.0, squared, 1.0)
+    across = np.cross(vector, shift)
+    return np.concatenate([shift - 0.5 * across + share * np.cross(vector, across), vector], axis=-1)
 
 
 def _turn(vector: Array, angle: Array) -> Array:

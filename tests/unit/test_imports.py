@@ -20,7 +20,7 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
     "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0, "store.machine": 0, "store.stopping": 0,
-    "store.ending": 1,
+    "store.ending": 1, "store.provenance": 1,
     "geometry": 1, "reading": 1,
     "models": 2,
     "scenario": 3,
@@ -34,7 +34,8 @@ RANK = {
     "runs.gather": 7, "runs.isolating": 7, "runs.resuming": 7, "runs.work": 8,
     "runs.backends": 9, "runs.campaign": 9, "runs.montecarlo": 10,
     "frontend": 8,
-    "verdicts.curves": 7, "verdicts.judge": 10, "verdicts.monitoring": 10, "verdicts.comparison": 11,
+    "verdicts.curves": 7, "verdicts.options": 8, "verdicts.files": 9, "verdicts.judge": 10, "verdicts.monitoring": 10,
+    "verdicts.baselines": 10, "verdicts.comparison": 11,
     "runs.sequential": 11,
     "terminal.table": 12,
     "runs.findings": 13, "sweeps": 13, "challenging": 13, "characterising": 13, "tuning": 13,

@@ -230,7 +230,9 @@ def _rows(
 
 def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[str, Column], Indices] | None:
     """The same of a block that every line of is a row; None where that has to be looked at."""
-    if len(names) == 1 or not block.plain or (block.count_of(separator.encode()) != len(names) - 1).any():
+    if len(names) == 1 or not block.plain or b"\n\t" in block.data or block.data[:1] == b"\t":
+        return None
+    if (block.count_of(separator.encode()) != len(names) - 1).any():
         return None
     numbers = block.first + np.arange(block.count)
     found = None if "filter" in names else block.numbers(separator.encode())

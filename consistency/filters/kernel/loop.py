@@ -142,7 +142,7 @@ def _map(
     points: Array,
     spread: Array,
 ) -> Array:
-    """``points`` and ``spread`` <- the landmarks in the world, as ``Outcome`` has them; returns its ``joint``, D P D'."""
+    """``points``, ``spread`` <- the landmarks in the world, as ``Outcome`` has them; returns its ``joint``, D P D'."""
     r, w, P = robot_width(motion), landmark_width(landmark), state.P
     width, count = r + w, 1
     for label in range(len(points)):

@@ -54,14 +54,14 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Counts:
     return counted(monkeypatch, functions.BaseFunction, "get_call_type")
 
 
-def type_of(*args: Any, fastmath: bool = False, error_model: str = "numpy") -> Any:
-    """Signature of the sum of these types, as a function that is being compiled asks for it."""
+def type_of(*args: Any, function: Any = operator.add, fastmath: bool = False, error_model: str = "numpy") -> Any:
+    """Signature of a function of these types, as a function that is being compiled asks for it."""
     flags = Flags()
     flags.fastmath, flags.error_model = fastmath, error_model
     context: Any = cpu_target.typing_context
     context.refresh()
     with stack().enter(flags):
-        return context.resolve_value_type(operator.add).get_call_type(context, args, {})
+        return context.resolve_value_type(function).get_call_type(context, args, {})
 
 
 def test_the_type_of_a_call_is_looked_for_once(asked: Counts) -> None:
@@ -80,6 +80,24 @@ def test_rules_of_arithmetic_are_not_mixed(asked: Counts) -> None:
         for rules in ({}, {"fastmath": True}, {"error_model": "python"}, {}):
             type_of(types.float64, types.float64, **rules)
     assert len(asked) == 3
+
+
+def test_functions_and_arguments_are_not_mixed() -> None:
+    pairs = [(types.int64, types.int64), (types.int64, types.float64), (types.float64, types.int64)]
+    cases = [(function, pair) for function in (operator.add, operator.truediv) for pair in pairs]
+    alone = [type_of(*pair, function=function) for function, pair in cases]
+    with remembered_types():
+        for _ in range(2):
+            assert [type_of(*pair, function=function) for function, pair in cases] == alone
+
+
+def test_who_compiles_nothing_asks_numba(asked: Counts) -> None:
+    context: Any = cpu_target.typing_context
+    context.refresh()
+    with remembered_types():
+        for _ in range(2):
+            assert context.resolve_value_type(operator.add).get_call_type(context, (types.int64,) * 2, {})
+    assert len(asked) == 2
 
 
 def test_what_has_no_type_is_looked_for_again(asked: Counts) -> None:

@@ -17,9 +17,10 @@ from consistency.errors import InputError
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
 Abort: Any = typer.Abort
 
+HELP = ["-h", "--help"]
 app = typer.Typer(
     help="Does your estimator tell the truth about its own uncertainty?",
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": HELP},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -666,7 +667,7 @@ def _command(arguments: list[str] | None = None) -> Any:
     _open_closed_streams()
     with stoppable(also=STOPS) as stop:
         try:
-            status = app(arguments, standalone_mode=False)
+            status = 0 if _show_help(arguments) else app(arguments, standalone_mode=False)
             if stop.number is not None:  # typer has an exit status of its own for KeyboardInterrupt
                 raise KeyboardInterrupt
             sys.stdout.flush()
@@ -694,6 +695,22 @@ def _command(arguments: list[str] | None = None) -> Any:
             if stop.number is None:
                 raise
             _end("stopped", stop.status)  # and who was called took it for an error of its own
+
+
+def _show_help(arguments: list[str] | None) -> bool:
+    """Print the help of a command, where that is all that is asked for.
+
+    Typer does so after it has imported what checks the values of options, which takes longer than all the rest.
+    """
+    words = sys.argv[1:] if arguments is None else arguments
+    if len(words) != 2 or words[1] not in HELP:
+        return False
+    root: Any = typer.main.get_command(app)
+    top: Any = typer.Context(root, info_name="consistency", help_option_names=HELP)
+    command = root.get_command(top, words[0])
+    if command is not None:
+        print(command.get_help(typer.Context(command, info_name=words[0], parent=top)))
+    return command is not None
 
 
 def _line(sentence: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -33,12 +33,21 @@ class Simulated:
 
     scenario: Scenario
     seed: int
+    _ahead: dict[int, Trial] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _ = self._world
 
     def __call__(self, run: int) -> Trial:
-        return self._world.trial(run, self.seed)
+        trial = self._ahead.pop(run, None)
+        return self._world.trial(run, self.seed) if trial is None else trial
+
+    def ahead(self, run: int) -> Trial:
+        """The trial that is about to be run, kept until then."""
+        if run not in self._ahead:
+            self._ahead.clear()
+            self._ahead[run] = self._world.trial(run, self.seed)
+        return self._ahead[run]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Simulated, (self.scenario, self.seed)
@@ -76,18 +85,22 @@ class Work:
     def filters(self) -> list[Filter]:
         return self.isolation.filters
 
+    def _ahead(self, run: int) -> Trial:
+        ahead: Callable[[int], Trial] = getattr(self.trials, "ahead", self.trials)
+        return ahead(run)
+
     def room_for(self, run: int, workers: int) -> int:
         """As many of ``workers`` as have memory for a run; raises InputError where not even one has.
 
         The runs of a scenario are alike, so that ``run`` speaks for all; of a log all are looked at.
         """
-        trials = list(self.trials.trials.values()) if isinstance(self.trials, Recorded) else [self.trials(run)]
+        trials = list(self.trials.trials.values()) if isinstance(self.trials, Recorded) else [self._ahead(run)]
         return workers_that_fit(self.isolation.compiled, trials, self.isolation.belief, workers)
 
     def compile(self, run: int) -> None:
         """Compile what a run needs and is not yet compiled, and say so."""
         if self.isolation.compiled:
-            compile_for(self.isolation.compiled, self.trials(run), self.isolation.belief)
+            compile_for(self.isolation.compiled, self._ahead(run), self.isolation.belief)
 
 
 class Backend(Protocol):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shlex
+import subprocess
+import sys
 
 import pytest
 import typer
 from documents import parsed
 
-from consistency.cli.app import app
+from consistency.cli.app import app, main
 from consistency.cli.examples import EXAMPLES
 
 ROOT = typer.main.get_command(app)
@@ -39,3 +41,29 @@ def test_help_is_for_people(name: str) -> None:
 def test_completion_is_offered() -> None:
     options = {option for parameter in ROOT.params for option in parameter.opts}
     assert {"--install-completion", "--show-completion"} <= options
+
+
+@pytest.mark.parametrize("name", ["run", "analyse", "tune"])
+def test_help_alone_is_that_of_typer(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = []
+    for words in ([name, "--help"], [name, "--help", "--help"]):  # the second goes through typer
+        with pytest.raises(SystemExit) as end:
+            main(words)
+        assert not end.value.code
+        shown.append(capsys.readouterr().out)
+    assert f"Usage: consistency {name} " in shown[0]
+    assert [text.partition(f" {name} ")[2] for text in shown] == [shown[0].partition(f" {name} ")[2]] * 2
+
+
+def test_help_of_no_command_is_refused() -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["runn", "--help"])
+    assert end.value.code == 2
+
+
+def test_help_imports_nothing_that_checks_values() -> None:
+    code = (
+        "import sys; sys.argv[1:] = ['run', '-h']; from consistency.cli.app import _show_help; import consistency.cli; \
+_show_help(None) or sys.exit(3); sys.exit('pydantic' in sys.modules or 'numpy' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

@@ -51,4 +51,4 @@ def all_new_may_enter(guard: Open, row: int, is_known: bool, watch: NoWatch) -> 
 
 @implement(rejected_rows, Open)
 def no_rows(guard: Open, watch: NoWatch) -> Array:
-    return np.zeros(0, np.bool_)
+    return np.empty(0, np.bool_)

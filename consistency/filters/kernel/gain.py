@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.filters.kernel.arrays import copy_matrix
+from consistency.filters.kernel.arrays import copy_matrix, sum_of
 from consistency.filters.kernel.blas import add_gram, add_product_of_transposed, add_transposed_times, solve_transposed
 from consistency.filters.kernel.covariance import definite_root, gather_rows, subtract_gram
 from consistency.filters.kernel.jit import inner
@@ -140,7 +140,7 @@ def add_noise(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTupl
             r = s * i + a
             for c in range(s):
                 S[r, s * i + c] += data.R[work.known[i], a, c]
-            total += y[r] + S[r, r:].sum()
+            total += y[r] + sum_of(S[r, r:])
     return total
 
 

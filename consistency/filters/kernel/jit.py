@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 from numba.core import serialize
 from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
@@ -20,6 +21,8 @@ from consistency.filters.kernel.dispatch import INNER, OPTIONS, Function
 from consistency.filters.kernel.whole import one_program
 
 _result: Any = CompileResult  # untyped
+_typeof: Callable[[Any], Any] = numba.typeof
+_signatures: dict[Any, tuple[Any, ...]] = {}
 
 
 def inner(function: Function) -> Function:
@@ -48,6 +51,7 @@ class Kernel:
         self.function: Any = function
         self.loaded = 0  # signatures that this process has read from disk
         self._entries: dict[Any, Any] = {}
+        self._contents: dict[Any, Content] = {}  # of what is not ready, as far as somebody has asked
 
     def __call__(self, *args: Any, stop: Callable[[], None] = lambda: None) -> Any:
         return apart(lambda: self._entry(*args)(*args), stop=stop)
@@ -68,7 +72,7 @@ class Kernel:
         signature = _signature(args)
         if signature in self._entries:
             return True
-        content = Content(self.function, signature)
+        content = self._contents[signature] = Content(self.function, signature)
         return content.unknown is None and kept.read(_path(content)) is not None
 
     @property
@@ -77,7 +81,8 @@ class Kernel:
         return list(self._entries)
 
     def _made(self, signature: tuple[Any, ...]) -> Any:
-        content, entry = Content(self.function, signature), numba.njit(**OPTIONS)(self.function)
+        content = self._contents.pop(signature, None) or Content(self.function, signature)
+        entry = numba.njit(**OPTIONS)(self.function)
         if content.unknown is not None:
             return self._compiled(entry, signature, content)
         path = _path(content)
@@ -117,5 +122,17 @@ def _keep(path: Path, result: Any) -> None:
 
 
 def _signature(args: tuple[Any, ...]) -> tuple[Any, ...]:
-    typeof: Callable[[Any], Any] = numba.typeof
-    return tuple(typeof(arg) for arg in args)
+    """Types of the arguments; those of one kind are found once, which takes Numba as long as a short trial."""
+    kind = _kind(args)
+    if kind not in _signatures:
+        _signatures[kind] = tuple(_typeof(arg) for arg in args)
+    return _signatures[kind]
+
+
+def _kind(value: Any) -> Any:
+    """What the type of an argument depends on."""
+    if isinstance(value, np.ndarray):
+        return value.dtype, value.ndim, value.flags.c_contiguous, value.flags.f_contiguous, value.flags.writeable
+    if isinstance(value, tuple):
+        return type(value), *map(_kind, value)
+    return type(value) if isinstance(value, bool | int | float | np.generic) else _typeof(value)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
+from consistency.filters.kernel.arrays import filled, integers, matrix, vector
 from consistency.filters.kernel.jit import inner
 from consistency.types import Array, Indices
 
@@ -31,16 +30,16 @@ class Factors(NamedTuple):
 def make_factors(c: int, width: int, landmarks: int) -> Factors:
     """Arrays for ``c`` active variables with up to ``landmarks`` landmarks, of ``width`` in all."""
     return Factors(
-        np.empty(c),
-        np.empty((c, c)),
-        np.empty((c, c)),
-        np.empty((c, c)),
-        np.empty(c),
-        np.empty(landmarks, np.int64),
-        np.empty(landmarks, np.int64),
-        np.empty((c, width)),
-        np.empty((c, width)),
-        np.empty((c, c)),
-        np.empty((c, c)),
-        np.zeros(6),
+        vector(c),
+        matrix(c, c),
+        matrix(c, c),
+        matrix(c, c),
+        vector(c),
+        integers(landmarks, 0),
+        integers(landmarks, 0),
+        matrix(c, width),
+        matrix(c, width),
+        matrix(c, c),
+        matrix(c, c),
+        filled(6, 0.0),
     )

@@ -7,7 +7,18 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.filters.guard import open as _open  # noqa: F401, registers the bodies of a filter without a guard
-from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
+from consistency.filters.kernel.arrays import (
+    copy,
+    copy_matrix,
+    fill,
+    fill_matrix,
+    filled,
+    filled_blocks,
+    filled_matrix,
+    integers,
+    matrix,
+    sum_of,
+)
 from consistency.filters.kernel.covariance import begin_landmark
 from consistency.filters.kernel.gain import HALTED, NOT_FINITE, POSE
 from consistency.filters.kernel.jit import Kernel, inner
@@ -108,7 +119,7 @@ def _step(
         if code > 0:
             return state, code, 0, nis, log_det
     state = _insert_new(slam, state, data, k, local, work, watch)
-    return state, 0 if np.isfinite(state.x[: state.n].sum()) else NOT_FINITE, m, nis, log_det
+    return state, 0 if np.isfinite(sum_of(state.x[: state.n])) else NOT_FINITE, m, nis, log_det
 
 
 @inner
@@ -121,66 +132,71 @@ def _most_seen(first: Indices) -> int:
 
 
 @inner
-def _map(slam: Slam, state: State, local: NamedTuple, points: Array, spread: Array) -> None:
-    """Positions of the landmarks in the world, and covariances of their additive errors."""
-    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-    D, block = np.empty((3, r + w)), np.empty((r + w, r + w))
+def _map(
+    motion: NamedTuple,
+    landmark: NamedTuple,
+    error: NamedTuple,
+    covariance: NamedTuple,
+    state: State,
+    local: NamedTuple,
+    points: Array,
+    spread: Array,
+) -> Array:
+    """``points``, ``spread`` <- the landmarks in the world, as ``Outcome`` has them; returns its ``joint``, D P D'."""
+    r, w, P = robot_width(motion), landmark_width(landmark), state.P
+    width, count = r + w, 1
+    for label in range(len(points)):
+        count += 1 if state.offset[label] >= 0 else 0
+    D, at, block = filled_blocks(count, 3, width, 0.0), integers(count * width, 0), matrix(width, width)
+    for a in range(3):
+        D[0, a, a], at[a] = 1.0, a
+    to_error(error, state.x[:r], filled(w, 1.0), D[0, :, :r], D[0, :, r:])
+    i, n = 0, 3
     for label in range(len(points)):
         o = state.offset[label]
         if o >= 0:
-            at, values = held_at(slam.covariance, label, local), state.x[o : o + w]
-            pose = state.x[at : at + r]
-            frame = robot_frame(slam.motion, pose)
-            world_point(slam.landmark, frame, values, points[label], D[:, :r], D[:, r:])
-            to_error(slam.error, pose, values, D[:, :r], D[:, r:])
-            for i in range(r + w):
-                for j in range(i, r + w):
-                    p, q = at + i if i < r else o + i - r, at + j if j < r else o + j - r
-                    block[i, j] = block[j, i] = state.P[min(p, q), max(p, q)]
-            for i in range(3):
-                for j in range(3):
-                    total = 0.0
-                    for a in range(r + w):
-                        for b in range(r + w):
-                            total += D[i, a] * block[a, b] * D[j, b]
-                    spread[label, i, j] = total
-
-
-@inner
-def _joint(slam: Slam, state: State, local: NamedTuple) -> Array:
-    """Covariance of the additive errors of the robot and of its landmarks in the world, by label: D P D'."""
-    r, w, P = robot_width(slam.motion), landmark_width(slam.landmark), state.P
-    labels = np.flatnonzero(state.offset >= 0)
-    count, point, nothing = len(labels) + 1, np.empty(3), np.ones(w)
-    D, at = np.zeros((count, 3, r + w)), np.zeros((count, r + w), np.int64)  # of each block its Jacobian, and by what
-    for a in range(3):
-        D[0, a, a], at[0, a] = 1.0, a
-    to_error(slam.error, state.x[:r], nothing, D[0, :, :r], D[0, :, r:])
-    for i, label in enumerate(labels, 1):
-        pose_at, o = held_at(slam.covariance, int(label), local), state.offset[label]
-        pose, values = state.x[pose_at : pose_at + r], state.x[o : o + w]
-        world_point(slam.landmark, robot_frame(slam.motion, pose), values, point, D[i, :, :r], D[i, :, r:])
-        to_error(slam.error, pose, values, D[i, :, :r], D[i, :, r:])
-        for a in range(r + w):
-            at[i, a] = pose_at + a if a < r else o + a - r
-    n = at.max() + 1
-    joint, rows = np.empty((3 * count, 3 * count)), np.empty((3, n))
+            i += 1
+            pose_at, own = held_at(covariance, label, local), at[width * i : width * i + width]
+            pose, values = state.x[pose_at : pose_at + r], state.x[o : o + w]
+            world_point(landmark, robot_frame(motion, pose), values, points[label], D[i, :, :r], D[i, :, r:])
+            to_error(error, pose, values, D[i, :, :r], D[i, :, r:])
+            for a in range(width):
+                own[a] = pose_at + a if a < r else o + a - r
+                n = max(n, own[a] + 1)
+            for a in range(width):
+                for b in range(a, width):
+                    block[a, b] = block[b, a] = P[min(own[a], own[b]), max(own[a], own[b])]
+            _transform(D[i], block, spread[label])
+    joint, rows = matrix(3 * count, 3 * count), matrix(3, n)
     for i in range(count):
         fill_matrix(rows, 0.0)
-        for b in range(r + w):
-            p = at[i, b]
+        for b in range(width):
+            p, d0, d1, d2 = at[width * i + b], D[i, 0, b], D[i, 1, b], D[i, 2, b]
             for q in range(n):
                 value = P[min(p, q), max(p, q)]
-                for a in range(3):
-                    rows[a, q] += D[i, a, b] * value
+                rows[0, q] += d0 * value
+                rows[1, q] += d1 * value
+                rows[2, q] += d2 * value
         for j in range(i, count):
             for a in range(3):
                 for b in range(3):
                     total = 0.0
-                    for c in range(r + w):
-                        total += rows[a, at[j, c]] * D[j, b, c]
+                    for c in range(width):
+                        total += rows[a, at[width * j + c]] * D[j, b, c]
                     joint[3 * i + a, 3 * j + b] = joint[3 * j + b, 3 * i + a] = total
     return joint
+
+
+@inner
+def _transform(D: Array, P: Array, out: Array) -> None:
+    """``out`` (m, m) <- D P D', with D (m, n)."""
+    for i in range(len(out)):
+        for j in range(len(out)):
+            total = 0.0
+            for a in range(len(P)):
+                for b in range(len(P)):
+                    total += D[i, a] * P[a, b] * D[j, b]
+            out[i, j] = total
 
 
 class Memory(NamedTuple):
@@ -194,25 +210,27 @@ class Memory(NamedTuple):
 
 @inner
 def _make_memory(size: int, n_landmarks: int) -> Memory:
-    return Memory(np.zeros(size), np.zeros((size, size)), np.full(n_landmarks, -1), np.full(n_landmarks, -1))
+    return Memory(
+        filled(size, 0.0), filled_matrix(size, size, 0.0), integers(n_landmarks, -1), integers(n_landmarks, -1)
+    )
 
 
 @inner
 def _empty_outcome(T: int, r: int, n_landmarks: int) -> Outcome:
     """Outcome of T steps, NaN everywhere."""
     return Outcome(
-        np.full((T, r), np.nan),
-        np.full((T, r, r), np.nan),
-        np.full((T, r, r), np.nan),
-        np.full(T, np.nan),
-        np.zeros(T, np.int64),
-        np.full(T, np.nan),
+        filled_matrix(T, r, np.nan),
+        filled_blocks(T, r, r, np.nan),
+        filled_blocks(T, r, r, np.nan),
+        filled(T, np.nan),
+        integers(T, 0),
+        filled(T, np.nan),
         0,
         0,
-        np.full((n_landmarks, 3), np.nan),
-        np.full((n_landmarks, 3, 3), np.nan),
-        np.empty((0, 0)),
-        np.zeros(0, np.bool_),
+        filled_matrix(n_landmarks, 3, np.nan),
+        filled_blocks(n_landmarks, 3, 3, np.nan),
+        matrix(0, 0),
+        np.empty(0, np.bool_),
     )
 
 
@@ -293,8 +311,9 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
         whole = State(memory.x, memory.P, _settle_new(labels, whole.n, w, state, memory.home), 0, memory.home)
     if code == 0:
         settle(slam.covariance, slam, whole, state, local)
-        _map(slam, whole, local, out.points, out.spread)
-    joint = _joint(slam, whole, local) if code == 0 else np.empty((0, 0))
+        joint = _map(slam.motion, slam.landmark, slam.error, slam.covariance, whole, local, out.points, out.spread)
+    else:
+        joint = matrix(0, 0)
     rejected = rejected_rows(slam.guard, own_watch)
     keep((own_slam, own_data, own_memory, own_work, own_local, own_watch))
     return Outcome(

@@ -17,6 +17,8 @@ import numba
 from numba.core import codegen, compiler_lock, config
 from numba.core.registry import cpu_target
 
+from consistency.filters.kernel.inference import remembered_types
+
 TESTED = ("0.61", "0.68")  # lowest and highest series of Numba in which this was tried
 INNER_OPTIMISATION = 1  # level of the passes over a function by itself; the whole is optimised at Numba's level
 _Library: Any = codegen.JITCodeLibrary
@@ -132,6 +134,7 @@ def one_program(callable_too: Collection[str]) -> Iterator[None]:
 
         code._library_class, code.set_env = library_class, set_later
         try:
-            yield
+            with remembered_types():
+                yield
         finally:
             del code._library_class, code.set_env

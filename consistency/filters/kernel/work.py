@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Generic, NamedTuple, TypeVar
 
-import numpy as np
-
+from consistency.filters.kernel.arrays import blocks, integers, matrix, vector
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import Slam, landmark_width, make_notes, make_room, observed_width, robot_width
 from consistency.types import Array, Indices
@@ -46,22 +45,22 @@ def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[Named
     r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
     rows = s * m
     return Work(
-        np.empty(m, np.int64),
-        np.empty(m, np.int64),
-        np.empty(m, np.int64),
-        np.empty(rows),
-        np.empty(max(r + w * m, rows)),
-        np.empty((rows, rows)),
-        np.empty((rows, n + 1)),
-        np.empty((r + w * m, n)),
-        np.empty(n),
-        np.empty((m, s, r)),
-        np.empty((m, s, w)),
-        np.empty((w, r)),
-        np.empty((w, s)),
-        np.empty((3, s)),
-        np.empty(r),
-        np.empty((r, r)),
+        integers(m, 0),
+        integers(m, 0),
+        integers(m, 0),
+        vector(rows),
+        vector(max(r + w * m, rows)),
+        matrix(rows, rows),
+        matrix(rows, n + 1),
+        matrix(r + w * m, n),
+        vector(n),
+        blocks(m, s, r),
+        blocks(m, s, w),
+        matrix(w, r),
+        matrix(w, s),
+        matrix(3, s),
+        vector(r),
+        matrix(r, r),
         make_room(slam.update, r, w, s, m, n),
         make_notes(slam.point, r, w, steps, labels),
     )

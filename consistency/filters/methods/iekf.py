@@ -13,6 +13,7 @@ import numpy as np
 
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled, planar
+from consistency.filters.kernel.arrays import vector
 from consistency.filters.kernel.covariance import state_index
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.gain import apply, combine_seen, gather, innovate, linearise_seen, shift, whiten
@@ -55,7 +56,7 @@ class PriorRoom(NamedTuple):
 
 @implement(make_room, Iterated)
 def iterated_room(update: Iterated, r: int, w: int, s: int, m: int, n: int) -> PriorRoom:
-    return PriorRoom(np.empty(r + w * m))
+    return PriorRoom(vector(r + w * m))
 
 
 implement(predict, Iterated)(predict_by_error)

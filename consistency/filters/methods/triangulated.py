@@ -25,6 +25,7 @@ import numpy as np
 
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled
+from consistency.filters.kernel.arrays import sum_of
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.gain import (
     combine_seen,
@@ -159,7 +160,7 @@ def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Wor
                 for b in range(3):
                     work.S[first + a, first + b] += data.R[work.known[i], a, b]
     for r in range(rows):
-        total += y[r] + work.S[r, r:rows].sum()
+        total += y[r] + sum_of(work.S[r, r:rows])
     return total
 
 

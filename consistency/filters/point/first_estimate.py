@@ -11,9 +11,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
-from consistency.filters.kernel.arrays import copy
+from consistency.filters.kernel.arrays import copy, matrix
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.measuring import place_observed
 from consistency.filters.kernel.slam import (
@@ -62,7 +60,7 @@ def first_estimate_stands_apart(point: FirstEstimate) -> bool:
 @implement(make_notes, FirstEstimate)
 def note_first_estimates(point: FirstEstimate, r: int, w: int, steps: int, labels: int) -> FirstEstimates:
     """Room for the predictions of all steps and the first estimate of each landmark."""
-    return FirstEstimates(np.empty((steps + 1, r)), np.empty((labels, w)))
+    return FirstEstimates(matrix(steps + 1, r), matrix(labels, w))
 
 
 @implement(motion_point, FirstEstimate)

@@ -30,8 +30,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
+from consistency.filters.kernel.arrays import filled, integers, matrix, vector
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.measuring import place_observed
 from consistency.filters.kernel.slam import (
@@ -83,8 +82,8 @@ def constrained_stands_apart(point: ObservabilityConstrained) -> bool:
 @implement(make_notes, ObservabilityConstrained)
 def note_unobserved_turn(point: ObservabilityConstrained, r: int, w: int, steps: int, labels: int) -> UnobservedTurn:
     """Room for the direction in all steps and of all landmarks."""
-    path, landmarks = np.empty((steps + 1, 2)), np.empty((labels, 2))
-    return UnobservedTurn(path, landmarks, np.empty(labels, np.int64), np.zeros(2), np.empty(w))
+    path, landmarks = matrix(steps + 1, 2), matrix(labels, 2)
+    return UnobservedTurn(path, landmarks, integers(labels, 0), filled(2, 0.0), vector(w))
 
 
 @implement(motion_point, ObservabilityConstrained)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.filters.kernel.arrays import copy_matrix
+from consistency.filters.kernel.arrays import copy_matrix, matrix, vector
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.measuring import linearise_at
 from consistency.filters.kernel.slam import (
@@ -85,7 +85,7 @@ def place_about_reference(
     """x[n:n + w] <- the landmark that solves the expanded h for z (3,), where w = 3; Jz = Hl^-1 and Jp = -Hl^-1 Hp."""
     pose, landmark, n = point.path[k + 1], point.landmarks[label], state.n
     r = robot_width(slam.motion)
-    z0, Hp, Hl = np.empty(3), np.empty((3, r)), np.empty((3, len(landmark)))
+    z0, Hp, Hl = vector(3), matrix(3, r), matrix(3, len(landmark))
     linearise_at(slam, robot_frame(slam.motion, pose), landmark, z0, Hp, Hl)
     copy_matrix(np.linalg.inv(Hl), work.Jz)
     copy_matrix(-np.dot(work.Jz, Hp), work.Jp)

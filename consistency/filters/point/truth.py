@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.filters.kernel.arrays import copy_matrix
+from consistency.filters.kernel.arrays import copy_matrix, matrix, vector
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.measuring import linearise_at, place_observed
 from consistency.filters.kernel.slam import (
@@ -93,7 +93,7 @@ def place_at_truth(
     """x[n:n + w] <- the inverse of h at the estimated pose; Jz = Hl^-1 and Jp = -Hl^-1 Hp at the truth."""
     w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     place_observed(slam, state.x[:3], z, state.x[state.n : state.n + w], work)
-    expected, Hp, Hl = np.empty(s), np.empty((s, 3)), np.empty((s, w))
+    expected, Hp, Hl = vector(s), matrix(s, 3), matrix(s, w)
     linearise_at(slam, robot_frame(slam.motion, point.path[k + 1]), point.landmarks[label], expected, Hp, Hl)
     copy_matrix(np.linalg.inv(Hl), work.Jz)
     copy_matrix(-np.dot(work.Jz, Hp), work.Jp)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.filters.kernel.arrays import copy, fill_matrix
+from consistency.filters.kernel.arrays import blocks, copy, fill_matrix, integers, matrix, vector
 from consistency.filters.kernel.blas import add_gram
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
@@ -82,17 +82,26 @@ class ConvertingRoom(NamedTuple):
     poses: Array  # (5, 3)
 
 
+@inner
+def _every_third(n: int) -> Indices:
+    """3, 6, 9, ..., (n,)."""
+    places = integers(n, 0)
+    for i in range(n):
+        places[i] = 3 + 3 * i
+    return places
+
+
 @implement(make_room, Converting)
 def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) -> ConvertingRoom:
     c = max(m, update.clones)
     most = 3 + 3 * (m + c)
     return ConvertingRoom(
-        np.empty(m + c, np.int64), np.empty(c, np.int64), np.empty(m, np.int64), np.empty((most, n)),
-        np.empty((most, most)), np.empty((most, most)), 3 + 3 * np.arange(m + c), np.zeros(1, np.int64),
-        np.empty((c + 1, 3)), np.empty((c + 1, 3, 3)), np.empty((c + 1, 3, 3)),
-        np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)), np.empty((m, 3, 3)),
-        np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3, 3)), np.empty(most), np.empty(most),
-        np.empty((2, n)), np.empty(n // 3, np.int64), np.empty((n // 3, 3, 3)), np.empty((4, 3, 3)), np.empty((5, 3)),
+        integers(m + c, 0), integers(c, 0), integers(m, 0), matrix(most, n),
+        matrix(most, most), matrix(most, most), _every_third(m + c), integers(1, 0),
+        matrix(c + 1, 3), blocks(c + 1, 3, 3), blocks(c + 1, 3, 3),
+        blocks(m, 3, 3), blocks(m, 3, 3), blocks(m, 3, 3), blocks(m, 3, 3),
+        matrix(m, 3), matrix(m, 3), blocks(m, 3, 3), vector(most), vector(most),
+        matrix(2, n), integers(n // 3, 0), blocks(n // 3, 3, 3), blocks(4, 3, 3), matrix(5, 3),
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.filters.kernel.arrays import copy, fill
+from consistency.filters.kernel.arrays import copy, fill, matrix, vector
 from consistency.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
 from consistency.filters.kernel.covariance import definite_root, state_index
 from consistency.filters.kernel.dispatch import implement, part
@@ -74,15 +74,15 @@ class SigmaRoom(NamedTuple):
 def sigma_room(update: Unscented, r: int, w: int, s: int, m: int, n: int) -> SigmaRoom:
     L = r + w * m
     return SigmaRoom(
-        np.empty((r, r)),
-        np.empty((2 * r + 1, r)),
-        np.empty((L, L)),
-        np.empty((L, L)),
-        np.empty((2 * L + 1, s * m)),
-        np.empty((L, s * m)),
-        np.empty(r),
-        np.empty(w),
-        np.empty(L),
+        matrix(r, r),
+        matrix(2 * r + 1, r),
+        matrix(L, L),
+        matrix(L, L),
+        matrix(2 * L + 1, s * m),
+        matrix(L, s * m),
+        vector(r),
+        vector(w),
+        vector(L),
     )
 
 

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from consistency.filters.error.invariant_pose import left_jacobian, move_pose
-from consistency.filters.kernel.arrays import copy, fill, fill_matrix
+from consistency.filters.kernel.arrays import copy, fill, fill_matrix, filled_matrix, integers, matrix
 from consistency.filters.kernel.covariance import gather_rows, replace_rows
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
@@ -89,19 +87,19 @@ def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landm
     is_local = most > 0 and n >= covariance.start
     c = max(n // (2 * w), 1) * w if is_local else r
     return Clones(
-        np.full(n_landmarks, -1),
-        np.zeros(n_landmarks, np.int64),
-        np.zeros(n_landmarks, np.int64),
-        np.zeros(n_landmarks, np.int64),
-        np.zeros(most, np.int64),
-        np.zeros(most, np.int64),
-        np.zeros(most, np.int64),
-        np.zeros(most, np.int64),
-        np.zeros(most, np.int64),
-        np.zeros(1, np.int64),
-        np.zeros((most, 3)),
-        np.zeros(1, np.int64),
-        np.zeros((9, n)),
+        integers(n_landmarks, -1),
+        integers(n_landmarks, 0),
+        integers(n_landmarks, 0),
+        integers(n_landmarks, 0),
+        integers(most, 0),
+        integers(most, 0),
+        integers(most, 0),
+        integers(most, 0),
+        integers(most, 0),
+        integers(1, 0),
+        filled_matrix(most, 3, 0.0),
+        integers(1, 0),
+        filled_matrix(9, n, 0.0),
         make_factors(c, n if is_local else r, c // w),
     )
 
@@ -358,7 +356,7 @@ def settle_clones(covariance: Parking, slam: Slam, whole: State, state: State, l
 def recentre(state: State, local: Clones) -> None:
     """Each clone of a whole state <- an error of zero about the pose that it has, and the covariance of that error."""
     x, P, n, rows = state.x, state.P, state.n, local.rows
-    turn, own, at = np.empty((3, 3)), np.empty((3, 3)), np.empty(1, np.int64)
+    turn, own, at = matrix(3, 3), matrix(3, 3), integers(1, 0)
     for number in range(len(local.at)):
         if local.uses[number] > 0:
             o = at[0] = local.at[number]

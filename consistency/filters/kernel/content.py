@@ -59,6 +59,12 @@ class Content:
     def key(self) -> str:
         return self._digest.hexdigest()[:32]
 
+    @property
+    def functions(self) -> set[str]:
+        """Names of the functions that are compiled, those of libraries left out."""
+        seen = (each for each in self._seen.values() if isinstance(each, FunctionType))
+        return {f"{each.__module__}.{each.__qualname__}" for each in seen if not _is_foreign(each.__module__)}
+
     def _add(self, value: Any, names: tuple[str, ...] = ()) -> None:
         """A value and what it reads; of a module, its attributes of these names."""
         if isinstance(value, _SCALARS):

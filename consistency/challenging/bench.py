@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from consistency.errors import InputError
 from consistency.filters.compiled import one_blas_thread
 from consistency.protocols import Filter
 from consistency.runs.backends.local import worker_count
-from consistency.runs.compiling import Wanted, compile_all
+from consistency.runs.compiling import compile_all, first_trials
 from consistency.runs.isolating import Isolation
 from consistency.scenario import Scenario
 from consistency.simulation import require_landmarks_in_view
@@ -59,11 +59,7 @@ class Bench:
 
     def compile(self, worlds: Sequence[Scenario]) -> None:
         """Compile what the filter needs in these worlds, so that a search spends no time on it."""
-        wanted = list[Wanted]()
-        for world in worlds:
-            with suppress(InputError):
-                wanted.append((self.filter, require_landmarks_in_view(world).trial(0, 0), world.belief))
-        compile_all(wanted, self.workers)
+        compile_all(first_trials((self.filter, world) for world in worlds), self.workers)
 
     def __call__(self, jobs: Sequence[Job], seed: int, until: float = np.inf) -> list[Done | None]:
         """Scores of each job in its order; None for a world in which no landmark comes into view.

@@ -14,10 +14,9 @@ from consistency.filters.kernel import kept
 from consistency.filters.stepping import name_of
 from consistency.protocols import Filter
 from consistency.runs.backends.local import worker_count
-from consistency.runs.compiling import Wanted, compile_all
+from consistency.runs.compiling import Wanted, compile_all, first_trials
 from consistency.runs.montecarlo import resolve_filters
 from consistency.scenario import Belief, load_scenario, scenario_names
-from consistency.simulation import require_landmarks_in_view
 
 FIRST_STEPS = "herath2007-stereo"  # the world of the README's first commands
 
@@ -79,13 +78,8 @@ def _wanted(names: Sequence[str], scenario: str | None) -> list[Wanted]:
                 raise InputError(f"filter '{name_of(filter_)}' has no kernel: nothing is to be compiled, leave it out")
         if scenario:
             resolve_filters(filters, worlds[0].belief)
-    trials = [(world, require_landmarks_in_view(world).trial(0, 0)) for world in worlds]
-    return [
-        (filter_, trial, world.belief)
-        for filter_ in filters
-        for world, trial in trials
-        if isinstance(filter_, Compiled) and _fits(filter_, world.belief)
-    ]
+    own = [filter_ for filter_ in filters if isinstance(filter_, Compiled)]
+    return list(first_trials((f, world) for world in worlds for f in own if _fits(f, world.belief)))
 
 
 def _fits(filter_: Filter, belief: Belief) -> bool:

@@ -13,12 +13,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
+from consistency.errors import InputError
 from consistency.filters.compiled import Compiled
 from consistency.filters.kernel import foreseen, kept
 from consistency.filters.kernel.jit import Outlook
 from consistency.filters.stepping import name_of
 from consistency.protocols import Filter, WholeTrial
-from consistency.scenario import Belief
+from consistency.scenario import Belief, Scenario
+from consistency.simulation import require_landmarks_in_view
 from consistency.store.stopping import STOPS
 from consistency.terminal import progress
 from consistency.types import Trial
@@ -70,6 +72,18 @@ def compile_all(wanted: Iterable[Wanted], jobs: int = 1) -> list[Need]:
     if missing:
         _compile(missing, jobs)
     return list(needs.values())
+
+
+def first_trials(worlds: Iterable[tuple[Filter, Scenario]]) -> Iterator[Wanted]:
+    """Filters and a trial of the scenario that each is for; nothing where no landmark comes into view."""
+    trials: dict[str, Trial | None] = {}
+    for filter_, world in worlds:
+        if world.hash not in trials:
+            trials[world.hash] = None
+            with contextlib.suppress(InputError):
+                trials[world.hash] = require_landmarks_in_view(world).trial(0, 0)
+        if (trial := trials[world.hash]) is not None:
+            yield filter_, trial, world.belief
 
 
 def _compile(missing: Sequence[Need], jobs: int) -> None:

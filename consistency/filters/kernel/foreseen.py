@@ -13,13 +13,13 @@ from consistency.filters.kernel import kept
 FILE = "seconds.txt"  # beside the compiled code: a line for each kernel, its size and seconds
 RECENT = 15  # kernels whose median counts, so that neither a busy hour nor an old processor does for long
 LONGEST = 1 << 16  # bytes of the file, after which it begins anew
-FIRST = 0.1  # s for each function where nothing was compiled yet; a desktop of 2022 takes 0.08, a shared core 0.15
-AGAIN = 0.5  # share of a function's time where the process has compiled it for another kernel: types may differ
+FIRST = 4e-4  # s a byte where nothing was compiled yet: two idle cores take 3.5e-4
+AGAIN = 0.5  # share of a function's time where the process has compiled it before, for types that may differ
 
 
 def seconds_for(size: float) -> float:
-    """Seconds for a kernel of this size, in functions."""
-    return size * _per_function()
+    """Seconds for a kernel of this size, in bytes of bytecode."""
+    return size * _per_byte()
 
 
 @contextmanager
@@ -27,7 +27,7 @@ def measured(size: float) -> Iterator[None]:
     """Keep how long the compiling inside took; where the folder does not take it, nothing is kept."""
     started = time.monotonic()
     yield
-    line = f"{size:.1f} {time.monotonic() - started:.3f}\n".encode()
+    line = f"{size:.0f} {time.monotonic() - started:.3f}\n".encode()
     path = kept.folder() / FILE
     with suppress(OSError):
         if kept.is_ours(path.parent):
@@ -40,7 +40,7 @@ def measured(size: float) -> Iterator[None]:
                 os.close(file)
 
 
-def _per_function() -> float:
+def _per_byte() -> float:
     try:
         lines = (kept.folder() / FILE).read_text(encoding="ascii", errors="replace").splitlines()[-RECENT:]
     except OSError:
@@ -50,9 +50,9 @@ def _per_function() -> float:
 
 
 def _rate(line: str) -> float | None:
-    """Seconds for each function; None for a line that nobody wrote so."""
+    """Seconds a byte; None for a line that nobody wrote so."""
     try:
         size, seconds = map(float, line.split())
     except ValueError:
         return None
-    return seconds / size if 0.0 < size < 1e6 and 0.0 < seconds < 1e5 else None
+    return seconds / size if 0.0 < size < 1e9 and 0.0 < seconds < 1e5 else None

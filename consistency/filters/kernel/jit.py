@@ -86,8 +86,10 @@ class Kernel:
         return Outlook(content.key, is_ready, is_shared, foreseen.seconds_for(self._size(content)))
 
     def _size(self, content: Content) -> float:
-        """Functions to be compiled; those that this process has compiled before count less."""
-        return len(content.functions) - (1.0 - foreseen.AGAIN) * len(content.functions & self._functions)
+        """Bytes of bytecode to be compiled; functions that this process has compiled before count less."""
+        return sum(
+            size * (foreseen.AGAIN if name in self._functions else 1.0) for name, size in content.functions.items()
+        )
 
     @property
     def signatures(self) -> list[Any]:
@@ -110,7 +112,7 @@ class Kernel:
         names = {self.function.__qualname__, *content.dispatchers}
         with foreseen.measured(self._size(content)), one_program(names):
             entry.compile(signature)
-        self._functions |= content.functions
+        self._functions |= content.functions.keys()
         return entry
 
     def _load(self, entry: Any, payload: bytes | None) -> bool:

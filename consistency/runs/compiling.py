@@ -21,7 +21,7 @@ from consistency.filters.stepping import name_of
 from consistency.protocols import Filter, WholeTrial
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import require_landmarks_in_view
-from consistency.store.stopping import STOPS
+from consistency.store.stopping import STOPS, undisturbed
 from consistency.terminal import progress
 from consistency.types import Trial
 
@@ -141,9 +141,11 @@ def _processes(needs: Sequence[Need], count: int) -> Iterator[list[Connection]]:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
         yield links
     finally:
-        for process in processes:
-            if process.pid is not None:
+        with undisturbed():
+            started = [process for process in processes if process.pid is not None]
+            for process in started:
                 process.kill()
+            for process in started:
                 process.join()
 
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from consistency.filters.kernel.content import Content
 from consistency.filters.kernel.foreseen import FIRST
 from consistency.runs import compiling
 
+Done = Callable[..., tuple[str, str]]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="kernels are compiled side by side on Linux")
 SCRIPT = """
 import multiprocessing, os, resource, signal, sys, time
@@ -25,8 +26,6 @@ from pathlib import Path
 from consistency.filters.compiled import Compiled
 from consistency.filters.kernel.jit import Kernel
 from consistency.runs import compiling
-
-here, what, jobs = os.getpid(), sys.argv[1], int(sys.argv[2])
 
 def total(values):
     result = 0.0
@@ -41,58 +40,90 @@ class Sum(Compiled):
         return self.kernel.outlook(self.values)
     def compile(self, *_):
         if os.getpid() != here:
-            Path(sys.argv[3], str(os.getpid())).touch()
+            Path(folder, "processes", str(os.getpid())).touch()
             if what == "die":
                 os.kill(os.getpid(), signal.SIGKILL)
             if what in ("hang", "abandon"):
-                os.kill(here, signal.SIGALRM)
+                os.kill(here, signal.SIGINT)
                 time.sleep(60.0)
         self.kernel.compile(self.values)
 
-def wake(*_):
+def case():
+    os.environ["NUMBA_CACHE_DIR"] = f"{folder}/cache"
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(f"{folder}/{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+    filters = [Sum("two", (1.0, 2.0)), Sum("three", (1.0, 2.0, 3.0)), Sum("again", (4.0, 5.0))]
+    if what == "full":
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
     if what == "abandon":
-        os.kill(here, signal.SIGKILL)
-    raise KeyboardInterrupt
+        signal.signal(signal.SIGINT, lambda *_: os.kill(here, signal.SIGKILL))
+    if what == "nobody":
+        os.setgroups([])
+        os.setgid(65534)
+        os.setuid(65534)
+    try:
+        compiling.compile_for(filters, None, None, int(jobs))
+    except KeyboardInterrupt:
+        print("stopped")
+    else:
+        print(*(f.kernel(f.values) for f in filters), *(f.kernel.loaded for f in filters))
+    assert not multiprocessing.active_children()
 
-filters = [Sum("two", (1.0, 2.0)), Sum("three", (1.0, 2.0, 3.0)), Sum("again", (4.0, 5.0))]
-if what == "full":
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
-if what in ("hang", "abandon"):
-    signal.signal(signal.SIGALRM, wake)
-try:
-    compiling.compile_for(filters, None, None, jobs)
-except KeyboardInterrupt:
-    print("stopped")
-else:
-    print(*(f.kernel(f.values) for f in filters), *(f.kernel.loaded for f in filters))
-assert not multiprocessing.active_children()
+os.environ["NUMBA_CACHE_DIR"] = os.devnull
+Kernel(total)((1.0,))  # what another user may not read is loaded
+for line in sys.stdin:  # each case in a copy of this process, as loading Numba takes seconds
+    folder, what, jobs = line.rstrip("\\n").split("\\t")
+    if not (child := os.fork()):
+        here = os.getpid()
+        try:
+            case()
+            sys.stdout.flush()
+        except BaseException as error:
+            os.write(2, repr(error).encode())
+            os._exit(1)
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
+
+
+@pytest.fixture(scope="module")
+def cases() -> Iterator[subprocess.Popen[str]]:
+    """A process that does a case for each line: folder, what happens, jobs."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdin=pipe, stdout=pipe, text=True) as process:
+        yield process
+        process.stdin.close()  # type: ignore[union-attr]
 
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """A folder that other users can read, with the script and the numbers of the processes that have compiled."""
+    """A folder that other users can read, for the cache and the numbers of the processes that have compiled."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name)
         path.chmod(0o755)
-        (path / "script.py").write_text(SCRIPT)
         (path / "processes").mkdir()
+        (path / "processes").chmod(0o777)
         yield path
 
 
-def done(folder: Path, what: str = "", jobs: int = 2, **options: object) -> tuple[str, str]:
-    """What the script says on standard output and error."""
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")}
-    command = [sys.executable, str(folder / "script.py"), what, str(jobs), str(folder / "processes")]
-    process = subprocess.run(
-        command, env=environment, capture_output=True, text=True, timeout=120, check=False, **options
-    )  # type: ignore[call-overload]
-    assert process.returncode == (-signal.SIGKILL if what == "abandon" else 0), process.stderr
-    return process.stdout.strip(), process.stderr
+@pytest.fixture
+def done(cases: subprocess.Popen[str], folder: Path) -> Done:
+    """Does a case, and gives what it says on standard output and error."""
+
+    def done(what: str = "", jobs: int = 2) -> tuple[str, str]:
+        assert cases.stdin is not None
+        assert cases.stdout is not None
+        cases.stdin.write(f"{folder}\t{what}\t{jobs}\n")
+        cases.stdin.flush()
+        status, out, err = int(cases.stdout.readline()), (folder / "out").read_text(), (folder / "err").read_text()
+        assert status == (-signal.SIGKILL if what == "abandon" else 0), err
+        return out.strip(), err
+
+    return done
 
 
 def processes(folder: Path) -> list[int]:
-    return [int(path.name) for path in (folder / "processes").iterdir()]
+    return [int(path.name) for path in (folder / "processes").iterdir() if path.name.isdecimal()]
 
 
 def living(folder: Path) -> list[int]:
@@ -100,35 +131,35 @@ def living(folder: Path) -> list[int]:
 
 
 @LINUX
-def test_kernels_are_compiled_side_by_side_and_once(folder: Path) -> None:
+def test_kernels_are_compiled_side_by_side_and_once(done: Done, folder: Path) -> None:
     """Two of the three filters have one kernel."""
-    out, err = done(folder)
+    out, err = done()
     assert out == "3.0 6.0 9.0 1 1 1"
     assert err == "compiling 2 kernels of two, three: about 1 s, once\n"
     assert len(processes(folder)) == 2
     assert not living(folder)
-    assert done(folder) == ("3.0 6.0 9.0 1 1 1", "")
+    assert done() == ("3.0 6.0 9.0 1 1 1", "")
     assert len(processes(folder)) == 2
 
 
 @LINUX
-def test_one_job_compiles_here(folder: Path) -> None:
-    out, err = done(folder, jobs=1)
+def test_one_job_compiles_here(done: Done, folder: Path) -> None:
+    out, err = done(jobs=1)
     assert out == "3.0 6.0 9.0 0 0 1"
     assert err.count("\n") == 1
     assert not processes(folder)
 
 
 @LINUX
-def test_what_killed_compilers_leave_is_compiled_here(folder: Path) -> None:
-    assert done(folder, "die")[0] == "3.0 6.0 9.0 0 0 1"
+def test_what_killed_compilers_leave_is_compiled_here(done: Done, folder: Path) -> None:
+    assert done("die")[0] == "3.0 6.0 9.0 0 0 1"
     assert len(processes(folder)) == 2
 
 
 @LINUX
-def test_a_disk_that_is_full_costs_the_cache_alone(folder: Path) -> None:
+def test_a_disk_that_is_full_costs_the_cache_alone(done: Done, folder: Path) -> None:
     """A limit on the size of files, which refuses what is written in the middle of it."""
-    out, err = done(folder, "full")
+    out, err = done("full")
     assert out == "3.0 6.0 9.0 0 0 0"
     assert err.count("is not kept") == 1
     assert {path.suffix for path in (folder / "cache" / "filter-consistency").iterdir()} <= {".lock", ".txt"}
@@ -136,9 +167,9 @@ def test_a_disk_that_is_full_costs_the_cache_alone(folder: Path) -> None:
 
 @LINUX
 @pytest.mark.parametrize("what", ["hang", "abandon"])
-def test_no_compiler_outlives_who_waits_for_it(folder: Path, what: str) -> None:
+def test_no_compiler_outlives_who_waits_for_it(done: Done, folder: Path, what: str) -> None:
     """Whether that is stopped or killed."""
-    assert done(folder, what)[0] == ("stopped" if what == "hang" else "")
+    assert done(what)[0] == ("stopped" if what == "hang" else "")
     assert processes(folder)
     until = time.monotonic() + 10.0
     while living(folder) and time.monotonic() < until:
@@ -147,24 +178,23 @@ def test_no_compiler_outlives_who_waits_for_it(folder: Path, what: str) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can become another user")
-def test_kernels_of_root_serve_other_users(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_of_root_serve_other_users(done: Done, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As in an image: made by root, read-only to who runs, who can still compile what is missing."""
-    nobody = {"user": 65534, "group": 65534, "extra_groups": []}
-    tried = subprocess.run([sys.executable, "-c", "import consistency"], check=False, capture_output=True, **nobody)  # type: ignore[call-overload]
-    if tried.returncode:
-        pytest.skip("another user cannot read this environment")
-    done(folder, jobs=1)
+    (folder / "processes").chmod(0o777)
+    done(jobs=1)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder / "cache"))
-    assert done(folder, jobs=1, **nobody)[0] == "3.0 6.0 9.0 0 0 0"  # root's own cache is not for others to read
+    out, err = done("nobody")
+    assert out == "3.0 6.0 9.0 0 0 0"  # root's own cache is not for others to read
+    assert "Permission denied" in err
     kept.open_to_readers()
     before = sorted(kept.folder().iterdir())
-    assert done(folder, **nobody) == ("3.0 6.0 9.0 1 1 1", "")
-    one = next(kept.folder().glob("*.kernel"))
-    one.unlink()
-    out, err = done(folder, **nobody)
-    assert sorted(out.split()[3:]) in (["0", "0", "1"], ["0", "1", "1"])
+    assert done("nobody") == ("3.0 6.0 9.0 1 1 1", "")
+    for path in kept.folder().glob("*.kernel"):
+        path.unlink()
+    out, err = done("nobody")
+    assert out == "3.0 6.0 9.0 0 0 0"
     assert err.count("is not kept") == 1
-    assert sorted(kept.folder().iterdir()) == [path for path in before if path != one]
+    assert {*before} - {*kept.folder().iterdir()} == {path for path in before if path.suffix == ".kernel"}
 
 
 # --- what is foreseen -------------------------------------------------------------------------------

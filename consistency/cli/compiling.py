@@ -39,7 +39,8 @@ def compile_(
     from consistency.runs.ahead import compile_ahead
 
     ahead = compile_ahead(filters or (), scenario, into, jobs)
-    print(f"{ahead.kernels} kernels of {ahead.filters} filters in {ahead.folder}, {ahead.compiled} compiled now")
+    count, of = (f"{n} {what}{'s' * (n != 1)}" for n, what in ((ahead.kernels, "kernel"), (ahead.filters, "filter")))
+    print(f"{count} of {of} in {ahead.folder}, {ahead.compiled} compiled now")
     if into is not None:
         environment = {"NUMBA_CACHE_DIR": str(ahead.folder)} | environment
     if environment:

@@ -90,7 +90,7 @@ def _compile(missing: Sequence[Need], jobs: int) -> None:
     shared = sorted(
         (need for need in missing if need.outlook.is_shared), key=lambda need: need.outlook.seconds, reverse=True
     )
-    workers = min(jobs, len(shared)) if _may_fork() and (len(shared) < 2 or not kept.refusal()) else 1
+    workers = min(jobs, len(shared)) if len(shared) > 1 and _may_fork() and not kept.refusal() else 1
     seconds = _wall([need.outlook.seconds for need in missing], workers)
     with _processes(shared, workers if workers > 1 else 0) as links, progress.foreseen(_label(missing), seconds):
         _side_by_side(len(shared), links)

@@ -10,12 +10,15 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from consistency.filters.kernel import foreseen, kept
 from consistency.filters.kernel.content import Content
 from consistency.filters.kernel.foreseen import FIRST
+from consistency.filters.kernel.jit import Outlook
 from consistency.runs import compiling
 
 Done = Callable[..., tuple[str, str]]
@@ -195,6 +198,21 @@ def test_kernels_of_root_serve_other_users(done: Done, folder: Path, monkeypatch
     assert out == "3.0 6.0 9.0 0 0 0"
     assert err.count("is not kept") == 1
     assert {*before} - {*kept.folder().iterdir()} == {path for path in before if path.suffix == ".kernel"}
+
+
+def test_what_others_cannot_read_is_compiled_here(capsys: pytest.CaptureFixture[str]) -> None:
+    made: list[int] = []
+    outlook = Outlook("", is_ready=False, is_shared=False, seconds=4.0)
+    need: Any = SimpleNamespace(filter=SimpleNamespace(name="mine"), outlook=outlook, compile=lambda: made.append(1))
+    compiling._compile([need, need], 2)
+    assert made == [1, 1]
+    assert capsys.readouterr().err == "compiling 2 kernels of mine: about 6 s, once\n"
+
+
+def test_a_few_filters_are_named() -> None:
+    needs: Any = [SimpleNamespace(filter=SimpleNamespace(name=name)) for name in "abcde"]
+    assert compiling._label(needs) == "compiling 5 kernels of a, b, c and 2 more"
+    assert compiling._label(needs[:1]) == "compiling the kernel of a"
 
 
 # --- what is foreseen -------------------------------------------------------------------------------

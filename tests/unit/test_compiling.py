@@ -18,7 +18,7 @@ import pytest
 from consistency.filters.kernel import foreseen, kept
 from consistency.filters.kernel.content import Content
 from consistency.filters.kernel.foreseen import FIRST
-from consistency.filters.kernel.jit import Outlook
+from consistency.filters.kernel.jit import Kernel, Outlook
 from consistency.runs import compiling
 
 Done = Callable[..., tuple[str, str]]
@@ -256,6 +256,21 @@ def test_what_compiling_took_is_kept(cache: Path, monkeypatch: pytest.MonkeyPatc
 def test_the_size_is_that_of_all_functions() -> None:
     sizes = Content(outer, ()).functions
     assert sizes == {f"{__name__}.{f.__name__}": len(f.__code__.co_code) for f in (inner, outer)}
+
+
+def test_functions_that_were_compiled_before_count_less(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foreseen, "seconds_for", lambda size: size)
+    kernel = Kernel(total)
+    first = kernel.outlook(1)
+    assert (first.is_ready, first.is_shared, first.seconds) == (False, True, len(total.__code__.co_code))
+    assert kernel(1.0) == 2.0
+    assert kernel.outlook(1.0).is_ready
+    assert kernel.outlook(1) == first._replace(seconds=foreseen.AGAIN * first.seconds)
+    assert float(cache.read_text().split()[0]) == first.seconds
+
+
+def total(x: float) -> float:
+    return x + x
 
 
 def test_seconds_of_several() -> None:

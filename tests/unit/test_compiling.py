@@ -19,6 +19,7 @@ from consistency.filters.kernel import foreseen, kept
 from consistency.filters.kernel.content import Content
 from consistency.filters.kernel.foreseen import FIRST
 from consistency.filters.kernel.jit import Kernel, Outlook
+from consistency.filters.kernel.slam import robot_width
 from consistency.runs import compiling
 
 Done = Callable[..., tuple[str, str]]
@@ -256,6 +257,14 @@ def test_what_compiling_took_is_kept(cache: Path, monkeypatch: pytest.MonkeyPatc
 def test_the_size_is_that_of_all_functions() -> None:
     sizes = Content(outer, ()).functions
     assert sizes == {f"{__name__}.{f.__name__}": len(f.__code__.co_code) for f in (inner, outer)}
+
+
+def of_a_part(part: Any) -> int:
+    return robot_width(part)
+
+
+def test_what_only_chooses_a_body_has_no_size() -> None:
+    assert set(Content(of_a_part, ()).functions) == {f"{__name__}.of_a_part"}
 
 
 def test_functions_that_were_compiled_before_count_less(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from consistency.runs.findings import script
 from consistency.verdicts.curves import Curves
 
 FINDINGS = ("fig2b", "fig2c")
+KERNELS = {"herath2007-xyz": ("ekf-xyz",)}
 
 LIMIT = 0.8975  # P(|N(0, 1)| <= 2 / sqrt(1.5)): 2-sigma coverage when the covariance is too small by x1.5
 LEVEL = 0.05  # of each one-sided t test over the runs

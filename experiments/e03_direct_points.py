@@ -7,6 +7,7 @@ from consistency.diagnostics import detectable_ratio, simultaneous_band
 from consistency.runs.findings import script
 
 FINDINGS = ("fig11a",)
+KERNELS = {"herath2007-xyz": ("ekf-xyz",), "linear-gaussian": ("kf",)}
 
 ALARM = 0.05  # over all steps at once
 DETECT = 2.0  # ratio of covariances; 50 runs, as published, find x1.9

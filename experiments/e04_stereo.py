@@ -13,6 +13,8 @@ FINDINGS = ("fig11b", "fig13a", "fig13b", "consistent-stereo")
 SCENARIO = "herath2007-stereo"
 ANSWER = "parked-ekf-uvd"  # in 36 worlds and beside ten others: e13
 UPPER = 3.72  # upper end of the published band
+FILTERS = ("ekf-xyz", "ekf-uvd", "ukf-xyz", "ukf-uvd", ANSWER)
+KERNELS = {SCENARIO: FILTERS}
 SIGN_TEST = 1e-3  # two-sided level of the paired sign test over runs
 MINIMAL = 0.5  # share of the way to consistency below which an improvement is minimal
 
@@ -30,7 +32,7 @@ ACCEPT_13B = (
 
 def main(study: cs.Study) -> list[cs.Finding]:
     """Average NEES of the robot pose on the stereo sensor, fig. 11b, 13a and 13b, and that of the answer."""
-    study.results(SCENARIO, ["ekf-xyz", "ekf-uvd", "ukf-xyz", "ukf-uvd", ANSWER])
+    study.results(SCENARIO, FILTERS)
     xyz, xyz_curves = study.judged(SCENARIO, "ekf-xyz")
     uvd, uvd_curves = study.judged(SCENARIO, "ekf-uvd")
     ukf, ukf_curves = study.judged(SCENARIO, "ukf-uvd")

@@ -7,6 +7,7 @@ from consistency.runs.findings import script
 from consistency.verdicts.curves import run_means
 
 FINDINGS = ("baseline-reduces-nonlinearity",)
+KERNELS = {"herath2007-stereo": ("ekf-xyz", "ekf-uvd")}
 
 BASELINES = (0.09, 0.2, 0.5)  # m: published, between, and that of fig. 12b
 

@@ -9,6 +9,7 @@ FINDINGS = ("other-worlds",)
 
 FIRST = ("herath2007-stereo", "herath2007-xyz")
 ON_STEREO = ("ekf-xyz", "ekf-uvd", "ukf-uvd")
+KERNELS = {FIRST[0]: ON_STEREO, FIRST[1]: ("ekf-xyz",)}
 
 ACCEPT = (
     "in a second world (rounded rectangle) and a third (figure of eight), each with its own landmarks, every verdict "

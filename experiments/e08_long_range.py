@@ -9,6 +9,7 @@ from consistency.runs.findings import script
 from consistency.verdicts.curves import run_means, wins
 
 FINDINGS = ("long-range",)
+KERNELS = {"herath2007-stereo": ("ekf-xyz", "ekf-uvd")}
 
 RANGE = 8.0  # m: mean disparity down to 1.7 px, where one view leaves a landmark's depth almost unknown
 SIGN_TEST = 1e-3  # two-sided level of the paired sign test over runs, as for fig13a

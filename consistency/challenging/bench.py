@@ -16,8 +16,8 @@ from consistency.filters.compiled import one_blas_thread
 from consistency.protocols import Filter
 from consistency.reading.columns import POSE
 from consistency.runs.backends.local import worker_count
+from consistency.runs.compiling import compile_all, first_trials
 from consistency.runs.isolating import Isolation
-from consistency.runs.work import compile_for
 from consistency.scenario import Scenario
 from consistency.simulation import require_landmarks_in_view
 from consistency.simulation.world import World
@@ -60,11 +60,7 @@ class Bench:
 
     def compile(self, worlds: Sequence[Scenario]) -> None:
         """Compile what the filter needs in these worlds, so that a search spends no time on it."""
-        for world in worlds:
-            try:
-                compile_for([self.filter], require_landmarks_in_view(world).trial(0, 0), world.belief)
-            except InputError:
-                continue
+        compile_all(first_trials((self.filter, world) for world in worlds), self.workers)
 
     def __call__(self, jobs: Sequence[Job], seed: int, until: float = np.inf) -> list[Done | None]:
         """Scores of each job in its order; None for a world in which no landmark comes into view.

@@ -34,6 +34,10 @@ EXAMPLES = {
         "characterise log --out sensor.toml",
         "characterise IMAGES --board 9x6 --square 0.024 --out s.toml",
     ),
+    "compile": (
+        "compile ekf-uvd ukf-uvd --scenario herath2007-stereo",
+        "compile ekf-uvd --into /opt/kernels --cpu x86-64-v3",
+    ),
     "sweep": ("sweep regime --out regime", "sweep grid.toml --share 1/4 --out cells"),
     "recommend": ("recommend herath2007-stereo --range 6",),
     "tune": ("tune herath2007-optimistic --filter oc-ekf-xyz", "tune --log log --filter ekf-uvd"),

@@ -17,6 +17,7 @@ from consistency.filters.guard.guarded import Guarded
 from consistency.filters.guard.parts import guard_part
 from consistency.filters.kernel.dispatch import fits, require_fitting
 from consistency.filters.kernel.gain import HALTED, REASONS
+from consistency.filters.kernel.jit import Outlook
 from consistency.filters.kernel.loop import Outcome, trial_kernel
 from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
 from consistency.filters.plain_sensors import bias_at, sensor_noise
@@ -126,6 +127,10 @@ class Compiled:
     def is_ready(self, trial: Trial, belief: Belief) -> bool:
         """Whether ``run`` starts at once on this trial, or spends seconds on compiling first."""
         return trial_kernel.is_ready(*self._arguments(trial, belief))
+
+    def outlook(self, trial: Trial, belief: Belief) -> Outlook:
+        """What ``run`` on this trial has to compile first, and how long that will take."""
+        return trial_kernel.outlook(*self._arguments(trial, belief))
 
     def compile(self, trial: Trial, belief: Belief) -> None:
         """Compile what ``run`` needs on this trial, or load it from disk."""

@@ -17,8 +17,10 @@ from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.diagnostics import Verdict
 from consistency.errors import InputError
+from consistency.filters import get_filter
 from consistency.reading import read_json, reading
 from consistency.runs.backends.local import worker_count
+from consistency.runs.compiling import compile_all, first_trials
 from consistency.runs.montecarlo import run_trials
 from consistency.scenario import Scenario, data_folder, load_scenario
 from consistency.store.provenance import manifest_of
@@ -111,6 +113,9 @@ class Study:
 def experiments() -> dict[str, ModuleType]:
     """Scripts of ``experiments/`` by name; each has FINDINGS (ids) and ``main(study)``.
 
+    KERNELS, names of filters by scenario, says what is compiled before the first script runs; what it leaves out is
+    compiled when it is needed.
+
     A script that takes long says so with ``LONG = True``; one that runs no filter, and so shares no trials with the
     others, with ``OWN_PROCESS = True``.
 
@@ -187,9 +192,17 @@ def reproduce(
     selection = _selection(scripts, only, long)
     require_free(out, overwrite, "findings")
     study, started = Study(runs, seed, jobs, only=only), time.monotonic()
+    _compile(selection, study.workers)
     findings = _findings_of(study, selection)
     study.write(out, findings, time.monotonic() - started, overwrite)
     return findings
+
+
+def _compile(selection: Sequence[tuple[ModuleType, Sequence[str]]], jobs: int) -> None:
+    """Compile what the scripts say that they need, side by side and before the first of them."""
+    needs = [need for module, _ in selection for need in getattr(module, "KERNELS", {}).items()]
+    pairs = [(get_filter(name), load_scenario(world)) for world, names in needs for name in names]
+    compile_all(first_trials(pairs), jobs)
 
 
 def _without_scripts(scripts: Mapping[str, ModuleType], only: Sequence[str]) -> list[str]:

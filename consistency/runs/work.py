@@ -7,15 +7,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
-from consistency.filters.stepping import name_of
-from consistency.protocols import Filter, WholeTrial
+from consistency.protocols import Filter
+from consistency.runs.compiling import compile_for
 from consistency.runs.footprint import workers_that_fit
 from consistency.runs.isolating import Isolation
-from consistency.scenario import Belief, Scenario
+from consistency.scenario import Scenario
 from consistency.simulation import require_landmarks_in_view
 from consistency.simulation.world import World
 from consistency.store.results import Outcome, outcome_of
-from consistency.terminal.progress import KERNELS, progress
 from consistency.types import Trial
 
 Outcomes = Generator[Outcome, None, None]
@@ -97,10 +96,10 @@ class Work:
         trials = list(self.trials.trials.values()) if isinstance(self.trials, Recorded) else [self._ahead(run)]
         return workers_that_fit(self.isolation.compiled, trials, self.isolation.belief, workers)
 
-    def compile(self, run: int) -> None:
-        """Compile what a run needs and is not yet compiled, and say so."""
+    def compile(self, run: int, jobs: int = 1) -> None:
+        """Compile what a run needs and is not yet compiled, in ``jobs`` processes at most, and say so."""
         if self.isolation.compiled:
-            compile_for(self.isolation.compiled, self._ahead(run), self.isolation.belief)
+            compile_for(self.isolation.compiled, self._ahead(run), self.isolation.belief, jobs)
 
 
 class Backend(Protocol):
@@ -114,12 +113,3 @@ class Backend(Protocol):
 
         The bits do not depend on who does a run: BLAS has one thread.
         """
-
-
-def compile_for(filters: Sequence[Filter], trial: Trial, belief: Belief) -> None:
-    """Compile what the filters need for ``trial`` and is not yet compiled, and say so."""
-    for filter_ in filters:
-        if isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, belief):
-            with progress(f"compiling {name_of(filter_)} (once on this machine)", 1, KERNELS) as advance:
-                filter_.compile(trial, belief)
-                advance(1)

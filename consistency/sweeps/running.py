@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
 from consistency.errors import InputError
+from consistency.filters import get_filter
 from consistency.runs.backends.local import worker_count
+from consistency.runs.compiling import compile_all, first_trials
 from consistency.runs.work import Backend
 from consistency.store.journal import Busy, Journal
 from consistency.store.stopping import Stop, stoppable
@@ -19,6 +21,7 @@ from consistency.sweeps.folder import SweepFolder, Work
 from consistency.sweeps.plan import Sweep
 from consistency.terminal.progress import say
 
+LOOKED_AT = 400  # cells whose kernels are compiled ahead, 10 ms each; cells of one grid differ little
 PAUSE = 1.0  # s, between looks at whether another process has done what is left
 
 
@@ -64,11 +67,23 @@ def run_sweep(
     if len(todo) < len(share):
         say(f"{len(share) - len(todo)} of {len(share)} are there already")
     with stoppable() as stop:
+        if backend is None:
+            with suppress(Exception):  # what breaks a cell is said of it
+                _compile(sweep, todo, jobs)
+            if stop.number is not None:
+                raise KeyboardInterrupt
         for count, (work, seconds) in enumerate(_in_turn(folder, todo, partial(_do, stop, jobs, backend)), 1):
             left = _left(seconds * (len(todo) - count))
             say(f"{count} of {len(todo)}: {work.text}: {_said(folder.done(work))}{left}")
     missing = sum(folder.is_missing(work) for work in folder.all_work())
     return folder, missing
+
+
+def _compile(sweep: Sweep, todo: Sequence[Work], jobs: int) -> None:
+    """Compile what the cells need before the first, so that the time left is that of cells."""
+    some = todo[:: len(todo) // LOOKED_AT + 1]
+    names = ((name, work.cell.scenario) for work in some for name in (work.filter, sweep.reference))
+    compile_all(first_trials((get_filter(name), world) for name, world in names), worker_count(jobs))
 
 
 def _in_turn(

@@ -35,13 +35,12 @@ class _Forgiving:
 
 
 EVERY = 5.0  # seconds between lines
-KERNELS = "kernels"  # unit of what is compiled: said even where all else is quiet
 _quiet = ContextVar("quiet", default=False)
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Inside, only the compiling of kernels is said: many short works report for themselves."""
+    """Inside, only what is foreseen to take long is said: many short works report for themselves."""
     token = _quiet.set(True)
     try:
         yield
@@ -70,7 +69,7 @@ def progress(label: str, total: int, unit: str = "runs", brief: bool = False) ->
 
     ``brief``: where there is no terminal, nothing is said of what is over in a few seconds.
     """
-    if _quiet.get() and unit != KERNELS:
+    if _quiet.get():
         yield lambda _: None
     elif sys.stderr is not None and sys.stderr.isatty():
         with _bar(label, total, unit) as advance:
@@ -104,6 +103,37 @@ def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
         yield advance
 
 
+@contextmanager
+def foreseen(label: str, seconds: float) -> Iterator[None]:
+    """Work that will take about so many seconds and cannot say how far it is; said even where all else is quiet.
+
+    On a terminal a bar goes by the clock, elsewhere there is one line.
+    """
+    said = f"{label}: about {_rounded(seconds)}, once"
+    if sys.stderr is None or not sys.stderr.isatty():
+        print(said, file=_Forgiving(), flush=True)
+        yield
+        return
+    from rich.console import Console
+    from rich.progress import Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+    from rich.progress_bar import ProgressBar
+
+    class Clock(ProgressColumn):
+        def render(self, task: Task) -> ProgressBar:
+            passed = seconds if task.finished else min(task.elapsed or 0.0, 0.99 * seconds)
+            return ProgressBar(total=seconds, completed=passed, width=40)
+
+    stream: Any = _Forgiving()
+    with Progress(TextColumn("{task.description}"), Clock(), TimeElapsedColumn(), console=Console(file=stream)) as bar:
+        task = bar.add_task(said, total=1)
+        yield
+        bar.update(task, completed=1)
+
+
+def _rounded(seconds: float) -> str:
+    return f"{seconds / 60.0:.0f} min" if seconds >= 90.0 else f"{max(seconds, 1.0):.0f} s"
+
+
 def _speed(rate: float, unit: str) -> str:
     return f"{rate:.1f} {unit}/s" if rate >= 1.0 else f"{1.0 / rate:.1f} s for one"
 
@@ -111,8 +141,6 @@ def _speed(rate: float, unit: str) -> str:
 def _lines(label: str, total: int, unit: str, brief: bool) -> Advance:
     started = last = time.monotonic()
     done = 0
-    if unit == KERNELS:  # takes half a minute, and nothing else is to be seen meanwhile
-        print(f"{label} ...", file=_Forgiving(), flush=True)
 
     def advance(count: int) -> None:
         nonlocal done, last

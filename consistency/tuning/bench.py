@@ -13,8 +13,8 @@ from consistency.filters.compiled import one_blas_thread
 from consistency.filters.stepping import name_of
 from consistency.protocols import Filter
 from consistency.runs.backends.local import worker_count
+from consistency.runs.compiling import compile_for
 from consistency.runs.isolating import Isolation
-from consistency.runs.work import compile_for
 from consistency.scenario import Belief
 from consistency.terminal.progress import say
 from consistency.tuning.scores import Score, score_of

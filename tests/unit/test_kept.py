@@ -98,12 +98,15 @@ def test_code_of_another_owner_is_neither_loaded_nor_overwritten(
     assert code_in(cache).read_bytes() == before
 
 
-def test_a_cache_that_cannot_be_written_fails_nothing(cache: Path) -> None:
+def test_a_cache_that_cannot_be_written_fails_nothing(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cache.write_text("a file where the cache would be", encoding="utf-8")
     assert use() == (False, 0)
+    assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_code_that_cannot_be_kept_serves_its_process(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_that_cannot_be_kept_serves_its_process(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A full disk."""
 
     def full(*_: object) -> None:
@@ -111,7 +114,8 @@ def test_code_that_cannot_be_kept_serves_its_process(cache: Path, monkeypatch: p
 
     monkeypatch.setattr(Path, "replace", full)
     assert use() == (False, 0)
-    assert [path.suffix for path in (cache / "filter-consistency").iterdir()] == [".lock"]
+    assert not list(cache.rglob(".*")) + list(cache.rglob(f"*{kept.SUFFIX}"))
+    assert capsys.readouterr().err.count("No space left on device; compiled code is not kept") == 1
 
 
 def test_what_was_not_used_for_longest_is_removed_first(tmp_path: Path) -> None:

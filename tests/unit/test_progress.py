@@ -2,17 +2,42 @@
 
 from __future__ import annotations
 
+import io
+import sys
+import time
+
 import pytest
 
 from consistency.terminal import progress as module
-from consistency.terminal.progress import KERNELS, each, progress, say
+from consistency.terminal.progress import each, foreseen, progress, quiet, say
 
 
-def test_compiling_is_announced_at_once(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress("compiling ekf-uvd (once on this machine)", 1, KERNELS) as advance:
-        assert capsys.readouterr().err == "compiling ekf-uvd (once on this machine) ...\n"
-        advance(1)
-        assert "1 of 1 kernels" in capsys.readouterr().err
+def test_what_is_foreseen_to_take_long_is_said_at_once_and_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with quiet(), foreseen("compiling the kernel of ekf-uvd", 14.6):
+        assert capsys.readouterr().err == "compiling the kernel of ekf-uvd: about 15 s, once\n"
+    assert capsys.readouterr().err == ""
+    with foreseen("compiling 40 kernels", 300.0):
+        assert capsys.readouterr().err == "compiling 40 kernels: about 5 min, once\n"
+
+
+def test_a_terminal_has_a_bar_by_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is full when the work is done, not when the seconds are over."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    with foreseen("compiling", 0.01):
+        time.sleep(0.25)
+        working = terminal.getvalue()
+    assert "compiling: about 1 s, once" in working
+    assert "━" * 38 in working
+    assert "━" * 40 not in working
+    assert "━" * 40 in terminal.getvalue()
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
 
 
 def test_runs_are_said_when_some_are_done(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -14,7 +14,7 @@ from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import register_jitable
 
-from consistency.filters.kernel import kept
+from consistency.filters.kernel import foreseen, kept
 from consistency.filters.kernel.apart import apart
 from consistency.filters.kernel.content import Content
 from consistency.filters.kernel.dispatch import INNER, OPTIONS, Function
@@ -39,6 +39,15 @@ def inner(function: Function) -> Function:
     return function
 
 
+class Outlook(NamedTuple):
+    """What a call of a kernel begins with."""
+
+    key: str  # of what the kernel is made of
+    is_ready: bool  # compiled in this process, or on disk
+    is_shared: bool  # whether other processes can read what one has compiled
+    seconds: float  # that compiling takes, or would take
+
+
 class Kernel:
     """A whole-trial entry: compiled on first use for each combination of parts, kept on disk for later processes.
 
@@ -51,7 +60,8 @@ class Kernel:
         self.function: Any = function
         self.loaded = 0  # signatures that this process has read from disk
         self._entries: dict[Any, Any] = {}
-        self._contents: dict[Any, Content] = {}  # of what is not ready, as far as somebody has asked
+        self._contents: dict[Any, Content] = {}  # by signature, as far as somebody has asked
+        self._functions: set[str] = set()  # that this process has compiled
 
     def __call__(self, *args: Any, stop: Callable[[], None] = lambda: None) -> Any:
         return apart(lambda: self._entry(*args)(*args), stop=stop)
@@ -69,11 +79,23 @@ class Kernel:
 
     def is_ready(self, *args: Any) -> bool:
         """Whether a call with these arguments starts at once, or spends seconds on compiling first."""
+        return _signature(args) in self._entries or self.outlook(*args).is_ready
+
+    def outlook(self, *args: Any) -> Outlook:
+        """What a call with these arguments begins with."""
         signature = _signature(args)
-        if signature in self._entries:
-            return True
-        content = self._contents[signature] = Content(self.function, signature)
-        return content.unknown is None and kept.read(_path(content)) is not None
+        if signature not in self._entries or signature not in self._contents:
+            self._contents[signature] = Content(self.function, signature)
+        content = self._contents[signature]
+        is_shared = content.unknown is None
+        is_ready = signature in self._entries or (is_shared and kept.read(kept.place(content.key)) is not None)
+        return Outlook(content.key, is_ready, is_shared, foreseen.seconds_for(self._size(content)))
+
+    def _size(self, content: Content) -> float:
+        """Bytes of bytecode to be compiled; functions that this process has compiled before count less."""
+        return sum(
+            size * (foreseen.AGAIN if name in self._functions else 1.0) for name, size in content.functions.items()
+        )
 
     @property
     def signatures(self) -> list[Any]:
@@ -81,11 +103,11 @@ class Kernel:
         return list(self._entries)
 
     def _made(self, signature: tuple[Any, ...]) -> Any:
-        content = self._contents.pop(signature, None) or Content(self.function, signature)
+        content = self._contents.get(signature) or Content(self.function, signature)
         entry = numba.njit(**OPTIONS)(self.function)
         if content.unknown is not None:
             return self._compiled(entry, signature, content)
-        path = _path(content)
+        path = kept.place(content.key)
         if not self._load(entry, kept.read(path, tell=True)):
             with kept.one_at_a_time(path):
                 if not self._load(entry, kept.read(path)):
@@ -94,8 +116,10 @@ class Kernel:
         return entry
 
     def _compiled(self, entry: Any, signature: tuple[Any, ...], content: Content) -> Any:
-        with one_program({self.function.__qualname__, *content.dispatchers}):
+        names = {self.function.__qualname__, *content.dispatchers}
+        with foreseen.measured(self._size(content)), one_program(names):
             entry.compile(signature)
+        self._functions |= content.functions.keys()
         return entry
 
     def _load(self, entry: Any, payload: bytes | None) -> bool:
@@ -109,10 +133,6 @@ class Kernel:
             entry.add_overload(result)
         self.loaded += 1
         return True
-
-
-def _path(content: Content) -> Path:
-    return kept.folder() / f"{content.key}{kept.SUFFIX}"
 
 
 def _keep(path: Path, result: Any) -> None:

@@ -30,13 +30,18 @@ def folder() -> Path:
     return Path(base) / "filter-consistency"
 
 
+def place(key: str) -> Path:
+    """File of the content with this key."""
+    return folder() / f"{key}{SUFFIX}"
+
+
 def read(path: Path, tell: bool = False) -> bytes | None:
     """What a file keeps; None where it is absent, damaged, or could have been written by somebody else.
 
     With ``tell``, what is wrong is said on stderr.
     """
     try:
-        content = path.read_bytes() if _is_ours(path.parent, path) else b""
+        content = path.read_bytes() if is_ours(path.parent, path) else b""
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
@@ -57,10 +62,10 @@ def read(path: Path, tell: bool = False) -> bytes | None:
 
 
 def write(path: Path, payload: bytes) -> bool:
-    """Keep this, whole or not at all; False where the folder does not take it."""
+    """Keep this, whole or not at all; False where the folder does not take it, which is said once."""
     try:
         _make(path.parent)
-        if not _is_ours(path.parent):
+        if not is_ours(path.parent):
             return False
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
             try:
@@ -71,9 +76,31 @@ def write(path: Path, payload: bytes) -> bool:
                 Path(file.name).unlink(missing_ok=True)
                 raise
         prune(path.parent)
-    except OSError:
+    except OSError as error:
+        _say(f"{path.parent}: {error.strerror}; compiled code is not kept, name another folder by NUMBA_CACHE_DIR")
         return False
     return True
+
+
+def refusal() -> str:
+    """Why the folder takes no compiled code; empty where it does, and then it is there."""
+    where = folder()
+    try:
+        _make(where)
+        if not is_ours(where):
+            return "somebody else may write there"
+        with tempfile.TemporaryFile(dir=where):
+            return ""
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def open_to_readers() -> None:
+    """Let every user of this machine read what is kept, as in an image; who owns it can still write alone."""
+    where = folder()
+    where.chmod(0o755)
+    for path in where.glob(f"*{SUFFIX}"):
+        path.chmod(0o644)
 
 
 def one_at_a_time(path: Path) -> AbstractContextManager[Any]:
@@ -106,7 +133,7 @@ def _make(where: Path) -> None:
     where.mkdir(mode=0o700, exist_ok=True)
 
 
-def _is_ours(*paths: Path) -> bool:
+def is_ours(*paths: Path) -> bool:
     """Whether this user or root owns all of them and nobody else may write there."""
     if not hasattr(os, "getuid"):
         return True

@@ -51,7 +51,7 @@ class Local:
         workers = worker_count(self.jobs)
         fitting = work.room_for(run, workers)
         self._room = fitting if self.jobs == -1 else workers
-        work.compile(run)
+        work.compile(run, workers)
 
     def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
         """See :class:`consistency.runs.work.Backend`."""

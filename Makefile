@@ -15,7 +15,7 @@ reproduce: .venv/.done
 
 # what is in which tier: CONTRIBUTING.md
 test-quick: .venv/.done
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not kernel and not slow and not browser"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m quick
 
 test: .venv/.done
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser"

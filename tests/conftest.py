@@ -1,8 +1,9 @@
-"""Small worlds that many tests share, and settings of the property tests."""
+"""Small worlds that many tests share, tiers, and settings of the property tests."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,55 @@ import pytest
 from hypothesis import settings
 
 import consistency as cs
+from consistency.filters.kernel import jit
 
 pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
 
 settings.register_profile("bench", deadline=None, max_examples=60, derandomize=True, database=None)
 settings.load_profile("bench")
 
+# Files of tests/unit that are not quick: they run kernels, begin processes or take longer. Only unit tests are quick.
+LONGER = {
+    "action", "apart", "bags", "batches", "bench", "blas", "both_errors", "bounded_memory", "ceiling", "challenging",
+    "content", "dask", "declared_gain", "documents", "effects", "ending", "extending", "extending_report",
+    "filters_table", "findings", "frontend_experiment", "gather", "guards", "ideal", "imaging_chain",
+    "imaging_experiments", "imports", "isolating", "joint", "journal", "kept", "kept_cells", "kept_looks", "kernels",
+    "lens_models", "log", "log_tables", "montecarlo", "offset", "own_error", "pytest_plugin", "recommend",
+    "recording", "relative", "reporting", "reporting_files", "sequential", "sequential_decisions", "skipping",
+    "slurm", "static_limit", "sweeps", "tuning", "vision_experiments", "vision_small", "wrong_inputs",
+}  # fmt: skip
+
 TILTED = {"position": [0.12, -0.05, 0.3], "rotation": [0.08, -0.15, 0.4]}  # m; roll, pitch, heading in rad
+
+
+def is_quick(path: Path) -> bool:
+    return path.parent.name == "unit" and path.stem.removeprefix("test_") not in LONGER
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """``-m quick`` need not import the others."""
+    asked = config.option.markexpr == "quick" and collection_path.suffix == ".py"
+    return True if asked and not is_quick(collection_path) else None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is quick; files with slow tests come first, so that workers end together."""
+    slow = {item.path for item in items if item.get_closest_marker("slow") or item.get_closest_marker("browser")}
+    for item in items:
+        if is_quick(item.path) and item.path not in slow:
+            item.add_marker("quick")
+    items.sort(key=lambda item: item.path not in slow)
+
+
+@pytest.fixture(autouse=True)
+def no_kernel_in_quick_tests(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.node.get_closest_marker("quick"):
+        monkeypatch.setattr(jit.Kernel, "_entry", refuse)
+
+
+def refuse(*_: Any) -> None:
+    pytest.fail("a test that runs a kernel is not quick: name its file among LONGER of tests/conftest.py")
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 
 import consistency as cs
+from consistency.filters.compiled import Compiled
 from consistency.filters.kernel import jit
 
 pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
@@ -20,13 +21,14 @@ settings.load_profile("bench")
 
 # Files of tests/unit that are not quick: they run kernels, begin processes or take longer. Only unit tests are quick.
 LONGER = {
-    "action", "apart", "bags", "batches", "bench", "blas", "both_errors", "bounded_memory", "ceiling", "challenging",
-    "content", "dask", "declared_gain", "documents", "effects", "ending", "extending", "extending_report",
-    "filters_table", "findings", "frontend_experiment", "gather", "guards", "ideal", "imaging_chain",
-    "imaging_experiments", "imports", "isolating", "joint", "journal", "kept", "kept_cells", "kept_looks", "kernels",
-    "lens_models", "log", "log_tables", "montecarlo", "offset", "own_error", "pytest_plugin", "recommend",
-    "recording", "relative", "reporting", "reporting_files", "sequential", "sequential_decisions", "skipping",
-    "slurm", "static_limit", "sweeps", "tuning", "vision_experiments", "vision_small", "wrong_inputs",
+    "action", "alignment", "apart", "bags", "batches", "bench", "blas", "both_errors", "bounded_memory", "ceiling",
+    "challenging", "comparison", "content", "conventions", "dask", "declared_gain", "documents", "effects", "ending",
+    "extending", "extending_report", "filters_table", "findings", "frontend_experiment", "gather", "guards", "ideal",
+    "imaging_chain", "imaging_experiments", "imports", "isolating", "joint", "journal", "kept", "kept_cells",
+    "kept_looks", "kernels", "lens_models", "log", "log_tables", "montecarlo", "offset", "overview", "own_error",
+    "pytest_plugin", "recommend", "recording", "relative", "report_errors", "reporting", "reporting_files",
+    "sequential", "sequential_decisions", "skipping", "slurm", "static_limit", "sweeps", "tuning",
+    "vision_experiments", "vision_small", "wrong_inputs",
 }  # fmt: skip
 
 TILTED = {"position": [0.12, -0.05, 0.3], "rotation": [0.08, -0.15, 0.4]}  # m; roll, pitch, heading in rad
@@ -52,14 +54,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path not in slow)
 
 
-@pytest.fixture(autouse=True)
-def no_kernel_in_quick_tests(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if request.node.get_closest_marker("quick"):
-        monkeypatch.setattr(jit.Kernel, "_entry", refuse)
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Quick tests and their fixtures are refused a kernel."""
+    with pytest.MonkeyPatch.context() as patch:
+        if item.get_closest_marker("quick"):
+            patch.setattr(jit.Kernel, "_entry", refuse)
+        return (yield)
 
 
 def refuse(*_: Any) -> None:
-    pytest.fail("a test that runs a kernel is not quick: name its file among LONGER of tests/conftest.py")
+    pytest.fail("a test that runs a kernel is not quick: its file belongs among LONGER of tests/conftest.py")
 
 
 @pytest.fixture(scope="session")
@@ -91,6 +96,14 @@ def linear(small: Callable[..., cs.Scenario]) -> cs.Scenario:
 def tilted() -> dict[str, list[float]]:
     """A mount with every number different from zero."""
     return TILTED
+
+
+@pytest.fixture(scope="module")
+def dense() -> Iterator[None]:
+    """Kernels without local updating, which small worlds do not come to and which takes longer to compile."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Compiled, "local_from", 10**9)
+        yield
 
 
 @pytest.fixture

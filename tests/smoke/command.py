@@ -7,11 +7,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+LIMIT = 120.0  # s, of a command that compiles nothing new, on a busy machine
+COMPILING = 300.0  # s, of one that may
+
 
 def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.CompletedProcess[str]:
     """Run the command line; the exit status must be ``status``."""
     done = subprocess.run(
-        [sys.executable, "-m", "consistency", *arguments], cwd=cwd, capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", "consistency", *arguments], cwd=cwd, capture_output=True, text=True, timeout=COMPILING
     )
     assert done.returncode == status, done.stdout + done.stderr
     assert "Traceback" not in done.stderr

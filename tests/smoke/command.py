@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import atexit
+import json
+import os
+import select
+import shlex
+import signal
 import subprocess
 import sys
+import tempfile
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +22,68 @@ COMPILING = 300.0  # s, of one that may
 
 def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.CompletedProcess[str]:
     """Run the command line; the exit status must be ``status``."""
-    done = subprocess.run(
-        [sys.executable, "-m", "consistency", *arguments], cwd=cwd, capture_output=True, text=True, timeout=COMPILING
-    )
+    done = _starter()(list(arguments), cwd)
     assert done.returncode == status, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
     return done
+
+
+STARTER = """
+import json, os, sys
+import consistency.cli, consistency.reporting.html, consistency.reporting.paper, consistency.runs.montecarlo
+import consistency.reporting.pdf, consistency.verdicts.comparison
+from consistency.__main__ import main
+
+consistency.get_filter("ekf-uvd")
+
+for line in sys.stdin:
+    arguments, folder, environment, streams = json.loads(line)
+    if child := os.fork():
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+        continue
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    for number, path in enumerate(streams):
+        os.dup2(os.open(path, os.O_RDWR), number)
+    sys.argv = ["consistency", *arguments]
+    sys.exit(main())
+"""
+
+
+class _Starter:
+    """A process that has imported what commands do, and forks for each: half of a short command is its imports.
+
+    Commands start from nothing where they are begun (:func:`begun`) and in tests/smoke/test_documents_run.py.
+    """
+
+    def __init__(self) -> None:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        self._process = subprocess.Popen([sys.executable, "-c", STARTER], text=True, start_new_session=True, **pipes)
+        atexit.register(self._end)
+
+    def __call__(self, arguments: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
+        requests, replies = self._process.stdin, self._process.stdout
+        assert requests is not None
+        assert replies is not None
+        with tempfile.NamedTemporaryFile() as out, tempfile.NamedTemporaryFile() as err:
+            streams = [os.devnull, out.name, err.name]
+            print(json.dumps([arguments, str(cwd), dict(os.environ), streams]), file=requests, flush=True)
+            if not select.select([replies], [], [], COMPILING)[0]:
+                _starter.cache_clear()
+                self._end()
+                raise TimeoutError(f"consistency {shlex.join(arguments)}: no end after {COMPILING:.0f} s")
+            code = int(replies.readline())
+            said = [Path(path).read_text(encoding="utf-8") for path in streams[1:]]
+        return subprocess.CompletedProcess(["consistency", *arguments], code, *said)
+
+    def _end(self) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.communicate()
+
+
+_starter = cache(_Starter)
 
 
 BEGUN: list[subprocess.Popen[str]] = []  # ended after the test, whatever became of it

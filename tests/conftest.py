@@ -24,12 +24,12 @@ LONGER = {
     "action", "alignment", "apart", "bags", "batches", "bench", "blas", "both_errors", "bounded_memory", "ceiling",
     "challenging", "comparison", "compiling", "compiling_once", "content", "conventions", "dask", "declared_gain",
     "effects", "ending", "extending", "extending_report", "filters_table", "findings", "frontend_experiment",
-    "frontend_motion", "gather", "guards", "ideal", "imaging_chain", "imaging_experiments", "imports", "isolating",
-    "joint", "journal", "kept", "kept_cells", "kept_looks", "kernels", "lens_models", "log", "log_tables",
-    "monitoring", "montecarlo", "offset", "overview", "own_error", "pytest_plugin", "recommend", "recording",
-    "relative", "report_errors", "reporting", "reporting_files", "results", "sensor_experiments", "sequential",
-    "sequential_decisions", "skipping", "slurm", "sources", "static_limit", "sweeps", "testing", "tuning",
-    "vision_experiments", "vision_small", "wrong_inputs",
+    "frontend_motion", "frontend_rigs", "gather", "guards", "heat", "hints", "ideal", "imaging_chain",
+    "imaging_experiments", "imports", "isolating", "joint", "journal", "kept", "kept_cells", "kept_looks", "kernels",
+    "lens_models", "log", "log_tables", "monitoring", "montecarlo", "offset", "overview", "own_error",
+    "pytest_plugin", "recommend", "recording", "relative", "report_errors", "reporting", "reporting_files", "results",
+    "sensor_experiments", "sequential", "sequential_decisions", "skipping", "slurm", "sources", "static_limit",
+    "sweeps", "testing", "tuning", "vision_experiments", "vision_shared", "vision_small", "wrong_inputs",
 }  # fmt: skip
 
 TILTED = {"position": [0.12, -0.05, 0.3], "rotation": [0.08, -0.15, 0.4]}  # m; roll, pitch, heading in rad

@@ -19,7 +19,7 @@ pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
 settings.register_profile("bench", deadline=None, max_examples=60, derandomize=True, database=None)
 settings.load_profile("bench")
 
-# Files of tests/unit that are not quick: they run kernels, begin processes or take longer. Only unit tests are quick.
+# Files of tests/unit that are not quick: they run kernels, begin processes or take longer; as do those with slow tests.
 LONGER = {
     "action", "alignment", "apart", "bags", "batches", "bench", "blas", "both_errors", "bounded_memory", "ceiling",
     "challenging", "comparison", "compiling", "compiling_once", "content", "conventions", "dask", "declared_gain",

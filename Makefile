@@ -1,7 +1,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: docs tutorial reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-all bench lint format clean
+.PHONY: docs tutorial reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-quick test-all bench lint format clean
+
+export PYTHONDONTWRITEBYTECODE :=  # byte code is kept: one process compiles a module of Python, the others load it
 
 .venv/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -10,6 +12,10 @@ BIN := .venv/bin
 
 reproduce: .venv/.done
 	$(BIN)/consistency reproduce --overwrite
+
+# what is in which tier: CONTRIBUTING.md
+test-quick: .venv/.done
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m quick
 
 test: .venv/.done
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser"

@@ -1,8 +1,9 @@
-"""Small worlds that many tests share, and settings of the property tests."""
+"""Small worlds that many tests share, tiers, and settings of the property tests."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,61 @@ import pytest
 from hypothesis import settings
 
 import consistency as cs
+from consistency.filters.compiled import Compiled
+from consistency.filters.kernel import jit
 
 pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
 
 settings.register_profile("bench", deadline=None, max_examples=60, derandomize=True, database=None)
 settings.load_profile("bench")
 
+# Files of tests/unit that are not quick: they run kernels, begin processes or take longer; as do those with slow tests.
+LONGER = {
+    "action", "alignment", "apart", "bags", "batches", "bench", "blas", "both_errors", "bounded_memory", "ceiling",
+    "challenging", "comparison", "compiling", "compiling_once", "content", "conventions", "dask", "declared_gain",
+    "effects", "ending", "extending", "extending_report", "filters_table", "findings", "frontend_experiment",
+    "frontend_motion", "frontend_rigs", "gather", "guards", "heat", "hints", "ideal", "imaging_chain",
+    "imaging_experiments", "imports", "isolating", "joint", "journal", "kept", "kept_cells", "kept_looks", "kernels",
+    "lens_models", "log", "log_tables", "monitoring", "montecarlo", "offset", "overview", "own_error",
+    "pytest_plugin", "recommend", "recording", "relative", "report_errors", "reporting", "reporting_files", "results",
+    "sensor_experiments", "sequential", "sequential_decisions", "skipping", "slurm", "sources", "static_limit",
+    "sweeps", "testing", "tuning", "vision_experiments", "vision_shared", "vision_small", "wrong_inputs",
+}  # fmt: skip
+
 TILTED = {"position": [0.12, -0.05, 0.3], "rotation": [0.08, -0.15, 0.4]}  # m; roll, pitch, heading in rad
+
+
+def is_quick(path: Path) -> bool:
+    return path.parent.name == "unit" and path.stem.removeprefix("test_") not in LONGER
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """``-m quick`` need not import the others."""
+    asked = config.option.markexpr == "quick" and collection_path.suffix == ".py"
+    return True if asked and not is_quick(collection_path) else None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is quick; files with slow tests come first, so that workers end together."""
+    slow = {item.path for item in items if item.get_closest_marker("slow") or item.get_closest_marker("browser")}
+    for item in items:
+        if is_quick(item.path) and item.path not in slow:
+            item.add_marker("quick")
+    items.sort(key=lambda item: item.path not in slow)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Quick tests and their fixtures are refused a kernel."""
+    with pytest.MonkeyPatch.context() as patch:
+        if item.get_closest_marker("quick"):
+            patch.setattr(jit.Kernel, "_entry", refuse)
+        return (yield)
+
+
+def refuse(*_: Any) -> None:
+    pytest.fail("a test that runs a kernel is not quick: its file belongs among LONGER of tests/conftest.py")
 
 
 @pytest.fixture(scope="session")
@@ -48,6 +97,14 @@ def linear(small: Callable[..., cs.Scenario]) -> cs.Scenario:
 def tilted() -> dict[str, list[float]]:
     """A mount with every number different from zero."""
     return TILTED
+
+
+@pytest.fixture(scope="module")
+def dense() -> Iterator[None]:
+    """Kernels without local updating, which small worlds do not come to and which takes longer to compile."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Compiled, "local_from", 10**9)
+        yield
 
 
 @pytest.fixture

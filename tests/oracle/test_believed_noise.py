@@ -21,6 +21,8 @@ from consistency.protocols import Problem
 from consistency.scenario import BelievedSensor, BiasMap
 from consistency.types import Array, Control, Estimates, Gaussian, Observation, Trial
 
+pytestmark = pytest.mark.usefixtures("dense")
+
 Small = Callable[..., cs.Scenario]
 NAMES = [name for name in MODULES if name.endswith(("-uvd", "-xyz"))]
 COMPILED = [

@@ -39,6 +39,8 @@ from consistency.filters.stepping import step_through
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Estimates, Gaussian, Info, Observation, Trial
 
+pytestmark = pytest.mark.usefixtures("dense")  # test_local_updating.py compares it with local updating
+
 Small = Callable[..., cs.Scenario]
 NAMES = [name for name in usable_names() if isinstance(cs.get_filter(name), Compiled)]
 WORLDS = {

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from cluster import Cluster
+from command import LIMIT
 from test_faults import at as at
 from test_faults import begin, end, fresh, kept, require_same, resume, wait_for, working
 
@@ -52,7 +53,7 @@ def test_a_killed_client_leaves_no_process(fresh: Path) -> None:
     process = begin(fresh, "--backend", "dask")
     wait_for(working(fresh), process)
     process.kill()
-    process.communicate()
+    process.communicate(timeout=LIMIT)
     assert kept(fresh) > 0
     assert not remaining(process.pid)
     resume(fresh)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command import begun, consistency, size_of
+from command import LIMIT, begun, consistency, size_of
 
 from consistency.scenario import data_folder
 from consistency.store.journal import Journal
@@ -77,12 +77,12 @@ def sizes(folder: Path) -> Iterator[int]:
 
 def stopped_once_grown(process: subprocess.Popen[str], out: Path, size: int, number: int, wait: float) -> None:
     """Send the signal some time after the journals below a folder have grown by ``size`` bytes in all."""
-    before, end = sum(sizes(out.parent)), time.monotonic() + 120.0
+    before, end = sum(sizes(out.parent)), time.monotonic() + LIMIT
     while process.poll() is None and sum(sizes(out.parent)) < before + size and time.monotonic() < end:
         time.sleep(0.002)
     time.sleep(wait)
     process.send_signal(number)
-    process.communicate(timeout=120)
+    process.communicate(timeout=LIMIT)
 
 
 @pytest.mark.parametrize("which", ["looks", "log"])
@@ -112,13 +112,13 @@ def test_a_signal_keeps_what_is_finished(at: Path, which: str, name: str, status
     command = {"looks": LOOKS, "log": LOG, "sweep": ("sweep", "grid.toml")}[which]
     out = at / f"{which}-{name}" / "out"
     process = begun(*command, "--out", str(out), cwd=at)
-    end = time.monotonic() + 120.0
+    end = time.monotonic() + LIMIT
     while process.poll() is None and time.monotonic() < end:
         if any(size > 50_000 for size in sizes(out.parent)):
             break
         time.sleep(0.002)
     process.send_signal(getattr(signal, name))
-    _, error = process.communicate(timeout=120)
+    _, error = process.communicate(timeout=LIMIT)
     assert process.returncode == status, error
     assert "Traceback" not in error
     said = "the same command goes on" if which == "sweep" else "add --resume to the same command to go on"
@@ -152,6 +152,6 @@ def test_two_processes_on_one_sweep(at: Path) -> None:
     out = at / "two" / "out"
     first, second = (begun("sweep", "grid.toml", "--out", str(out), cwd=at) for _ in range(2))
     stopped_once_grown(first, out, 20_000, signal.SIGKILL, 0.0)
-    _, error = second.communicate(timeout=300)
+    _, error = second.communicate(timeout=LIMIT)
     assert second.returncode == 0, error
     require_same(at, out, "sweep")

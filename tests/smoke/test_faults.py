@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import begun, size_of
+from command import COMPILING, LIMIT, begun, size_of
 
 from consistency.scenario import data_folder
 from consistency.store.journal import Journal
@@ -37,7 +37,7 @@ def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("faults")
     text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
     (folder / "world.toml").write_text(text.replace(f"steps = {steps_of(text)}", "steps = 40"))
-    status, error = end(begin(folder, out="whole"))
+    status, error = end(begin(folder, out="whole"), COMPILING)
     assert status == 0, error
     return folder
 
@@ -51,14 +51,14 @@ def begin(at: Path, *options: str, out: str = "out", runs: int = RUNS, **popen: 
     return begun(*command, cwd=at, **popen)
 
 
-def end(process: subprocess.Popen[str]) -> tuple[int, str]:
+def end(process: subprocess.Popen[str], limit: float = LIMIT) -> tuple[int, str]:
     """Exit status and what was said on standard error."""
-    error = process.communicate(timeout=300)[1] or ""
+    error = process.communicate(timeout=limit)[1] or ""
     return process.returncode, error
 
 
 def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    end = time.monotonic() + 120.0
+    end = time.monotonic() + LIMIT
     while not condition() and process.poll() is None and time.monotonic() < end:
         time.sleep(0.002)
 
@@ -98,7 +98,7 @@ def require_same(at: Path, out: str = "out") -> None:
 
 def resume(at: Path) -> None:
     process = begin(at, "--resume")
-    _, error = process.communicate(timeout=300)
+    _, error = process.communicate(timeout=LIMIT)
     assert process.returncode == 0, error
     require_same(at)
 
@@ -114,7 +114,7 @@ def test_killed_and_resumed(fresh: Path) -> None:
     process = begin(fresh)
     wait_for(working(fresh), process)
     process.kill()
-    process.communicate()
+    process.communicate(timeout=LIMIT)
     done = kept(fresh)
     assert 0 < done < RUNS
     resume(fresh)
@@ -125,7 +125,7 @@ def test_killed_and_begun_anew(fresh: Path) -> None:
     process = begin(fresh)
     wait_for(working(fresh), process)
     process.kill()
-    process.communicate()
+    process.communicate(timeout=LIMIT)
     status, error = end(begin(fresh))
     assert status == 2
     said = f"unfinished work is there, with {kept(fresh)} finished runs; add --resume"
@@ -147,7 +147,7 @@ def test_twenty_kills_at_random_moments(fresh: Path) -> None:
         wait_for(tables.exists if late else working(fresh, size + 3_000), process)
         time.sleep(moments.uniform(0.0, 0.15))
         process.kill()
-        process.communicate()
+        process.communicate(timeout=LIMIT)
         if not journal.exists():  # it was just done
             assert open_results(fresh / "out").finished_runs([FILTER]) == set(range(RUNS))
             continue
@@ -167,7 +167,7 @@ def test_a_signal_keeps_what_is_finished(fresh: Path, name: str) -> None:
     if name == "twice":
         time.sleep(0.005)
         os.kill(process.pid, number)
-    _, error = process.communicate(timeout=300)
+    _, error = process.communicate(timeout=LIMIT)
     assert process.returncode == 128 + number, error
     if "kept where there are any" not in error:  # a machine so busy that the command was ended before it had written
         done = len(open_results(fresh / "out").finished_runs([FILTER]))
@@ -185,7 +185,7 @@ def test_a_terminal_that_is_closed(fresh: Path) -> None:
         assert stream is not None
         stream.close()
     os.killpg(process.pid, signal.SIGHUP)
-    assert process.wait(300) == 129
+    assert process.wait(LIMIT) == 129
     assert open_results(fresh / "out").finished_runs([FILTER])
     resume(fresh)
 
@@ -198,11 +198,11 @@ def test_output_that_nobody_reads(fresh: Path, how: str) -> None:
         process = begin(fresh, stderr=subprocess.STDOUT)
         assert process.stdout is not None
         process.stdout.close()
-        assert process.wait(300) == 141
+        assert process.wait(LIMIT) == 141
     else:
         code = "from consistency.cli import main; main()"
         command = f"{sys.executable} -c '{code}' run world.toml --filter {FILTER} --out out --runs {RUNS} >&- 2>&-"
-        assert subprocess.run(["bash", "-c", command], cwd=fresh, timeout=300, check=False).returncode == 0
+        assert subprocess.run(["bash", "-c", command], cwd=fresh, timeout=LIMIT, check=False).returncode == 0
     require_same(fresh)
 
 
@@ -212,7 +212,7 @@ def test_standard_output_alone_is_closed(fresh: Path) -> None:
     assert process.stdout is not None
     process.stdout.close()
     process.stdout = None
-    _, error = process.communicate(timeout=300)
+    _, error = process.communicate(timeout=LIMIT)
     assert process.returncode == 141
     assert [line for line in error.splitlines() if not line.startswith("runs: ")] == []
     require_same(fresh)
@@ -224,7 +224,7 @@ def test_a_limit_on_the_size_of_files(fresh: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
 
     process = begin(fresh, preexec_fn=limit)
-    _, error = process.communicate(timeout=300)
+    _, error = process.communicate(timeout=LIMIT)
     assert process.returncode == 2
     done = kept(fresh)
     said = f"--out out: cannot be written (File too large); {done} finished runs are kept, and the same command"
@@ -239,7 +239,7 @@ def test_three_processes_on_one_place(fresh: Path) -> None:
     os.killpg(first.pid, signal.SIGSTOP)  # as a terminal does
     for options in ((), ("--overwrite",), ("--resume",)):
         other = begin(fresh, *options)
-        _, error = other.communicate(timeout=300)
+        _, error = other.communicate(timeout=LIMIT)
         assert other.returncode == 2
         assert "another process is at work on it" in one_sentence(error)
     os.killpg(first.pid, signal.SIGCONT)
@@ -252,7 +252,7 @@ def test_a_place_that_is_taken_meanwhile(fresh: Path) -> None:
     process = begin(fresh)
     wait_for(working(fresh), process)
     shutil.copytree(fresh / "whole", fresh / "out")
-    _, error = process.communicate(timeout=300)
+    _, error = process.communicate(timeout=LIMIT)
     assert process.returncode == 2
     assert one_sentence(error).endswith("the finished work is in out-2")
     require_same(fresh, "out-2")
@@ -266,7 +266,7 @@ def test_results_that_are_removed_meanwhile(fresh: Path) -> None:
     process = begin(fresh, "--resume")
     wait_for(working(fresh), process)
     shutil.rmtree(fresh / "out")
-    process.communicate(timeout=300)
+    process.communicate(timeout=LIMIT)
     assert process.returncode == 2
     assert kept(fresh) == RUNS - 50
     resume(fresh)
@@ -284,7 +284,7 @@ def test_a_full_disk_that_is_freed(fresh: Path, tmp_path: Path) -> None:
         (disk / "ballast").write_bytes(bytes(11 * 2**20))
         shutil.copy(fresh / "world.toml", disk)
         process = begin(disk)
-        _, error = process.communicate(timeout=300)
+        _, error = process.communicate(timeout=LIMIT)
         assert process.returncode == 2
         done = kept(disk)
         said = f"--out out: cannot be written (No space left on device); {done} finished runs are kept, and the same"
@@ -307,7 +307,7 @@ def test_memory_that_is_taken_away(fresh: Path) -> None:
     taken = int(Path(f"/proc/{process.pid}/statm").read_text().split()[0]) * resource.getpagesize()
     resource.prlimit(process.pid, resource.RLIMIT_AS, (taken, resource.RLIM_INFINITY))
     done = kept_beside(fresh)
-    _, error = process.communicate(timeout=300)
+    _, error = process.communicate(timeout=LIMIT)
     assert "Traceback" not in error
     if process.returncode > 0:  # below 0 a library aborted, by a signal
         assert "memory" in error.lower()
@@ -322,7 +322,7 @@ def test_a_journal_that_is_cut_short_anywhere(fresh: Path) -> None:
     process = begin(fresh)
     wait_for(working(fresh), process)
     process.kill()
-    process.communicate()
+    process.communicate(timeout=LIMIT)
     journal, done = fresh / UNFINISHED / "journal", kept(fresh)
     cut = random.Random().randrange(journal.stat().st_size)
     os.truncate(journal, cut)
@@ -335,6 +335,6 @@ def test_a_journal_that_is_cut_short_anywhere(fresh: Path) -> None:
 def test_standard_output_on_a_full_disk(arguments: list[str]) -> None:
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "consistency", *arguments]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=300)
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=LIMIT)
     assert done.returncode == 2
     assert done.stderr == "consistency: output cannot be written (No space left on device)\n"

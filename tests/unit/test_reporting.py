@@ -75,6 +75,14 @@ def folder(results, tmp_path) -> Path:
     return tmp_path / "run"
 
 
+@pytest.fixture(scope="module")
+def report(results, tmp_path_factory) -> Report:
+    """Of the results as they are; nothing changes it in place."""
+    at = tmp_path_factory.mktemp("built") / "run"
+    results.write(at)
+    return build_report(at)
+
+
 def odd_results(results):
     """The same under odd names; one filter fails in two runs, the other in all of them at once."""
     estimates = results.estimates.assign(filter=results.estimates["filter"].map(ODD))
@@ -197,8 +205,8 @@ def test_the_model_is_what_analyse_says(folder):
         np.testing.assert_allclose(path, first[["x", "y"]])
 
 
-def test_the_odometry_is_that_of_the_trial(folder, uvd):
-    (study,) = build_report(folder).studies
+def test_the_odometry_is_that_of_the_trial(report, uvd):
+    (study,) = report.studies
     trial = cs.simulate(uvd, run=0, seed=1)
     np.testing.assert_array_equal(world.read(study).truth, trial.truth[:, :2])
     step = trial.controls[0, 0] * trial.controls[0, 1]
@@ -206,8 +214,8 @@ def test_the_odometry_is_that_of_the_trial(folder, uvd):
     np.testing.assert_allclose(np.linalg.norm(odometry[1] - odometry[0]), abs(step))
 
 
-def test_verdict_cells_are_the_records(folder):
-    (study,) = build_report(folder).studies
+def test_verdict_cells_are_the_records(report):
+    (study,) = report.studies
     track = study.tracks[0]
     v, heads = track.verdict, [column.head for column in verdicts.columns(study)]
     cells = dict(zip(heads, verdicts.row(track), strict=True))
@@ -226,8 +234,8 @@ def test_verdict_cells_are_the_records(folder):
 
 
 @pytest.mark.parametrize("ends", [(0.0, np.inf), (0.0, 1e300), (0.02, 2.5)])
-def test_an_interval_that_says_nothing_is_shown_as_such(folder, ends):
-    (study,) = build_report(folder).studies
+def test_an_interval_that_says_nothing_is_shown_as_such(report, ends):
+    (study,) = report.studies
     track = study.tracks[0]
     scale = replace(track.verdict.scale, inflation=Interval(2.5, *ends))
     assert verdicts.inflation(replace(track, verdict=replace(track.verdict, scale=scale))) == "×2.50 [unknown]"
@@ -235,8 +243,8 @@ def test_an_interval_that_says_nothing_is_shown_as_such(folder, ends):
     assert verdicts.inflation(replace(track, verdict=replace(track.verdict, scale=scale))) == "×2.50 [1.50, 4.00]"
 
 
-def test_the_diagnosis_is_what_the_verdict_holds(folder):
-    (study,) = build_report(folder).studies
+def test_the_diagnosis_is_what_the_verdict_holds(report):
+    (study,) = report.studies
     asked = {question.name: question.answers for question in questions.read(study).asked}
     by_name = {part.name: dict(part.rows) for part in axes.forests(study)}
     for number, track in enumerate(study.tracks):
@@ -252,7 +260,7 @@ def test_the_diagnosis_is_what_the_verdict_holds(folder):
         np.testing.assert_array_equal(of.x[1:-1], v.tails.pit)
         np.testing.assert_allclose(of.y, [0, 0.25, 0.5, 0.75, 1, 1])
         assert innovations.lags(track) is None  # four runs of 60 steps have too few innovations
-    text = "".join(Page(shown(build_report(folder))).text)
+    text = "".join(Page(shown(report)).text)
     assert all(question.name in text and question.about in text for question in questions.read(study).asked)
 
 
@@ -273,8 +281,8 @@ def test_answers_have_a_mark_and_not_colour_alone(answer, cell):
 
 
 @pytest.mark.parametrize("ends", [(0.0, np.inf), (1e-12, 1e12), (19.0, 21.0)])
-def test_windows_are_finite_and_hold_every_value(folder, ends):
-    (study,) = build_report(folder).studies
+def test_windows_are_finite_and_hold_every_value(report, ends):
+    (study,) = report.studies
     track = study.tracks[0]
     v = track.verdict
     v = replace(
@@ -296,8 +304,7 @@ EMPTY = dict.fromkeys(("scale", "axes", "bias", "shape", "tails", "innovations",
 
 
 @pytest.mark.parametrize("all_steps_failed", [False, True])
-def test_a_verdict_without_figures_is_drawn_all_the_same(folder, all_steps_failed):
-    report = build_report(folder)
+def test_a_verdict_without_figures_is_drawn_all_the_same(report, all_steps_failed):
 
     def bare(track: Track) -> Track:
         v = replace(track.verdict, answers=(), **EMPTY)
@@ -316,8 +323,7 @@ def test_a_verdict_without_figures_is_drawn_all_the_same(folder, all_steps_faile
     assert printed(report).startswith(b"%PDF")
 
 
-def test_nees_alone_without_axes(folder):
-    report = build_report(folder)
+def test_nees_alone_without_axes(report):
     (study,) = report.studies
     whole = judge(Evidence("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3))
     track = replace(study.tracks[0], verdict=whole)
@@ -327,8 +333,7 @@ def test_nees_alone_without_axes(folder):
     assert printed(replace(report, studies=(study,))).startswith(b"%PDF")
 
 
-def test_the_captions_state_the_rates_in_force(folder):
-    report = build_report(folder)
+def test_the_captions_state_the_rates_in_force(report):
     v = report.studies[0].tracks[0].verdict
     (share,) = (a.share for a in v.answers if a.question == STEP)
     assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in anees.caption(anees.read(report.studies[0]))
@@ -367,8 +372,7 @@ def every_status(track: Track) -> dict[str, Track]:
     }
 
 
-def test_every_status_is_shown_with_its_meaning(folder):
-    report = build_report(folder)
+def test_every_status_is_shown_with_its_meaning(report):
     tracks = every_status(report.studies[0].tracks[0])
     assert set(tracks) == set(STATUSES)
     assert [track.verdict.status for track in tracks.values()] == list(tracks)
@@ -383,8 +387,8 @@ def test_every_status_is_shown_with_its_meaning(folder):
         assert f'<span class="verdict {status}">{status}</span>' in source
 
 
-def test_consistent_has_been_shown_and_undecided_says_what_would_decide(folder):
-    tracks = every_status(build_report(folder).studies[0].tracks[0])
+def test_consistent_has_been_shown_and_undecided_says_what_would_decide(report):
+    tracks = every_status(report.studies[0].tracks[0])
     assert verdicts.shown_inside(tracks["consistent"]).startswith("yes, p ")
     assert verdicts.shown_inside(tracks["overconfident"]) == "no, p 1"
     shown = tracks["undecided"].verdict.scale.equivalence
@@ -394,8 +398,8 @@ def test_consistent_has_been_shown_and_undecided_says_what_would_decide(folder):
     assert f"[{short(tracks['undecided'].verdict.inflation_interval[0])}, " in sentence
 
 
-def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(folder):
-    report = build_report(folder)
+def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(report):
+    assert "≈" not in question_caption(report.studies[0])
     error, P = drawn(3, 300, np.sqrt(1.1))
     track = judged(report.studies[0].tracks[0], error, P, Settings(0.05, tolerance=1.3))
     marks = {a.question: questions.answer_cell(a)[0] for a in track.verdict.answers}
@@ -407,12 +411,10 @@ def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(folder):
     source = shown(report)
     cell = '<td class="number tolerated"><span role="img" aria-label="found, within the tolerance">≈<'
     assert source.count(cell) == sum(mark == "≈" for mark in marks.values())
-    assert "≈" not in question_caption(build_report(folder).studies[0])
     assert printed(report).startswith(b"%PDF")
 
 
-def test_where_only_too_small_is_a_fault_the_worst_direction_is_shown(folder):
-    report = build_report(folder)
+def test_where_only_too_small_is_a_fault_the_worst_direction_is_shown(report):
     error, P = drawn(4)
     error[..., :2] = error[..., :2] @ np.array([[1.25, 0.95], [0.95, 1.25]])  # x and y err together
     track = judged(report.studies[0].tracks[0], 0.7 * error, P, Settings(0.05, allow="conservative"))
@@ -434,8 +436,8 @@ def bounds_of(panel) -> list[float]:
     return [mark.high for mark in panel.marks if isinstance(mark, Span)]
 
 
-def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(folder, linear, tmp_path):
-    (study,) = build_report(folder).studies
+def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, linear, tmp_path):
+    (study,) = report.studies
     for track in study.tracks:
         assert not track.innovations_judged
     caption = innovations.caption(innovations.read(study), panels=True)
@@ -472,8 +474,7 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(folder, l
     assert shown(report).count("(not judged)") == 1
 
 
-def test_without_truth_only_a_declared_optimal_gain_is_put_to_the_test(folder):
-    report = build_report(folder)
+def test_without_truth_only_a_declared_optimal_gain_is_put_to_the_test(report):
     first, second = report.studies[0].tracks
     rng = np.random.default_rng(5)
     nis, dof = rng.chisquare(4, (1, STEPS)), np.full((1, STEPS), 4)
@@ -547,8 +548,7 @@ def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
     assert anees.common({"late": late, "whole": whole, "early": early}) is whole
 
 
-def test_runs_of_a_fixed_number_say_nothing_of_looks(folder):
-    report = build_report(folder)
+def test_runs_of_a_fixed_number_say_nothing_of_looks(report):
     assert not report.studies[0].until_decided
     for text in (verdicts.caption(report.studies[0]), verdicts.method(report.studies), compose(report).answer):
         assert "look" not in text
@@ -686,8 +686,7 @@ def test_without_a_calibration_the_appendix_says_nothing(folder, tmp_path, monke
     assert printed(report).startswith(b"%PDF")
 
 
-def test_the_answer_names_every_filter(folder):
-    report = build_report(folder)
+def test_the_answer_names_every_filter(report):
     assert all(name in compose(report).answer for name in FILTERS)
     assert report.studies[0].tracks[0].verdict.status in compose(report).answer.lower()
 
@@ -953,8 +952,8 @@ def test_the_figures_of_the_front_end_draw_the_tables(results, tmp_path):
     np.testing.assert_array_equal([linear.y, fitted.y], [narrow.linear_density, narrow.fitted_density])
 
 
-def test_the_forest_has_the_interval_of_each_axis_in_its_row(folder):
-    (study,) = build_report(folder).studies
+def test_the_forest_has_the_interval_of_each_axis_in_its_row(report):
+    (study,) = report.studies
     ratios = axes.read(study).forests[0]
     for number, mark in enumerate(marks(axes, study, Intervals)):
         for (label, row), y, x in zip(ratios.rows, mark.y, mark.x, strict=True):
@@ -1077,8 +1076,8 @@ def test_a_filter_looks_the_same_in_every_study(results, tmp_path):
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_a_long_document_is_set_in_a_process_of_its_own(folder, monkeypatch, broken):
-    document = compose(build_report(folder))
+def test_a_long_document_is_set_in_a_process_of_its_own(report, monkeypatch, broken):
+    document = compose(report)
     expected = pdf.render_pdf(document)
     monkeypatch.setattr(pdf, "MANY", 1)
     monkeypatch.setattr(pdf.joblib, "cpu_count", lambda: 2)

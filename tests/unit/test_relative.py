@@ -213,6 +213,16 @@ def test_a_window_over_missing_rows_is_left_out() -> None:
     assert (first.tolist(), last.tolist(), left_out) == ([0, 2, 9, 11], [2, 4, 11, 13], 1)
 
 
+def test_rows_without_truth_change_no_other_window(rng: np.random.Generator) -> None:
+    stretch, size = motion_stretch(drive(rng, "SE(2)", 12)), Relative(2, "step", True, True)
+    there = np.delete(np.arange(13), 3)
+    whole, some = windows_of(stretch, size), windows_of(replace(stretch, rows=there, truth=stretch.truth[there]), size)
+    same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.start[:, None] == some.start))
+    assert len(here) >= 4
+    np.testing.assert_array_equal(some.error[here], whole.error[same])
+    np.testing.assert_array_equal(some.covariance[here], whole.covariance[same])
+
+
 def test_time_on_a_common_clock_of_1970_is_no_matter_of_rounding() -> None:
     t = 1.7e9 + np.arange(101) * 0.1
     first, last, _ = windows(t, np.zeros((101, 2)), np.arange(101), Relative(1, "s"), "f")

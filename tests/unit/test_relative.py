@@ -284,6 +284,8 @@ def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> 
     stretch.estimate[row] = np.nan
     record = recorded([stretch], "5", True)
     assert [f.reason for f in record.failures] == [f"estimate is not finite (row {row})"]
+    found = windows_of(stretch, Relative(5, "step", True))
+    assert (found.start[-1], found.t[-1]) == (stretch.t[row - 1], stretch.t[row])
     verdict = analyse_recordings([record])["log"]
     assert verdict.runs == (row - 1) // 5 + 1
     assert verdict.status != "consistent"
@@ -302,6 +304,7 @@ def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
         stretch.estimate[0] = np.nan
         record = recorded([stretch], "1", False)
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
+        assert windows_of(stretch, Relative(1, "step")).start.tolist() == [stretch.t[0]]
         assert analyse_recordings([record])["log"].status == "failed"
 
 

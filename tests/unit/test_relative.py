@@ -296,6 +296,9 @@ def test_a_covariance_that_is_not_finite_is_named(rng: np.random.Generator) -> N
     stretch = motion_stretch(drive(rng, "SE(2)", 20))
     stretch.covariance[8, 0, 0] = np.inf
     assert recorded([stretch], "5", True).failures[0].reason == "covariance is not finite (row 8)"
+    found = windows_of(stretch, Relative(5, "step", True))
+    np.testing.assert_array_equal(found.error[-1], 0.0)
+    assert np.isnan(found.covariance[-1]).all()
 
 
 def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:

@@ -109,6 +109,7 @@ WORLDS = {
     "differences": World("differences of independent errors", differences),
     "1 period": World("one period over the run", lambda r, s: periods(r, s, 1.0)),
     "1.5 periods": World("one and a half periods over the run", lambda r, s: periods(r, s, 1.5)),
+    "1 period of heading": World("white, heading one period over the run", lambda r, s: periods(r, s, 1.0, (2,))),
     "2 periods of heading": World("white, heading two periods over the run", lambda r, s: periods(r, s, 2.0, (2,))),
     "AR(2)": World("oscillating, period 50, time constant 60 steps", lambda r, s: second_order(r, s, 50.0, 60.0)),
 }
@@ -140,6 +141,7 @@ FURTHER = [Case(world, 1.0, ALIGNED, 100, draws=FEWER) for world in ("AR(.95)", 
 OSCILLATING = [
     *(Case(world, 1.0, ALIGNED, 20, draws=OFTEN) for world in ("AR(-.5)", "differences", "1 period")),
     *(Case(world, 1.0, ALIGNED, 100, draws=OFTEN) for world in ("1.5 periods", "2 periods of heading", "AR(2)")),
+    Case("1 period of heading", 1.0, ("posyaw-all",), 20, draws=OFTEN),
 ]
 OFFSET = [
     *(Case(world, 1.0, ("offset",), 100, draws=FEWER) for world in ("white", "AR(.95)", "drift")),

@@ -22,7 +22,9 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from calibration_cases import DETECT, MOST, POWER, QUICK_FAILURE, Case, cases, quick_cases, quick_confidence
@@ -217,16 +219,22 @@ def _share(folder: Path | None) -> None:
         POOL["linear-gaussian"] = error, np.load(folder / "covariance.npy")
 
 
-def further_rows(quick: bool, seed: int) -> tuple[list[Row], dict[str, str]]:
-    """Rows of the other modules, and what their worlds and questions are."""
+def further_rows(quick: bool, seed: int, workers: int = 2) -> tuple[list[Row], dict[str, str]]:
+    """Rows of the other modules, each measured by one worker, and what their worlds and questions are."""
+    there = [name for name in MODULES if importlib.util.find_spec(name) is not None]
     rows: list[Row] = []
     about: dict[str, str] = {}
-    for name in MODULES:
-        if importlib.util.find_spec(name) is not None:
-            module = importlib.import_module(name)
-            rows += [Row(**row) for row in module.rows(quick, seed)]
-            about |= module.ABOUT
+    with ProcessPoolExecutor(workers) as pool:
+        for found, its in pool.map(_rows_of, there, repeat(quick), repeat(seed)):
+            rows += [Row(**row) for row in found]
+            about |= its
     return rows, about
+
+
+def _rows_of(name: str, quick: bool, seed: int) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """In a worker: what a module measures."""
+    module = importlib.import_module(name)
+    return module.rows(quick, seed), module.ABOUT
 
 
 # --- command ------------------------------------------------------------------------------------------------
@@ -263,7 +271,7 @@ def _measured(options: argparse.Namespace, seed: int) -> tuple[list[Row], dict[s
     for row in measure(every, seed, options.workers, QUICK_POOLED if options.quick else POOLED):
         rows.append(row)
         print(said(row), flush=True)
-    further, about = ([], {}) if options.only else further_rows(options.quick, seed)
+    further, about = ([], {}) if options.only else further_rows(options.quick, seed, options.workers)
     for row in further:
         print(said(row), flush=True)
     return rows + further, about

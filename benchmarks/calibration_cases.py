@@ -70,11 +70,11 @@ def cases() -> list[Case]:
 
 
 def quick_cases() -> list[Case]:
-    """What a minute or two can measure: whether a promise is broken badly."""
+    """What two or three minutes can measure: whether a promise is broken badly."""
     slow = ("AR(.95)", "AR(.99)", "fully dependent", "fully dependent, n = 1", "body frame", "5 % slow, n = 1")
     return [
-        *_alarms(WORLDS, gate_runs(DOF, 2.0, FALSE_ALARM, POWER), FALSE_ALARM, 200),
-        *_alarms(WORLDS, MANY, FALSE_ALARM, 100),
+        *_alarms(WORLDS, gate_runs(DOF, 2.0, FALSE_ALARM, POWER), FALSE_ALARM, 150),
+        *_alarms(WORLDS, MANY, FALSE_ALARM, 80),
         *_until_decided(("AR(.95)", "fully dependent", "body frame", "Schmidt-Kalman"), 50),
         *_bets(slow, 100),
         *_all_clears(slow, 100),

@@ -25,8 +25,9 @@ def plan_command(dof: int, terms: Terms) -> str:
 
 def undecided_text(gate: str, name: str, sentence: str, needed: int, dof: int, terms: Terms) -> str:
     """Neither a fault nor that there is none: how many runs to simulate, and where the number comes from."""
+    larger = "a larger detect" if terms.lost is None else "a larger detect and a larger lost"
     return (
-        f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for a larger detect; the number that is enough "
+        f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for {larger}; the number that is enough "
         f"however the steps depend on each other: {plan_command(dof, terms)}"
     )
 

@@ -34,7 +34,7 @@ from consistency.diagnostics.fitted import (
 from consistency.diagnostics.questions import BIAS
 from consistency.errors import InputError
 from consistency.geometry import wrap
-from consistency.recording.alignment import ALL_BUT_SCALE, FREE, aligned, clocks_and_frames
+from consistency.recording.alignment import ALL_BUT_SCALE, FREE, Aligned, aligned, clocks_and_frames
 from consistency.recording.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.recording.frames import Frame, moved
 from consistency.recording.poses import Poses
@@ -582,6 +582,20 @@ def test_clock_and_frame_are_found_together(rng: np.random.Generator) -> None:
     sizes = [np.nanmax(np.abs(p.errors(shift)[:, :2])) for p in found.runs]
     assert max(sizes) < 0.02
     np.testing.assert_array_equal(found.runs[0].t, runs[0].t)
+
+
+@pytest.mark.parametrize(
+    ("shifts", "said"), [([0.1, 0.15, 0.15009, 0.3], 0.15009), ([0.1, 0.2, 0.1, 0.2, 0.1, 0.3], 0.1), ([0.0], 0.0)]
+)
+def test_clock_and_frame_are_found_in_turn_until_the_clock_settles(
+    shifts: list[float], said: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To 0.1 ms, or five times."""
+    module, then = "consistency.recording.alignment", iter(shifts)
+    monkeypatch.setattr(f"{module}.frames_of", lambda *_: [])
+    monkeypatch.setattr(f"{module}.clock_shift", lambda *_: (next(then), []))
+    monkeypatch.setattr(f"{module}.aligned", lambda *_: Aligned([]))
+    assert clocks_and_frames("est", [], "estimate", "posyaw", range(3))[0] == said
 
 
 def test_frames_are_those_of_the_clock_that_is_said(rng: np.random.Generator) -> None:

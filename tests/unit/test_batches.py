@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -196,6 +197,27 @@ def test_other_versions_are_refused(work: Work, name: str) -> None:
 
 def test_all_that_the_bits_depend_on_is_compared() -> None:
     assert set(remote.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
+
+
+def test_sources_that_the_bits_depend_on_count_and_others_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def own() -> str:
+        return str(remote.versions_here.__wrapped__()["filter-consistency"])
+
+    assert Path(cs.__file__).parent == remote.PACKAGE
+    assert remote.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
+    monkeypatch.setattr(remote, "PACKAGE", tmp_path)
+    seen = [own()]
+    for room in ("geometry", "models", "scenario", "simulation", "filters"):
+        (tmp_path / room / "inner").mkdir(parents=True)
+        (tmp_path / room / "inner" / "source.py").write_text(f"x = '{room}'")
+        seen.append(own())
+    assert len(set(seen)) == len(seen)
+    assert re.search(r"\(sources [0-9a-f]{12}\)$", own())
+    (tmp_path / "reporting").mkdir()
+    (tmp_path / "reporting" / "source.py").write_text("x = 1")
+    assert own() == seen[-1]
 
 
 def test_differing_machines_are_said_once(work: Work, capsys: pytest.CaptureFixture[str]) -> None:

@@ -387,7 +387,7 @@ def test_a_broken_promise_is_the_exit_status(
 ) -> None:
     row = replace(ALARMS, gates=100, found=found)
     monkeypatch.setattr(calibration, "measure", lambda *arguments: iter([row]))
-    monkeypatch.setattr(calibration, "further_rows", lambda quick, seed: ([], {"w": "a world"}))
+    monkeypatch.setattr(calibration, "further_rows", lambda *arguments: ([], {"w": "a world"}))
     assert calibration.main(["--quick", "--out", str(tmp_path / "t.json")]) == status
     said = capsys.readouterr().out
     assert f"promises broken: {status} (by chance: less than once in 5,000 runs)" in said

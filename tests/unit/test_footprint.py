@@ -51,6 +51,16 @@ def test_the_covariance_counts_as_the_kernel_makes_it(linear: cs.Scenario) -> No
     assert whole.working < 2.0 * (memory.P.nbytes + whole.joint) + 300_000
 
 
+def test_a_trial_fills_its_covariance_and_outcome(
+    linear: cs.Scenario, parts: Slam, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 18 variables and one spare one; 5 steps of pose, its two covariances, NIS; 12 numbers of 7 landmarks."""
+    monkeypatch.setattr(module, "touched", lambda slam, data, size, spare: 1000 * size + spare)
+    monkeypatch.setattr(module, "spare_width", lambda covariance, steps, labels: 1)
+    data = seen([[0, 6], [], [], [], [1]])
+    assert module._working(parts, data, 18) == 18_001 + 8 * (19**2 + 5 * (3 + 2 * 9 + 3) + 12 * 7)
+
+
 def test_it_grows_by_the_square_of_the_landmarks(linear: cs.Scenario) -> None:
     def bytes_of(count: int) -> int:
         changes = {"truth__landmarks__count": count, "truth__sensor__range": (0.0, 50.0), "truth__steps": 2}

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 import consistency as cs
 from consistency.geometry import wrap
@@ -66,6 +67,56 @@ def test_the_interval_by_hand(rng: np.random.Generator, monkeypatch: pytest.Monk
     reach = 2.776445 * np.sqrt(5e-6 / 5)  # squares about the mean of 0.001 add up to 20e-6
     assert found.high - found.value == pytest.approx(reach, rel=1e-6)
     assert found.value - found.low == pytest.approx(reach, rel=1e-6)
+    t = (found.value + 0.001) / np.sqrt(5e-6 / 5)
+    assert found.p_value == pytest.approx(2.0 * stats.t.sf(t, 4), rel=1e-6)
+    assert not found.alone
+
+
+@pytest.mark.parametrize(
+    ("nees", "then", "alone"), [(5.0, 2.0, False), (5.0, 3.0, True), (3.9, 1.0, True), (4.1, 1.0, False)]
+)
+def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(
+    nees: float, then: float, alone: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mean NEES over its degrees of freedom as it is, and 0.04 s later: beyond 4, and less than half of that."""
+    asked = []
+
+    def steps(poses: Poses, shift: float, parts: int) -> Array:
+        asked.append(parts)
+        return np.array([0.001, -0.001, np.nan, 0.0])
+
+    slope = (nees - then) / 0.04**2
+    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift: then + slope * (shift - 0.04) ** 2)
+    monkeypatch.setattr("consistency.recording.offset.steps_of", steps)
+    found = offset_of([run_of(rng, 0.0)])
+    assert found is not None
+    assert asked == [12]
+    assert found.alone is alone
+    assert found.value == pytest.approx(0.04, abs=1e-4)
+    assert found.explained == pytest.approx(1.0 - then / nees, abs=1e-4)
+    asked.clear()
+    several = offset_of([run_of(rng, 0.0)] * 2)
+    assert several is not None
+    assert not several.alone
+    assert asked == [1, 1]
+
+
+@pytest.mark.parametrize(("steps", "p"), [((0.0, 0.0), None), ((0.0, np.nan, 0.0), None), ((0.0, 0.0, 0.0), 0.0)])
+def test_steps_that_agree_are_certain_and_two_are_none(
+    steps: tuple[float, ...], p: float | None, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift: 1.0 + (shift - 0.04) ** 2)
+    monkeypatch.setattr("consistency.recording.offset.steps_of", lambda *_: np.array(steps))
+    found = offset_of([run_of(rng, 0.0)])
+    assert (None if found is None else found.p_value) == p
+
+
+def test_steps_that_agree_on_no_offset_find_none(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift: 1.0 + abs(shift))
+    monkeypatch.setattr("consistency.recording.offset.steps_of", lambda *_: np.zeros(4))
+    found = offset_of([run_of(rng, 0.0)])
+    assert found is not None
+    assert (found.value, found.p_value) == (0.0, 1.0)
 
 
 def test_with_noise_it_is_named(rng: np.random.Generator) -> None:

@@ -214,6 +214,16 @@ def test_a_window_over_missing_rows_is_left_out() -> None:
     assert (first.tolist(), last.tolist(), left_out) == ([0, 2, 9, 11], [2, 4, 11, 13], 1)
 
 
+def test_rows_without_truth_change_no_other_window(rng: np.random.Generator) -> None:
+    stretch, size = motion_stretch(drive(rng, "SE(2)", 12)), Relative(2, "step", True, True)
+    there = np.delete(np.arange(13), 3)
+    whole, some = windows_of(stretch, size), windows_of(replace(stretch, rows=there, truth=stretch.truth[there]), size)
+    same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.start[:, None] == some.start))
+    assert len(here) >= 4
+    np.testing.assert_array_equal(some.error[here], whole.error[same])
+    np.testing.assert_array_equal(some.covariance[here], whole.covariance[same])
+
+
 def test_time_on_a_common_clock_of_1970_is_no_matter_of_rounding() -> None:
     t = 1.7e9 + np.arange(101) * 0.1
     first, last, _ = windows(t, np.zeros((101, 2)), np.arange(101), Relative(1, "s"), "f")
@@ -275,6 +285,8 @@ def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> 
     stretch.estimate[row] = np.nan
     record = recorded([stretch], "5", True)
     assert [f.reason for f in record.failures] == [f"estimate is not finite (row {row})"]
+    found = windows_of(stretch, Relative(5, "step", True))
+    assert (found.start[-1], found.t[-1]) == (stretch.t[row - 1], stretch.t[row])
     verdict = analyse_recordings([record])["log"]
     assert verdict.runs == (row - 1) // 5 + 1
     assert verdict.status != "consistent"
@@ -285,6 +297,9 @@ def test_a_covariance_that_is_not_finite_is_named(rng: np.random.Generator) -> N
     stretch = motion_stretch(drive(rng, "SE(2)", 20))
     stretch.covariance[8, 0, 0] = np.inf
     assert recorded([stretch], "5", True).failures[0].reason == "covariance is not finite (row 8)"
+    found = windows_of(stretch, Relative(5, "step", True))
+    np.testing.assert_array_equal(found.error[-1], 0.0)
+    assert np.isnan(found.covariance[-1]).all()
 
 
 def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
@@ -293,6 +308,7 @@ def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
         stretch.estimate[0] = np.nan
         record = recorded([stretch], "1", False)
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
+        assert windows_of(stretch, Relative(1, "step")).start.tolist() == [stretch.t[0]]
         assert analyse_recordings([record])["log"].status == "failed"
 
 

@@ -175,6 +175,8 @@ def test_what_cannot_be_fitted(rng: np.random.Generator) -> None:
         fit_shared(errors, J, S)
     with pytest.raises(cs.InputError, match="do not fit"):
         fit_shared(errors, J[:, :, :5], S)
+    errors, J, S, *_ = simulated(rng, FEWEST)
+    assert (fit_shared(errors, J, S).floor > 0.0).all()
 
 
 def test_a_prediction_has_all_three_parts(rng: np.random.Generator) -> None:

@@ -112,8 +112,8 @@ def test_arguments_of_other_types_are_other_kinds() -> None:
     A = np.zeros((3, 4))
     frozen = A.copy()
     frozen.setflags(write=False)
-    values = [A, A.T, A[:, ::2], frozen, A[0], A.astype(np.float32), A.astype(int), 1, 1.0, True, np.float64(1.0),
-              Small(1.0), Small(1), Other(1.0), (1.0,), "text"]  # fmt: skip
+    values = [A, np.zeros((1, 1)), A.T, A[:, ::2], frozen, A[0], A.astype(np.float32), A.astype(int), 1, 1.0, True,
+              np.float64(1.0), Small(1.0), Small(1), Other(1.0), (1.0,), "text"]  # fmt: skip
     for a in values:
         for b in values:
             assert jit._kind(a) != jit._kind(b) or numba.typeof(a) == numba.typeof(b), (a, b)

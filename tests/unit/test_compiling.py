@@ -21,6 +21,12 @@ from consistency.filters.kernel.foreseen import FIRST
 from consistency.filters.kernel.jit import Kernel, Outlook
 from consistency.filters.kernel.slam import robot_width
 from consistency.runs import compiling
+from consistency.runs.findings import experiments
+from consistency.runs.montecarlo import resolve_filters
+from consistency.scenario import load_scenario
+from consistency.sweeps import running
+from consistency.sweeps.folder import SweepFolder
+from consistency.sweeps.plan import load_sweep
 
 Done = Callable[..., tuple[str, str]]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="kernels are compiled side by side on Linux")
@@ -288,3 +294,21 @@ def test_seconds_of_several() -> None:
     assert compiling._wall([10.0, 20.0], 1) == 25.0
     assert compiling._wall([10.0, 20.0], 2) == 20.0
     assert compiling._wall([10.0, 10.0, 10.0, 10.0], 2) == 15.0
+
+
+# --- before what takes long -------------------------------------------------------------------------
+
+
+def test_a_sweep_compiles_what_its_cells_need(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[tuple[str, int]] = []
+    monkeypatch.setattr(running, "compile_all", lambda wanted, jobs: asked.extend((f.name, jobs) for f, _, _ in wanted))
+    sweep = load_sweep("small", ["ukf-uvd"])
+    running._compile(sweep, SweepFolder(sweep, tmp_path).all_work(), 2)
+    assert sorted(asked) == sorted([("ukf-uvd", 2), ("ekf-uvd", 2)] * len(sweep.cells))
+
+
+def test_what_experiments_say_that_they_need_fits() -> None:
+    needs = [need for module in experiments().values() for need in getattr(module, "KERNELS", {}).items()]
+    assert len(needs) > 5
+    for world, names in needs:
+        assert len(resolve_filters(names, load_scenario(world).belief)) == len(names)

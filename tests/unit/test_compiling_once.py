@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numba
 import numpy as np
@@ -127,8 +127,8 @@ def test_types_of_arguments_are_those_of_numba() -> None:
 
 def test_content_is_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
     class Unknown:
-        unknown = "something"
-        found = 0
+        unknown, key, found = "something", "", 0
+        functions: ClassVar[dict[str, int]] = {}
 
         def __init__(self, function: Any, signature: Any) -> None:
             type(self).found += 1
@@ -141,7 +141,8 @@ def test_content_is_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
         assert kernel.compile(x) is len
         assert Unknown.found == found
         assert kernel.is_ready(x)
-    assert not kernel._contents
+        assert kernel.outlook(x).is_ready
+        assert Unknown.found == found
 
 
 def test_the_first_trial_is_simulated_once(monkeypatch: pytest.MonkeyPatch) -> None:

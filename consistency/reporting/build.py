@@ -13,9 +13,9 @@ from consistency.errors import InputError
 from consistency.reporting.answer import answer
 from consistency.reporting.blocks import Block, Chapter, Document
 from consistency.reporting.clock import clock_of
+from consistency.reporting.contents import SECTIONS
 from consistency.reporting.model import Report, Study, Track
 from consistency.reporting.section import OPENING, STUDY, Section
-from consistency.reporting.sections import SECTIONS
 from consistency.runs.findings import read_findings
 from consistency.store.results import open_results
 from consistency.store.storage import read_manifest

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,9 +12,11 @@ from consistency.diagnostics import Verdict
 from consistency.reporting.clock import Clock
 from consistency.reporting.drawing import Key, Owner
 from consistency.reporting.looks import Look, style
-from consistency.store.results import Tables
 from consistency.types import Array, Failure, Indices
-from consistency.verdicts.curves import Curves, curves
+
+if TYPE_CHECKING:
+    from consistency.store.results import Tables
+    from consistency.verdicts.curves import Curves
 
 SINGLE_RUN = 1
 DECADE = 10.0  # values that span more are drawn on a log axis
@@ -55,6 +57,8 @@ class Track(Estimator):
     @property
     def curves(self) -> Curves:
         """All R runs, read anew each time: a report holds those of one filter at a time, if any."""
+        from consistency.verdicts.curves import curves
+
         return curves(self.results, self.name)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import os
 import pickle
 import re
 import subprocess
@@ -16,7 +17,6 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import joblib
 import typst
 
 from consistency.reporting import blocks, paper
@@ -50,7 +50,7 @@ def pdf_beside(document: blocks.Document) -> Iterator[Callable[[], bytes]]:
 
     Gives a function that waits for the PDF; a short document is set when that is called.
     """
-    if sum(len(figure.sheets) for figure in document.figures) < MANY or joblib.cpu_count() < 2:
+    if sum(len(figure.sheets) for figure in document.figures) < MANY or (os.cpu_count() or 1) < 2:
         yield lambda: render_pdf(document)
         return
     with tempfile.TemporaryDirectory(prefix="consistency-report-") as name:

@@ -155,11 +155,11 @@ def write_folder(
 
     The manifest says what ``kind`` of folder it is.
     """
-    from consistency.store.parquet import write_table
-
     with undisturbed(), NewFolder(folder, manifest["kind"], overwrite, keep_others) as new:
         with new.writing():
             for name, table in tables.items():
+                from consistency.store.parquet import write_table
+
                 write_table(new.path / f"{name}.parquet", name, table)
             if extra is not None:
                 extra(new.path)

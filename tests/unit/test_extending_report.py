@@ -14,7 +14,8 @@ from documents import blocks
 import consistency as cs
 from consistency.reporting import build, pdf, write_reports
 from consistency.reporting.build import build_report
-from consistency.reporting.sections import SECTIONS, pose_errors
+from consistency.reporting.contents import SECTIONS
+from consistency.reporting.sections import pose_errors
 
 
 def example(path: str) -> str:

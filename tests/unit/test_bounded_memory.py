@@ -187,7 +187,7 @@ READ = "from consistency.store.results import open_results\n"
 WORK = {
     "analyse": READ + "from consistency.verdicts.judge import analyse\nwork = lambda f: analyse(open_results(f))",
     "report": "from consistency.reporting.build import build_report as work",
-    "baseline": "from consistency.verdicts.comparison import read_baseline as work",
+    "baseline": "from consistency.verdicts.baselines import read_baseline as work",
 }
 
 

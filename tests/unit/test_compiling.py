@@ -62,6 +62,7 @@ def case():
     os.environ["NUMBA_CACHE_DIR"] = f"{folder}/cache"
     for number, name in ((1, "out"), (2, "err")):
         os.dup2(os.open(f"{folder}/{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background of a shell
     filters = [Sum("two", (1.0, 2.0)), Sum("three", (1.0, 2.0, 3.0)), Sum("again", (4.0, 5.0))]
     if what == "full":
         resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))

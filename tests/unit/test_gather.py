@@ -347,7 +347,7 @@ def test_a_run_that_takes_long_keeps_no_other_from_the_journal(
             kept.set()
 
     monkeypatch.setattr(World, "trial", last)
-    monkeypatch.setattr(Work, "compile", lambda self, run: None)
+    monkeypatch.setattr(Work, "compile", lambda self, run, jobs: None)
     monkeypatch.setattr(gather.Gathered, "add", counted)
     cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=2, out=tmp_path / "out")
     assert content(tmp_path / "out") == content(written)

@@ -1080,7 +1080,7 @@ def test_a_long_document_is_set_in_a_process_of_its_own(report, monkeypatch, bro
     document = compose(report)
     expected = pdf.render_pdf(document)
     monkeypatch.setattr(pdf, "MANY", 1)
-    monkeypatch.setattr(pdf.joblib, "cpu_count", lambda: 2)
+    monkeypatch.setattr(pdf.os, "cpu_count", lambda: 2)
     if broken:  # then it is set here
         monkeypatch.setattr(pdf.sys, "executable", "false")
     else:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from consistency.diagnostics import Evidence, Settings, Verdict, judge, nis_of
 from consistency.diagnostics.skipping import Skip, skip_of, without_first
 from consistency.gating.watch import Terms
+from consistency.reading.columns import POSE
 from consistency.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
@@ -138,7 +139,6 @@ def of_results(
     ValueError
         No results, no such filter, or more than one to choose from; ``skip`` leaves nothing.
     """
-    from consistency.reading.columns import POSE
     from consistency.store.results import Results
     from consistency.verdicts.curves import curves
     from consistency.verdicts.judge import evidence_of

@@ -12,6 +12,7 @@ from consistency.diagnostics import Comparison, RunSummary, compare, summary, wh
 from consistency.diagnostics.comparison import FailedRuns
 from consistency.diagnostics.skipping import Skip
 from consistency.gating.checks import Arrays, Candidate, evidence, of_results
+from consistency.reading.columns import POSE
 
 if TYPE_CHECKING:
     from consistency.store.results import Results
@@ -106,7 +107,6 @@ def of_filters(
     ValueError
         No such filter, nothing to compare with, or a baseline that cannot be read.
     """
-    from consistency.reading.columns import POSE
     from consistency.verdicts.baselines import Baseline, baseline_of, read_baseline, require_skip
 
     if reference is None and than is None:

@@ -18,6 +18,7 @@ FOLDED = 100  # how many times as large as its file, beyond that; numbers of a s
 HUGE = 1e30  # m, s or px; what is measured is smaller, and a NEES of such numbers is finite, and so is its square
 MOST_DOF = 2.0**31  # degrees of freedom in a step, whose sums then are exact
 LARGEST_NUMBER = HUGE**2  # that a filter may say, or a NEES be; sums of squares of such numbers are finite
+WHOLE = 2**53  # beyond it a floating-point number counts no more
 DEEPEST = 64  # parts of a dotted key
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""  # its possessive quantifiers need Python 3.11
 UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # categories of Unicode: control, surrogate, ends of lines and paragraphs
@@ -118,9 +119,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     with reading(path, "not valid TOML"):
         import tomllib  # which Python 3.10 lacks
 
-        if re.search(
-            rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}", text
-        ):  # the parser would take memory by the square of their number
+        deep = rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}"
+        if re.search(deep, text):  # the parser would take memory by the square of their number
             raise InputError(f"{path}: not valid TOML (a key of more than {DEEPEST} parts)")
         return tomllib.loads(text)
 

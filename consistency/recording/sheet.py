@@ -13,7 +13,7 @@ from typing import Any, overload
 import numpy as np
 
 from consistency.errors import InputError
-from consistency.reading import HUGE, MOST_DOF, is_file, one_line, reading, require_name
+from consistency.reading import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.recording.text import Block, blocks
 from consistency.types import Array, Indices
 
@@ -41,7 +41,6 @@ EMPTY = frozenset(
         "",
     ]
 )  # what pandas and R write for no value
-WHOLE = 2.0**53  # up to which floats hold every whole number
 TRUTHS = {text: value for value in (True, False) for text in (str(value), str(value).lower(), str(value).upper())}
 
 

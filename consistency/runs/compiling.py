@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -21,13 +20,13 @@ from consistency.filters.stepping import name_of
 from consistency.protocols import Filter, WholeTrial
 from consistency.scenario import Belief, Scenario
 from consistency.simulation import require_landmarks_in_view
+from consistency.store.ending import die_with_parent
 from consistency.store.stopping import STOPS, undisturbed
 from consistency.terminal import progress
 from consistency.types import Trial
 
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 NAMED = 3  # filters that are named where several are compiled
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
 Wanted = tuple[Filter, Trial, Belief]  # a filter, and a trial that it is to run on
 
 
@@ -170,7 +169,7 @@ def _compiler(needs: Sequence[Need], link: Connection, parent: int) -> None:
     for number in STOPS:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    die_with_parent()
     nowhere = os.open(os.devnull, os.O_WRONLY)  # what is wrong is said where it is compiled again
     for stream in (1, 2):
         os.dup2(nowhere, stream)

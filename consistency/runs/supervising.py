@@ -9,7 +9,6 @@ thread and BLAS another none.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib
 import multiprocessing
 import os
@@ -34,6 +33,7 @@ from consistency.filters.record import Record
 from consistency.filters.stepping import reason_of, run_filter
 from consistency.runs.streams import AT_ONCE, Printed, open_files, redirect
 from consistency.scenario import Belief
+from consistency.store.ending import die_with_parent
 from consistency.types import Array, Estimates, Trial
 
 IDLE = 300.0  # s without a study, after which a supervisor ends
@@ -43,7 +43,6 @@ GIB = 2**30
 PER_STEP = 24  # numbers of a record in a step: pose, two covariances, NIS, its degrees of freedom, log det S
 LOADING = 60.0  # s that loading a filter may take where there is a time-out
 READY = b"ready"
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
 
 
@@ -297,7 +296,7 @@ def _settle(study: Study) -> None:
     with contextlib.suppress(OSError, AttributeError):
         os.setpgid(0, 0)
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        die_with_parent()
     if resource is not None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     sys.path[:] = study.path

@@ -66,7 +66,7 @@ def _settle(parent: int, alive: int, numbers: list[int]) -> None:
     for number in numbers:
         signal.signal(number, signal.SIG_DFL)
     if IS_LINUX:
-        _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        die_with_parent()
         if os.getppid() != parent:
             os._exit(1)
     else:
@@ -76,6 +76,11 @@ def _settle(parent: int, alive: int, numbers: list[int]) -> None:
 def _watch(alive: int) -> None:
     os.read(alive, 1)
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_with_parent() -> None:
+    """Let the system kill this process when the thread that started it ends; Linux alone can."""
+    _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _prctl(option: int, value: int) -> None:

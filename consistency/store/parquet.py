@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from consistency.errors import InputError
-from consistency.reading import HUGE, LARGEST_NUMBER, MOST_DOF, is_file, one_line, reading, require_room
+from consistency.reading import HUGE, LARGEST_NUMBER, MOST_DOF, WHOLE, is_file, one_line, reading, require_room
 from consistency.reading.columns import COLUMNS, OWN_COVARIANCE
 from consistency.types import Array
 
@@ -30,7 +30,6 @@ UNBOUNDED = {"joint_nees"}  # infinite where the joint covariance of a run is no
 BY_FILTER = {"estimates", "map"}  # tables whose row groups hold one filter each
 REPEATED = {"t", "dt"}  # floating-point columns of few different values
 ROWS = 65_536  # of a row group, and of a batch that is read
-WHOLE = 2**53  # beyond it a floating-point number counts no more
 TYPES = {"str": pa.string(), "int64": pa.int64(), "float64": pa.float64()}
 NO_NUMBERS = (bool, np.bool_, datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
 

@@ -9,6 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from consistency.errors import InputError
+from consistency.geometry.conventions import se3_log
+from consistency.recording.hints import hints
+from consistency.recording.sheet import read_sheet
+from consistency.verdicts.baselines import _known
 
 HEAVY = (
     "bokeh", "cv2", "filelock", "filterpy", "jinja2", "joblib", "llvmlite", "matplotlib", "numba", "pandas", "pyarrow",
@@ -103,3 +111,29 @@ except InputError as error:
     print(error)
 """
     assert said(folder, code).strip() == "est.parquet: Parquet needs pandas: pip install pandas pyarrow"
+
+
+def test_the_logarithm_of_a_motion_in_space() -> None:
+    """Beside the exponential of its matrix."""
+    twist = np.array([0.3, -1.2, 2.0, 0.4, -0.7, 1.1])
+    generator = np.zeros((4, 4))
+    generator[:3, 3], (a, b, c) = twist[:3], twist[3:]
+    generator[:3, :3] = [[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]
+    motion = expm(generator)
+    pose = np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_quat()])
+    np.testing.assert_allclose(se3_log(pose), twist, atol=1e-12)
+
+
+def test_a_quoted_row_with_too_few_fields(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text('x,y,z\n"1",2\n')
+    with pytest.raises(InputError, match="line 2: has 2 columns, the header has 3"):
+        read_sheet(tmp_path / "a.csv")
+
+
+def test_an_unknown_key_of_a_baseline() -> None:
+    with pytest.raises(ValueError, match=r"key 'filters\.a\.more': unknown"):
+        _known({"runs": [], "more": 1}, "filters.a", ("runs",))
+
+
+def test_no_run_needs_no_hint() -> None:
+    assert hints("a", ("x", "y", "heading"), []) == []

@@ -75,7 +75,7 @@ class FilterpyUkf(Peer):
 def stone_soup(kind: str, case: Case, steps: int) -> Peer | str:
     """Stone Soup's filter, ``ekf`` or ``ukf``, or why there is none."""
     if importlib.util.find_spec("stonesoup") is None:
-        return "not installed; pip install -e '.[bench]'"
+        return "not installed; pip install -e '.[peers]'"
     peers = importlib.import_module("bench_stonesoup")
     peer: Peer = getattr(peers, {"ekf": "StoneSoupEkf", "ukf": "StoneSoupUkf"}[kind])(case, steps)
     return peer

@@ -1,6 +1,7 @@
 """The pytest plugin: runs to simulate, a record of every gate, and one false-alarm rate for a whole session.
 
-Nothing heavy is imported here: a session without gates pays for this file alone.
+Nothing heavy is imported here: a session without gates pays for this file alone. It works with pytest 6.2, that of
+Ubuntu 22.04: without the stash of 7.0, and with wrappers of hooks in their older form.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
 from consistency.gating.budget import in_place_rate
 from consistency.gating.report import refusal, write
 from consistency.gating.session import PROPERTY, STATISTICS, Ledger, lines, to_property
-from consistency.gating.watch import DEFAULTS, Entry, Watch, watching
+from consistency.gating.watch import DEFAULTS, Entry, Watch, current, watching
 
 NAME = "consistency-gates"
 MARKER = (
@@ -70,7 +72,7 @@ def consistency_runs(request: pytest.FixtureRequest) -> int:
     gates = request.config.pluginmanager.get_plugin(NAME)
     assert isinstance(gates, Gates)
     if gates.runs is None and "dof" not in marked(request.node)[0]:
-        request.node.stash[WATCH].plan = lambda dof: gates.runs_of(request.node, dof)
+        current().plan = lambda dof: gates.runs_of(request.node, dof)
     return gates.runs_of(request.node)
 
 
@@ -114,16 +116,14 @@ class Gates:
             terms["false_alarm"] = in_place_rate(self.budget, self.collected)
         return gate_runs(**{key: value for key, value in terms.items() if key != "tolerance"})
 
-    @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
-        watch = Watch(budget=self.budget, tests=self.collected, keep=lambda entry: self._keep(item, entry))
-        item.stash[WATCH] = watch
-        with watching(watch):
-            return (yield)
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, None]:
+        with watching(Watch(budget=self.budget, tests=self.collected, keep=lambda entry: self._keep(item, entry))):
+            yield
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
-        watch, self.statistics = item.stash[WATCH], []
+        watch, self.statistics = current(), []
         watch.budgeted = 0
         item.user_properties[:] = [pair for pair in item.user_properties if pair[0] != PROPERTY]  # of an earlier try
         watch.marked, why = marked(item)
@@ -137,19 +137,18 @@ class Gates:
 
             self.statistics.append(plain(entry.statistics))
 
-    @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-        report = yield
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_makereport(self) -> Generator[None, Any, None]:
+        made = yield
         if self.statistics:
-            setattr(report, STATISTICS, json.dumps(self.statistics, allow_nan=False))
-        return report
+            setattr(made.get_result(), STATISTICS, json.dumps(self.statistics, allow_nan=False))
 
     # --- the session ---
 
     def pytest_report_header(self) -> str | None:
         return None if self.budget is None else f"consistency: false-alarm budget {self.budget:g} for the session"
 
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+    def pytest_runtest_logreport(self, report: TestReport) -> None:
         if not self.worker and not hasattr(report, LATE):
             self.ledger.take(report)
 
@@ -169,7 +168,7 @@ class Gates:
         terminal = self.config.pluginmanager.get_plugin("terminalreporter")
         if terminal is not None:  # one outcome a test
             terminal.stats["passed"] = [r for r in terminal.stats.get("passed", []) if r.nodeid != nodeid]
-        report = pytest.TestReport(nodeid, location, {}, "failed", text, "call")
+        report = TestReport(nodeid, location, {}, "failed", text, "call")
         setattr(report, LATE, True)
         self.config.hook.pytest_runtest_logreport(report=report)
 
@@ -183,4 +182,3 @@ class Gates:
 
 
 LATE = "consistency_late"
-WATCH = pytest.StashKey[Watch]()

@@ -19,10 +19,12 @@ pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
 settings.register_profile("bench", deadline=None, max_examples=60, derandomize=True, database=None)
 settings.load_profile("bench")
 
-# Files of tests/unit that are not quick: they run kernels, begin processes or take longer; as do those with slow tests.
+# Files of tests/unit and tests/referee that are not quick: they run kernels, begin processes or take longer; as do
+# those with slow tests.
 LONGER = {
     "action", "alignment", "apart", "bags", "batches", "bench", "blas", "both_errors", "bounded_memory", "ceiling",
-    "challenging", "comparison", "compiling", "compiling_once", "content", "conventions", "dask", "declared_gain",
+    "challenging", "comparison", "compiling", "compiling_once", "content", "conventions", "core_commands", "core_gates",
+    "dask", "declared_gain",
     "effects", "ending", "extending", "extending_report", "filters_table", "findings", "frontend_experiment",
     "frontend_motion", "frontend_rigs", "gather", "guards", "heat", "hints", "ideal", "imaging_chain",
     "imaging_experiments", "imports", "isolating", "joint", "journal", "kept", "kept_cells", "kept_looks", "kernels",
@@ -36,7 +38,7 @@ TILTED = {"position": [0.12, -0.05, 0.3], "rotation": [0.08, -0.15, 0.4]}  # m; 
 
 
 def is_quick(path: Path) -> bool:
-    return path.parent.name == "unit" and path.stem.removeprefix("test_") not in LONGER
+    return path.parent.name in ("unit", "referee") and path.stem.removeprefix("test_") not in LONGER
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special, stats
 
+from consistency.diagnostics.intervals import binomial_interval
 from consistency.diagnostics.normality import normality
 from consistency.types import Array
 
@@ -109,8 +110,8 @@ def _negative(w: Array, weight: float, log_scale: float) -> float:
 
 def rate(count: int, total: int, level: float) -> Estimate:
     """A share with the interval of Clopper & Pearson (1934)."""
-    test = stats.binomtest(count, total).proportion_ci(1.0 - level, "exact")
-    return Estimate(count / total, float(test.low), float(test.high))
+    low, high = binomial_interval(count, total, 1.0 - level)
+    return Estimate(count / total, float(low), float(high))
 
 
 def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -> tuple[Estimate, ...]:

@@ -8,11 +8,10 @@ from typing import Annotated
 
 import typer
 
-from consistency.cli.app import Seed, app
+from consistency.cli.options import Seed
 from consistency.errors import InputError
 
 
-@app.command()
 def challenge(
     filter_name: Annotated[str, typer.Argument(metavar="FILTER", help="Built-in filter (see 'list').")],
     scenario: Annotated[

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from consistency.cli.app import app
+from consistency.extras import require
 
 
-@app.command()
 def characterise(
     source: Annotated[
         Path, typer.Argument(metavar="LOG|IMAGES", help="Log folder with truth, or folder of stereo pairs.")
@@ -52,6 +51,7 @@ def characterise(
 
     require_free_file(out, overwrite)
     if report is not None:
+        require("--report", "report")
         require_free(report, overwrite, "characterisation", "--report")
     size = None if board is None else counts(board, "--board", CORNERS)
     nodes = None if grid is None else counts(grid, "--grid", NODES)

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from consistency.cli.app import SCENARIO, Jobs, app
+from consistency.cli.options import SCENARIO, Jobs
 
 
-@app.command("compile")
 def compile_(
     filters: Annotated[
         list[str] | None,

@@ -121,12 +121,14 @@ def tell_notes(*read: list[Recording]) -> None:
 
 def reads_files(command: Callable[..., Any]) -> Callable[..., Any]:
     """A command with the options of files, which it gets as one argument ``files``."""
-    signature, hints = inspect.signature(command), get_type_hints(command, include_extras=True)
+    signature = inspect.signature(command, eval_str=True)
+    shared = get_type_hints(FileOptions, include_extras=True)
     own = {
-        field.name: inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=None)
+        field.name: inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=shared[field.name]
+        )
         for field in fields(FileOptions)
     }
-    shared = get_type_hints(FileOptions, include_extras=True)
 
     @wraps(command)
     def with_files(**given: Any) -> Any:
@@ -135,9 +137,8 @@ def reads_files(command: Callable[..., Any]) -> Callable[..., Any]:
     parameters = []
     for name, parameter in signature.parameters.items():
         parameters += list(own.values()) if name == "files" else [parameter.replace(kind=parameter.KEYWORD_ONLY)]
-    typed = [parameter.replace(annotation=(hints | shared)[parameter.name]) for parameter in parameters]
-    with_files.__signature__ = signature.replace(parameters=typed)  # type: ignore[attr-defined]
-    with_files.__annotations__ = {parameter.name: parameter.annotation for parameter in typed}
+    with_files.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    with_files.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return with_files
 
 

@@ -9,11 +9,10 @@ from typing import Annotated
 
 import typer
 
-from consistency.cli.app import SCENARIO, BackendName, Jobs, Scheduler, SchedulerWait, Seed, SlurmOptions, app
+from consistency.cli.options import SCENARIO, BackendName, Jobs, Scheduler, SchedulerWait, Seed, SlurmOptions
 from consistency.errors import InputError
 
 
-@app.command()
 def sweep(
     source: Annotated[
         str,
@@ -88,7 +87,6 @@ def _share(text: str | None) -> tuple[int, int]:
     return int(part), int(parts)
 
 
-@app.command()
 def recommend(
     rig: Annotated[str, typer.Argument(metavar="RIG", help=f"{SCENARIO[:-1]}, or sensor.toml of a log.")],
     range_: Annotated[float | None, typer.Option("--range", help="Metres up to which landmarks are used.")] = None,

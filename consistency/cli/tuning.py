@@ -8,11 +8,10 @@ from typing import Annotated
 
 import typer
 
-from consistency.cli.app import SCENARIO, FalseAlarm, Jobs, app
+from consistency.cli.options import SCENARIO, FalseAlarm, Jobs
 from consistency.errors import InputError
 
 
-@app.command()
 def tune(
     filter_name: Annotated[str, typer.Option("--filter", help="Filter name (see 'list').")],
     scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,

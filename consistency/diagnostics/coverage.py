@@ -7,9 +7,9 @@ import operator
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import special
 
 from consistency.diagnostics.blocks import by_runs, of_runs
+from consistency.diagnostics.intervals import binomial_interval
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.whitening import entries, spread_steps, squared_length
 from consistency.types import Array
@@ -86,10 +86,7 @@ def coverage_interval(
     if not len(rows):
         n = error.shape[-1]
         return np.full(n, np.nan), np.tile([0.0, 1.0], (n, 1))
-    N, tail = len(rows), 0.5 * (1.0 - confidence)
-    low = np.where(inside > 0, special.betaincinv(np.maximum(inside, 1), N - inside + 1, tail), 0.0)
-    high = np.where(inside < N, special.betaincinv(inside + 1, np.maximum(N - inside, 1), 1.0 - tail), 1.0)
-    return inside / N, np.stack([low, high], axis=-1)
+    return inside / len(rows), np.stack(binomial_interval(inside, len(rows), confidence), axis=-1)
 
 
 def _usable(error: Array, P: Symmetric) -> Array:

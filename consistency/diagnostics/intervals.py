@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from scipy import stats
+from typing import Any
+
+import numpy as np
+from scipy import special, stats
+
+from consistency.types import Array
 
 
 def anees_interval(dof: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -31,3 +36,16 @@ def chi2_mean_interval(dof: float, confidence: float = 0.95) -> tuple[float, flo
         raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
     tail = 0.5 * (1.0 - confidence)
     return float(stats.chi2.ppf(tail, dof) / dof), float(stats.chi2.isf(tail, dof) / dof)
+
+
+def binomial_interval(count: Any, draws: Any, confidence: float = 0.95) -> tuple[Array, Array]:
+    """Exact interval of a share, Clopper & Pearson (1934), of ``count`` in ``draws``.
+
+    Numbers or arrays that go together, whole or not; low and high have their shape. Where nothing is drawn: 0 and 1.
+    """
+    count, draws = np.broadcast_arrays(np.asarray(count, float), np.asarray(draws, float))
+    tail = 0.5 * (1.0 - confidence)
+    some, not_all = count > 0.0, count < draws
+    low = special.betaincinv(np.where(some, count, 1.0), draws - count + 1.0, tail)
+    high = special.betaincinv(count + 1.0, np.where(not_all, draws - count, 1.0), 1.0 - tail)
+    return np.where(some, low, 0.0), np.where(not_all, high, 1.0)

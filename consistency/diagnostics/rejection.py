@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import special, stats
+from scipy import stats
 
+from consistency.diagnostics.intervals import binomial_interval
 from consistency.diagnostics.records import Interval, RejectionScore
 from consistency.types import Array, Indices
 
@@ -45,7 +46,5 @@ def clustered_share(count: Array, size: Array, confidence: float = 0.95) -> Inte
     effect = max(between / binomial, 1.0) if binomial > 0.0 else 1.0
     quantiles = stats.t.isf(tail, clusters - 1) / stats.t.isf(tail, draws - 1)
     effective = draws / effect / quantiles**2
-    hits = share * effective
-    low = float(special.betaincinv(hits, effective - hits + 1.0, tail)) if hits > 0.0 else 0.0
-    high = float(special.betaincinv(hits + 1.0, effective - hits, 1.0 - tail)) if hits < effective else 1.0
-    return Interval(share, low, high)
+    low, high = binomial_interval(share * effective, effective, confidence)
+    return Interval(share, float(low), float(high))

@@ -7,11 +7,12 @@ methods use have a folder for each role; ``kernel`` is what all share. Nothing h
 from __future__ import annotations
 
 import difflib
-import importlib
-import importlib.util
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 from consistency.errors import InputError
+from consistency.extras import MissingPackageError, remedy
 
 # name -> module of this folder, the attribute in it, imported when asked for, and what the filter is
 MODULES: dict[str, tuple[str, str, str]] = {
@@ -81,7 +82,10 @@ MODULES |= {
 # told the truth: ``realisable`` of these is False
 BOUNDS = frozenset(name for name in MODULES if name.startswith("ideal-ekf-"))
 SMOOTHERS = frozenset({"gtsam-map-uvd"})  # each pose by the data of the whole trial: ``causal`` of these is False
-EXTRAS = {"external.gtsam": ("gtsam", "smoothing")}  # module -> the package it needs, and the extra that has it
+EXTRAS = {  # module -> the package it needs, and the extra that has it
+    "external.filterpy": ("filterpy", "peers"),
+    "external.gtsam": ("gtsam", "smoothing"),
+}
 
 
 def filter_names() -> list[str]:
@@ -121,11 +125,11 @@ def get_filter(name: str) -> Any:
     module, attribute, _ = MODULES[name]
     if (missing := _missing(module)) is not None:
         package, extra = missing
-        raise InputError(f"filter '{name}' needs {package}: pip install 'filter-consistency[{extra}]'")
-    return getattr(importlib.import_module(f"consistency.filters.{module}"), attribute)
+        raise MissingPackageError(f"filter '{name}' needs {remedy(extra, own=package)}")
+    return getattr(import_module(f"consistency.filters.{module}"), attribute)
 
 
 def _missing(module: str) -> tuple[str, str] | None:
     """Package that a module needs and that is not installed, and the extra that has it."""
     needed = EXTRAS.get(module)
-    return needed if needed is not None and importlib.util.find_spec(needed[0]) is None else None
+    return needed if needed is not None and find_spec(needed[0]) is None else None

@@ -10,38 +10,11 @@ from pathlib import Path
 
 from consistency.gating.session import Ledger, ending, interval, named, number, outcome
 from consistency.gating.watch import Entry
+from consistency.reporting.static import page
 from consistency.store.atomic import write_whole
 
 SUFFIXES = (".json", ".html")
 
-# colours of the bench's report, and lighter ones on dark ground with a contrast above 4.5
-STYLE = """
-:root { color-scheme: light dark; --ink: #1a1a1a; --ground: #fff; --line: #d5d5d5; --faint: #444;
-  --consistent: #00664a; --overconfident: #a84300; --conservative: #00507d; --biased: #8a2a63; --undecided: #4d4d4d; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e8e8e8; --ground: #16181a; --line: #44484c; --faint: #b5b5b5;
-  --consistent: #4fd1a5; --overconfident: #ff9d5c; --conservative: #6cb8f0; --biased: #f09cc8; --undecided: #b5b5b5; } }
-body { margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 96rem; color: var(--ink); background: var(--ground);
-  font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .9rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .5rem; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
-thead th { border-bottom: 2px solid var(--ink); }
-tbody th { font-weight: 600; overflow-wrap: anywhere; min-width: 12rem; }
-tbody td:last-child { min-width: 22rem; }
-.number { text-align: right; white-space: nowrap; }
-.verdict { display: inline-block; padding: 0 .5em; border: 1.5px solid currentColor; border-radius: .7em;
-  font-weight: 600; white-space: nowrap; }
-.consistent, .not-worse { color: var(--consistent); }
-.overconfident, .worse { color: var(--overconfident); }
-.conservative { color: var(--conservative); border-style: dashed; }
-.biased { color: var(--biased); }
-.heavy-tailed { color: var(--biased); border-style: dashed; }
-.inconsistent { color: var(--overconfident); border-style: dashed; }
-.undecided { color: var(--undecided); border-style: dotted; }
-.failed { color: var(--ground); background: var(--ink); border-color: var(--ink); }
-summary { cursor: pointer; }
-ul { margin: .25rem 0; padding-left: 1.2rem; color: var(--faint); }
-"""
 HEAD = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "planned", "inflation", "why")
 NUMBERS = {"p", "false-alarm rate", "runs", "planned", "inflation"}
 
@@ -63,30 +36,12 @@ def as_html(ledger: Ledger) -> str:
     """One page that needs nothing else."""
     head = "".join(f'<th scope="col"{_number(name)}>{name}</th>' for name in HEAD)
     rows = "\n".join(_row(entry) for entry in ledger.entries())
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Consistency gates</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<main>
-<h1>Consistency gates</h1>
-<p>{escape(ending(ledger))}.</p>
-<div class="scroll" tabindex="0" role="region" aria-label="Gates">
-<table>
-<thead><tr>{head}</tr></thead>
-<tbody>
-{rows}
-</tbody>
-</table>
-</div>
-</main>
-</body>
-</html>
-"""
+    table = f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
+    return page(
+        "Consistency gates",
+        f"<p>{escape(ending(ledger))}.</p>",
+        f'<div class="scroll" tabindex="0" role="region" aria-label="Gates">\n{table}\n</div>',
+    )
 
 
 def _row(e: Entry) -> str:

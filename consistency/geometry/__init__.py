@@ -8,8 +8,9 @@ from consistency.types import Array
 
 
 def wrap(angle: Array) -> Array:
-    """Angle in radians brought to [-pi, pi), any shape."""
-    return np.mod(np.asarray(angle) + np.pi, 2.0 * np.pi) - np.pi
+    """Angle in radians brought to [-pi, pi), any shape; NaN where it is not finite."""
+    with np.errstate(invalid="ignore"):
+        return np.mod(np.asarray(angle) + np.pi, 2.0 * np.pi) - np.pi
 
 
 def pose_error(truth: Array, estimate: Array) -> Array:

@@ -115,6 +115,8 @@ def spatial_error(truth: Array, estimate: Array, convention: str) -> Array:
     truth, estimate = np.asarray(truth, float), np.asarray(estimate, float)
     shape = np.broadcast_shapes(truth.shape, estimate.shape)
     truth, estimate = (np.array(np.broadcast_to(pose, shape)).reshape(-1, 7) for pose in (truth, estimate))
+    if not len(truth):  # older SciPy composes no empty rotations
+        return np.empty((*shape[:-1], 6))
     true_turn, turn = Rotation.from_quat(truth[:, 3:]), Rotation.from_quat(estimate[:, 3:])
     shift = truth[:, :3] - estimate[:, :3]
     body = convention in ("left", "so3-body")
@@ -145,6 +147,8 @@ def se3_log(pose: Array) -> Array:
     """Log of poses (x, y, z, qx, qy, qz, qw), shape (..., 7) -> (..., 6), Solà et al. (2018) eq. 173."""
     pose = np.asarray(pose, float)
     flat = pose.reshape(-1, 7)
+    if not len(flat):  # older SciPy has no vectors of empty rotations
+        return np.empty((*pose.shape[:-1], 6))
     return _twist(flat[:, :3], Rotation.from_quat(flat[:, 3:])).reshape(*pose.shape[:-1], 6)
 
 

@@ -79,7 +79,7 @@ def to_left(T: Array, convention: str) -> Array:
         return adjoint(inverse(T))
     d = T.shape[-1] - 1
     n = 3 if d == 2 else 6
-    out = np.broadcast_to(np.eye(n), (*T.shape[:-2], n, n)).copy()
+    out: Array = np.broadcast_to(np.eye(n), (*T.shape[:-2], n, n)).copy()
     back = np.swapaxes(T[..., :d, :d], -1, -2)
     if convention != "left":
         out[..., :d, :d] = back

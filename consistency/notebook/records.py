@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from html import escape
@@ -13,6 +12,7 @@ from consistency.diagnostics import Verdict
 from consistency.diagnostics.export import html_table
 from consistency.diagnostics.wording import plural
 from consistency.errors import InputError
+from consistency.extras import require
 from consistency.recording import Recording, read_recordings
 from consistency.store.atomic import write_whole
 from consistency.verdicts.files import analyse_recordings
@@ -74,7 +74,10 @@ class Judgement(Verdict):
         return _drawn(record_sheet(self.record, self), path)
 
     def _repr_html_(self) -> str:
-        text, figure = super()._repr_html_(), _picture(self)
+        from consistency.reporting.static import picture
+
+        assert self.record is not None
+        text, figure = super()._repr_html_(), picture(self.record, self)
         return text if figure is None else f'{text}<img alt="errors, NEES, coverage" src="{figure}">'
 
 
@@ -176,6 +179,7 @@ def _parts(of: Any) -> dict[str, Any]:
 
 
 def _drawn(sheet: Sheet, path: str | Path | None) -> Drawn:
+    require("a plot", "plot")
     from consistency.reporting.paper import drawn, picture
 
     figure = drawn(sheet)
@@ -186,16 +190,3 @@ def _drawn(sheet: Sheet, path: str | Path | None) -> Drawn:
         require_plot(path, overwrite=True)
         write_whole(path, picture(figure, path.suffix.lower().removeprefix(".")), 0o644)
     return figure
-
-
-def _picture(verdict: Judgement) -> str | None:
-    """The plot as the source of an image in HTML; None where there is nothing to draw."""
-    from consistency.reporting.files import record_sheet
-    from consistency.reporting.paper import render
-
-    assert verdict.record is not None
-    try:
-        sheet = record_sheet(verdict.record, verdict)
-    except InputError:
-        return None
-    return f"data:image/png;base64,{b64encode(render(sheet, 'png', 110)).decode()}"

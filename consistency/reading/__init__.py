@@ -117,12 +117,13 @@ def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as nested tables; raises :class:`InputError`."""
     text = read_text(path, "not valid TOML")
     with reading(path, "not valid TOML"):
-        import tomllib  # which Python 3.10 lacks
+        import tomllib  # type: ignore[import-not-found, unused-ignore]  # which Python 3.10 lacks
 
         deep = rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}"
         if re.search(deep, text):  # the parser would take memory by the square of their number
             raise InputError(f"{path}: not valid TOML (a key of more than {DEEPEST} parts)")
-        return tomllib.loads(text)
+        tables: dict[str, Any] = tomllib.loads(text)
+        return tables
 
 
 def read_json(path: Path) -> Any:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.extras import MissingPackageError, remedy
 from consistency.geometry.conventions import SPATIAL
 from consistency.reading import reading
 from consistency.recording.poses import Poses
@@ -101,7 +102,7 @@ def _opened(bag: Path) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError(f"{bag}: a ROS bag needs rosbags: pip install 'filter-consistency[ros]'") from None
+        raise MissingPackageError(f"{bag}: a ROS bag needs {remedy('ros')}") from None
     with reading(bag, "cannot be read as a ROS bag, damaged or cut short"):
         reader = AnyReader([bag], default_typestore=get_typestore(Stores.LATEST))
         reader.open()

@@ -37,7 +37,8 @@ class Frame:
 
     def placed(self, values: Array, manifold: Manifold) -> Array:
         """Poses (k, m) of one world in the other; those that are not finite stay."""
-        out, finite = values.copy(), np.isfinite(values).all(axis=1)
+        out: Array = values.copy()
+        finite = np.isfinite(values).all(axis=1)
         if manifold == "planar":
             out[:, :2] = values[:, :2] @ self.turn.as_matrix()[:2, :2].T + self.shift[:2]
             out[:, 2] = wrap(values[:, 2] + self.heading)

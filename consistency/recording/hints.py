@@ -236,7 +236,8 @@ def _ned(convention: str) -> Iterator[Guess]:
     def with_body(p: Poses) -> Poses:
         p = moved(p, north)
         finite = np.isfinite(p.estimate).all(axis=1)
-        p.estimate[finite, 3:] = (Rotation.from_quat(p.estimate[finite, 3:]) * Rotation.from_matrix(down)).as_quat()
+        if finite.any():
+            p.estimate[finite, 3:] = (Rotation.from_quat(p.estimate[finite, 3:]) * Rotation.from_matrix(down)).as_quat()
         return replace(p, covariance=T @ p.covariance @ T)
 
     worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
@@ -324,7 +325,7 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
     part = slice(0, width)
 
     def shrunk(values: Array) -> Array:
-        out = values.copy()
+        out: Array = values.copy()
         out[:, part] *= MILLI
         return out
 

@@ -83,8 +83,10 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     if not some:
         return None
 
+    judged = [np.isfinite(np.square(whiten(poses.errors(), poses.covariance)).sum(axis=1)) for poses in some]
+
     def size(shift: float) -> float:
-        return float(np.mean([_size(poses, shift) for poses in some]))
+        return float(np.mean([_size(poses, shift, those) for poses, those in zip(some, judged, strict=True)]))
 
     steps = np.geomspace(0.004, REACH, 12)
     grid = np.concatenate([-steps[::-1], [0.0], steps])
@@ -106,11 +108,10 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     return Offset(value, value - reach, value + reach, p, 1.0 - size(value) / size(0.0), alone)
 
 
-def _size(poses: Poses, shift: float) -> float:
-    """Mean NEES over its degrees of freedom, capped; an estimate that has no truth then counts as capped."""
+def _size(poses: Poses, shift: float, judged: Array) -> float:
+    """Mean NEES of ``judged`` over its degrees of freedom, capped, as it is where there is no truth then."""
     w = whiten(poses.errors(shift), poses.covariance)
     nees = np.square(w).sum(axis=1) / w.shape[1]
-    judged = np.isfinite(np.square(whiten(poses.errors(), poses.covariance)).sum(axis=1))
     return float(np.minimum(np.where(np.isfinite(nees), nees, CAP), CAP)[judged].mean()) if judged.any() else np.nan
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from consistency.diagnostics import nees
 from consistency.diagnostics.skipping import Skip, Skipped, without_first
 from consistency.errors import InputError
 from consistency.types import Array, Failure, Indices
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 DEFAULT_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
 DEFICIENT = 1e-12  # eigenvalue of a correlation matrix below which a direction carries no uncertainty

@@ -13,6 +13,7 @@ from typing import Any, overload
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.extras import require
 from consistency.reading import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.recording.text import Block, blocks
 from consistency.types import Array, Indices
@@ -171,10 +172,9 @@ def read_sheet(path: Path) -> Sheet:
 def _read_parquet(path: Path) -> Sheet:
     if not is_file(path):
         raise InputError(f"{path}: no such file")
-    try:
-        from consistency.store.parquet import read_columns
-    except ImportError as error:
-        raise InputError(f"{path}: Parquet needs {error.name}: pip install pandas pyarrow") from None
+    require(f"{path}: Parquet", "parquet")
+    from consistency.store.parquet import read_columns
+
     columns, rows = read_columns(path, "cannot be read as Parquet")
     return Sheet(path, columns, np.arange(rows), "row")
 

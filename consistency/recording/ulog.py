@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.extras import MissingPackageError, remedy
 from consistency.reading import is_file, reading
 from consistency.recording.nis import NisLog, choose
 from consistency.recording.record import associate, count
@@ -84,7 +85,7 @@ def _loaded(path: Path) -> Any:
     try:
         from pyulog import ULog
     except ImportError:
-        raise InputError(f"{path}: a ULog needs pyulog: pip install 'filter-consistency[ulog]'") from None
+        raise MissingPackageError(f"{path}: a ULog needs {remedy('ulog')}") from None
     if not is_file(path):
         raise InputError(f"{path}: no such file")
     refusal = "cannot be read as a ULog, damaged or cut short"

@@ -10,13 +10,14 @@ from __future__ import annotations
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from consistency.errors import InputError
+from consistency.extras import missing, require
 from consistency.store.atomic import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from consistency.characterising.characterise import Characterisation
     from consistency.diagnostics import Verdict
@@ -150,6 +151,8 @@ def write_file_reports(
 ) -> list[Path]:
     """``report.html``, ``report.pdf`` and ``verdict.json`` in a folder that appears whole or not at all.
 
+    Without the packages of [report] the page is a static one, and there is no PDF.
+
     Parameters
     ----------
     judged : verdicts by name of the records that are shown
@@ -160,19 +163,35 @@ def write_file_reports(
     InputError
         The folder exists or cannot be written.
     """
-    from consistency.reporting.files import compose_files
     from consistency.store.provenance import manifest_of
     from consistency.store.storage import write_folder
 
     manifest = manifest_of(kind="verdict", source=title)
-    document = compose_files(records, judged, title, manifest)
+    write = _static_page(records, judged, title) if missing("report") else _pages(records, judged, title, manifest)
 
     def contents(at: Path) -> None:
-        _write_document(document, at / "report.html", at / "report.pdf")
+        write(at)
         _write(at / "verdict.json", data.encode("utf-8"))
 
     write_folder(folder, {}, manifest, contents, overwrite)
-    return [folder / name for name in ("report.html", "report.pdf", "verdict.json")]
+    names = ("report.html", "report.pdf", "verdict.json")
+    return [path for path in (folder / name for name in names) if path.exists()]
+
+
+def _pages(
+    records: Sequence[Recording], judged: Mapping[str, Verdict], title: str, manifest: dict[str, Any]
+) -> Callable[[Path], None]:
+    from consistency.reporting.files import compose_files
+
+    document = compose_files(records, judged, title, manifest)
+    return lambda at: _write_document(document, at / "report.html", at / "report.pdf")
+
+
+def _static_page(records: Sequence[Recording], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
+    from consistency.reporting.static import verdicts_page
+
+    text = verdicts_page(records, judged, title)
+    return lambda at: _write(at / "report.html", text.encode("utf-8"))
 
 
 def _write_document(
@@ -204,6 +223,7 @@ def require_plot(path: Path, overwrite: bool) -> None:
     """
     if path.suffix.lower() not in KINDS:
         raise InputError(f"--plot {path}: must end in {', '.join(KINDS)}")
+    require("a plot", "plot")
     _require_writable(path, overwrite)
 
 

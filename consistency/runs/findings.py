@@ -152,12 +152,8 @@ def _executed(path: Path, name: str) -> ModuleType:
     return module
 
 
-def experiment_summaries() -> dict[str, str]:
-    """First line of every script's docstring."""
-    return {name: _summary(module) for name, module in experiments().items()}
-
-
 def _summary(module: ModuleType) -> str:
+    """First line of a script's docstring."""
     return (module.__doc__ or "").strip().splitlines()[0]
 
 

@@ -5,10 +5,11 @@ scenario, ``record`` puts them together, ``writing`` makes a file of one. ``effe
 ideal observation, one effect a file: its keys and its ``apply``. Nothing here draws a trial; that is the simulation's.
 """
 
+from consistency.reading.shipped import data_folder
 from consistency.scenario.agreement import misbelief
 from consistency.scenario.belief import Belief, BelievedMotion, GuardSettings, SigmaPoints
 from consistency.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
-from consistency.scenario.record import Scenario, data_folder, load_scenario, scenario_names
+from consistency.scenario.record import Scenario, load_scenario, scenario_names
 from consistency.scenario.sensor import (
     PLANAR_SENSORS,
     BelievedSensor,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,6 +12,7 @@ from pydantic import model_validator
 
 from consistency.errors import InputError
 from consistency.reading import is_folder, one_line
+from consistency.reading.shipped import data_folder
 from consistency.scenario.belief import Belief
 from consistency.scenario.tables import Table, read_table
 from consistency.scenario.truth import Truth
@@ -59,13 +59,6 @@ class Scenario(Table):
                 table = table[parent]
             table[key] = value
         return Scenario.model_validate(data)
-
-
-def data_folder(name: str) -> Path:
-    """Folder of shipped data (``scenarios``, ``experiments``): inside the wheel, else beside the package."""
-    inside = Path(str(resources.files("consistency"))) / "_data" / name
-    beside = Path(str(resources.files("consistency"))).parent / name
-    return inside if inside.is_dir() else beside
 
 
 def scenario_names() -> list[str]:

@@ -6,10 +6,9 @@ import datetime
 import functools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -18,6 +17,9 @@ from consistency.errors import InputError
 from consistency.reading import HUGE, LARGEST_NUMBER, MOST_DOF, WHOLE, is_file, one_line, reading, require_room
 from consistency.reading.columns import COLUMNS, OWN_COVARIANCE
 from consistency.types import Array
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 OPTIONAL = {  # columns of a table that may be missing
     "observations": {"z2": "float64", "source": "int64"},  # z2 by sensors of three values
@@ -213,20 +215,23 @@ def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
     InputError
         It cannot be read, or has a name of a column twice.
     """
-    frame = read_frame(path, refusal)
-    names = [str(name) for name in frame.columns]
+    file = open_parquet(path, refusal)
+    with reading(path, refusal):
+        table = file.read()
+    names = table.column_names
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"{path}: column '{one_line(twice[0])}' is there twice")
     with reading(path, refusal):
-        return {name: _cells(frame.iloc[:, k]) for k, name in enumerate(names)}, len(frame)
+        return {name: _cells(name, column) for name, column in zip(names, table.columns, strict=True)}, table.num_rows
 
 
-def _cells(column: pd.Series[Any]) -> Array:
-    if column.name != "filter" and column.dtype.kind != "c" and not are_no_numbers(column).any():
-        values: Array = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
-        if (np.isnan(values) <= column.isna()).all():
-            return values
-    return column.astype(object).where(column.notna(), None).to_numpy()
+def _cells(name: str, column: Any) -> Array:
+    if pa.types.is_decimal(column.type):
+        column = column.cast(pa.float64())
+    if name != "filter" and (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+        values: Array = column.to_numpy().astype(float)
+        return values
+    return np.fromiter(column.to_pylist(), object, len(column))
 
 
 def _plain(table: Any) -> Any:
@@ -280,6 +285,8 @@ def are_no_numbers(cells: pd.Series[Any]) -> Array:
 
 def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
     """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
+    import pandas as pd
+
     with reading(path, f"column '{column.name}' cannot be read as numbers"):
         if column.dtype.kind == "c" or are_no_numbers(column).any():
             raise TypeError(column.dtype)

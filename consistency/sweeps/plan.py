@@ -149,11 +149,6 @@ def sweep_names() -> list[str]:
     return sorted(path.stem for path in _shipped().glob("*.toml"))
 
 
-def sweep_summaries() -> dict[str, str]:
-    """What each built-in sweep is for."""
-    return {name: read_table(_shipped() / f"{name}.toml", SweepFile).summary for name in sweep_names()}
-
-
 def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
     """A sweep by built-in name or by path to a ``.toml`` file, every cell checked.
 

@@ -3,7 +3,7 @@
 Only :func:`relative_motion` and what else works on images needs OpenCV, the extra ``vision``.
 """
 
-import lazy_loader
+from consistency.extras import lazy_names
 
 # the names stand in __init__.pyi; each is loaded on first use, so that matches are registered without OpenCV
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

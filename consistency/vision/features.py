@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.extras import MissingPackageError, remedy
 from consistency.types import Array
 
 COUNT = 3000  # strongest features of an image; at 1226 x 370 px that is nearly all of them
@@ -38,7 +39,7 @@ def opencv() -> Any:
     try:
         return importlib.import_module("cv2")
     except ImportError:
-        raise InputError("images need OpenCV: pip install 'filter-consistency[vision]'") from None
+        raise MissingPackageError(f"an image needs {remedy('vision')}") from None
 
 
 def grey(image: Array, name: str = "image") -> Array:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from consistency.errors import InputError
+from consistency.extras import MissingPackageError, remedy
 from consistency.reading import HUGE, read_text, reading
 from consistency.types import Array
 from consistency.vision.features import opencv
@@ -53,7 +54,7 @@ def _plain(path: Path, text: str) -> Any:
     try:
         yaml: Any = importlib.import_module("yaml")
     except ImportError:
-        raise InputError(f"{path}: YAML needs PyYAML: pip install 'filter-consistency[vision]'") from None
+        raise MissingPackageError(f"{path}: YAML needs {remedy('vision')}") from None
     with reading(path, UNREADABLE):
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise ValueError("aliases (*name) are not followed; write their values")  # a few lines hold 10^9 of them

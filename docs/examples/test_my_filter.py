@@ -2,7 +2,8 @@
 
     pytest docs/examples/test_my_filter.py
 
-The guide is docs/gates.md. Each gate fails a right filter with probability 1e-6 at most.
+The guide is docs/gates.md. Each gate fails a right filter with probability 1e-6 at most. Filters of the bench need the
+extra of that name.
 """
 
 from __future__ import annotations

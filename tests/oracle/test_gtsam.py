@@ -21,7 +21,7 @@ from consistency.models import motion, point, stereo
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Estimates, Gaussian, Observation, Trial
 
-gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install 'filter-consistency[smoothing]'")
+gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
 
 from consistency.filters.external import planar_factors  # noqa: E402
 from consistency.filters.external.gtsam import FixedLag, Incremental, WholeTrialSmoother  # noqa: E402
@@ -325,4 +325,4 @@ def test_a_world_without_stereo_is_refused(xyz: cs.Scenario) -> None:
 
 def test_the_registry_knows_them() -> None:
     assert set(NAMES) <= set(filter_names())
-    assert set(EXTRAS) == {"external.gtsam"}
+    assert set(EXTRAS) == {"external.filterpy", "external.gtsam"}

@@ -10,7 +10,7 @@ import pytest
 
 import consistency as cs
 
-gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install 'filter-consistency[smoothing]'")
+gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from relative_poses import drive, motion_stretch, vectors  # noqa: E402

@@ -13,7 +13,7 @@ from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
-from consistency.filters.compiled import problem_of
+from consistency.filters.compiled import Compiled, problem_of
 from consistency.filters.guard import deciding, joint
 from consistency.filters.guard.deciding import kept
 from consistency.filters.guard.parts import guard_part
@@ -197,11 +197,18 @@ def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
     assert difference(filter_.run(cs.simulate(scenario, run=2), scenario.belief), twin) > 1e-6  # negative control
 
 
+@pytest.fixture
+def no_local_updating(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels that compile sooner; whether guards go with local updating has tests of its own."""
+    monkeypatch.setattr(Compiled, "local_from", 10**9)
+
+
 def of_tracks(scenario: cs.Scenario) -> cs.Scenario:
     """The world with rules on tracks in the belief."""
     return scenario.variant("tracks", belief__guard=TRACKS)
 
 
+@pytest.mark.usefixtures("no_local_updating")
 @pytest.mark.parametrize(("name", "world"), NAMES)
 def test_a_guarded_kernel_is_the_guarded_twin(small: Small, name: str, world: str, rng: np.random.Generator) -> None:
     agree(name, small(world, truth__steps=200), rng)
@@ -209,6 +216,7 @@ def test_a_guarded_kernel_is_the_guarded_twin(small: Small, name: str, world: st
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_local_updating")
 @pytest.mark.parametrize(("name", "world"), MORE)
 def test_more_guarded_kernels_are_their_guarded_twins(
     small: Small, name: str, world: str, rng: np.random.Generator

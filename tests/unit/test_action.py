@@ -338,7 +338,8 @@ def test_installs_what_is_asked_for(
     assert run_action(at, tests="tests").status == 3
     *_, source, pytest_ = (tmp_path / "said").read_text().split("\n")[:-1]
     assert pytest_ == "pytest"
-    assert Path(source).resolve() == ROOT
+    assert Path(source.removesuffix("[report]")).resolve() == ROOT
+    assert source.endswith("[report]")
     assert run_action(at, tests="tests", package="filter-consistency==0.1.0; touch broken").status == 3
     assert "filter-consistency==0.1.0; touch broken\npytest\n" in (tmp_path / "said").read_text()
     assert not (at / "broken").exists()

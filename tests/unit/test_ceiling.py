@@ -33,7 +33,7 @@ def test_without_gtsam_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_it_compares_the_last_poses(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("gtsam", reason="gtsam is not installed: pip install 'filter-consistency[smoothing]'")
+    pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
     world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=20, truth__landmarks__count=40)
 
     class Cell:

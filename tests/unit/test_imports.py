@@ -20,7 +20,7 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
     "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0, "store.machine": 0, "store.stopping": 0,
-    "store.ending": 1, "store.provenance": 1,
+    "extras": 1, "store.ending": 1, "store.provenance": 1,
     "geometry": 1, "reading": 1,
     "models": 2,
     "scenario": 3,
@@ -39,9 +39,9 @@ RANK = {
     "runs.sequential": 11, "runs.ahead": 11,
     "terminal.table": 12,
     "runs.findings": 13, "sweeps": 13, "challenging": 13, "characterising": 13, "tuning": 13,
-    "reporting": 14, "gating": 14,
-    "cli": 15, "notebook": 15, "testing": 15, "pytest_plugin": 15,
-    "__main__": 16,
+    "reporting": 14, "gating": 15,
+    "cli": 16, "notebook": 16, "testing": 16, "pytest_plugin": 16,
+    "__main__": 17,
 }  # fmt: skip
 DIAGNOSTICS = {"types", "geometry", "errors", "diagnostics"}
 DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}  # only reporting draws

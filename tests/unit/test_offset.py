@@ -86,7 +86,7 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(
         return np.array([0.001, -0.001, np.nan, 0.0])
 
     slope = (nees - then) / 0.04**2
-    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift: then + slope * (shift - 0.04) ** 2)
+    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift, __: then + slope * (shift - 0.04) ** 2)
     monkeypatch.setattr("consistency.recording.offset.steps_of", steps)
     found = offset_of([run_of(rng, 0.0)])
     assert found is not None
@@ -105,14 +105,14 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(
 def test_steps_that_agree_are_certain_and_two_are_none(
     steps: tuple[float, ...], p: float | None, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift: 1.0 + (shift - 0.04) ** 2)
+    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift, __: 1.0 + (shift - 0.04) ** 2)
     monkeypatch.setattr("consistency.recording.offset.steps_of", lambda *_: np.array(steps))
     found = offset_of([run_of(rng, 0.0)])
     assert (None if found is None else found.p_value) == p
 
 
 def test_steps_that_agree_on_no_offset_find_none(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift: 1.0 + abs(shift))
+    monkeypatch.setattr("consistency.recording.offset._size", lambda _, shift, __: 1.0 + abs(shift))
     monkeypatch.setattr("consistency.recording.offset.steps_of", lambda *_: np.zeros(4))
     found = offset_of([run_of(rng, 0.0)])
     assert found is not None
@@ -232,3 +232,19 @@ def test_offsets_need_clocks(tables: Path) -> None:
         table.rename(columns={"t": "step"}).to_csv(tables / name, index=False)
     with pytest.raises(cs.InputError, match="--time-offset: needs a column t"):
         read_recordings(tables / "est.csv", tables / "truth.csv", time_offset=1.0)
+
+
+def test_what_has_truth_is_judged_at_every_offset(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a shift leaves it without truth: an offset explains nothing by leaving estimates out."""
+    asked = []
+
+    def size(_: object, shift: float, judged: np.ndarray) -> float:
+        asked.append(bool(judged.all()))
+        return 1.0 + (shift - 0.04) ** 2
+
+    monkeypatch.setattr("consistency.recording.offset._size", size)
+    run = run_of(rng, 0.0)
+    within = (run.true_t >= run.t[0]) & (run.true_t <= run.t[-1] + 1e-9)  # any shift leaves some without truth
+    offset_of([replace(run, true_t=run.true_t[within], truth=run.truth[within])])
+    assert len(asked) > 20
+    assert all(asked)

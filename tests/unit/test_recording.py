@@ -220,7 +220,7 @@ def test_layouts_of_one_line(tmp_path: Path) -> None:
     i, j = np.triu_indices(3)
     layouts = {
         "44.txt": np.hstack([est, P[:, 1:]]),
-        "29.txt": np.hstack([est, full[:, *np.triu_indices(6)]]),
+        "29.txt": np.hstack([est, full[(slice(None), *np.triu_indices(6))]]),
         "20.txt": np.hstack([est, full[:, 3:, 3:][:, i, j], full[:, :3, :3][:, i, j]]),
     }
     for name, rows in layouts.items():

@@ -21,7 +21,6 @@ from consistency.diagnostics import Answer, Evidence, Interval, Settings, judge
 from consistency.diagnostics.questions import DIRECTION, STEP
 from consistency.diagnostics.records import STATUSES
 from consistency.diagnostics.wording import short
-from consistency.gating.report import STYLE
 from consistency.reading.columns import COVARIANCE
 from consistency.reporting import html, pdf, write_reports
 from consistency.reporting.answer import answer
@@ -47,6 +46,7 @@ from consistency.reporting.sections import (
     verdicts,
     world,
 )
+from consistency.reporting.static import STYLE
 from consistency.reporting.thin import thin
 from consistency.runs.findings import Finding
 from consistency.runs.montecarlo import run_log, simulate_log

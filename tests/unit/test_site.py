@@ -16,8 +16,7 @@ from matplotlib.figure import Figure
 
 import consistency
 from consistency import diagnostics, testing, vision
-from consistency.cli.app import app
-from consistency.cli.examples import EXAMPLES
+from consistency.cli.commands import COMMANDS
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -117,14 +116,13 @@ def test_every_command_has_a_page_with_its_examples(tmp_path: Path, monkeypatch:
     commands.write_commands(SimpleNamespace())
     pages = {path.stem: path.read_text("utf-8") for path in (tmp_path / "commands").glob("*.md")}
     index = pages.pop("index")
-    names = {each.name or each.callback.__name__ for each in app.registered_commands if each.callback}
-    assert set(pages) == names
+    assert set(pages) == set(COMMANDS)
     for name, text in pages.items():
         assert f"[{name}]({name}.md)" in index
         assert text.startswith(f"# consistency {name}\n")
         assert "**Options**" in text
         assert "\x08" not in text
-        for line in EXAMPLES.get(name, ()):
+        for line in COMMANDS[name].examples:
             assert f"$ consistency {line}\n" in text
     assert "dask or slurm ([docs/cluster.md](../../cluster.md))" in pages["run"]
     assert "As many runs as the verdict takes, instead of `--runs`." in pages["run"]

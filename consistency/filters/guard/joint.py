@@ -2,42 +2,22 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from consistency.filters.guard.deciding import MOST_NODES
 from consistency.filters.guard.screening import (
-    Tracks,
     Watch,
     added_distance,
-    pass_gate,
-    share_screening,
 )
-from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import keep_some
 from consistency.types import Array
 
 
-@part()
-class Compatible(NamedTuple):
-    """Squared distances (m + 1,) up to which 0, 1, ... observations are accepted together."""
-
-    tracks: Tracks
-    joint: Array
-
-
-share_screening(Compatible)
-
-
-@implement(keep_some, Compatible)
-def keep_compatible(guard: Compatible, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
-    count = pass_gate(guard.joint[1], s, m, y, S, watch)
-    if count < 0:
-        return False
+@inner
+def keep_compatible(joint: Array, count: int, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
+    """``kept`` (m,) <- the largest jointly compatible set of the ``count`` that passed the gate."""
     _sort_by_distance(count, watch)
-    best = _search(guard.joint, count, s, y, S, watch)
+    best = _search(joint, count, s, y, S, watch)
     for i in range(m):
         watch.kept[i] = False
     for i in range(best):

@@ -2,44 +2,26 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from consistency.filters.guard.screening import (
-    Tracks,
     Watch,
     added_distance,
-    pass_gate,
-    share_screening,
 )
-from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import keep_some
 from consistency.types import Array
 
 
-@part()
-class OnePoint(NamedTuple):
-    """Squared distances up to which 0, 1, ... observations are accepted, and one supports a hypothesis."""
+@inner
+def keep_supported(own: float, support: float, count: int, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
+    """``kept`` (m,) <- what supports the best hypothesis and what is rescued, of the ``count`` that passed the gate.
 
-    tracks: Tracks
-    joint: Array  # (m + 1,)
-    support: float
-
-
-share_screening(OnePoint)
-
-
-@implement(keep_some, OnePoint)
-def keep_supported(guard: OnePoint, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
-    count = pass_gate(guard.joint[1], s, m, y, S, watch)
-    if count < 0:
-        return False
-    best = _best_hypothesis(guard.support, count, s, y, S, watch)
+    ``own`` and ``support`` are the squared distances up to which an observation passes the gate and supports.
+    """
+    best = _best_hypothesis(support, count, s, y, S, watch)
     for i in range(m):
         watch.kept[i] = False
     if best < 0:
         return True
-    low = _list_support(best, guard.support, count, s, y, S, watch)
+    low = _list_support(best, support, count, s, y, S, watch)
     for i in range(low):
         watch.chosen[i] = watch.best[i]
         watch.kept[watch.best[i]] = True
@@ -47,7 +29,7 @@ def keep_supported(guard: OnePoint, s: int, m: int, y: Array, S: Array, watch: W
             return False
     for c in range(count):
         i = watch.order[c]
-        watch.kept[i] = watch.kept[i] or added_distance(i, low, s, y, S, watch) <= guard.joint[1]  # rescued
+        watch.kept[i] = watch.kept[i] or added_distance(i, low, s, y, S, watch) <= own  # rescued
     return True
 
 

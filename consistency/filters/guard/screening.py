@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.filters.kernel.dispatch import implement
 from consistency.filters.kernel.gain import INNOVATION
 from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import (
@@ -15,11 +14,7 @@ from consistency.filters.kernel.slam import (
     State,
     foresee,
     keep_some,
-    make_watch,
-    may_enter,
     observed_width,
-    rejected_rows,
-    screen,
     withhold,
 )
 from consistency.filters.kernel.work import Work
@@ -157,14 +152,6 @@ def enters_unless_rejected(guard: NamedTuple, row: int, is_known: bool, watch: W
 def rejected_of(guard: NamedTuple, watch: Watch) -> Array:
     """The rows that were rejected, (M,)."""
     return watch.rejected.copy()
-
-
-def share_screening(guard: type[NamedTuple]) -> None:
-    """A part, with ``tracks``, is a guard once it has a body of :func:`keep_some` as well."""
-    implement(make_watch, guard)(watch_tracks)
-    implement(screen, guard)(screen_known)
-    implement(may_enter, guard)(enters_unless_rejected)
-    implement(rejected_rows, guard)(rejected_of)
 
 
 @inner

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
+from scipy import special
 
-from consistency.scenario import GuardSettings
 from consistency.types import Array
+
+if TYPE_CHECKING:
+    from consistency.scenario import GuardSettings
 
 KINDS = {
     "gate": "chi-square gate of each observation by its own innovation",
@@ -39,4 +42,4 @@ def limits_of(settings: GuardSettings, s: int, m: int) -> Limits:
 @cache
 def _quantiles(confidence: float, s: int, m: int) -> tuple[float, ...]:
     """Of chi-square with 0, s, ... s m degrees of freedom; asked in every trial, or in every step by a plain filter."""
-    return 0.0, *map(float, np.atleast_1d(chi2.ppf(confidence, s * np.arange(1, m + 1))))
+    return 0.0, *map(float, 2.0 * special.gammaincinv(0.5 * s * np.arange(1, m + 1), confidence))

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scipy import stats
+import numpy as np
 
+from consistency.diagnostics.intervals import binomial_interval
 from consistency.reporting.blocks import Block, Cell, Column, Details, Facts, Table, Text
 from consistency.reporting.model import Report
 from consistency.reporting.section import Part, Section
@@ -119,12 +120,13 @@ def shipped() -> Path | None:
 
 
 def _rates(rows: Iterable[dict[str, Any]]) -> Iterable[Rate]:
-    for row in rows:
-        gates, found = int(row["gates"]), int(row["found"])
-        ends = stats.binomtest(found, gates).proportion_ci(CONFIDENCE, "exact")
+    rows = list(rows)
+    found, gates = (np.array([row[key] for row in rows], float) for key in ("found", "gates"))
+    intervals = zip(*binomial_interval(found, gates, CONFIDENCE), strict=True)
+    for row, (low, high) in zip(rows, intervals, strict=True):
         yield Rate(
             row["world"], row["question"], row["ratio"], row["runs"], row["looks"], row.get("mean_runs", row["runs"]),
-            row["stated"], row["bound"] == "<=", gates, found / gates, (float(ends.low), float(ends.high)),
+            row["stated"], row["bound"] == "<=", row["gates"], row["found"] / row["gates"], (float(low), float(high)),
         )  # fmt: skip
 
 

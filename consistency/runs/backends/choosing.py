@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from consistency.errors import InputError
+from consistency.extras import MissingPackageError, remedy
 from consistency.runs.backends.local import Local
 from consistency.runs.work import Backend
 
-NAMES = ("local", "dask", "slurm")
+ENGINES = {"dask": "distributed", "slurm": "submitit"}  # package of each that is not local
+NAMES = ("local", *ENGINES)
 
 
 def backend_for(
@@ -54,8 +56,8 @@ def backend_for(
         from consistency.runs.backends.slurm import Slurm, options_of
 
         return Slurm(out.absolute().with_name(f".{out.absolute().name}.jobs"), options_of(slurm), jobs)
-    except ImportError as error:
-        raise InputError(f"--backend {name} needs {error.name}: pip install 'filter-consistency[cluster]'") from None
+    except ImportError:
+        raise MissingPackageError(f"--backend {name} needs {remedy('cluster', own=ENGINES[name])}") from None
 
 
 def require_scheduler(name: str, scheduler: str | None, what: str) -> None:

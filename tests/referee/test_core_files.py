@@ -1,0 +1,140 @@
+"""Files of every format that the core reads, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import inputs
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+import consistency as cs
+from consistency.errors import InputError
+from consistency.geometry import wrap
+from consistency.geometry.conventions import SPATIAL, se3_log, spatial_error
+from consistency.recording import read_recordings
+from consistency.recording.hints import hints
+from consistency.recording.sheet import read_sheet
+from consistency.verdicts.baselines import _known
+
+
+def test_a_table_has_the_errors_that_were_written(tmp_path: Path) -> None:
+    record = cs.read(inputs.planar(tmp_path, "fair"), truth=tmp_path / "truth.csv")
+    expected = (inputs.normal(inputs.RUNS * inputs.STEPS, 3) @ np.linalg.cholesky(inputs.P).T).reshape(
+        inputs.RUNS, inputs.STEPS, 3
+    )
+    np.testing.assert_allclose(record.error, expected, atol=1e-11)
+    np.testing.assert_allclose(record.covariance[3, 2], inputs.P, atol=1e-13)
+    assert record.axes == ("x", "y", "heading")
+    assert cs.judge(record).status == "consistent"
+
+
+@pytest.mark.parametrize(("scale", "status"), [(1.0, "consistent"), (1.6, "overconfident"), (0.6, "conservative")])
+def test_a_trajectory_in_space(scale: float, status: str, tmp_path: Path) -> None:
+    est, true, cov = inputs.trajectories(tmp_path, scale)
+    record = cs.read(est, truth=true, covariance=cov, time_offset=0.0)
+    np.testing.assert_allclose(record.error[0, 0, :3], scale * np.array([0.1, 0.2, 0.05]) * inputs.normal(1, 3)[0])
+    assert cs.judge(record).status == status
+
+
+@pytest.mark.parametrize("align", ["origin", "posyaw", "se3", "posyaw-all", "se3-all"])
+def test_a_trajectory_in_another_world(align: str, tmp_path: Path) -> None:
+    est, true, cov = inputs.trajectories(tmp_path, runs=4)
+    turn, shift = Rotation.from_euler("z", 0.7), np.array([5.0, -2.0, 1.0])
+    for path in true.iterdir():
+        rows = np.loadtxt(path)
+        rows[:, 1:4] = turn.apply(rows[:, 1:4]) + shift
+        rows[:, 4:] = (turn * Rotation.from_quat(rows[:, 4:])).as_quat()
+        np.savetxt(path, rows, fmt="%.17g")
+    assert np.abs(cs.read(est, truth=true, covariance=cov, axes=["x", "y", "z"]).error).max() > 1.0
+    assert np.nanmax(np.abs(cs.read(est, truth=true, covariance=cov, align=align).error)) < 1.0
+
+
+def test_an_archive(tmp_path: Path) -> None:
+    record = cs.read(inputs.archive(tmp_path, 2.0))
+    np.testing.assert_array_equal(record.error.ravel(), 2.0 * inputs.normal(inputs.RUNS * inputs.STEPS, 2).ravel())
+    assert cs.judge(record).status == "overconfident"
+
+
+def test_nees_alone(tmp_path: Path) -> None:
+    np.savez(tmp_path / "nees.npz", nees=np.square(inputs.normal(200, 3)).sum(axis=1)[:, None], dof=3)
+    assert cs.judge(cs.read(tmp_path / "nees.npz")).status == "consistent"
+
+
+def test_windows_of_motions(tmp_path: Path) -> None:
+    est, true = inputs.drive(tmp_path)
+    record = cs.read(est, truth=true, relative=20, motions=True)
+    assert cs.judge(record).status == "consistent"
+
+
+def test_a_state_of_other_columns(tmp_path: Path) -> None:
+    lines = [[k, float(e), 1.0] for k, e in enumerate(inputs.normal(50, 1)[:, 0])]
+    inputs.rows(tmp_path / "est.csv", "step,bias,P_bias_bias", lines)
+    inputs.rows(tmp_path / "true.csv", "step,bias", [[k, 0.0] for k in range(50)])
+    record = cs.read(tmp_path / "est.csv", truth=tmp_path / "true.csv", state=["bias"])
+    assert record.axes == ("bias",)
+    np.testing.assert_allclose(record.error[0, :, 0], -inputs.normal(50, 1)[:, 0], atol=1e-11)
+
+
+@pytest.mark.parametrize(("column", "value"), [("x", "nan"), ("heading", "inf"), ("heading", "nan")])
+def test_an_estimate_that_is_not_finite_is_a_failed_run(column: str, value: str, tmp_path: Path) -> None:
+    """Without a warning on any version; warnings are errors here."""
+    path = inputs.planar(tmp_path, "fair")
+    header, *lines = path.read_text().splitlines()
+    cells = lines[8].split(",")  # run 1, step 3
+    cells[header.split(",").index(column)] = value
+    lines[8] = ",".join(cells)
+    path.write_text("\n".join([header, *lines]))
+    [recording] = read_recordings(path, tmp_path / "truth.csv")
+    [failure] = recording.failures
+    assert (failure.run, failure.step) == (1, 3)
+    assert failure.reason.startswith("estimate is not finite")
+
+
+def test_truth_of_another_time_is_refused(tmp_path: Path) -> None:
+    est, true, cov = inputs.trajectories(tmp_path)
+    for path in true.iterdir():
+        rows = np.loadtxt(path)
+        rows[:, 0] += 1000.0
+        np.savetxt(path, rows, fmt="%.17g")
+    with pytest.raises(InputError, match="no estimate has a truth within"):
+        cs.read(est, truth=true, covariance=cov)
+
+
+@pytest.mark.parametrize("convention", SPATIAL)
+def test_no_poses_have_no_errors(convention: str) -> None:
+    assert spatial_error(np.empty((0, 7)), np.empty((0, 7)), convention).shape == (0, 6)
+    assert spatial_error(np.empty((2, 0, 7)), np.empty((2, 0, 7)), convention).shape == (2, 0, 6)
+    assert se3_log(np.empty((2, 0, 7))).shape == (2, 0, 6)
+
+
+def test_an_angle_that_is_not_finite_is_nan() -> None:
+    np.testing.assert_array_equal(wrap(np.array([0.5, np.nan, np.inf])), [0.5, np.nan, np.nan])
+
+
+def test_the_logarithm_of_a_motion_in_space() -> None:
+    """Beside the exponential of its matrix."""
+    twist = np.array([0.3, -1.2, 2.0, 0.4, -0.7, 1.1])
+    generator = np.zeros((4, 4))
+    generator[:3, 3], (a, b, c) = twist[:3], twist[3:]
+    generator[:3, :3] = [[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]
+    motion = expm(generator)
+    pose = np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_quat()])
+    np.testing.assert_allclose(se3_log(pose), twist, atol=1e-12)
+
+
+def test_a_quoted_row_with_too_few_fields(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text('x,y,z\n"1",2\n')
+    with pytest.raises(InputError, match="line 2: has 2 columns, the header has 3"):
+        read_sheet(tmp_path / "a.csv")
+
+
+def test_an_unknown_key_of_a_baseline() -> None:
+    with pytest.raises(ValueError, match=r"key 'filters\.a\.more': unknown"):
+        _known({"runs": [], "more": 1}, "filters.a", ("runs",))
+
+
+def test_no_run_needs_no_hint() -> None:
+    assert hints("a", ("x", "y", "heading"), []) == []

@@ -6,6 +6,7 @@ import atexit
 import gc
 import io
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -72,9 +73,18 @@ def stoppable(also: Sequence[int] = ()) -> Iterator[Stop]:
     }
     for number in before:
         signal.signal(number, stop)
+    dropped = sys.unraisablehook
+
+    def quiet(unraisable: sys.UnraisableHookArgs) -> None:
+        if not (stop.number and issubclass(unraisable.exc_type, KeyboardInterrupt)):
+            dropped(unraisable)
+
+    sys.unraisablehook = quiet  # a callback that drops the interrupt would print it; ``stop.number`` remembers it
     try:
         yield stop
     finally:
+        if sys.unraisablehook is quiet:
+            sys.unraisablehook = dropped
         for number, handler in before.items():
             signal.signal(number, handler)
 

@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from consistency.store import ending
-from consistency.store.stopping import STOPS
+from consistency.store.stopping import STOPS, stoppable
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="fork")
 
@@ -142,3 +143,28 @@ def test_a_program_that_was_stopped_ends_soon_and_flushes_what_is_open(tmp_path:
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert (tmp_path / "file").read_text() == "all of it"
     assert done.stderr == ""
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_interrupt_that_a_callback_drops_is_remembered_in_silence(capsys: pytest.CaptureFixture[str]) -> None:
+    class Dropped:
+        def __init__(self, action: Callable[[], object]) -> None:
+            self.action = action
+
+        def __del__(self) -> None:
+            self.action()
+
+    before, hook = sys.unraisablehook, sys.__unraisablehook__
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.unraisablehook = hook  # pytest's own collects them
+    try:
+        with stoppable() as stop:
+            Dropped(lambda: signal.raise_signal(signal.SIGINT))
+            assert stop.number == signal.SIGINT
+            assert capsys.readouterr().err == ""
+            Dropped(lambda: 1 / 0)  # what else is dropped is printed as before
+            assert "ZeroDivisionError" in capsys.readouterr().err
+        assert sys.unraisablehook is hook
+    finally:
+        sys.unraisablehook = before
+        signal.signal(signal.SIGINT, handler)

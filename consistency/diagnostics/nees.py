@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.diagnostics.blocks import by_steps
+from consistency.diagnostics.validity import asymmetric
 from consistency.diagnostics.whitening import whiten
 from consistency.types import Array
 
@@ -38,10 +39,8 @@ def nees(error: Array, covariance: Array) -> Array:
         raise ValueError(f"error {e.shape} and covariance {P.shape} must be (..., n) and (..., n, n)") from None
     _require(np.isfinite(e), "the error is not finite", 1)
     _require(np.isfinite(P), "the covariance is not finite", 2)
-    mirrored = np.swapaxes(P, -1, -2)
-    if not (mirrored == P).all():
-        scale = np.abs(P).max(axis=(-2, -1), keepdims=True)
-        _require(np.abs(P - mirrored) <= 1e-8 * scale, "the covariance is not symmetric", 2)
+    if not (np.swapaxes(P, -1, -2) == P).all():
+        _require(~asymmetric(P), "the covariance is not symmetric", 0)
     whitened = whiten(e, P)
     if not np.isfinite(whitened).all():
         _require(np.linalg.eigvalsh(P) > 0, "the covariance is not positive definite", 1)

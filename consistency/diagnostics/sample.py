@@ -14,6 +14,7 @@ from consistency.diagnostics.innovations import nis_of
 from consistency.diagnostics.records import Evidence, Settings
 from consistency.diagnostics.scale import means_and_counts, run_means
 from consistency.diagnostics.symmetric import Symmetric
+from consistency.diagnostics.validity import negative
 from consistency.diagnostics.whitening import all_finite, entries, squared_length, subset, whiten
 from consistency.types import Array
 
@@ -207,9 +208,7 @@ def impossible(e: Evidence, counted: Array) -> Array:
     def of_block(error: Array, P: Symmetric, counted: Array) -> Array:
         odd = np.isinf(error).any(axis=-1) | ~P.where_all(lambda entry: ~np.isinf(entry))
         suspect = ~counted & ~odd & P.where_all(np.isfinite)
-        some = np.asarray(P[suspect])
-        if len(some):
-            odd[suspect] = np.linalg.eigvalsh(some)[:, 0] < -1e-9 * np.abs(some).max(axis=(-2, -1))
+        odd[suspect] = negative(np.asarray(P[suspect]))
         return odd
 
     return by_runs(of_block, e.error, entries(e.covariance), counted)

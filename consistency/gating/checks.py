@@ -11,15 +11,13 @@ from numpy.typing import ArrayLike
 
 from consistency.diagnostics import Evidence, Settings, Verdict, judge, nis_of
 from consistency.diagnostics.skipping import Skip, skip_of, without_first
+from consistency.diagnostics.validity import Validity, classify
 from consistency.gating.watch import Terms
 from consistency.reading.columns import POSE
 from consistency.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
     from consistency.store.results import Results
-
-ASYMMETRY = 1e-8  # of a covariance, relative to its largest entry
-SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix; below, its inverse is rounding error
 
 
 @dataclass(frozen=True)
@@ -181,17 +179,14 @@ def pair(errors: ArrayLike, covariances: ArrayLike, name: str = "errors", of: st
 def covariance(P: Array, name: str, there: Array | None = None) -> None:
     """Refuse covariances (runs, steps, n, n) that are none; ``there`` (runs, steps) says which to look at."""
     there = np.ones(P.shape[:2], bool) if there is None else there
-    require(np.isfinite(P).all(axis=(-2, -1)) | ~there, f"{name}: not finite")
-    scale = np.abs(P).max(axis=(-2, -1))
-    twist = np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1))
-    require((twist <= ASYMMETRY * scale) | ~there, f"{name}: not symmetric")
-    variance = np.diagonal(P, axis1=-2, axis2=-1)
-    require((variance > 0).all(axis=-1) | ~there, f"{name}: not positive definite (a variance is not positive)")
-    sigma = np.sqrt(np.where(there[..., None], variance, 1.0))
-    R = np.where(there[..., None, None], P / sigma[..., None] / sigma[..., None, :], np.eye(P.shape[-1]))
-    smallest = np.linalg.eigvalsh(R)[..., 0]
-    require(smallest > -SINGULAR, f"{name}: not positive definite")
-    require(smallest > SINGULAR, f"{name}: singular; leave out steps in which a component is known exactly")
+    kind = np.where(there, classify(P), Validity.VALID)
+    for fault, what in (
+        (Validity.NOT_FINITE, "not finite"),
+        (Validity.ASYMMETRIC, "not symmetric"),
+        (Validity.INDEFINITE, "not positive definite"),
+        (Validity.DEFICIENT, "singular; leave out steps in which a component is known exactly"),
+    ):
+        require(kind != fault, f"{name}: {what}")
 
 
 def values(name: str, value: ArrayLike, there: Array | None = None) -> Array:

@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
+from consistency.diagnostics.validity import Validity, classify
 from consistency.recording.poses import Poses
 from consistency.types import Array
 
 FACTOR = 6.0  # by which a wrong filter's covariance is off without a mix-up: the table of benchmarks/hints.py has 4
-SINGULAR = 1e-12  # eigenvalue of a correlation matrix
 ODD = 1e-3  # chance that errors with the stated covariance are not taken for such
 GROUPS = {3: ([0, 1],), 6: ([0, 1, 2], [3, 4, 5])}  # position and attitude, of poses
 
@@ -116,7 +116,7 @@ def fit_of(runs: Sequence[Poses], errors: Array | None = None) -> Fit | None:
     try:
         L = np.linalg.cholesky(R)
     except np.linalg.LinAlgError:
-        definite = np.linalg.eigvalsh(R)[:, 0] > SINGULAR
+        definite = classify(R) == Validity.VALID
         if not definite.any():
             return None
         good[good], sigma = definite, sigma[definite]

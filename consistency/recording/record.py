@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from consistency.diagnostics import nees
 from consistency.diagnostics.skipping import Skip, Skipped, without_first
+from consistency.diagnostics.validity import ROUNDED, ZERO, Validity, asymmetric, classify, pieces
 from consistency.errors import InputError
 from consistency.types import Array, Failure, Indices
 
@@ -18,11 +19,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 DEFAULT_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
-DEFICIENT = 1e-12  # eigenvalue of a correlation matrix below which a direction carries no uncertainty
-ZERO = 1e-24  # variance that counts as none, as in the filters of this package
-ROUNDED = 1e-4  # a singular matrix in a text file of few digits has an eigenvalue of either sign up to this
-ASYMMETRY = 1e-6  # of the largest entry: text files of seven digits pass
-ROWS = 65_536  # matrices that are looked at together: a million take no more memory than so many
 
 
 @dataclass(frozen=True)
@@ -228,49 +224,17 @@ def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, I
     return own, nearest[own]
 
 
-def _pieces(rows: int) -> Iterator[slice]:
-    """``ROWS`` at a time."""
-    return (slice(start, start + ROWS) for start in range(0, rows, ROWS))
-
-
 def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
     out = np.empty(covariance.shape)
     with np.errstate(invalid="ignore"):  # of infinite ones
-        for piece in _pieces(len(out)):
-            P, turned = covariance[piece], np.swapaxes(covariance[piece], -1, -2)
-            gap = np.abs(P - turned).max(axis=(-2, -1))
-            bad = np.flatnonzero(gap > ASYMMETRY * np.abs(P).max(axis=(-2, -1)))  # false for NaN
+        for piece in pieces(len(out)):
+            P = covariance[piece]
+            bad = np.flatnonzero(asymmetric(P, ROUNDED))
             if len(bad):
                 row = piece.start + int(bad[0])
                 raise InputError(f"{place(row)}: the covariance is not symmetric; write P = (P + P') / 2")
-            out[piece] = 0.5 * (P + turned)
-    return out
-
-
-def smallest_correlation(covariance: Array) -> Array:
-    """Smallest eigenvalue of the correlation matrices (k, n, n); zero for a variance of zero, NaN for NaN.
-
-    -1 where a variance is negative or a correlation is beyond 1.
-    """
-    if not len(covariance):
-        return np.empty(0)
-    return np.concatenate([_smallest_correlation(covariance[piece]) for piece in _pieces(len(covariance))])
-
-
-def _smallest_correlation(covariance: Array) -> Array:
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    none = np.abs(variance) <= ZERO
-    scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
-    finite = np.isfinite(covariance).all(axis=(-2, -1))
-    with np.errstate(invalid="ignore"):  # of infinite ones
-        correlation = covariance / (scale[..., :, None] * scale[..., None, :])
-        wrong = ((variance < 0) & ~none).any(axis=-1)
-        wrong |= (np.abs(correlation) > 1.0 + ROUNDED).any(axis=(-2, -1))
-    out = np.full(len(covariance), np.nan)
-    out[finite] = np.linalg.eigvalsh(correlation[finite])[:, 0]
-    out[finite & none.any(axis=-1)] = np.minimum(out[finite & none.any(axis=-1)], 0.0)
-    out[finite & wrong] = -1.0
+            out[piece] = 0.5 * (P + np.swapaxes(P, -1, -2))
     return out
 
 
@@ -278,17 +242,17 @@ def _judged(track: Track) -> tuple[int, int, str]:
     """First row with a covariance of full rank, first broken row, and why it is broken."""
     rows = len(track.column)
     error_ok: Array = np.all(np.isfinite(np.zeros((rows, 1)) if track.error is None else track.error), axis=1)
-    size = np.ones(rows) if track.covariance is None else smallest_correlation(track.covariance)
-    full: Array = np.asarray(size > DEFICIENT)
+    kind = np.zeros(rows, int) if track.covariance is None else classify(track.covariance, ROUNDED)
+    full: Array = np.asarray(kind == Validity.VALID)
     start = int(np.argmax(full)) if full.any() else rows
     bad: Array = ~error_ok | ~full
-    bad[:start] = ~error_ok[:start] | ~(size[:start] >= -ROUNDED)
+    bad[:start] = ~error_ok[:start] | (kind[:start] != Validity.DEFICIENT)
     if not bad.any():
         return start, rows, ""
     end = int(np.argmax(bad))
     if not error_ok[end]:
         reason = "estimate is not finite"
-    elif np.isnan(size[end]):
+    elif kind[end] == Validity.NOT_FINITE:
         reason = "covariance is not finite"
     else:
         reason = "covariance is not positive definite"

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
 from consistency.reading.columns import COVARIANCE, OWN_COVARIANCE
@@ -27,7 +28,6 @@ from consistency.recording.record import (
     common_times,
     count,
     listed,
-    smallest_correlation,
     symmetric,
 )
 from consistency.recording.relative import Stretch, relative_recording
@@ -390,9 +390,13 @@ def _same_instants(sheet: Sheet, truth: Sheet, keep: Array, partner: Array, max_
 def _exact_start(steps: Array, covariance: Array) -> Array:
     """Rows of step 0 where no run is uncertain yet: the start, not an estimate."""
     start: Array = steps == 0
-    if not start.any() or (steps < 0).any() or not (smallest_correlation(covariance[start]) <= 0).all():
+    if not start.any() or (steps < 0).any() or not _is_exact(covariance[start]):
         return np.zeros(len(steps), bool)
     return start
+
+
+def _is_exact(covariance: Array) -> bool:
+    return bool(np.isin(classify(covariance, ROUNDED), (Validity.DEFICIENT, Validity.INDEFINITE)).all())
 
 
 def _has_own(sheet: Sheet) -> bool:

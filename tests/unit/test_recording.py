@@ -29,7 +29,7 @@ from consistency.recording import (
     se3_log,
     spatial_error,
 )
-from consistency.recording.record import associate, common_times, smallest_correlation
+from consistency.recording.record import associate, common_times
 from consistency.types import Array
 from consistency.verdicts.files import analyse_recordings
 
@@ -342,15 +342,6 @@ def test_association_by_brute_force(reference: list[float], seed: int) -> None:
         assert [int(i) for i, j in zip(own, match, strict=True) if j == k] == (
             [min(wants, key=lambda i: distance[i, k])] if wants else []
         )
-
-
-def test_definiteness_does_not_depend_on_units() -> None:
-    P = np.array([[2.0, 0.9, 0.1], [0.9, 1.0, 0.2], [0.1, 0.2, 0.5]])
-    units = np.array([1e-9, 1.0, 1e6])
-    both = smallest_correlation(np.stack([P, P * np.outer(units, units)]))
-    np.testing.assert_allclose(both[0], both[1], rtol=1e-9)
-    wrong = np.stack([np.diag([1.0, 0, 1]), np.diag([1.0, -1, 1]), np.array([[1, 2, 0], [2, 1, 0], [0, 0, 1.0]])])
-    assert smallest_correlation(wrong).tolist() == [0.0, -1.0, -1.0]
 
 
 # --- tables: poses ---------------------------------------------------------------------------------

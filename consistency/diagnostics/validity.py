@@ -1,0 +1,88 @@
+"""Which matrices can be judged as covariances; what follows from a matrix that cannot is for the caller to say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.types import Array, Indices
+
+DEFICIENT = 1e-12  # eigenvalue of a correlation matrix below which a direction carries no uncertainty
+ZERO = 1e-24  # variance that counts as none, as in the filters of this package
+NEGATIVE = 1e-9  # of the largest entry: an eigenvalue further below zero is not rounding, in any unit
+ROWS = 65_536  # matrices that are looked at together: a million take no more memory than so many
+
+
+class Validity(IntEnum):
+    """What :func:`classify` finds; where several hold, the last of them."""
+
+    VALID = 0
+    DEFICIENT = 1  # positive semidefinite: a direction carries no uncertainty
+    INDEFINITE = 2
+    ASYMMETRIC = 3
+    NOT_FINITE = 4
+
+
+class Tolerance(NamedTuple):
+    """What counts as rounding."""
+
+    asymmetry: float  # of the largest entry
+    indefinite: float  # eigenvalue of a correlation matrix, below zero
+
+
+EXACT = Tolerance(asymmetry=1e-8, indefinite=DEFICIENT)  # arrays of doubles
+ROUNDED = Tolerance(asymmetry=1e-6, indefinite=1e-4)  # text files of seven digits; of fewer, a singular matrix
+
+
+def classify(covariance: Array, tolerance: Tolerance = EXACT) -> Indices:
+    """:class:`Validity` of each matrix, (..., n, n) -> (...), in any units of the components.
+
+    Rank is judged by the smallest eigenvalue of the correlation matrix, where a component whose variance is zero has
+    the variance 1 and the covariances that it has.
+    """
+    P = covariance.reshape(-1, *covariance.shape[-2:])
+    out = np.empty(len(P), np.int64)
+    for piece in pieces(len(P)):
+        out[piece] = _classify(P[piece], tolerance)
+    return out.reshape(covariance.shape[:-2])
+
+
+def _classify(P: Array, tolerance: Tolerance) -> Indices:
+    finite = np.isfinite(P).all(axis=(-2, -1))
+    out = np.full(len(P), Validity.NOT_FINITE, dtype=np.int64)
+    P = P[finite]
+    variance = np.diagonal(P, axis1=-2, axis2=-1)
+    none = np.abs(variance) <= ZERO
+    scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
+    smallest = np.linalg.eigvalsh(P / (scale[..., :, None] * scale[..., None, :]))[:, 0]
+    smallest = np.where(none.any(axis=-1), np.minimum(smallest, 0.0), smallest)
+    kind = np.where(smallest > DEFICIENT, Validity.VALID, Validity.DEFICIENT)
+    kind[smallest < -tolerance.indefinite] = Validity.INDEFINITE
+    kind[asymmetric(P, tolerance)] = Validity.ASYMMETRIC
+    out[finite] = kind
+    return out
+
+
+def asymmetric(covariance: Array, tolerance: Tolerance = EXACT) -> Array:
+    """Which matrices (..., n, n) differ from their transpose by more than rounding; not those that are not finite."""
+    with np.errstate(invalid="ignore"):  # infinity less infinity
+        gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
+    return np.asarray(gap > tolerance.asymmetry * np.abs(covariance).max(axis=(-2, -1)))
+
+
+def negative(covariance: Array) -> Array:
+    """Which finite matrices (N, n, n) have a negative variance in some direction that is no rounding in any unit.
+
+    More lenient than :attr:`Validity.INDEFINITE`, so that a filter whose covariance lost its rank is not accused.
+    """
+    if not len(covariance):
+        return np.zeros(0, bool)
+    return np.asarray(np.linalg.eigvalsh(covariance)[:, 0] < -NEGATIVE * np.abs(covariance).max(axis=(-2, -1)))
+
+
+def pieces(rows: int) -> Iterator[slice]:
+    """``ROWS`` at a time."""
+    return (slice(start, start + ROWS) for start in range(0, rows, ROWS))

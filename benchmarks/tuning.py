@@ -168,9 +168,10 @@ def fit_in(world: World, seed: int, jobs: int) -> tuple[Fit, Array]:
     parts = parts_of(wrong(world.scenario(), *true), world.runs, seed)
     parts = replace(parts, trials=[world.observed(trial, rng) for trial in parts.trials])
     kf, groups = cs.get_filter("kf"), groups_of("Q,R", parts.belief)
-    bench = Bench(kf, parts.trials, "innovations", jobs)
-    bench.compile(parts.belief)
-    return _Tuner(kf, parts, groups, jobs, None, Settings())._fit(bench), true * [1.0, 2.0 if world.uneven else 1.0]
+    with Bench(kf, parts.trials, parts.belief, "innovations", jobs) as bench:
+        bench.compile()
+        fit = _Tuner(kf, parts, groups, jobs, None, Settings())._fit(bench)
+    return fit, true * [1.0, 2.0 if world.uneven else 1.0]
 
 
 def speed(options: argparse.Namespace) -> None:
@@ -178,14 +179,12 @@ def speed(options: argparse.Namespace) -> None:
     for world, name in SPEED:
         scenario = cs.load_scenario(world)
         trials = [cs.simulate(scenario, run, options.seed) for run in range(SPEED_RUNS)]
-        bench, groups = (
-            Bench(cs.get_filter(name), trials, "innovations", options.jobs),
-            groups_of("Q,R", scenario.belief),
-        )
-        bench.compile(scenario.belief)
-        began = time.monotonic()
-        for log_factors in np.random.default_rng(options.seed).uniform(-1.0, 1.0, (SETTINGS, 2)):
-            bench(scaled(scenario.belief, groups, log_factors))
+        groups = groups_of("Q,R", scenario.belief)
+        with Bench(cs.get_filter(name), trials, scenario.belief, "innovations", options.jobs) as bench:
+            bench.compile()
+            began = time.monotonic()
+            for log_factors in np.random.default_rng(options.seed).uniform(-1.0, 1.0, (SETTINGS, 2)):
+                bench(scaled(scenario.belief, groups, log_factors))
         print(f"{name} on {world}: {SETTINGS} settings of {SPEED_RUNS} runs in {time.monotonic() - began:.1f} s")
 
 

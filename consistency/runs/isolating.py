@@ -43,6 +43,7 @@ class Isolation:
     Parameters
     ----------
     filters : all filters of a study
+    belief : of the filters, unless a trial is run with one of its own
     timeout : seconds that a filter that is not compiled has for a trial
     memory : GiB that it may allocate in a trial, beyond what its process has before
 
@@ -64,7 +65,7 @@ class Isolation:
         self.compiled = [filter_ for filter_ in filters if isinstance(filter_, Compiled)]
         alone = [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]
         self._guests = {name_of(filter_): _guest(filter_) for filter_ in alone}
-        self._study = Study(self._guests, belief, timeout, memory, tuple(sys.path), _folder())
+        self._study = Study(self._guests, timeout, memory, tuple(sys.path), _folder())
         self._free: list[_Supervisor] = []
         self._busy: set[_Supervisor] = set()
         self._is_open, self._halt = False, np.zeros(1, np.int64)
@@ -86,26 +87,31 @@ class Isolation:
             _idle.extend(supervisor for supervisor in self._free if supervisor.tell(None))
             self._free.clear()
 
-    def run(self, trial: Trial) -> list[Estimates]:
+    def run(self, trial: Trial, belief: Belief | None = None) -> list[Estimates]:
         """A trial through all filters, one after the other; may be called from several threads at once.
 
         A process that is killed from outside, or whose supervisor is, is replaced once; then the run has failed.
+
+        Parameters
+        ----------
+        belief : for this trial, in place of the study's
 
         Raises
         ------
         InputError
             A filter needs what the trial does not have.
         """
+        belief = self.belief if belief is None else belief
         return [
-            filter_.run(trial, self.belief, self._halt)
+            filter_.run(trial, belief, self._halt)
             if isinstance(filter_, Compiled)
-            else self._apart(filter_, trial)
+            else self._apart(filter_, trial, belief)
             for filter_ in self.filters
         ]
 
-    def _apart(self, filter_: Filter, trial: Trial) -> Estimates:
+    def _apart(self, filter_: Filter, trial: Trial, belief: Belief) -> Estimates:
         guest = self._guests[name_of(filter_)]
-        message, reply = pickle.dumps(Task(guest.name, trial)), None
+        message, reply = pickle.dumps(Task(guest.name, trial, belief)), None
         for _ in range(2):
             with self._supervisor() as supervisor:
                 reply = supervisor.ask(message)

@@ -61,7 +61,6 @@ class Study:
     """What a supervisor is told before the first trial."""
 
     guests: dict[str, Guest]  # by name
-    belief: Belief
     timeout: float | None  # s a trial
     memory: float | None  # GiB beyond what the process has before the trial
     path: tuple[str, ...]  # where modules are looked for
@@ -70,10 +69,11 @@ class Study:
 
 @dataclass(frozen=True)
 class Task:
-    """A trial for a filter."""
+    """A trial for a filter, and what the filter believes."""
 
     guest: str
     trial: Trial
+    belief: Belief
 
 
 @dataclass(frozen=True)
@@ -256,12 +256,12 @@ def _host(study: Study, guest: Guest, room: _Room, link: Connection, mouth: Conn
     while True:
         link.send_bytes(READY)
         try:
-            trial = pickle.loads(link.recv_bytes()).trial
+            task: Task = pickle.loads(link.recv_bytes())
         except EOFError:
             return
         try:
             with _limited(study.memory):
-                reply = Reply(_run(guest, trial, study.belief, room.record(trial)))
+                reply = Reply(_run(guest, task, room.record(task.trial)))
         except InputError as error:
             reply = Reply(None, refusal=str(error))
         if os.getpid() != own_pid:
@@ -275,19 +275,19 @@ def _host(study: Study, guest: Guest, room: _Room, link: Connection, mouth: Conn
         link.send_bytes(pickle.dumps(replace(reply, is_spent=now != files)))
 
 
-def _run(guest: Guest, trial: Trial, belief: Belief, record: Record) -> Estimates:
+def _run(guest: Guest, task: Task, record: Record) -> Estimates:
     """Estimates of a trial; whatever the filter throws ends it as a failed run.
 
     The filter is as it was sent, so that no run depends on those that this process did before.
     """
     try:
-        return run_filter(pickle.loads(guest.pickled), trial, belief, record)
+        return run_filter(pickle.loads(guest.pickled), task.trial, task.belief, record)
     except InputError:
         raise
     except BaseException as error:
         _lift_limit()
         reason = reason_of(error) if record.at[0] else f"cannot be loaded in a process of its own: {reason_of(error)}"
-        return record.estimates(guest.name, trial.run, guest.error, reason=reason, guarded=guest.guarded)
+        return record.estimates(guest.name, task.trial.run, guest.error, reason=reason, guarded=guest.guarded)
 
 
 def _settle(study: Study) -> None:

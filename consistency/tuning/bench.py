@@ -38,25 +38,44 @@ class Scores:
 
 
 class Bench:
-    """Scores a filter on trials under any belief.
+    """Scores a filter on trials under any belief; to be used in a ``with``, whose end kills what still works.
+
+    A filter that is not compiled keeps its processes from one setting to the next, with the modules that it imports.
 
     Parameters
     ----------
+    belief : that a fit begins with
     by : one of :data:`consistency.tuning.scores.BY`
     timeout : seconds a trial of a filter that is not compiled
     """
 
     def __init__(
-        self, filter_: Filter, trials: Sequence[Trial], by: str, jobs: int = -1, timeout: float | None = None
+        self,
+        filter_: Filter,
+        trials: Sequence[Trial],
+        belief: Belief,
+        by: str,
+        jobs: int = -1,
+        timeout: float | None = None,
     ) -> None:
         self.filter, self.trials, self.by, self.timeout = filter_, list(trials), by, timeout
         self.workers = min(worker_count(jobs), len(self.trials))
         self.settings, self.began = 0, time.monotonic()
         self._told = self.began
+        self._pool = ThreadPoolExecutor(self.workers)  # kernels release the GIL; other filters run in processes
+        self._isolation = Isolation([filter_], belief, timeout)
 
-    def compile(self, belief: Belief) -> None:
+    def __enter__(self) -> Bench:
+        self._isolation.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._isolation.__exit__()
+        self._pool.shutdown(cancel_futures=True)
+
+    def compile(self) -> None:
         """Compile what the filter needs, and is not yet compiled."""
-        compile_for([self.filter], self.trials[0], belief)
+        compile_for([self.filter], self.trials[0], self._isolation.belief)
 
     def __call__(self, belief: Belief) -> Scores:
         """Scores of all runs.
@@ -66,12 +85,8 @@ class Bench:
         InputError
             The filter reports no innovations, or needs what a trial does not have.
         """
-        pool = ThreadPoolExecutor(self.workers)  # kernels release the GIL; other filters run in processes
-        try:
-            with one_blas_thread(), Isolation([self.filter], belief, self.timeout) as isolation:
-                scores = list(pool.map(lambda trial: self._score(trial, isolation), self.trials))
-        finally:
-            pool.shutdown(cancel_futures=True)
+        with one_blas_thread():
+            scores = list(self._pool.map(lambda trial: self._score(trial, belief), self.trials))
         self.settings += 1
         self._tell()
         density = np.zeros((len(scores), max(trial.steps for trial in self.trials)))
@@ -82,8 +97,8 @@ class Bench:
         failed = [(trial.run, score.failure) for trial, score in zip(self.trials, scores, strict=True) if score.failure]
         return Scores(density, ratio, tuple(f"run {run}, {reason}" for run, reason in failed))
 
-    def _score(self, trial: Trial, isolation: Isolation) -> Score:
-        [estimates] = isolation.run(trial)
+    def _score(self, trial: Trial, belief: Belief) -> Score:
+        [estimates] = self._isolation.run(trial, belief)
         return score_of(trial, estimates, self.by)
 
     def _tell(self) -> None:

@@ -173,9 +173,9 @@ class _Tuner:
 
     def fitted(self, by: str) -> Setting:
         """The best setting by a score, with the verdict on it."""
-        bench = Bench(self.filter, self.parts.trials, by, self.jobs, self.timeout)
-        bench.compile(self.parts.belief)
-        fit = self._fit(bench)
+        with Bench(self.filter, self.parts.trials, self.parts.belief, by, self.jobs, self.timeout) as bench:
+            bench.compile()
+            fit = self._fit(bench)
         return self._setting(by, fit.log_factors, fit.interval, fit.edge, bench.settings)
 
     def explained(self, chosen: Setting) -> Explanation:
@@ -199,7 +199,6 @@ class _Tuner:
     def nearest(self, fitted: Setting) -> tuple[Setting | None, int]:
         """Of settings at which errors have the size that is stated, the one nearest to consistent; and their number."""
         say("looking for settings at which errors are as large as stated")
-        bench = Bench(self.filter, self.parts.trials, "nees", self.jobs, self.timeout)
 
         def ratio(log_factors: Array) -> float:
             scores = bench(scaled(self.parts.belief, self.groups, log_factors))
@@ -210,7 +209,8 @@ class _Tuner:
             return self._verdict(self.parts.on_fitted, belief, self.settings)
 
         centre = np.array([0.0 if factor.edge else np.log(factor.value) for factor in fitted.factors])
-        settings = balanced(centre, ratio, judge)
+        with Bench(self.filter, self.parts.trials, self.parts.belief, "nees", self.jobs, self.timeout) as bench:
+            settings = balanced(centre, ratio, judge)
         best = nearest(settings)
         if best is None:
             return None, 0

@@ -493,7 +493,7 @@ def test_a_process_that_is_spawned(world: cs.Scenario, doomed: Control, monkeypa
     longest = max(trials, key=lambda trial: len(trial.landmark))
     host = supervising._Host(study, study.guests["bad"], longest, supervising.Printed("bad"))
     for trial in trials:
-        reply = host.run(trial, pickle.dumps(supervising.Task("bad", trial)), far)
+        reply = host.run(trial, pickle.dumps(supervising.Task("bad", trial, world.belief)), far)
         assert reply.estimates is not None
         expected = run_filter(Still("bad"), trial, world.belief)
         if trial.run == DOOMED:

@@ -176,15 +176,38 @@ def test_what_cannot_be_scored_is_refused(uvd: cs.Scenario) -> None:
 
 
 def test_a_run_that_fails_makes_the_setting_impossible(uvd: cs.Scenario) -> None:
-    scores = Bench(Broken(), [cs.simulate(uvd, seed=SEED)], "nees", 1)(uvd.belief)
+    with Bench(Broken(), [cs.simulate(uvd, seed=SEED)], uvd.belief, "nees", 1) as bench:
+        scores = bench(uvd.belief)
     assert scores.total == -np.inf
     assert scores.failures[0].startswith("run 0, step 1: ")
 
 
 def test_the_same_trials_are_scored_alike_by_any_number_of_workers(uvd: cs.Scenario) -> None:
     trials = [cs.simulate(uvd, run, SEED) for run in range(4)]
-    one, two = (Bench(cs.get_filter("ekf-uvd"), trials, "innovations", jobs)(uvd.belief) for jobs in (1, 2))
-    assert np.array_equal(one.log_density, two.log_density)
+    benches = [Bench(cs.get_filter("ekf-uvd"), trials, uvd.belief, "innovations", jobs) for jobs in (1, 2)]
+    with benches[0] as alone, benches[1] as together:
+        assert np.array_equal(alone(uvd.belief).log_density, together(uvd.belief).log_density)
+
+
+class Believer(Silent):
+    """Says its noise as its pose, and the process that it is in as its variance."""
+
+    def pose(self, state: Any) -> cs.Gaussian:
+        x = np.array([state.belief.motion.sigma_v, 0.0, 0.0])
+        return cs.Gaussian(x, np.diag([float(os.getpid()), 1.0, 1.0]))
+
+
+def test_a_filter_keeps_its_process_and_takes_each_belief(uvd: cs.Scenario) -> None:
+    trials = [cs.simulate(uvd, run, SEED) for run in range(2)]
+    said = set()
+    with Bench(Believer(), trials, uvd.belief, "nees", 1) as bench:
+        for factor in (1.0, 2.0, 3.0):
+            belief = scaled(uvd.belief, groups_of("Q", uvd.belief), np.log([factor**2]))
+            for trial in trials:
+                [estimates] = bench._isolation.run(trial, belief)
+                assert estimates.pose[-1, 0] == belief.motion.sigma_v
+                said.add(estimates.covariance[-1, 0, 0])
+    assert len(said) == 1
 
 
 # --- parts -------------------------------------------------------------------------------------------

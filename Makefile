@@ -3,6 +3,8 @@ BIN := .venv/bin
 
 .PHONY: docs tutorial reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-quick test-all bench lint format clean
 
+# matrices are small and work is divided among processes: further threads of BLAS would wait for each other
+export OPENBLAS_NUM_THREADS ?= 1
 export PYTHONDONTWRITEBYTECODE :=  # byte code is kept: one process compiles a module of Python, the others load it
 
 .venv/.done: pyproject.toml constraints.txt
@@ -24,22 +26,22 @@ test-all: .venv/.done
 	$(BIN)/python -m pytest -n 3 --dist worksteal --durations=40 --durations-min=5
 
 calibrate: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py \
+	$(BIN)/python benchmarks/calibration.py \
 		--out reports/reference/calibration.json --docs docs/referee.md
 
 calibrate-quick: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --quick
+	$(BIN)/python benchmarks/calibration.py --quick
 
 calibrate-alignment: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/alignment.py --docs docs/align.md
+	$(BIN)/python benchmarks/alignment.py --docs docs/align.md
 
 calibrate-alignment-quick: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/alignment.py --quick
+	$(BIN)/python benchmarks/alignment.py --quick
 
 RECURSIVE := ekf-uvd ukf-uvd parked-ekf-uvd robocentric-ekf-uvd anchored-ekf-uvd eqf-uvd ri-ekf-uvd fej-ekf-uvd oc-ekf-uvd \
 	ckf-uvd iekf-uvd ispkf-uvd
 regime: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/consistency sweep regime $(addprefix --filter ,$(RECURSIVE)) --out reports/regime
+	$(BIN)/consistency sweep regime $(addprefix --filter ,$(RECURSIVE)) --out reports/regime
 	cp reports/regime/map.json reports/reference/regime.json
 
 docs: .venv/.done
@@ -50,7 +52,7 @@ tutorial: .venv/.done
 	$(BIN)/python docs/tutorial.py
 
 bench: .venv/.done
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/bench.py
+	$(BIN)/python benchmarks/bench.py
 
 # what the core is, whose types are also checked for Python 3.10
 CORE := $(addprefix consistency/,errors.py extras.py types.py testing.py pytest_plugin.py reading geometry diagnostics recording gating \

@@ -15,6 +15,7 @@ from consistency.characterising.likelihood import Fit, Rows, fit
 from consistency.characterising.residuals import Residuals, Selection, select
 from consistency.characterising.tails import Estimate, Tails, rate, ratios, tails
 from consistency.errors import InputError
+from consistency.filters.compiled import one_blas_thread
 from consistency.scenario import PicturedSensor
 from consistency.scenario.effects.nodes import hats
 from consistency.types import Array
@@ -83,6 +84,7 @@ class Characterisation:
     ratio: tuple[Estimate, ...] = ()  # sd while moving over sd at rest, of u, v, d
 
 
+@one_blas_thread()  # its matrices are small: a second one takes twice the time of the processors, and gains nothing
 def characterise(
     data: Residuals,
     sensor: PicturedSensor,

@@ -15,6 +15,7 @@ from consistency.challenging.search import RUNGS, Budget, Candidate, ranked, sea
 from consistency.challenging.shrink import shrink
 from consistency.challenging.worlds import Point, Space, space_of
 from consistency.diagnostics import Settings, Verdict, gate_runs
+from consistency.diagnostics.defaults import DETECT, FALSE_ALARM
 from consistency.diagnostics.questions import SCALE
 from consistency.errors import InputError
 from consistency.filters import get_filter
@@ -51,8 +52,8 @@ class Plan:
     trials: int | None = None  # of search and shrinking together, at most
     seed: int = 0
     jobs: int = -1
-    false_alarm: float = 0.05  # chance that a challenge finds a right filter overconfident
-    detect: float = 1.5  # ratio of true to stated covariance that the confirmation finds with a power of 95 %
+    false_alarm: float = FALSE_ALARM  # chance that a challenge finds a right filter overconfident
+    detect: float = DETECT  # ratio of true to stated covariance that the confirmation finds with a power of 95 %
 
     def __post_init__(self) -> None:
         if (self.minutes is None) == (self.trials is None):

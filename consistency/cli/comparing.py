@@ -9,6 +9,7 @@ import typer
 
 from consistency.cli.files import FileOptions, reads_files, tell_notes
 from consistency.cli.options import FalseAlarm, Judged, Skip
+from consistency.diagnostics.defaults import FALSE_ALARM
 from consistency.errors import InputError
 
 
@@ -25,7 +26,7 @@ def compare(
             "--filter", metavar="NAME", help="Without OTHER: the first against the rest. With it: this filter in both."
         ),
     ] = None,
-    false_alarm: FalseAlarm = 0.05,
+    false_alarm: FalseAlarm = FALSE_ALARM,
     skip: Skip = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,

@@ -21,6 +21,7 @@ from consistency.cli.options import (
     Skip,
     given,
 )
+from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.errors import InputError
 from consistency.extras import missing, remedy
 
@@ -33,11 +34,14 @@ def analyse(
         list[str] | None, typer.Option("--filter", metavar="NAME", help="Only this filter; may be repeated.")
     ] = None,
     false_alarm: Annotated[
-        float | None, typer.Option("--false-alarm", help="Chance to find a fault in a filter that has none [0.05].")
+        float | None,
+        typer.Option("--false-alarm", help=f"Chance to find a fault in a filter that has none [{FALSE_ALARM}]."),
     ] = None,
     detect: Annotated[
         float | None,
-        typer.Option("--detect", help="Consistent is a covariance ratio shown inside [1/R, R] [1.5].", metavar="R"),
+        typer.Option(
+            "--detect", help=f"Consistent is a covariance ratio shown inside [1/R, R] [{DETECT}].", metavar="R"
+        ),
     ] = None,
     tolerance: Annotated[
         float | None,
@@ -171,10 +175,10 @@ def plan(
     ] = None,
     pilot_runs: Annotated[int, typer.Option("--pilot-runs", help="Runs of the pilot.")] = 40,
     seed: Seed = 0,
-    detect: Annotated[float, typer.Option("--detect", help=f"{DETECT_HELP.capitalize()}.")] = 1.5,
+    detect: Annotated[float, typer.Option("--detect", help=f"{DETECT_HELP.capitalize()}.")] = DETECT,
     dof: Annotated[int, typer.Option("--dof", help="Dimension of the error; 3 for a planar pose.")] = 3,
-    false_alarm: FalseAlarm = 0.05,
-    power: Power = 0.95,
+    false_alarm: FalseAlarm = FALSE_ALARM,
+    power: Power = POWER,
     allow: Annotated[
         str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
     ] = None,

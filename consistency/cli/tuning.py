@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from consistency.cli.options import SCENARIO, FalseAlarm, Jobs
+from consistency.diagnostics.defaults import DETECT, FALSE_ALARM
 from consistency.errors import InputError
 
 
@@ -31,10 +32,10 @@ def tune(
     timeout: Annotated[
         float | None, typer.Option("--timeout", help="Seconds a run of a filter that is not compiled.")
     ] = None,
-    false_alarm: FalseAlarm = 0.05,
+    false_alarm: FalseAlarm = FALSE_ALARM,
     detect: Annotated[
         float, typer.Option("--detect", help="Consistent is a covariance ratio shown inside [1/R, R].", metavar="R")
-    ] = 1.5,
+    ] = DETECT,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the tuned scenario or sensor.toml, and tuning.json.")
     ] = None,

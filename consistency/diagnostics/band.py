@@ -8,6 +8,7 @@ import numpy as np
 from scipy import optimize, special, stats
 
 from consistency.diagnostics.blocks import blocks
+from consistency.diagnostics.defaults import FALSE_ALARM
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.scale import FEW
 from consistency.types import Array, Indices
@@ -30,7 +31,7 @@ class Band:
 
 
 def simultaneous_band(
-    nees: Array, dof: int, false_alarm: float = 0.05, method: str = "max", allow: str | None = None
+    nees: Array, dof: int, false_alarm: float = FALSE_ALARM, method: str = "max", allow: str | None = None
 ) -> Band:
     """Band that the ANEES of a consistent filter leaves in any step with probability ``false_alarm`` at most.
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import special, stats
 
 from consistency.diagnostics.blocks import blocks
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.whitening import all_finite
 from consistency.types import Array, Indices
 
@@ -23,7 +24,7 @@ class Hotelling:
     p_value: float
 
 
-def hotelling(sample: Array, confidence: float = 0.95) -> Hotelling:
+def hotelling(sample: Array, confidence: float = CONFIDENCE) -> Hotelling:
     """T-squared test of a sample (N, n), exact for independent Gaussian rows, N > n.
 
     Raises

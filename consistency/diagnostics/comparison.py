@@ -10,6 +10,7 @@ from scipy import special
 
 from consistency.diagnostics.blocks import by_runs
 from consistency.diagnostics.contrast import Contrast, contrast, margin
+from consistency.diagnostics.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics.scale import run_means
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.whitening import entries
@@ -80,7 +81,7 @@ class Comparison:
         """a is less consistent than b at the stated false-alarm rate."""
         return self.p_value <= self.false_alarm
 
-    def needed_runs(self, detect: float = 1.5, power: float = 0.95) -> int:
+    def needed_runs(self, detect: float = DETECT, power: float = POWER) -> int:
         """Runs with which a covariance ratio farther from 1 by ``detect`` is found with ``power``.
 
         Planned with the test of :func:`compare` and the spread between these runs, for an ``a`` that errs to the side
@@ -126,10 +127,10 @@ def _squared_and_covered(nees: Array, error: Array, covariance: Symmetric) -> Ar
 def compare(
     a: RunSummary,
     b: RunSummary,
-    false_alarm: float = 0.05,
+    false_alarm: float = FALSE_ALARM,
     axes: tuple[str, ...] | None = None,
     paired: bool | None = None,
-    confidence: float = 0.95,
+    confidence: float = CONFIDENCE,
 ) -> Comparison:
     """Paired intervals of the ratio of ANEES and RMSE and the difference of coverage, and a verdict on 'worse'.
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from consistency.diagnostics.blocks import by_runs, of_runs
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.intervals import binomial_interval
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.whitening import entries, spread_steps, squared_length
@@ -68,7 +69,7 @@ def coverage_interval(
     error: Array,
     covariance: Array | Symmetric,
     bound: float = 2.0,
-    confidence: float = 0.95,
+    confidence: float = CONFIDENCE,
     counted: Array | None = None,
 ) -> tuple[Array, Array]:
     """Coverage of one step of each run and its exact binomial interval (Clopper & Pearson 1934), for each axis.

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import stats
 
+from consistency.diagnostics.defaults import FALSE_ALARM
 from consistency.diagnostics.whitening import spread_steps
 from consistency.types import Array
 
@@ -22,7 +23,7 @@ class Pit:
     p_value: float
 
 
-def pit(nees: Array, dof: int, false_alarm: float = 0.05) -> Pit:
+def pit(nees: Array, dof: int, false_alarm: float = FALSE_ALARM) -> Pit:
     """Distribution function of the chi-square at the NEES of one step of each run, and Kolmogorov's test.
 
     One value a run, at steps spread over the trajectory (:func:`spread_steps`), is an independent sample, so

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from scipy import special, stats
 
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.types import Array
 
 
-def anees_interval(dof: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
+def anees_interval(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Two-sided interval [r1, r2] of the average NEES of one step, Herath et al. (2007) eq. 17.
 
     Parameters
@@ -30,7 +31,7 @@ def anees_interval(dof: int, runs: int, confidence: float = 0.95) -> tuple[float
     return low * dof, high * dof
 
 
-def chi2_mean_interval(dof: float, confidence: float = 0.95) -> tuple[float, float]:
+def chi2_mean_interval(dof: float, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Two-sided interval of chi-square over its degrees of freedom, for example of summed NIS."""
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
@@ -38,7 +39,7 @@ def chi2_mean_interval(dof: float, confidence: float = 0.95) -> tuple[float, flo
     return float(stats.chi2.ppf(tail, dof) / dof), float(stats.chi2.isf(tail, dof) / dof)
 
 
-def binomial_interval(count: Any, draws: Any, confidence: float = 0.95) -> tuple[Array, Array]:
+def binomial_interval(count: Any, draws: Any, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
     """Exact interval of a share, Clopper & Pearson (1934), of ``count`` in ``draws``.
 
     Numbers or arrays that go together, whole or not; low and high have their shape. Where nothing is drawn: 0 and 1.

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.distribution import kolmogorov
 from consistency.diagnostics.landmarks import POSE
 from consistency.diagnostics.questions import JOINT, JOINT_DISTRIBUTION
 from consistency.diagnostics.records import JointNees, JointScore, Settings
 from consistency.diagnostics.scale import ratio_interval
-from consistency.diagnostics.scaling import INTERVAL
 from consistency.types import Array, Indices
 
 SURE = 0.04  # false-alarm rate of naming a landmark that does not stand out
@@ -56,9 +56,9 @@ def joint_test(
             p_values[JOINT_DISTRIBUTION] = kolmogorov(stats.chi2.cdf(q, d))[1]
     least = int(d.min()) if len(d) else 2 * POSE
     score = JointScore(
-        both=ratio_interval(q / d, least, INTERVAL),
-        pose=ratio_interval(joint.pose[kept] / POSE, POSE, INTERVAL),
-        map=ratio_interval(joint.map[kept] / joint.dof[kept], least - POSE, INTERVAL),
+        both=ratio_interval(q / d, least, CONFIDENCE),
+        pose=ratio_interval(joint.pose[kept] / POSE, POSE, CONFIDENCE),
+        map=ratio_interval(joint.map[kept] / joint.dof[kept], least - POSE, CONFIDENCE),
         runs=len(q),
         dof=D,
         chief=_chief(joint, landmarks),

@@ -13,6 +13,7 @@ from consistency.diagnostics.bias import hotelling
 from consistency.diagnostics.blocks import blocks, by_runs
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.questions import BIAS, SCALE, SHAPE, STEP
 from consistency.diagnostics.records import (
@@ -29,7 +30,7 @@ from consistency.diagnostics.records import (
 )  # fmt: skip
 from consistency.diagnostics.sample import ATTITUDE, POSITION, Errors, Sample
 from consistency.diagnostics.scale import ratio_interval, run_means
-from consistency.diagnostics.scaling import INTERVAL, pointwise_band
+from consistency.diagnostics.scaling import pointwise_band
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.whitening import mean_of_runs, standardise
 from consistency.types import Array, Indices
@@ -86,7 +87,7 @@ def _absent_before(sample: Sample, first: int, sign: int) -> bool:
     if len(early) < FEWEST or not early.mean() > 0 or not late.mean() > 0:
         return False
     error = float(early.std(ddof=1) / (early.mean() * np.sqrt(len(early))))
-    upper = sign * np.log(early.mean()) + float(stats.t.isf(1.0 - INTERVAL, len(early) - 1)) * error
+    upper = sign * np.log(early.mean()) + float(stats.t.isf(1.0 - CONFIDENCE, len(early) - 1)) * error
     return bool(upper < 0.5 * sign * np.log(late.mean()))
 
 
@@ -112,7 +113,7 @@ def until(sample: Sample, band: Band, detect: float) -> Until | None:
         error = float((b / b.mean() - 0.5 * a / a.mean()).std(ddof=1))
         if left + bar * error >= 0.0 or (band.above if sign > 0 else band.below)[end:].any():
             continue
-        rest = ratio_interval(b, sample.dof, INTERVAL)
+        rest = ratio_interval(b, sample.dof, CONFIDENCE)
         if rest.holds(1.0) or (rest.low >= 1.0 / detect and rest.high <= detect):
             return Until(int(end), float(a.mean()), rest)
     return None
@@ -169,7 +170,7 @@ def _stands_out(own: Array, others: Array, axes: int) -> bool:
 def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
     """Inflation of each component and group, since the fault began."""
     errors = _errors(sample)
-    late, confidence = _late(location), 1.0 - (1.0 - INTERVAL) / len(errors.groups)
+    late, confidence = _late(location), 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
     inflation = {
         key: ratio_interval(sample.group_means(index, late), len(index), confidence)
         for key, index in errors.groups.items()
@@ -188,11 +189,11 @@ def bias_of(sample: Sample, tests: Tests, location: Location, answers: Answers) 
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     by_axis = {}
     if len(of_runs) > sample.dof:
-        test = hotelling(of_runs, INTERVAL)
+        test = hotelling(of_runs, CONFIDENCE)
         by_axis = {a: Interval(test.mean[i], *test.interval[i]) for i, a in enumerate(errors.names)}
     if not _any(answers, BIAS):
         return Bias(by_axis, tests.bias_step, None, None, None)
-    without = ratio_interval(sample.centred_means(late), sample.dof, INTERVAL)
+    without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
     return Bias(by_axis, tests.bias_step, *_axis_in_step(sample, tests.bias_step), without)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special, stats
 
+from consistency.diagnostics.defaults import CONFIDENCE, FALSE_ALARM, POWER
 from consistency.diagnostics.questions import MAIN, SHARES
 from consistency.diagnostics.scale import FEW, scale_test
 from consistency.types import Array
@@ -16,7 +17,7 @@ MARGIN = 1.15  # on the runs of a pilot's plan, measured: it then keeps its powe
 
 
 def required_runs(
-    dof: float, ratio: float, false_alarm: float = 0.05, power: float = 0.95, two_sided: bool = True
+    dof: float, ratio: float, false_alarm: float = FALSE_ALARM, power: float = POWER, two_sided: bool = True
 ) -> int:
     """Runs that find a covariance wrong by ``ratio`` with ``power`` in the average NEES of one step.
 
@@ -54,8 +55,8 @@ def required_runs(
 def gate_runs(
     dof: int,
     detect: float,
-    false_alarm: float = 0.05,
-    power: float = 0.95,
+    false_alarm: float = FALSE_ALARM,
+    power: float = POWER,
     allow: str | None = None,
     lost: float | None = None,
 ) -> int:
@@ -69,12 +70,12 @@ def gate_runs(
     return runs if lost is None else max(runs, lost_runs(lost, power))
 
 
-def share_limit(lost: int, runs: int, confidence: float = 0.95) -> float:
+def share_limit(lost: int, runs: int, confidence: float = CONFIDENCE) -> float:
     """Upper limit of the share of lost runs, where ``lost`` of ``runs`` are (Clopper & Pearson 1934)."""
     return float(special.betaincinv(lost + 1, runs - lost, confidence)) if lost < runs else 1.0
 
 
-def lost_runs(share: float, power: float = 0.95, lost: int = 0) -> int:
+def lost_runs(share: float, power: float = POWER, lost: int = 0) -> int:
     """Runs with ``lost`` lost ones among them whose Clopper-Pearson limit is ``share`` at most: 59 for 0.05 and none.
 
     Raises
@@ -109,8 +110,8 @@ def pilot_plan(
     dof: int,
     steps: int,
     detect: float,
-    false_alarm: float = 0.05,
-    power: float = 0.95,
+    false_alarm: float = FALSE_ALARM,
+    power: float = POWER,
     allow: str | None = None,
     lost: float | None = None,
 ) -> PilotPlan:
@@ -142,7 +143,7 @@ def pilot_plan(
     return PilotPlan(len(means), test.effective_dof, float(np.sqrt(2.0 / test.spread)), runs)
 
 
-def power_of(dof: float, runs: int, ratio: float, false_alarm: float = 0.05, two_sided: bool = True) -> float:
+def power_of(dof: float, runs: int, ratio: float, false_alarm: float = FALSE_ALARM, two_sided: bool = True) -> float:
     """Chance that ``runs`` runs find a covariance wrong by ``ratio``; the complement of :func:`required_runs`."""
     tail, k = false_alarm / (2 if two_sided else 1), dof * runs
     if ratio > 1.0:
@@ -151,7 +152,7 @@ def power_of(dof: float, runs: int, ratio: float, false_alarm: float = 0.05, two
 
 
 def detectable_ratio(
-    dof: int, runs: int, false_alarm: float = 0.05, power: float = 0.95, two_sided: bool = True
+    dof: int, runs: int, false_alarm: float = FALSE_ALARM, power: float = POWER, two_sided: bool = True
 ) -> float:
     """Smallest ratio of true to stated covariance that ``runs`` runs find with ``power``."""
     _require(dof, false_alarm, power)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics.ends import EarlyEnds
 from consistency.diagnostics.skipping import Skipped
 from consistency.diagnostics.symmetric import Symmetric
@@ -93,9 +94,9 @@ class Settings:
         A value out of its range.
     """
 
-    false_alarm: float = 0.05  # chance to find a fault in a right filter, all questions together
-    detect: float = 1.5  # consistent: the ratio of true to stated covariance is shown to be in [1 / detect, detect]
-    power: float = 0.95  # a filter at either end is not called consistent, with this probability or more
+    false_alarm: float = FALSE_ALARM  # chance to find a fault in a right filter, all questions together
+    detect: float = DETECT  # consistent: the ratio of true to stated covariance is shown to be in [1 / detect, detect]
+    power: float = POWER  # a filter at either end is not called consistent, with this probability or more
     tolerance: float | None = None  # a ratio shown to lie in [1 / tolerance, tolerance] is no fault
     allow: str | None = None  # "conservative": a covariance that is too large is no fault
     method: str = "max"  # of the band over all steps: "max" or "bonferroni"

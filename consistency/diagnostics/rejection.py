@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.intervals import binomial_interval
 from consistency.diagnostics.records import Interval, RejectionScore
 from consistency.types import Array, Indices
@@ -24,7 +25,7 @@ def rejection_score(offered: Indices, spurious: Indices, rejected: Indices, hits
     )  # fmt: skip
 
 
-def clustered_share(count: Array, size: Array, confidence: float = 0.95) -> Interval:
+def clustered_share(count: Array, size: Array, confidence: float = CONFIDENCE) -> Interval:
     """Share of ``size`` (N,) that is counted in ``count`` (N,), pooled over N independent clusters, and its interval.
 
     Korn & Graubard (1998): the exact binomial interval of Clopper & Pearson at the effective number of draws, which is

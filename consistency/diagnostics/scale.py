@@ -8,6 +8,7 @@ import numpy as np
 from scipy import special, stats
 
 from consistency.diagnostics.blocks import by_runs, by_steps
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.records import Interval
 from consistency.types import Array
 
@@ -136,7 +137,7 @@ def acceptance(test: MeanTest, dof: int, false_alarm: float, allow: str | None =
     return low, float(stats.chi2.isf(stats.norm.sf(z), k)) * dof / k
 
 
-def ratio_interval(means: Array, dof: int = 1, confidence: float = 0.95) -> Interval:
+def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -> Interval:
     """Ratio of true to stated covariance (1 is right) and its interval, from the runs' mean NEES over dof (runs,).
 
     From 20 runs on the spread between the runs is taken as it is, so that neither dependence between steps nor heavy

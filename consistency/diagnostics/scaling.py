@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.diagnostics.asking import Tests
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.intervals import anees_interval
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.planning import detectable_ratio
@@ -15,7 +16,6 @@ from consistency.diagnostics.scale import acceptance, ratio_interval
 from consistency.diagnostics.within import within
 from consistency.types import Array, Indices
 
-INTERVAL = 0.95  # confidence of the intervals that are reported and not judged
 NOTHING = (float("nan"), float("nan"))
 
 
@@ -37,7 +37,7 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
         mean_anees=tests.main.ratio * dof,
         accepted=acceptance(tests.main, dof, rate, settings.allow),
         effective_dof=tests.main.effective_dof,
-        inflation=ratio_interval(late, dof, INTERVAL),
+        inflation=ratio_interval(late, dof, CONFIDENCE),
         detectable=detectable_ratio(dof, len(means), rate, two_sided=not settings.one_sided) if some else np.nan,
         median_run=float(np.median(means)) * dof if some else np.nan,
         worst_run=float(means.max()) * dof if some else np.nan,
@@ -49,5 +49,5 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
 
 def pointwise_band(alive: Indices, dof: int) -> Array:
     """95 % interval of the ANEES of each step by itself, (steps,) -> (steps, 2); NaN without a run."""
-    intervals = {int(m): anees_interval(dof, int(m), INTERVAL) for m in set(alive[alive > 0])}
+    intervals = {int(m): anees_interval(dof, int(m), CONFIDENCE) for m in set(alive[alive > 0])}
     return np.array([intervals.get(int(m), NOTHING) for m in alive]).reshape(-1, 2)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import takewhile
 
+from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics.eprocess import e_process, ever
 from consistency.diagnostics.questions import MAIN, SHARES
 from consistency.diagnostics.records import Evidence, Settings, Verdict
@@ -26,9 +27,9 @@ class Design:
     """
 
     dof: int
-    detect: float = 1.5
-    false_alarm: float = 0.05  # of all looks together
-    power: float = 0.95
+    detect: float = DETECT
+    false_alarm: float = FALSE_ALARM  # of all looks together
+    power: float = POWER
     max_runs: int | None = None  # what is open then is undecided
     lost: float | None = None  # see :class:`Settings`
 
@@ -107,9 +108,9 @@ def follow(design: Design, evidence_of: Callable[[int], Evidence], limit: int | 
 
 def sequential_design(
     dof: int,
-    detect: float = 1.5,
-    false_alarm: float = 0.05,
-    power: float = 0.95,
+    detect: float = DETECT,
+    false_alarm: float = FALSE_ALARM,
+    power: float = POWER,
     max_runs: int | None = None,
     lost: float | None = None,
 ) -> Design:

@@ -10,6 +10,7 @@ import numpy as np
 from consistency.diagnostics import wording
 from consistency.diagnostics.asking import Tests, ask
 from consistency.diagnostics.band import simultaneous_band
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.ends import early_ends
 from consistency.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.diagnostics.headline import at_share, status_of
@@ -30,7 +31,7 @@ from consistency.diagnostics.questions import (
 from consistency.diagnostics.records import Answer, Equivalence, Evidence, Innovations, Settings, Verdict
 from consistency.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.diagnostics.sample import shape_of as shape_of_arrays
-from consistency.diagnostics.scaling import INTERVAL, scale_of
+from consistency.diagnostics.scaling import scale_of
 from consistency.diagnostics.whitening import entries
 
 DEFAULT = Settings()
@@ -121,7 +122,7 @@ def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | 
     if nis_and_dof is None:
         return None, {}
     test = nis_test(*nis_and_dof)
-    low_high = chi2_mean_interval(test.dof, INTERVAL) if test.dof else (float("nan"), float("nan"))
+    low_high = chi2_mean_interval(test.dof, CONFIDENCE) if test.dof else (float("nan"), float("nan"))
     if evidence.innovations is not None and evidence.innovation_covariances is not None:
         white = whiteness(evidence.innovations, evidence.innovation_covariances)
     else:

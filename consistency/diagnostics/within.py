@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special, stats
 
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.equivalence import deciding_runs
 from consistency.diagnostics.planning import MARGIN
 from consistency.diagnostics.records import Interval, Settings, Within
@@ -17,7 +18,7 @@ APART = 10.0  # correlation times in a piece of a log that stands as a run
 MOST = 50  # pieces; more gain nothing
 
 
-def within(nees: Array, dof: int, settings: Settings, factor: float, confidence: float = 0.95) -> Within | None:
+def within(nees: Array, dof: int, settings: Settings, factor: float, confidence: float = CONFIDENCE) -> Within | None:
     """Ratio of true to stated covariance of one log, with an interval from how its NEES decorrelates.
 
     The mean of T values Y_k = NEES_k / dof has the variance s^2 tau / T with the integrated autocorrelation time tau,

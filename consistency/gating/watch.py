@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from consistency.diagnostics.defaults import DETECT, GATE_FALSE_ALARM, POWER
 from consistency.gating.budget import in_place_rate
 
 # of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose
 DEFAULTS: dict[str, Any] = {
-    "dof": 3, "detect": 1.5, "false_alarm": 1e-3, "power": 0.95, "tolerance": None, "allow": None, "lost": None,
+    "dof": 3, "detect": DETECT, "false_alarm": GATE_FALSE_ALARM, "power": POWER, "tolerance": None,
+    "allow": None, "lost": None,
 }  # fmt: skip
 
 

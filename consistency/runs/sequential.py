@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from consistency.diagnostics import Design, Verdict, look, sequential_design, speaks
+from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.errors import InputError
 from consistency.protocols import Filter
 from consistency.reading.columns import POSE
@@ -29,9 +30,9 @@ def run_until_decided(
     scenario: Scenario,
     filters: Sequence[str | Filter],
     *,
-    detect: float = 1.5,
-    false_alarm: float = 0.05,
-    power: float = 0.95,
+    detect: float = DETECT,
+    false_alarm: float = FALSE_ALARM,
+    power: float = POWER,
     max_runs: int | None = None,
     lost: float | None = None,
     seed: int = 0,

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError, field_validator
 
 from consistency.diagnostics import Settings
+from consistency.diagnostics.defaults import DETECT, POWER
 from consistency.errors import InputError
 from consistency.filters import get_filter
 from consistency.reading import HUGE
@@ -35,8 +36,8 @@ class Rule(Table):
     """When a cell is decided; the keys are those of ``consistency run --until-decided``."""
 
     false_alarm: Positive = 0.01
-    detect: Positive = 1.5
-    power: Positive = 0.95
+    detect: Positive = DETECT
+    power: Positive = POWER
     max_runs: Count = 192
 
     @property

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.types import Array
 
-CONFIDENCE = 0.95
 UNITS = 20  # independent parts that an interval needs at least; fewer runs are cut into blocks of steps
 WEAK = 1.0  # curvature below which a log factor is hardly told: its standard deviation is then above a factor of e
 TRUSTED = 16.0  # curvature above which it holds as far as the ends: a standard deviation of a factor of 1.3

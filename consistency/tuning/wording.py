@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from consistency.diagnostics import Verdict
+from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.wording import short
 from consistency.scenario import Belief, scenario_text, toml_text
 from consistency.scenario.tables import SIGMA_UNITS
@@ -19,7 +20,6 @@ from consistency.store.storage import write_folder
 from consistency.tuning.fit import LIMIT
 from consistency.tuning.groups import sigma_by_channel
 from consistency.tuning.parts import with_belief
-from consistency.tuning.profile import CONFIDENCE
 from consistency.tuning.tune import Factor, Setting, Tuning
 
 TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}

@@ -9,10 +9,9 @@ import numpy as np
 
 from consistency.diagnostics import Comparison, compare
 from consistency.diagnostics.comparison import FailedRuns
+from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.errors import InputError
 from consistency.verdicts.baselines import Baseline
-
-DETECT = 1.5  # ratio that a sentence speaks of
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,9 @@ class Compared:
         elif not c.worse:
             text += f"; {self._limit}"
             if not c.at_most < np.log(DETECT):
-                text += f"; {c.needed_runs(DETECT)} runs find a covariance farther off by x{DETECT:g} with power 0.95"
+                text += (
+                    f"; {c.needed_runs(DETECT)} runs find a covariance farther off by x{DETECT:g} with power {POWER:g}"
+                )
         if any(self.failures):
             text += f"; failed runs {self.failures.a}, {self.failures.b} in the reference"
         return f"{text}. {self.note}".rstrip(". ") if self.note else text
@@ -65,7 +66,7 @@ class Compared:
         return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
 
 
-def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = 0.05) -> list[Compared]:
+def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = FALSE_ALARM) -> list[Compared]:
     """The first filter against each of the others, on the same trials."""
     names = list(filters) or list(base.filters)
     if len(names) < 2:
@@ -75,7 +76,9 @@ def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float =
     return [_compared(base, names[0], base, other, true_pairs=True, false_alarm=false_alarm) for other in names[1:]]
 
 
-def compare_with(new: Baseline, old: Baseline, filters: Sequence[str], false_alarm: float = 0.05) -> list[Compared]:
+def compare_with(
+    new: Baseline, old: Baseline, filters: Sequence[str], false_alarm: float = FALSE_ALARM
+) -> list[Compared]:
     """Each filter of ``new`` against the same in ``old``; run by run only where the trials are the same."""
     pairs = [(name, name) for name in filters or new.filters if filters or name in old.filters]
     if not pairs and len(new.filters) == len(old.filters) == 1:  # estimators that are named after their files

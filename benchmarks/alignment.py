@@ -202,7 +202,11 @@ def verdict(runs: Sequence[Poses], mode: str) -> Verdict:
 def evidence(found: Aligned, shift: float) -> Evidence:
     error = np.stack([p.errors(shift) for p in found.runs])
     return Evidence(
-        "bench", error, np.stack([p.covariance for p in found.runs]), reduced=found.reduced, spoilt=found.spoilt
+        "bench",
+        error,
+        np.stack([p.covariance for p in found.runs]),
+        reduced=found.reduced,
+        unavailable=found.unavailable,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.diagnostics.asking import Tests, ask
+from consistency.diagnostics.hypothesis_tests import Tests, ask
 from consistency.diagnostics.joint import JointTest
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.questions import (

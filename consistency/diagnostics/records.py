@@ -79,7 +79,7 @@ class Evidence:
     joint: JointNees | None = None  # of a map
     unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
     reduced: bool = False  # a fit to the truth may have made the errors smaller than the covariance says: no fault
-    spoilt: Collection[str] = ()  # questions that such a fit leaves no answer to, which are not asked
+    unavailable: Collection[str] = ()  # questions that such a fit leaves no answer to, which are not asked
     skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
     unseen: float = 0.0  # share of the NEES that such a fit may have taken: consistent is shown with it added
 

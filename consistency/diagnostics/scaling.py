@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.diagnostics.asking import Tests
 from consistency.diagnostics.defaults import CONFIDENCE
+from consistency.diagnostics.hypothesis_tests import Tests
 from consistency.diagnostics.intervals import anees_interval
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.planning import detectable_ratio

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.diagnostics import wording
-from consistency.diagnostics.asking import Tests, ask
 from consistency.diagnostics.band import simultaneous_band
 from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.ends import early_ends
 from consistency.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.diagnostics.headline import at_share, status_of
+from consistency.diagnostics.hypothesis_tests import Tests, ask
 from consistency.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
 from consistency.diagnostics.intervals import chi2_mean_interval
 from consistency.diagnostics.joint import joint_test, near
@@ -63,7 +63,7 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     Where a fit to the truth took of the errors (``Evidence.reduced``) what is not known, a covariance that is too large
     is no fault, as with ``allow="conservative"``; but consistent is shown on both sides, with the share of the NEES
     added that it may have taken at most (``Evidence.unseen``). Questions that it leaves no answer to
-    (``Evidence.spoilt``) are not asked.
+    (``Evidence.unavailable``) are not asked.
 
     A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
     pose and map together, where it is given.
@@ -85,7 +85,7 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     tests = None
     if sample is not None:
         tests = ask(sample, settings, p_values, look.scale if look else None)
-        p_values |= {q: p for q, p in tests.p_values.items() if q not in evidence.spoilt}
+        p_values |= {q: p for q, p in tests.p_values.items() if q not in evidence.unavailable}
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)

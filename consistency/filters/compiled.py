@@ -13,6 +13,8 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from consistency.errors import InputError
+from consistency.filters.covariance_update.local import LOCAL_FROM, Local
+from consistency.filters.covariance_update.parking import Parking
 from consistency.filters.guard.guarded import Guarded
 from consistency.filters.guard.parts import guard_part
 from consistency.filters.kernel.dispatch import fits, require_fitting
@@ -21,8 +23,6 @@ from consistency.filters.kernel.jit import Outlook
 from consistency.filters.kernel.loop import Outcome, trial_kernel
 from consistency.filters.kernel.slam import Data, Slam, landmark_width, robot_width
 from consistency.filters.plain_sensors import bias_at, sensor_noise
-from consistency.filters.upkeep.local import LOCAL_FROM, Local
-from consistency.filters.upkeep.parking import Parking
 from consistency.geometry.conventions import ADDITIVE
 from consistency.protocols import Problem, Truth
 from consistency.scenario import Belief, GuardSettings
@@ -176,13 +176,13 @@ class Compiled:
         halt = np.zeros(1, np.int64) if halt is None else halt
         data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks, halt)
         r, w = robot_width(slam.motion), landmark_width(slam.landmark)
-        slam = self._with_upkeep(slam, r + w * trial.n_landmarks)
+        slam = self._with_covariance_update(slam, r + w * trial.n_landmarks)
         if self.guard is not None:
             most = int(np.diff(first).max(initial=1))
             slam = slam._replace(guard=guard_part(self.guard, belief.guard or GuardSettings(), z.shape[1], most))
         return slam, data, r + w * len(np.unique(landmark))
 
-    def _with_upkeep(self, slam: Slam, most: int) -> Slam:
+    def _with_covariance_update(self, slam: Slam, most: int) -> Slam:
         """Local updating, which takes longer to compile, only in a world in which the state may grow so large."""
         if isinstance(slam.covariance, Parking):
             slam = slam._replace(covariance=slam.covariance._replace(start=self.local_from))

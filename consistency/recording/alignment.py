@@ -41,15 +41,20 @@ class Aligned:
     runs: Sequence[Poses]  # estimates moved; covariances those of the errors that are left
     mode: str = "none"
     notes: tuple[str, ...] = ()
-    face: str = ""  # what the verdict has to say of it
+    caption: str = ""  # what the verdict has to say of it
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
-    spoilt: tuple[str, ...] = ()  # questions that have no answer
+    unavailable: tuple[str, ...] = ()  # questions that have no answer
     unseen: float = 0.0  # share of the NEES that a frame may have taken without its being made up for
 
     def on(self, recording: Recording) -> Recording:
         """The recording of these runs, which says how they were aligned."""
         return replace(
-            recording, align=self.mode, face=self.face, reduced=self.reduced, spoilt=self.spoilt, unseen=self.unseen
+            recording,
+            align=self.mode,
+            caption=self.caption,
+            reduced=self.reduced,
+            unavailable=self.unavailable,
+            unseen=self.unseen,
         )
 
 
@@ -159,14 +164,16 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         note = (
             f"{name}: fewer than {ENOUGH} runs do not show what the frame takes of the errors; nothing makes up for it"
         )
-        return Aligned(runs, notes=(note,), face=f"{what}: {OF_RUNS}", reduced=True, spoilt=ALL_BUT_SCALE)
+        return Aligned(runs, notes=(note,), caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
     residuals = [found[i].whitened for i in some]
     left = left_covariances(residuals, bases, bool(for_all))
     if left.oscillating:
         most = f"at most about {100.0 * left.unseen:.2g} % of the NEES"
         note = f"{name}: the errors alternate or oscillate; nothing makes up for what the frame takes of them, {most}"
-        face = f"{what}: {OF_RUNS}, and {OSCILLATING} ({most})"
-        return Aligned(runs, notes=(note,), face=face, reduced=True, spoilt=ALL_BUT_SCALE, unseen=left.unseen)
+        caption = f"{what}: {OF_RUNS}, and {OSCILLATING} ({most})"
+        return Aligned(
+            runs, notes=(note,), caption=caption, reduced=True, unavailable=ALL_BUT_SCALE, unseen=left.unseen
+        )
     kept = [max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST) for M in left.covariances]
     factors = dict(zip(some, kept, strict=True))
     out = [replace(p, covariance=p.covariance * factors.get(i, 1.0)) for i, p in enumerate(runs)]
@@ -174,13 +181,13 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         f"{name}: the frame takes {100.0 * (1.0 - np.mean(kept)):.2g} % of the NEES of a right covariance, made up for"
     )
     if not for_all:
-        return Aligned(out, notes=(note,), face=f"{what}: {OF_RUNS}", reduced=True, spoilt=ALL_BUT_SCALE)
+        return Aligned(out, notes=(note,), caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
     added = len(some) * (max(float(np.linalg.eigvalsh(M)[:, -1].max()) for M in left.covariances) - 1.0)
     if added > COMMON:
-        return Aligned(out, notes=(note,), face=f"{what}: {OF_ALL}, nor are single steps", spoilt=(STEP, *BIAS))
+        return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}, nor are single steps", unavailable=(STEP, *BIAS))
     if inflation_of_mean(residuals, bases) > 1.0 + COMMON:
-        return Aligned(out, notes=(note,), face=f"{what}: {OF_ALL}, nor is a bias: {NO_MEAN}", spoilt=BIAS)
-    return Aligned(out, notes=(note,), face=f"{what}: {OF_ALL}")
+        return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}, nor is a bias: {NO_MEAN}", unavailable=BIAS)
+    return Aligned(out, notes=(note,), caption=f"{what}: {OF_ALL}")
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
@@ -189,13 +196,13 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
     every = np.concatenate(factors)
     larger = float(np.median(every)) if len(every) else 1.0
     if larger < 1.0 + SLIGHT:
-        return Aligned(out, face="aligned by origin: the error of the first pose of each run is not judged")
+        return Aligned(out, caption="aligned by origin: the error of the first pose of each run is not judged")
     note = (
         f"{name}: the first pose is not exact, and files do not say how its error is correlated with the others; "
         f"covariances are made {larger:.3g} times as large in the median, which holds whatever that is"
     )
-    face = "aligned by origin, whose first poses are not exact: a covariance that is too large is not judged"
-    return Aligned(out, notes=(note,), face=face, reduced=True, spoilt=(*BIAS, "outliers"))
+    caption = "aligned by origin, whose first poses are not exact: a covariance that is too large is not judged"
+    return Aligned(out, notes=(note,), caption=caption, reduced=True, unavailable=(*BIAS, "outliers"))
 
 
 # --- words --------------------------------------------------------------------------------------------------

@@ -45,9 +45,9 @@ class Recording:
     window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
     independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
     align: str = "none"  # how the estimates were moved into the world of the truth
-    face: str = ""  # what the verdict has to say of that
+    caption: str = ""  # what the verdict has to say of that
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
-    spoilt: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
+    unavailable: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
     unseen: float = 0.0  # share of the NEES that a fit to the truth may have taken without its being made up for
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
     times: Array | None = None  # (R, T), s, of the steps of each run, or of the beginnings of windows; None with one t

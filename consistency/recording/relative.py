@@ -170,9 +170,9 @@ def relative_recording(
     record = assemble(name, tracks, t, tuple(axes[i] for i in part), file, KIND, notes)
     if not relative.independent:
         return replace(record, window=relative.text)
-    face = f"the {_whose(relative)} do not seem to be independent, on which this rests" if of.doubtful else ""
+    caption = f"the {_whose(relative)} do not seem to be independent, on which this rests" if of.doubtful else ""
     unshown = _too_few(of, relative)
-    return replace(record, window=relative.text, independent=True, face=face, unshown=unshown)
+    return replace(record, window=relative.text, independent=True, caption=caption, unshown=unshown)
 
 
 def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention: str, relative: Relative) -> list[str]:

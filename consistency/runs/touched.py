@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.filters.covariance_update.local import Local, count, count_settling, is_due, may_split, start_counting
+from consistency.filters.covariance_update.parking import WORTH, Parking
 from consistency.filters.kernel.local_state import Factors, make_factors
 from consistency.filters.kernel.slam import (
     Data,
@@ -20,8 +22,6 @@ from consistency.filters.kernel.slam import (
     observed_width,
     robot_width,
 )
-from consistency.filters.upkeep.local import Local, count, count_settling, is_due, may_split, start_counting
-from consistency.filters.upkeep.parking import WORTH, Parking
 
 NUMBER = 8  # bytes
 PAGE = 4096 // NUMBER  # numbers of a page, the least that is taken at a time

@@ -40,14 +40,14 @@ def analyse_recordings(
         else:
             evidence = Evidence(
                 name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
-                failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, spoilt=r.spoilt,
+                failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, unavailable=r.unavailable,
                 skipped=r.skipped, unseen=r.unseen,
             )  # fmt: skip
         verdict = _unshown(judge(evidence, settings), r.unshown)
         first, *rest = verdict.reasons
         verdicts[name] = replace(
             verdict,
-            reasons=(f"{first}; {r.face}" if r.face else first, *rest, *_other_ways(verdict, r)),
+            reasons=(f"{first}; {r.caption}" if r.caption else first, *rest, *_other_ways(verdict, r)),
             convention=r.convention or None,
             align=r.align if r.convention else None,
             notes=tuple(r.notes),
@@ -95,5 +95,5 @@ def evidence_of_windows(r: Recording) -> Evidence:
     return Evidence(
         r.name, r.error[there][:, None], r.covariance[there][:, None], r.nees[there][:, None], r.dof,
         failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures), axes=r.axes,
-        run_numbers=number[there], unit="window", spoilt=tuple(SHARES) if r.unshown else (), skipped=r.skipped,
+        run_numbers=number[there], unit="window", unavailable=tuple(SHARES) if r.unshown else (), skipped=r.skipped,
     )  # fmt: skip

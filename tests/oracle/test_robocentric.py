@@ -13,14 +13,14 @@ from scipy.stats import truncnorm
 import consistency as cs
 from consistency.filters import centred, plain
 from consistency.filters.compiled import problem_of
+from consistency.filters.covariance_update.parking import Parking, _is_worth_it, make_clones, unpark
 from consistency.filters.kernel.slam import State
 from consistency.filters.methods import robocentric as rc
 from consistency.filters.sensor.conversion import Pixels
 from consistency.filters.sensor.growth import Growth
 from consistency.filters.stepping import step_through
-from consistency.filters.update.charting import aim_chained, cast_columns, cast_rows, unchain
 from consistency.filters.update.converting import Converting, converting_room
-from consistency.filters.upkeep.parking import Parking, _is_worth_it, make_clones, unpark
+from consistency.filters.update.retraction_chain import aim_chained, cast_columns, cast_rows, unchain
 from consistency.types import Array
 
 Small = Callable[..., cs.Scenario]

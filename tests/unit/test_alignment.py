@@ -158,7 +158,7 @@ def test_only_judged_axes_decide(rng: np.random.Generator) -> None:
     away = moved(replace(p, covariance=P), WORLD["yaw"])
     found = aligned("est", [away], "posyaw", [0, 1, 5])
     np.testing.assert_allclose(found.runs[0].errors()[:, [0, 1, 5]], 0.0, atol=1e-8)
-    assert "a frame of 3 degrees of freedom" in found.face
+    assert "a frame of 3 degrees of freedom" in found.caption
 
 
 def test_broken_estimates_do_not_move_the_others(rng: np.random.Generator) -> None:
@@ -379,18 +379,18 @@ def test_nothing_makes_up_for_a_frame_of_runs_that_oscillate(rng: np.random.Gene
     for back, p in zip(found.runs, runs, strict=True):
         np.testing.assert_allclose(np.linalg.det(back.covariance), np.linalg.det(p.covariance), rtol=1e-9)
     assert found.reduced
-    assert found.spoilt == ALL_BUT_SCALE
+    assert found.unavailable == ALL_BUT_SCALE
     assert 0.3 < found.unseen < 0.6  # half of the NEES of a wave, and a little more where noise makes it so
     assert "the errors alternate or oscillate; nothing makes up" in found.notes[1]
-    assert f"at most about {100 * found.unseen:.2g} % of the NEES)" in found.face
+    assert f"at most about {100 * found.unseen:.2g} % of the NEES)" in found.caption
 
 
 def test_a_frame_of_all_runs_leaves_no_bias_of_errors_that_cancel(rng: np.random.Generator) -> None:
     found = aligned("est", with_waves(rng, 24, 20), "posyaw-all", range(3))
-    assert found.spoilt == BIAS
-    assert "nor is a bias: the errors cancel over each run" in found.face
+    assert found.unavailable == BIAS
+    assert "nor is a bias: the errors cancel over each run" in found.caption
     white = aligned("est", [run_of(rng, "planar", "so2", steps=20) for _ in range(24)], "posyaw-all", range(3))
-    assert white.spoilt == ()  # its ratio of 0.7 to 1.1 stays below 1.25
+    assert white.unavailable == ()  # its ratio of 0.7 to 1.1 stays below 1.25
     assert white.unseen == 0.0
 
 
@@ -398,7 +398,7 @@ def test_what_a_frame_may_have_taken_is_added_before_consistent_is_said(rng: np.
     """60 runs of 20 steps know their ratio to 3 %: within 1.5 with a tenth added, and not with 0.4 added."""
     error, P = rng.normal(size=(60, 20, 3)), np.broadcast_to(np.eye(3), (60, 20, 3, 3))
     for unseen, status in ((0.0, "consistent"), (0.1, "consistent"), (0.4, "undecided"), (1.0, "undecided")):
-        v = judge(Evidence("f", error, P, reduced=True, spoilt=ALL_BUT_SCALE, unseen=unseen), Settings(1e-6))
+        v = judge(Evidence("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE, unseen=unseen), Settings(1e-6))
         assert v.status == status
         assert "would probably decide" not in v.reasons[0]
     means = np.square(error).mean(axis=(1, 2))
@@ -546,7 +546,7 @@ def test_questions_without_an_answer_are_not_asked(rng: np.random.Generator) -> 
     P = np.broadcast_to(np.eye(3), (30, 20, 3, 3))
     every = judge(Evidence("f", error, P))
     assert "bias in some step" in every.faults
-    some = judge(Evidence("f", error, P, reduced=True, spoilt=ALL_BUT_SCALE))
+    some = judge(Evidence("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE))
     assert {a.question for a in some.answers} == {"scale"}
     low = judge(Evidence("f", 0.3 * rng.normal(size=(30, 20, 3)), P, reduced=True))
     assert low.status == "undecided"
@@ -560,7 +560,7 @@ def test_where_the_scale_is_asked_alone_it_has_the_whole_rate(rng: np.random.Gen
     P = np.broadcast_to(np.eye(3), (40, 10, 3, 3))
     w = rng.normal(size=(40, 10, 3))
     for ratio in np.linspace(0.9, 1.5, 120):
-        v = judge(Evidence("f", np.sqrt(ratio) * w, P, reduced=True, spoilt=ALL_BUT_SCALE), Settings())
+        v = judge(Evidence("f", np.sqrt(ratio) * w, P, reduced=True, unavailable=ALL_BUT_SCALE), Settings())
         (answer,) = v.answers
         if 0.026 < answer.p_value < 0.049:
             assert v.status == "overconfident"

@@ -17,7 +17,7 @@ from consistency.runs.backends import remote
 from consistency.runs.backends.batches import Batch, Batches, Event, Lost, failed, in_batches
 from consistency.runs.backends.choosing import backend_for
 from consistency.runs.backends.local import Local
-from consistency.runs.backends.remote import Desk, Part, pickled_work
+from consistency.runs.backends.remote import Part, Worker, pickled_work
 from consistency.runs.isolating import Isolation
 from consistency.runs.montecarlo import Interrupted
 from consistency.runs.work import Outcomes, Simulated, Work
@@ -240,12 +240,12 @@ def test_differing_machines_are_said_once(work: Work, capsys: pytest.CaptureFixt
 def test_a_desk_does_what_local_workers_do(linear: cs.Scenario) -> None:
     work = Work(Simulated(linear, 5), Isolation([Still("still"), cs.get_filter("kf")], linear.belief))
     expected = {outcome.run: outcome for outcome in Local(1).outcomes(work, range(4))}
-    desk = Desk(pickled_work(work))
+    worker = Worker(pickled_work(work))
     try:
-        whole = list(desk.parts([3, 1], 1000.0))
-        each = list(desk.parts([0, 2], 0.0))
+        whole = list(worker.parts([3, 1], 1000.0))
+        each = list(worker.parts([0, 2], 0.0))
     finally:
-        desk.close()
+        worker.close()
     assert [[outcome.run for outcome in part.outcomes()] for part in whole + each] == [[3, 1], [0], [2]]
     for outcome in (outcome for part in whole + each for outcome in part.outcomes()):
         assert outcome.machine == remote.this_machine()
@@ -262,11 +262,11 @@ def test_bad_input_ends_a_desk(linear: cs.Scenario, monkeypatch: pytest.MonkeyPa
         return Outcome(run, {}, None, ())
 
     monkeypatch.setattr(Work, "__call__", refuse)
-    desk = Desk(pickled_work(Work(Simulated(linear, 0), Isolation([Still("still")], linear.belief))))
-    (part,) = desk.parts([0, 1, 2, 3], 1000.0)
+    worker = Worker(pickled_work(Work(Simulated(linear, 0), Isolation([Still("still")], linear.belief))))
+    (part,) = worker.parts([0, 1, 2, 3], 1000.0)
     assert [outcome.run for outcome in part.outcomes()] == [0, 1]
     assert part.refusal == "no"
-    (part,) = desk.parts([2], 1000.0)
+    (part,) = worker.parts([2], 1000.0)
     assert (part.outcomes(), part.refusal) == ([], "no")
 
 

@@ -9,11 +9,11 @@ import pytest
 
 import consistency as cs
 from consistency.filters.compiled import problem_of
+from consistency.filters.covariance_update.local import Local
 from consistency.filters.kernel.dispatch import fits, generic, implement, part, require_fitting
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.methods.riekf import RightInvariant
 from consistency.filters.update.unscented import Unscented
-from consistency.filters.upkeep.local import Local
 
 
 @part()

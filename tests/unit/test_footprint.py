@@ -11,11 +11,11 @@ import pytest
 import consistency as cs
 from consistency.errors import InputError
 from consistency.filters.compiled import Compiled
+from consistency.filters.covariance_update.local import Local as Locally
+from consistency.filters.covariance_update.parking import Parking
 from consistency.filters.kernel.local_state import make_factors
 from consistency.filters.kernel.loop import _make_memory
 from consistency.filters.kernel.slam import Data, Slam, make_local
-from consistency.filters.upkeep.local import Local as Locally
-from consistency.filters.upkeep.parking import Parking
 from consistency.runs import footprint as module
 from consistency.runs import touched
 from consistency.runs.backends.local import Local

@@ -94,12 +94,12 @@ print(hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest())
 
 
 def test_lent_arrays_live_as_long_as_the_trial() -> None:
-    """What the loop lends it uses to the end; and a C library that overwrites what is freed changes no bit."""
+    """The loop uses what it passes by reference to the end; a C library that overwrites freed memory changes no bit."""
     source = inspect.getsource(trial_kernel.function)
-    lent = re.findall(r"\blend\((\w+)\)", source)
-    assert len(lent) == 7
+    passed = re.findall(r"\bby_reference\((\w+)\)", source)
+    assert len(passed) == 7
     end = source[source.index(" keep(") :]
-    assert [name for name in lent if not re.search(rf"\b{name}\b", end)] == []
+    assert [name for name in passed if not re.search(rf"\b{name}\b", end)] == []
     found = []
     for byte in ("0", "170"):
         environment = os.environ | {"MALLOC_PERTURB_": byte}

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from consistency.filters.covariance_update.dense import Dense
 from consistency.filters.error.additive import Additive
 from consistency.filters.kernel.measuring import linearise, linearise_at, observe, place_observed
 from consistency.filters.kernel.slam import Slam, State, robot_frame
@@ -21,7 +22,6 @@ from consistency.filters.plain_sensors import PointSensor, sensor_noise
 from consistency.filters.point.at_estimate import AtEstimate
 from consistency.filters.point.reference import Reference, place_about_reference
 from consistency.filters.update.joint import Joint
-from consistency.filters.upkeep.dense import Dense
 from consistency.models import motion, point, stereo
 from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.types import Array, Control

@@ -13,7 +13,7 @@ import pytest
 import consistency as cs
 from consistency.diagnostics import map_score
 from consistency.filters import PLANAR
-from consistency.filters.kernel.slam import locate, locate_jacobian, measure, measure_jacobian, unwind
+from consistency.filters.kernel.slam import locate, locate_jacobian, measure, measure_jacobian, wrap_residual
 from consistency.filters.parts import sensor_of
 from consistency.filters.stepping import step_through
 from consistency.models import planar
@@ -64,10 +64,10 @@ def test_a_sensor_locates_what_it_measures(world: str) -> None:
 def test_a_bearing_is_taken_by_the_shorter_way_round() -> None:
     sensor = sensor_of(cs.load_scenario("range-bearing").belief, uvd=False)
     z = np.array([2.0, 3.1])
-    unwind(sensor, z, np.array([5.0, -3.1]))
+    wrap_residual(sensor, z, np.array([5.0, -3.1]))
     assert np.allclose(z, [2.0, 3.1 - 2.0 * np.pi], rtol=0, atol=1e-15)
     lengths = np.array([2.0, 3.1])
-    unwind(sensor_of(cs.load_scenario("esde-xy").belief, uvd=False), lengths, np.array([5.0, -3.1]))
+    wrap_residual(sensor_of(cs.load_scenario("esde-xy").belief, uvd=False), lengths, np.array([5.0, -3.1]))
     assert lengths.tolist() == [2.0, 3.1]
 
 

@@ -376,7 +376,7 @@ def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng: np.random.Ge
     verdict = analyse_recordings([record])["log"]
     assert verdict.reasons[0].endswith("the motions do not seem to be independent, on which this rests")
     plain_one = recorded([motion_stretch(drive(rng, "SE(2)", 19))], "1", True)
-    assert (plain_one.face, plain_one.unshown) == ("", "")
+    assert (plain_one.caption, plain_one.unshown) == ("", "")
 
 
 def test_windows_too_wide_for_first_order_are_named(rng: np.random.Generator) -> None:

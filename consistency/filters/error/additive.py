@@ -11,7 +11,6 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     add_motion_noise,
-    carry_at,
     expands,
     insert_error,
     motion_point,
@@ -19,6 +18,7 @@ from consistency.filters.kernel.slam import (
     move_about,
     pose_covariance,
     propagate,
+    propagate_covariance_at,
     retract,
     robot_width,
     to_error,
@@ -39,7 +39,7 @@ def propagate_additive(
     """One step of motion, eq. 9 and 10: x <- f(x) and P <- F P F' + G Q G' in the robot's rows."""
     pose = state.x[: robot_width(slam.motion)]
     at = motion_point(slam.point, pose, k)
-    carry_at(slam.point, slam, state, k, u, Phi, work)
+    propagate_covariance_at(slam.point, slam, state, k, u, Phi, work)
     add_motion_noise(slam.motion, at, u, state.P)
     if expands(slam.point):
         move_about(slam.motion, at, u, pose)

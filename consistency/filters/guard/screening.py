@@ -12,9 +12,9 @@ from consistency.filters.kernel.slam import (
     Data,
     Slam,
     State,
-    foresee,
     keep_some,
     observed_width,
+    predict_innovation,
     withhold,
 )
 from consistency.filters.kernel.work import Work
@@ -87,7 +87,7 @@ def screen_known(
     withhold(slam.covariance, state, data, k, watch.rejected, watch.anew, local)
     if m == 0:
         return 0, 0, False
-    code, _ = foresee(slam.update, slam, state, data, k, m, local, work)
+    code, _ = predict_innovation(slam.update, slam, state, data, k, m, local, work)
     if code > 0:
         return code, m, False
     s = observed_width(slam.sensor)

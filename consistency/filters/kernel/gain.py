@@ -17,13 +17,13 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     combine,
-    foresee,
     landmark_width,
     observed_width,
+    predict_innovation,
     retract,
     robot_width,
     to_error,
-    unwind,
+    wrap_residual,
 )
 from consistency.filters.kernel.work import Work
 from consistency.types import Array
@@ -91,7 +91,7 @@ def innovate(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple
     y = work.A[: s * m, state.n + state.base]
     for i in range(m):
         measured, expected = data.z[work.known[i]], work.zhat[s * i : s * i + s]
-        unwind(slam.sensor, expected, measured)
+        wrap_residual(slam.sensor, expected, measured)
         for a in range(s):
             y[s * i + a] = measured[a] - expected[a]
     return y
@@ -105,14 +105,14 @@ def correct_at_once(
     data: Data,
     k: int,
     m: int,
-    is_foreseen: bool,
+    has_innovation: bool,
     local: Factors,
     work: Work[NamedTuple],
 ) -> tuple[int, float, float]:
-    """The update of a filter that does not iterate: it is led by what :func:`foresee` leaves in ``work``."""
+    """The update of a filter that does not iterate: it is led by what :func:`predict_innovation` leaves in ``work``."""
     code, total = 0, 0.0
-    if not is_foreseen:
-        code, total = foresee(update, slam, state, data, k, m, local, work)
+    if not has_innovation:
+        code, total = predict_innovation(update, slam, state, data, k, m, local, work)
     if code > 0:
         return code, np.nan, np.nan
     code, nis, log_det = divide_by_root(state, observed_width(slam.sensor) * m, work, total)

@@ -1,4 +1,4 @@
-"""What local updating carries beside the state, see :mod:`consistency.filters.upkeep.local`."""
+"""What local updating carries beside the state, see :mod:`consistency.filters.covariance_update.local`."""
 
 from __future__ import annotations
 

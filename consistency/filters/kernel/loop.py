@@ -19,10 +19,10 @@ from consistency.filters.kernel.arrays import (
     matrix,
     sum_of,
 )
+from consistency.filters.kernel.by_reference import by_reference, keep
 from consistency.filters.kernel.covariance import begin_landmark
 from consistency.filters.kernel.gain import HALTED, NOT_FINITE, POSE
 from consistency.filters.kernel.jit import Kernel, inner
-from consistency.filters.kernel.lending import keep, lend
 from consistency.filters.kernel.linalg import definiteness_with
 from consistency.filters.kernel.slam import (
     Data,
@@ -111,11 +111,11 @@ def _step(
     """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, the NIS, and log det S."""
     predict(slam.update, slam, state, k, data.controls[k], local, work)
     m, nis, log_det = _find_known(data, k, state.offset, work), np.nan, np.nan
-    code, m, is_foreseen = screen(slam.guard, slam, state, data, k, m, local, work, watch)
+    code, m, has_innovation = screen(slam.guard, slam, state, data, k, m, local, work, watch)
     if code > 0:
         return state, code, 0, nis, log_det
     if m > 0:
-        code, nis, log_det = correct(slam.update, slam, state, data, k, m, is_foreseen, local, work)
+        code, nis, log_det = correct(slam.update, slam, state, data, k, m, has_innovation, local, work)
         if code > 0:
             return state, code, 0, nis, log_det
     state = _insert_new(slam, state, data, k, local, work, watch)
@@ -275,7 +275,7 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     The loop stands here, not in a function of its own: compiling such a function a second time, as a part of this one,
     would take a tenth of the whole.
     """
-    slam, data = lend(own_slam), lend(own_data)
+    slam, data = by_reference(own_slam), by_reference(own_data)
     T, r, w = len(data.controls), robot_width(slam.motion), landmark_width(slam.landmark)
     size += spare_width(slam.covariance, T, data.n_landmarks)
     own_memory, own_out = _make_memory(size, data.n_landmarks), _empty_outcome(T, r, data.n_landmarks)
@@ -284,8 +284,13 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     own_watch = make_watch(
         slam.guard, observed_width(slam.sensor), _most_seen(data.first), len(data.landmark), data.n_landmarks
     )
-    memory, work, local, out = lend(own_memory), lend(own_work), lend(own_local), lend(own_out)
-    watch = lend(own_watch)
+    memory, work, local, out = (
+        by_reference(own_memory),
+        by_reference(own_work),
+        by_reference(own_local),
+        by_reference(own_out),
+    )
+    watch = by_reference(own_watch)
     copy(data.start, memory.x[:r])
     whole = State(memory.x, memory.P, r, 0, memory.home)
     state = State(memory.x, memory.P, r, 0, memory.active)  # of a step: the whole, unless it has a base

@@ -14,14 +14,14 @@ from consistency.filters.kernel.slam import (
     landmark_point,
     locate,
     locate_jacobian,
-    look,
     measure,
     measure_jacobian,
     observation_point,
     observed_width,
-    pull_back,
     robot_frame,
     stands_apart,
+    to_body,
+    to_body_jacobian,
 )
 from consistency.filters.kernel.work import Work
 from consistency.models import point
@@ -31,7 +31,7 @@ from consistency.types import Array
 @inner
 def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
     """z (s,) <- h: the landmark ``values`` (w,) as the sensor of a robot at ``frame`` sees it."""
-    bx, by, bz = look(slam.landmark, frame, values)
+    bx, by, bz = to_body(slam.landmark, frame, values)
     cx, cy, cz = point.to_sensor(bx, by, bz, slam.sensor.mount)
     expected = measure(slam.sensor, cx, cy, cz)
     for i in range(observed_width(slam.sensor)):
@@ -41,7 +41,7 @@ def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
 @inner
 def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, Hl: Array) -> None:
     """z (s,), Hp (s, r), Hl (s, w) <- h at ``frame`` and ``values`` (w,), and its Jacobians by variables of both."""
-    body = look(slam.landmark, frame, values)
+    body = to_body(slam.landmark, frame, values)
     mount = slam.sensor.mount
     cx, cy, cz = point.to_sensor(body[0], body[1], body[2], mount)
     expected = measure(slam.sensor, cx, cy, cz)
@@ -55,7 +55,7 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
             j0 * mount.yx + j1 * mount.yy + j2 * mount.yz,
             j0 * mount.zx + j1 * mount.zy + j2 * mount.zz,
         )
-        pull_back(slam.landmark, frame, values, body, row, Hp[i], Hl[i])
+        to_body_jacobian(slam.landmark, frame, values, body, row, Hp[i], Hl[i])
 
 
 @inner

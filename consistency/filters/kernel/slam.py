@@ -102,7 +102,7 @@ def move_about(motion: NamedTuple, at: Array, u: Array, pose: Array) -> None:
 
 
 @generic()
-def carry(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
+def propagate_covariance(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
     """P (n, n) <- F P F' and Phi (n, base) <- F Phi, with F (r, r) the Jacobian of f at ``at`` (r,) under ``u`` (3,).
 
     Of both, the r rows of the robot are changed; in P the block of the robot becomes valid as a whole.
@@ -111,8 +111,8 @@ def carry(motion: NamedTuple, at: Array, u: Array, P: Array, n: int, Phi: Array,
 
 
 @generic()
-def carry_by(motion: NamedTuple, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
-    """:func:`carry` of P (n, n), Phi (n, base), with F of a displacement of the robot by (dx, dy) in the world, m."""
+def propagate_covariance_by(motion: NamedTuple, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
+    """:func:`propagate_covariance` with F of a displacement of the robot by (dx, dy) in the world, m."""
     raise NotImplementedError
 
 
@@ -135,7 +135,7 @@ def robot_frame(motion: NamedTuple, pose: Array) -> Frame:
 
 
 @generic()
-def carry_root(motion: NamedTuple, P: Array, first: int, last: int, C: Array, F: Array) -> None:
+def propagate_covariance_root(motion: NamedTuple, P: Array, first: int, last: int, C: Array, F: Array) -> None:
     """Columns first..last-1 of the robot's rows: P (r, n) <- F C^-1 P for a lower root C (r, r) and F (r, r).
 
     A direction whose pivot in C is zero carries nothing.
@@ -177,7 +177,7 @@ def locate_jacobian(sensor: Sensor, z: Array) -> Six | Nine:
 
 
 @generic()
-def unwind(sensor: Sensor, z: Array, about: Array) -> None:
+def wrap_residual(sensor: Sensor, z: Array, about: Array) -> None:
     """z (s,) <- the same observation, each angle in it by full turns as near as can be to that of ``about`` (s,)."""
     raise NotImplementedError
 
@@ -192,18 +192,18 @@ def landmark_width(landmark: NamedTuple) -> int:
 
 
 @generic()
-def look(landmark: NamedTuple, frame: Frame, values: Array) -> Triple:
+def to_body(landmark: NamedTuple, frame: Frame, values: Array) -> Triple:
     """Position of the landmark ``values`` (w,) in the frame of the robot, in m."""
     raise NotImplementedError
 
 
 @generic()
-def pull_back(
+def to_body_jacobian(
     landmark: NamedTuple, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
-    """Rows ``Hp`` (r,) and ``Hl`` (w,) <- derivatives by the variables of robot and landmark, through :func:`look`.
+    """Rows ``Hp`` (r,) and ``Hl`` (w,) <- derivatives by the variables of robot and landmark, through :func:`to_body`.
 
-    ``row`` holds the derivative by the point in the frame of the robot, ``body`` that point, as :func:`look` gave it.
+    ``row`` holds the derivative by the point in the frame of the robot, ``body`` that point, of :func:`to_body`.
     """
     raise NotImplementedError
 
@@ -302,8 +302,10 @@ def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 
 @generic()
-def carry_at(point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple) -> None:
-    """P (n, n) <- F P F' and Phi (n, base) <- F Phi as :func:`carry`, with F of step k + 1 as the point asks.
+def propagate_covariance_at(
+    point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: NamedTuple
+) -> None:
+    """:func:`propagate_covariance` of P (n, n) and Phi (n, base), with F of step k + 1 as the point asks.
 
     Called before x (n,) moves under the control ``u`` (3,).
     """
@@ -346,7 +348,7 @@ def predict(
 
 
 @generic()
-def foresee(
+def predict_innovation(
     update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: NamedTuple, work: NamedTuple
 ) -> tuple[int, float]:
     """Upper half of ``work.S`` (s m, s m) <- innovation covariance; column n + base of ``work.A`` <- innovation (s m,).
@@ -365,14 +367,14 @@ def correct(
     data: Data,
     k: int,
     m: int,
-    is_foreseen: bool,
+    has_innovation: bool,
     local: NamedTuple,
     work: NamedTuple,
 ) -> tuple[int, float, float]:
     """x (n,), P (n, n) <- the joint update in step k + 1 with the ``m`` landmarks that ``work`` lists.
 
-    ``is_foreseen`` says whether :func:`foresee` has been called for these, and nothing since. Returns a code of
-    REASONS, 0 where all is well, the NIS, and log det S of that innovation.
+    ``has_innovation`` says whether :func:`predict_innovation` has been called for these, and nothing since. Returns
+    a code of REASONS, 0 where all is well, the NIS, and log det S of that innovation.
     """
     raise NotImplementedError
 
@@ -426,7 +428,7 @@ def rejected_rows(guard: NamedTuple, watch: NamedTuple) -> Array:
     raise NotImplementedError
 
 
-# --- upkeep of the covariance --------------------------------------------------------------------------
+# --- update of the covariance --------------------------------------------------------------------------
 
 
 @generic()
@@ -437,7 +439,7 @@ def spare_width(covariance: NamedTuple, steps: int, n_landmarks: int) -> int:
 
 @generic()
 def make_local(covariance: NamedTuple, r: int, w: int, n: int, steps: int, n_landmarks: int) -> NamedTuple:
-    """What this upkeep keeps beside a state of up to ``n`` variables."""
+    """What this covariance update keeps beside a state of up to ``n`` variables."""
     raise NotImplementedError
 
 

@@ -13,8 +13,8 @@ from consistency.filters.kernel.slam import (
     combine,
     insert,
     landmark_width,
-    look,
-    pull_back,
+    to_body,
+    to_body_jacobian,
     world_point,
 )
 from consistency.models import point
@@ -33,14 +33,14 @@ def planar_point_width(landmark: PlanarPoint) -> int:
     return 2
 
 
-@implement(look, PlanarPoint)
-def look_at_planar_point(landmark: PlanarPoint, frame: Frame, values: Array) -> Triple:
+@implement(to_body, PlanarPoint)
+def to_body_of_planar_point(landmark: PlanarPoint, frame: Frame, values: Array) -> Triple:
     """The point in the frame of the robot, in m, at height zero."""
     return point.turned_to_robot(frame.x, frame.y, frame.c, frame.s, values[0], values[1], 0.0)
 
 
-@implement(pull_back, PlanarPoint)
-def pull_back_to_planar_point(
+@implement(to_body_jacobian, PlanarPoint)
+def to_body_jacobian_of_planar_point(
     landmark: PlanarPoint, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
     """Hp (3,) <- by x, y, heading, Hl (2,) <- by the point in the world: the ``row`` turned by the heading."""

@@ -20,8 +20,8 @@ from consistency.filters.kernel.slam import (
     combine,
     insert,
     landmark_width,
-    look,
-    pull_back,
+    to_body,
+    to_body_jacobian,
     world_point,
 )
 from consistency.filters.landmark.inverse_range import inward, outward
@@ -53,13 +53,13 @@ def sensor_point_width(landmark: SensorPoint) -> int:
     return 3
 
 
-@implement(look, SensorPoint)
-def look_at_sensor_point(landmark: SensorPoint, frame: Frame, values: Array) -> Triple:
+@implement(to_body, SensorPoint)
+def to_body_of_sensor_point(landmark: SensorPoint, frame: Frame, values: Array) -> Triple:
     return point.from_sensor(values[0], values[1], values[2], landmark.mount)
 
 
-@implement(pull_back, SensorPoint)
-def pull_back_to_sensor_point(
+@implement(to_body_jacobian, SensorPoint)
+def to_body_jacobian_of_sensor_point(
     landmark: SensorPoint, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
     fill(Hp, 0.0)

@@ -12,8 +12,8 @@ from consistency.filters.kernel.slam import (
     combine,
     insert,
     landmark_width,
-    look,
-    pull_back,
+    to_body,
+    to_body_jacobian,
     world_point,
 )
 from consistency.models import point
@@ -32,14 +32,14 @@ def world_point_width(landmark: WorldPoint) -> int:
     return 3
 
 
-@implement(look, WorldPoint)
-def look_at_world_point(landmark: WorldPoint, frame: Frame, values: Array) -> Triple:
+@implement(to_body, WorldPoint)
+def to_body_of_world_point(landmark: WorldPoint, frame: Frame, values: Array) -> Triple:
     """The point in the frame of the robot, in m, eq. 19."""
     return point.turned_to_robot(frame.x, frame.y, frame.c, frame.s, values[0], values[1], values[2])
 
 
-@implement(pull_back, WorldPoint)
-def pull_back_to_world_point(
+@implement(to_body_jacobian, WorldPoint)
+def to_body_jacobian_of_world_point(
     landmark: WorldPoint, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
     """Hp (3,) <- by x, y, heading, Hl (3,) <- by the point in the world: the ``row`` turned by the heading."""

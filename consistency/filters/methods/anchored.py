@@ -24,8 +24,8 @@ from consistency.filters.kernel.slam import (
     combine,
     insert,
     landmark_width,
-    look,
-    pull_back,
+    to_body,
+    to_body_jacobian,
     world_point,
 )
 from consistency.filters.methods import ekf
@@ -53,16 +53,16 @@ def _ray(values: Array) -> Triple:
     return c * np.cos(values[3]), c * np.sin(values[3]), np.sin(values[4])
 
 
-@implement(look, AnchoredInverseDepth)
-def look_at_anchored(landmark: AnchoredInverseDepth, frame: Frame, values: Array) -> Triple:
+@implement(to_body, AnchoredInverseDepth)
+def to_body_of_anchored(landmark: AnchoredInverseDepth, frame: Frame, values: Array) -> Triple:
     """The end of the ray in the frame of the robot, in m."""
     mx, my, mz = _ray(values)
     x, y, z = values[0] + mx / values[5], values[1] + my / values[5], values[2] + mz / values[5]
     return turned_to_robot(frame.x, frame.y, frame.c, frame.s, x, y, z)
 
 
-@implement(pull_back, AnchoredInverseDepth)
-def pull_back_to_anchored(
+@implement(to_body_jacobian, AnchoredInverseDepth)
+def to_body_jacobian_of_anchored(
     landmark: AnchoredInverseDepth, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
 ) -> None:
     """Hp (3,) <- by x, y, heading, Hl (6,) <- by the six numbers, through the point in the world."""

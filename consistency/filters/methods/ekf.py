@@ -6,13 +6,13 @@ from dataclasses import replace
 
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled, planar
+from consistency.filters.covariance_update.dense import Dense
 from consistency.filters.error.additive import Additive
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.parts import landmark_of, motion_of, sensor_of
 from consistency.filters.plain import SlamState
 from consistency.filters.point.at_estimate import AtEstimate
 from consistency.filters.update.joint import Joint
-from consistency.filters.upkeep.dense import Dense
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Info
 

@@ -50,11 +50,11 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     correct,
-    foresee,
     locate,
     make_room,
     measure_jacobian,
     predict,
+    predict_innovation,
 )
 from consistency.filters.kernel.work import Work
 from consistency.filters.landmark.sensor_point import SensorPoint, sight
@@ -77,8 +77,8 @@ implement(predict, EquivariantOutput)(predict_by_error)
 implement(correct, EquivariantOutput)(correct_at_once)
 
 
-@implement(foresee, EquivariantOutput)
-def foresee_equivariant(
+@implement(predict_innovation, EquivariantOutput)
+def predict_innovation_equivariant(
     update: EquivariantOutput,
     slam: Slam,
     state: State,

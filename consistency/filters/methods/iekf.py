@@ -24,17 +24,17 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     correct,
-    foresee,
     landmark_width,
     make_room,
     observed_width,
     predict,
+    predict_innovation,
     robot_width,
 )
 from consistency.filters.kernel.work import Work
 from consistency.filters.methods import ekf
 from consistency.filters.plain import SlamState
-from consistency.filters.update.joint import foresee_linearised, predict_by_error
+from consistency.filters.update.joint import predict_by_error, predict_innovation_linearised
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Info
 
@@ -60,7 +60,7 @@ def iterated_room(update: Iterated, r: int, w: int, s: int, m: int, n: int) -> P
 
 
 implement(predict, Iterated)(predict_by_error)
-implement(foresee, Iterated)(foresee_linearised)
+implement(predict_innovation, Iterated)(predict_innovation_linearised)
 
 
 @implement(correct, Iterated)
@@ -71,7 +71,7 @@ def correct_iterated(
     data: Data,
     k: int,
     m: int,
-    is_foreseen: bool,
+    has_innovation: bool,
     local: Factors,
     work: Work[PriorRoom],
 ) -> tuple[int, float, float]:

@@ -30,10 +30,10 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     correct,
-    foresee,
     landmark_width,
     make_room,
     predict,
+    predict_innovation,
     robot_width,
 )
 from consistency.filters.kernel.work import Work
@@ -78,7 +78,7 @@ def correct_by_iterated_points(
     data: Data,
     k: int,
     m: int,
-    is_foreseen: bool,
+    has_innovation: bool,
     local: Factors,
     work: Work[SigmaRoom],
 ) -> tuple[int, float, float]:
@@ -104,12 +104,12 @@ def correct_by_iterated_points(
     return 0, first_nis, first_log_det
 
 
-@implement(foresee, IteratedPoints)
-def foresee_by_first_points(
+@implement(predict_innovation, IteratedPoints)
+def predict_innovation_by_first_points(
     update: IteratedPoints, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
 ) -> tuple[int, float]:
     """Innovation and S of the first pass, which are those of the unscented filter."""
-    return foresee(update.points, slam, state, data, k, m, local, work)
+    return predict_innovation(update.points, slam, state, data, k, m, local, work)
 
 
 @inner

@@ -8,6 +8,7 @@ import numpy as np
 
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled
+from consistency.filters.covariance_update.dense import Dense
 from consistency.filters.error.additive import Additive
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.landmark.world_point import WorldPoint
@@ -16,7 +17,6 @@ from consistency.filters.plain import SlamState
 from consistency.filters.plain_sensors import PointSensor
 from consistency.filters.point.reference import Reference
 from consistency.filters.update.joint import Joint
-from consistency.filters.upkeep.dense import Dense
 from consistency.models.motion import dead_reckoning
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Gaussian, Info, Observation

@@ -49,6 +49,7 @@ from consistency.filters.centred import (
     shift_matrix,
 )
 from consistency.filters.compiled import Compiled
+from consistency.filters.covariance_update.parking import Parking
 from consistency.filters.error.invariant_pose import InvariantPose
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.landmark.inverse_range import InverseRange
@@ -56,9 +57,8 @@ from consistency.filters.parts import motion_of, sensor_of
 from consistency.filters.plain_sensors import bias_at, variance_at
 from consistency.filters.sensor.conversion import Pixels
 from consistency.filters.sensor.growth import growth_of
-from consistency.filters.update import reclaiming  # noqa: F401, registers the update
+from consistency.filters.update import reactivation  # noqa: F401, registers the update
 from consistency.filters.update.converting import Converted, Converting
-from consistency.filters.upkeep.parking import Parking
 from consistency.geometry import wrap
 from consistency.protocols import Problem
 from consistency.types import Array, Control, Gaussian, Info, Observation

@@ -42,7 +42,6 @@ from consistency.filters.kernel.slam import (
     State,
     Triple,
     correct,
-    foresee,
     locate,
     locate_jacobian,
     make_room,
@@ -50,7 +49,8 @@ from consistency.filters.kernel.slam import (
     measure_jacobian,
     observed_width,
     predict,
-    unwind,
+    predict_innovation,
+    wrap_residual,
 )
 from consistency.filters.kernel.work import Work
 from consistency.filters.methods import ekf
@@ -85,7 +85,7 @@ class DebiasedXyz(NamedTuple):
 
 
 implement(observed_width, DebiasedXyz)(xyz_width)
-implement(unwind, DebiasedXyz)(xyz_has_no_angle)
+implement(wrap_residual, DebiasedXyz)(xyz_has_no_angle)
 implement(measure, DebiasedXyz)(measure_xyz)
 implement(measure_jacobian, DebiasedXyz)(measure_xyz_jacobian)
 implement(locate_jacobian, DebiasedXyz)(locate_xyz_jacobian)  # the bias is taken as known
@@ -120,8 +120,8 @@ implement(predict, NoiseAtPrediction)(predict_by_error)
 implement(correct, NoiseAtPrediction)(correct_at_once)
 
 
-@implement(foresee, NoiseAtPrediction)
-def foresee_with_noise_at_prediction(
+@implement(predict_innovation, NoiseAtPrediction)
+def predict_innovation_with_noise_at_prediction(
     update: NoiseAtPrediction,
     slam: Slam,
     state: State,

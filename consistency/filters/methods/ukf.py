@@ -8,6 +8,7 @@ import numpy as np
 
 from consistency.filters import plain
 from consistency.filters.compiled import Compiled, planar
+from consistency.filters.covariance_update.dense import Dense
 from consistency.filters.error.additive import Additive
 from consistency.filters.kernel.slam import Slam
 from consistency.filters.parts import landmark_of, motion_of, sensor_of
@@ -15,7 +16,6 @@ from consistency.filters.plain import SlamState
 from consistency.filters.plain_sensors import view
 from consistency.filters.point.at_estimate import AtEstimate
 from consistency.filters.update.unscented import Unscented
-from consistency.filters.upkeep.dense import Dense
 from consistency.protocols import Problem
 from consistency.scenario import SigmaPoints
 from consistency.types import Array, Control, Info

@@ -11,12 +11,12 @@ from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import (
     Frame,
     add_motion_noise,
-    carry,
-    carry_by,
-    carry_root,
     move,
     move_about,
     noise_columns,
+    propagate_covariance,
+    propagate_covariance_by,
+    propagate_covariance_root,
     robot_frame,
     robot_width,
 )
@@ -57,21 +57,25 @@ def move_unicycle_about(motion: Unicycle, at: Array, u: Array, pose: Array) -> N
     pose[2] = heading + turn
 
 
-@implement(carry, Unicycle)
-def carry_unicycle(motion: Unicycle, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int) -> None:
+@implement(propagate_covariance, Unicycle)
+def propagate_covariance_unicycle(
+    motion: Unicycle, at: Array, u: Array, P: Array, n: int, Phi: Array, base: int
+) -> None:
     """P (n, n) <- F P F' and Phi (n, base) <- F Phi, where F (3, 3) is the identity but for its last column."""
     fx, fy = unicycle_jacobian(at[2], u[0], u[1])
-    _carry(P, n, Phi, base, fx, fy)
+    _propagate_covariance(P, n, Phi, base, fx, fy)
 
 
-@implement(carry_by, Unicycle)
-def carry_unicycle_by(motion: Unicycle, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int) -> None:
+@implement(propagate_covariance_by, Unicycle)
+def propagate_covariance_unicycle_by(
+    motion: Unicycle, dx: float, dy: float, P: Array, n: int, Phi: Array, base: int
+) -> None:
     """F[0, 2] = -dy and F[1, 2] = dx: how the position turns with the heading."""
-    _carry(P, n, Phi, base, -dy, dx)
+    _propagate_covariance(P, n, Phi, base, -dy, dx)
 
 
 @inner
-def _carry(P: Array, n: int, Phi: Array, base: int, fx: float, fy: float) -> None:
+def _propagate_covariance(P: Array, n: int, Phi: Array, base: int, fx: float, fy: float) -> None:
     """P <- F P F' and Phi <- F Phi, F the identity but for F[0, 2] = fx and F[1, 2] = fy."""
     _move_rows(P, n, fx, fy)
     for i in range(3):
@@ -117,8 +121,8 @@ def unicycle_frame(motion: Unicycle, pose: Array) -> Frame:
     return Frame(pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]))
 
 
-@implement(carry_root, Unicycle)
-def carry_unicycle_root(motion: Unicycle, P: Array, first: int, last: int, C: Array, F: Array) -> None:
+@implement(propagate_covariance_root, Unicycle)
+def propagate_covariance_unicycle_root(motion: Unicycle, P: Array, first: int, last: int, C: Array, F: Array) -> None:
     """P (3, n) <- F C^-1 P in columns first..last-1, by forward substitution."""
     i0, i1, i2 = _reciprocal(C[0, 0]), _reciprocal(C[1, 1]), _reciprocal(C[2, 2])
     c10, c20, c21 = C[1, 0], C[2, 0], C[2, 1]

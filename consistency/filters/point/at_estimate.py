@@ -9,14 +9,14 @@ from consistency.filters.kernel.measuring import place_observed
 from consistency.filters.kernel.slam import (
     Slam,
     State,
-    carry,
-    carry_at,
     expands,
     landmark_point,
     make_notes,
     motion_point,
     observation_point,
     place,
+    propagate_covariance,
+    propagate_covariance_at,
     robot_width,
     stands_apart,
 )
@@ -51,12 +51,12 @@ def motion_at_estimate(point: AtEstimate, pose: Array, k: int) -> Array:
     return pose
 
 
-@implement(carry_at, AtEstimate)
-def carry_at_estimate(
+@implement(propagate_covariance_at, AtEstimate)
+def propagate_covariance_at_estimate(
     point: AtEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """F at the estimate before the step."""
-    carry(slam.motion, state.x[: robot_width(slam.motion)], u, state.P, state.n, Phi, state.base)
+    propagate_covariance(slam.motion, state.x[: robot_width(slam.motion)], u, state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, AtEstimate)

@@ -17,8 +17,6 @@ from consistency.filters.kernel.measuring import place_observed
 from consistency.filters.kernel.slam import (
     Slam,
     State,
-    carry_at,
-    carry_by,
     expands,
     landmark_point,
     landmark_width,
@@ -27,6 +25,8 @@ from consistency.filters.kernel.slam import (
     move,
     observation_point,
     place,
+    propagate_covariance_at,
+    propagate_covariance_by,
     stands_apart,
 )
 from consistency.filters.kernel.work import Work
@@ -69,8 +69,8 @@ def motion_about_estimate(point: FirstEstimate, pose: Array, k: int) -> Array:
     return pose
 
 
-@implement(carry_at, FirstEstimate)
-def carry_between_first_estimates(
+@implement(propagate_covariance_at, FirstEstimate)
+def propagate_covariance_between_first_estimates(
     point: FirstEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """F by the displacement p_k+1|k - p_k|k-1 between first estimates; notes the prediction."""
@@ -78,7 +78,7 @@ def carry_between_first_estimates(
     if k == 0:
         copy(state.x[:3], before)
     move(slam.motion, state.x[:3], u, after)
-    carry_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
+    propagate_covariance_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, FirstEstimate)

@@ -36,8 +36,6 @@ from consistency.filters.kernel.measuring import place_observed
 from consistency.filters.kernel.slam import (
     Slam,
     State,
-    carry_at,
-    carry_by,
     expands,
     landmark_point,
     landmark_width,
@@ -46,6 +44,8 @@ from consistency.filters.kernel.slam import (
     move,
     observation_point,
     place,
+    propagate_covariance_at,
+    propagate_covariance_by,
     stands_apart,
 )
 from consistency.filters.kernel.work import Work
@@ -92,8 +92,8 @@ def motion_from_estimate(point: ObservabilityConstrained, pose: Array, k: int) -
     return pose
 
 
-@implement(carry_at, ObservabilityConstrained)
-def carry_constrained(
+@implement(propagate_covariance_at, ObservabilityConstrained)
+def propagate_covariance_constrained(
     point: ObservabilityConstrained, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """F by the displacement p_k+1|k - p*_k|k; notes a_k+1 and e."""
@@ -109,7 +109,7 @@ def carry_constrained(
             total += x[3 + w * i + a] - notes.landmarks[notes.order[i], a]
         shift[a] = total / (1 + count)
         after[a] = predicted[a] - shift[a]
-    carry_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
+    propagate_covariance_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, ObservabilityConstrained)

@@ -12,14 +12,14 @@ from consistency.filters.kernel.measuring import linearise_at
 from consistency.filters.kernel.slam import (
     Slam,
     State,
-    carry,
-    carry_at,
     expands,
     landmark_point,
     make_notes,
     motion_point,
     observation_point,
     place,
+    propagate_covariance,
+    propagate_covariance_at,
     robot_frame,
     robot_width,
     stands_apart,
@@ -58,12 +58,12 @@ def motion_at_reference(point: Reference, pose: Array, k: int) -> Array:
     return point.path[k]
 
 
-@implement(carry_at, Reference)
-def carry_at_reference(
+@implement(propagate_covariance_at, Reference)
+def propagate_covariance_at_reference(
     point: Reference, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """F at the reference pose before the step."""
-    carry(slam.motion, point.path[k], u, state.P, state.n, Phi, state.base)
+    propagate_covariance(slam.motion, point.path[k], u, state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, Reference)

@@ -16,8 +16,6 @@ from consistency.filters.kernel.measuring import linearise_at, place_observed
 from consistency.filters.kernel.slam import (
     Slam,
     State,
-    carry_at,
-    carry_by,
     expands,
     landmark_point,
     landmark_width,
@@ -26,6 +24,8 @@ from consistency.filters.kernel.slam import (
     observation_point,
     observed_width,
     place,
+    propagate_covariance_at,
+    propagate_covariance_by,
     robot_frame,
     stands_apart,
 )
@@ -65,13 +65,13 @@ def motion_at_truth(point: AtTruth, pose: Array, k: int) -> Array:
     return point.path[k]
 
 
-@implement(carry_at, AtTruth)
-def carry_at_truth(
+@implement(propagate_covariance_at, AtTruth)
+def propagate_covariance_at_truth(
     point: AtTruth, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
 ) -> None:
     """F by the true displacement of the robot."""
     before, after = point.path[k], point.path[k + 1]
-    carry_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
+    propagate_covariance_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
 
 
 @implement(observation_point, AtTruth)

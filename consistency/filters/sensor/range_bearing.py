@@ -16,7 +16,7 @@ from consistency.filters.kernel.slam import (
     measure,
     measure_jacobian,
     observed_width,
-    unwind,
+    wrap_residual,
 )
 from consistency.models import planar
 from consistency.models.point import Mounting
@@ -36,8 +36,8 @@ def range_bearing_width(sensor: RangeBearing) -> int:
     return 2
 
 
-@implement(unwind, RangeBearing)
-def unwind_bearing(sensor: RangeBearing, z: Array, about: Array) -> None:
+@implement(wrap_residual, RangeBearing)
+def wrap_bearing(sensor: RangeBearing, z: Array, about: Array) -> None:
     """The bearing of z (2,) <- the same by full turns, within half a turn of that of ``about`` (2,)."""
     z[1] += 2.0 * np.pi * np.rint((about[1] - z[1]) / (2.0 * np.pi))
 

@@ -14,7 +14,7 @@ from consistency.filters.kernel.slam import (
     measure,
     measure_jacobian,
     observed_width,
-    unwind,
+    wrap_residual,
 )
 from consistency.models.point import Mounting
 from consistency.types import Array
@@ -33,7 +33,7 @@ def relative_xy_width(sensor: RelativeXy) -> int:
     return 2
 
 
-@implement(unwind, RelativeXy)
+@implement(wrap_residual, RelativeXy)
 def relative_xy_has_no_angle(sensor: RelativeXy, z: Array, about: Array) -> None:
     """Nothing to do: lengths do not wrap."""
 

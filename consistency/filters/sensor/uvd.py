@@ -13,7 +13,7 @@ from consistency.filters.kernel.slam import (
     measure,
     measure_jacobian,
     observed_width,
-    unwind,
+    wrap_residual,
 )
 from consistency.models import stereo
 from consistency.models.point import Mounting
@@ -35,7 +35,7 @@ def uvd_width(sensor: Uvd) -> int:
     return 3
 
 
-@implement(unwind, Uvd)
+@implement(wrap_residual, Uvd)
 def uvd_has_no_angle(sensor: Uvd, z: Array, about: Array) -> None:
     """Nothing to do: pixels do not wrap."""
 

@@ -13,7 +13,7 @@ from consistency.filters.kernel.slam import (
     measure,
     measure_jacobian,
     observed_width,
-    unwind,
+    wrap_residual,
 )
 from consistency.models.point import Mounting
 from consistency.types import Array
@@ -32,7 +32,7 @@ def xyz_width(sensor: Xyz) -> int:
     return 3
 
 
-@implement(unwind, Xyz)
+@implement(wrap_residual, Xyz)
 def xyz_has_no_angle(sensor: Xyz, z: Array, about: Array) -> None:
     """Nothing to do: lengths do not wrap."""
 

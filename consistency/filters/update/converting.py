@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.filters.covariance_update.parking import Clones, Parking
 from consistency.filters.kernel.arrays import blocks, copy, fill_matrix, integers, matrix, vector
 from consistency.filters.kernel.blas import add_gram
 from consistency.filters.kernel.dispatch import implement, part
@@ -16,7 +17,6 @@ from consistency.filters.landmark.inverse_range import InverseRange, carried
 from consistency.filters.motion.unicycle import Unicycle
 from consistency.filters.sensor.conversion import Pixels, conversion_jacobian, convert, subtract_bias
 from consistency.filters.sensor.uvd import Uvd
-from consistency.filters.upkeep.parking import Clones, Parking
 from consistency.types import Array, Indices
 
 

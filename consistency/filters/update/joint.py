@@ -14,7 +14,16 @@ from consistency.filters.kernel.gain import (
     linearise_seen,
 )
 from consistency.filters.kernel.local_state import Factors
-from consistency.filters.kernel.slam import Data, Slam, State, correct, foresee, make_room, predict, propagate
+from consistency.filters.kernel.slam import (
+    Data,
+    Slam,
+    State,
+    correct,
+    make_room,
+    predict,
+    predict_innovation,
+    propagate,
+)
 from consistency.filters.kernel.work import Work
 from consistency.types import Array
 
@@ -44,8 +53,8 @@ def predict_by_error(
 implement(correct, Joint)(correct_at_once)
 
 
-@implement(foresee, Joint)
-def foresee_linearised(
+@implement(predict_innovation, Joint)
+def predict_innovation_linearised(
     update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NamedTuple]
 ) -> tuple[int, float]:
     """Innovation and S with Jacobians at the prediction, eq. 11; an iterated update begins there, too."""

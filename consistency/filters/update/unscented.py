@@ -31,17 +31,17 @@ from consistency.filters.kernel.slam import (
     Slam,
     State,
     add_motion_noise,
-    carry_root,
     correct,
-    foresee,
     landmark_width,
     make_room,
     move,
     observed_width,
     predict,
+    predict_innovation,
+    propagate_covariance_root,
     robot_frame,
     robot_width,
-    unwind,
+    wrap_residual,
 )
 from consistency.filters.kernel.work import Work
 from consistency.types import Array
@@ -121,8 +121,8 @@ def predict_unscented(
             x[a] += w * Y[i, a]
         for j in range(r):
             F[a, j] = w * spread * (Y[2 * j, a] - Y[2 * j + 1, a])
-    carry_root(slam.motion, P, r, state.n, C, F)
-    carry_root(slam.motion, local.Phi, 0, state.base, C, F)
+    propagate_covariance_root(slam.motion, P, r, state.n, C, F)
+    propagate_covariance_root(slam.motion, local.Phi, 0, state.base, C, F)
     for a in range(r):
         for b in range(r):
             P[a, b] = w0c * (Y[2 * r, a] - x[a]) * (Y[2 * r, b] - x[b])
@@ -134,8 +134,8 @@ def predict_unscented(
 implement(correct, Unscented)(correct_at_once)
 
 
-@implement(foresee, Unscented)
-def foresee_by_points(
+@implement(predict_innovation, Unscented)
+def predict_innovation_by_points(
     update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
 ) -> tuple[int, float]:
     gather(slam, state, m, local, work)
@@ -234,4 +234,4 @@ def _project(slam: Slam, x: Array, m: int, spread: float, work: Work[SigmaRoom])
                 landmark[a] = x[at[i] + a] + step * U[j, r + w * i + a]
             projected = Z[k, s * i : s * i + s]
             observe(slam, frame, landmark, projected)
-            unwind(slam.sensor, projected, Z[2 * L, s * i : s * i + s])
+            wrap_residual(slam.sensor, projected, Z[2 * L, s * i : s * i + s])

@@ -27,7 +27,7 @@ from consistency.errors import InputError
 from consistency.filters.stepping import reason_of
 from consistency.runs.backends.batches import Batch, Batches, Event, Lost, in_batches
 from consistency.runs.backends.local import worker_count
-from consistency.runs.backends.remote import Desk, Part, pickled_work
+from consistency.runs.backends.remote import Part, Worker, pickled_work
 from consistency.runs.isolating import ONE_THREAD
 from consistency.runs.work import Outcomes, Work
 
@@ -45,7 +45,7 @@ OUR_CONFIG = {  # of our own cluster, which is to be as fast as threads
 }
 OUR_SCHEDULER = {"allowed_failures": 1, "dashboard": False, "dashboard_address": "127.0.0.1:0"}  # of its scheduler
 ADDRESS = re.compile(r"(\w+://)?[^/\s]+:\d+")
-_desks: dict[str, Desk] = {}  # in a worker, by name of the work
+_workers: dict[str, Worker] = {}  # in a worker, by name of the work
 
 
 @dataclass(frozen=True)
@@ -255,16 +255,16 @@ class _Keep(WorkerPlugin):  # type: ignore[misc]
     def setup(self, worker: Any) -> None:
         if self.is_ours and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is said to all processes of a terminal
-        _desks[self.name] = Desk(self.pickled)
+        _workers[self.name] = Worker(self.pickled)
 
     def teardown(self, worker: Any) -> None:
-        if (desk := _desks.pop(self.name, None)) is not None:
-            desk.close()
+        if (own := _workers.pop(self.name, None)) is not None:
+            own.close()
 
 
 def _do(name: str, runs: Sequence[int]) -> Part:
     """In a worker: what runs left, the first of them where all would take too long."""
-    with closing(_desks[name].parts(runs, LIMIT)) as parts:
+    with closing(_workers[name].parts(runs, LIMIT)) as parts:
         return next(parts)
 
 

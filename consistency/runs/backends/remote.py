@@ -80,7 +80,7 @@ def pickled_work(work: Work) -> bytes:
     return bytes(dumps(work))
 
 
-class Desk:
+class Worker:
     """Work that this process was sent: unpickled when the first run is asked for, and kept until it is closed."""
 
     def __init__(self, pickled: bytes) -> None:

@@ -24,7 +24,7 @@ from consistency.errors import InputError
 from consistency.filters.stepping import reason_of
 from consistency.runs.backends.batches import Batch, Batches, Event, Lost, in_batches
 from consistency.runs.backends.local import worker_count
-from consistency.runs.backends.remote import Desk, Part, pickled_work
+from consistency.runs.backends.remote import Part, Worker, pickled_work
 from consistency.runs.work import Outcomes, Work
 from consistency.terminal.progress import say
 
@@ -205,14 +205,14 @@ class Sent:
 def do_job(sent: Sent, runs: Sequence[int], outbox: str) -> None:
     """In a job: leave parts in ``outbox``, each of which appears as a whole."""
     sys.path[:] = sent.path
-    desk = Desk(Path(sent.work).read_bytes())
+    worker = Worker(Path(sent.work).read_bytes())
     try:
-        for number, part in enumerate(desk.parts(runs, EVERY)):
+        for number, part in enumerate(worker.parts(runs, EVERY)):
             unfinished = Path(outbox) / "unfinished"
             unfinished.write_bytes(pickle.dumps(part))
             os.replace(unfinished, Path(outbox) / f"{number}.pickle")
     finally:
-        desk.close()
+        worker.close()
 
 
 def _last_line(text: str) -> str:

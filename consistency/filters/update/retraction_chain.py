@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.filters.covariance_update.parking import Clones
 from consistency.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.filters.error.planar import exponential
 from consistency.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
@@ -18,7 +19,6 @@ from consistency.filters.kernel.jit import inner
 from consistency.filters.kernel.slam import State, Triple
 from consistency.filters.kernel.work import Work
 from consistency.filters.update.converting import ConvertingRoom
-from consistency.filters.upkeep.parking import Clones
 from consistency.types import Array, Indices
 
 

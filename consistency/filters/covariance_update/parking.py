@@ -1,15 +1,25 @@
 """Landmarks that have not been seen for a while stay in the frame of a clone of the pose.
 
 Nothing moves them there, so that they and the clones are the passive part of a state that is updated locally
-(:mod:`consistency.filters.upkeep.local`): the active part is the robot, the landmarks in use, and what was seen again
-since the split. A clone is Exp(xi) T with the pose T at which it was made and xi in the state, so that what a step
-says of it is a sum.
+(:mod:`consistency.filters.covariance_update.local`): the active part is the robot, the landmarks in use, and what
+was seen again since the split. A clone is Exp(xi) T with the pose T at which it was made and xi in the state, so that
+what a step says of it is a sum.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.filters.covariance_update.local import LOCAL_FROM
+from consistency.filters.covariance_update.splitting import (
+    add_label,
+    append_rows,
+    join,
+    start_rows,
+    take_out,
+    to_base,
+    wake,
+)
 from consistency.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.filters.kernel.arrays import copy, fill, fill_matrix, filled_matrix, integers, matrix
 from consistency.filters.kernel.covariance import gather_rows, replace_rows
@@ -29,8 +39,6 @@ from consistency.filters.kernel.slam import (
     withhold,
 )
 from consistency.filters.kernel.work import Work
-from consistency.filters.upkeep.local import LOCAL_FROM
-from consistency.filters.upkeep.splitting import add_label, append_rows, join, start_rows, take_out, to_base, wake
 from consistency.types import Array, Indices
 
 WORTH = 1.1  # variables of the whole state for each of active part and base from which updating is local; measured

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.filters.covariance_update.parking import Clones, is_in_doubt, recentre, unpark
 from consistency.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.filters.kernel.blas import add_transposed_times
@@ -11,11 +12,12 @@ from consistency.filters.kernel.covariance import gather_rows, replace_rows, sta
 from consistency.filters.kernel.dispatch import implement
 from consistency.filters.kernel.gain import apply_beyond, divide_by_root
 from consistency.filters.kernel.jit import inner
-from consistency.filters.kernel.slam import Data, Frame, State, correct, foresee, robot_frame
+from consistency.filters.kernel.slam import Data, Frame, State, correct, predict_innovation, robot_frame
 from consistency.filters.kernel.work import Work
 from consistency.filters.landmark.inverse_range import carried
 from consistency.filters.sensor.conversion import observe_range
-from consistency.filters.update.charting import (
+from consistency.filters.update.converting import CentredSlam, Converting, ConvertingRoom
+from consistency.filters.update.retraction_chain import (
     aim_apart,
     aim_chained,
     cast_columns,
@@ -24,8 +26,6 @@ from consistency.filters.update.charting import (
     move_chain,
     unchain,
 )
-from consistency.filters.update.converting import CentredSlam, Converting, ConvertingRoom
-from consistency.filters.upkeep.parking import Clones, is_in_doubt, recentre, unpark
 from consistency.types import Array, Indices
 
 SETTLED = 1e-3  # change in standard deviations that ends an iteration
@@ -40,7 +40,7 @@ def correct_converted(
     data: Data,
     k: int,
     m: int,
-    is_foreseen: bool,
+    has_innovation: bool,
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> tuple[int, float, float]:
@@ -48,7 +48,7 @@ def correct_converted(
     waits = in_doubt and m == 1
     waits = waits and state.P[rho, rho] < (update.waiting * state.x[rho]) ** 2
     code, clones, chained, total = 0, 0, False, 0.0  # as foreseen; clones are scratch then
-    if in_doubt or not is_foreseen:
+    if in_doubt or not has_innovation:
         code, clones, chained, total = _aim(update, slam, state, data, m, local, work)
     if code > 0:
         return code, np.nan, np.nan
@@ -63,12 +63,12 @@ def correct_converted(
             copy(room.frames[clones], state.x[:3])
         for i in range(m):
             if room.clone[i] >= 0 and not waits:
-                _reclaim(slam, state, work.label[i], local, work)
+                _reactivate(slam, state, work.label[i], local, work)
     return code, nis, log_det
 
 
-@implement(foresee, Converting)
-def foresee_converted(
+@implement(predict_innovation, Converting)
+def predict_innovation_converted(
     update: Converting,
     slam: CentredSlam,
     state: State,
@@ -378,7 +378,7 @@ def _move(state: State, m: int, work: Work[ConvertingRoom]) -> None:
 
 
 @inner
-def _reclaim(slam: CentredSlam, state: State, label: int, local: Clones, work: Work[ConvertingRoom]) -> None:
+def _reactivate(slam: CentredSlam, state: State, label: int, local: Clones, work: Work[ConvertingRoom]) -> None:
     """A landmark that was parked, in the frame of the sensor again."""
     x, P, n, base, room, Phi = state.x, state.P, state.n, state.base, work.room, local.factors.Phi
     J, shift, D, turned = room.three[0], room.three[1], room.three[2], room.three[3]

@@ -26,6 +26,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from consistency.filters.covariance_update.splitting import (
+    add_label,
+    append_rows,
+    join,
+    start_rows,
+    take_out,
+    to_base,
+    wake,
+)
 from consistency.filters.kernel.arrays import copy, fill
 from consistency.filters.kernel.dispatch import implement, part
 from consistency.filters.kernel.jit import inner
@@ -45,7 +54,6 @@ from consistency.filters.kernel.slam import (
     withhold,
 )
 from consistency.filters.kernel.work import Work
-from consistency.filters.upkeep.splitting import add_label, append_rows, join, start_rows, take_out, to_base, wake
 from consistency.types import Array, Indices
 
 LOCAL_FROM = 100  # variables in the state from which local updating is tried; measured, as the next three

@@ -1,9 +1,9 @@
 """Records of arrays passed to kernel functions by reference, and without counting references.
 
 Numba passes a NamedTuple by value, seven numbers for each array in it, and counts a reference to each array that a
-function touches; in steps of some microseconds both take longer than the arithmetic. A lent record is a pointer to
-the record in the frame of the function that lends it. Its arrays do not own their memory, so the lender keeps the
-record alive with :func:`keep` until nobody uses them any more.
+function touches; in steps of some microseconds both take longer than the arithmetic. Such a record is a
+pointer to the record in the frame of the function that passes it. Its arrays do not own their memory, so that
+function keeps the record alive with :func:`keep` until nobody uses them any more.
 """
 
 from __future__ import annotations
@@ -22,33 +22,34 @@ _intrinsic: Callable[[Any], Any] = intrinsic
 _llvm: Any = cgutils  # untyped
 
 
-class Lent(types.Type):
+class Reference(types.Type):
     """Pointer to a NamedTuple."""
 
     def __init__(self, record: Any) -> None:
         self.record = record
-        super().__init__(name=f"Lent({record})")
+        super().__init__(name=f"Reference({record})")
 
 
-@register_model(Lent)
-class _LentModel(models.PrimitiveModel):
+@register_model(Reference)
+class _ReferenceModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
         super().__init__(dmm, fe_type, ir.IntType(8).as_pointer())  # type: ignore[no-untyped-call]
 
 
 @infer_getattr
-class _LentFields(AttributeTemplate):
-    key = Lent
+class _ReferenceFields(AttributeTemplate):
+    key = Reference
 
-    def generic_resolve(self, lent: Any, field: str) -> Any:  # type: ignore[override]
-        fields = lent.record.fields
-        return lent.record.types[fields.index(field)] if field in fields else None
+    def generic_resolve(self, reference: Any, field: str) -> Any:  # type: ignore[override]
+        fields = reference.record.fields
+        return reference.record.types[fields.index(field)] if field in fields else None
 
 
-@lower_getattr_generic(Lent)  # type: ignore[no-untyped-call, untyped-decorator]
-def _lent_field(context: Any, builder: Any, lent: Any, pointer: Any, field: str) -> Any:
-    kind = context.get_value_type(lent.record).as_pointer()
-    return builder.load(_llvm.gep_inbounds(builder, builder.bitcast(pointer, kind), 0, lent.record.fields.index(field)))
+@lower_getattr_generic(Reference)  # type: ignore[no-untyped-call, untyped-decorator]
+def _field(context: Any, builder: Any, reference: Any, pointer: Any, field: str) -> Any:
+    kind = context.get_value_type(reference.record).as_pointer()
+    place = reference.record.fields.index(field)
+    return builder.load(_llvm.gep_inbounds(builder, builder.bitcast(pointer, kind), 0, place))
 
 
 def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
@@ -68,12 +69,12 @@ def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
 
 
 @_intrinsic
-def _lend(_: Any, record: Any) -> Any:
+def _by_reference(_: Any, record: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         bare = _without_owner(context, builder, record, values[0])
         return builder.bitcast(_llvm.alloca_once_value(builder, bare), ir.IntType(8).as_pointer())
 
-    return Lent(record)(record), generate
+    return Reference(record)(record), generate
 
 
 @_intrinsic
@@ -84,5 +85,5 @@ def _keep(_: Any, record: Any) -> Any:
     return types.void(record), generate
 
 
-lend: Callable[[Record], Record] = _lend  # for a type checker what is lent is what it was
+by_reference: Callable[[Record], Record] = _by_reference  # to a type checker the same type
 keep: Callable[[Any], None] = _keep

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import consistency as cs
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from relative_poses import drive, motion_stretch, vectors  # noqa: E402
 
 STEPS, APART = 40, 5

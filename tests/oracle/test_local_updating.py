@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bench_trials import growing, grown
 
 import consistency as cs
 from consistency.filters.stepping import step_through
 from consistency.scenario import Belief
 from consistency.types import Estimates, Trial
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-from bench_trials import growing, grown
 
 NEVER = 10**9
 ALL = [

@@ -1,7 +1,7 @@
 """Every command and piece of code of README and docs, run in the order of its page, on small inputs and few runs.
 
-A page has an empty folder with the files that tests/document_inputs.py makes for it. What cannot be run stands there in
-``NOT_RUN``; tests/unit/test_documents.py parses that, too, and commands that a sentence mentions.
+A page has an empty folder with the files that tests/helpers/document_inputs.py makes for it. What cannot be run stands
+there in ``NOT_RUN``; tests/unit/test_documents.py parses that, too, and commands that a sentence mentions.
 """
 
 from __future__ import annotations

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
+import characterisation as benchmark
 import numpy as np
 import pytest
 from scipy import stats
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import characterisation as benchmark
 
 pytestmark = pytest.mark.slow
 REPETITIONS, RUNS, MISSES = 20, 3, 5

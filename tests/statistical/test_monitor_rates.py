@@ -6,15 +6,10 @@ them, together under 1 false failure in 3,000 runs of this file.
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
+import calibration_monitor as calibration
 import numpy as np
 import pytest
 from scipy import stats
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import calibration_monitor as calibration
 
 pytestmark = pytest.mark.slow
 

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import bench
+import bench_whole as whole
 import numpy as np
 import pytest
+from bench_models import WARM
+from bench_peers import FilterpyEkf, FilterpyUkf, stone_soup
+from bench_trials import Case, Unequal, growing, grown, interleaved, require_equal, steady
 from threadpoolctl import threadpool_limits
 
 import consistency as cs
 from consistency.simulation import World
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import bench
-import bench_whole as whole
-from bench_models import WARM
-from bench_peers import FilterpyEkf, FilterpyUkf, stone_soup
-from bench_trials import Case, Unequal, growing, grown, interleaved, require_equal, steady
 
 BENCHMARKS = Path(bench.__file__).parent
 TINY = bench.Effort(

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
-import pytest
-from scipy import stats
-
-from consistency.diagnostics import nees, nis_of
-from consistency.recording import planar_error, read_recordings
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import calibration
 import calibration_cases
 import calibration_rows
 import calibration_worlds as worlds
+import numpy as np
+import pytest
 from calibration_cases import Case, Claim
 from calibration_gates import Draw, Gate, joined, random_walk_filter, turned
 from calibration_rows import Row, kept
+from scipy import stats
+
+from consistency.diagnostics import nees, nis_of
+from consistency.recording import planar_error, read_recordings
 
 ROOT = Path(__file__).parents[2]
 TABLE = json.loads((ROOT / "reports/reference/calibration.json").read_text(encoding="utf-8"))

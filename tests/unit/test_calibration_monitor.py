@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
+import calibration_monitor as calibration
 import numpy as np
 import pytest
+from calibration_rows import Row
 from scipy import stats
 
 import consistency as cs
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import calibration_monitor as calibration
-from calibration_rows import Row
 
 
 @pytest.mark.parametrize("gate", [None, 0.99, 0.95])

@@ -5,9 +5,7 @@ Random tests have levels of 1e-7 an interval, so that one of them fails by chanc
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
+import characterisation as benchmark
 import numpy as np
 import pytest
 from scipy import stats
@@ -27,9 +25,6 @@ from consistency.scenario.effects.bias_map import BiasMap
 from consistency.scenario.effects.nodes import bilinear, hats
 from consistency.simulation import simulate
 from consistency.types import Array
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import characterisation as benchmark
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import hints as world
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -22,9 +22,6 @@ from consistency.recording.hints import _ned, decades, hints, turns
 from consistency.recording.poses import Poses
 from consistency.recording.sheet import Places
 from consistency.types import Array
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import hints as world
 
 RUNS, STEPS = 3, 60
 SIX = ("x", "y", "z", "roll", "pitch", "yaw")

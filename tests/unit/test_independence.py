@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
+import calibration_windows
 import numpy as np
 import pytest
 from scipy import signal, stats
@@ -14,9 +12,6 @@ from consistency.diagnostics.ends import early_ends
 from consistency.diagnostics.export import flat
 from consistency.diagnostics.independence import ALIKE, ENOUGH, FEWEST, RATE, SIZES, independence
 from consistency.types import Array
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import calibration_windows
 
 SURE = 1e-5  # false-failure rate of each statistical assertion
 

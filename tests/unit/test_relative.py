@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import relative_poses as world
 from documents import blocks
+from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
 from consistency.cli import main as command
@@ -29,10 +30,6 @@ from consistency.types import Array
 from consistency.verdicts.baselines import baseline_of_files
 from consistency.verdicts.comparison import compare_with
 from consistency.verdicts.files import analyse_recordings
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import relative_poses as world
-from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 GROUPS = tuple(world.SIGMA)
 SURE = 1e-5  # false-alarm rate of a verdict in a test

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
+import first_steps
 import numpy as np
 import pytest
 from draws import autoregression, fully_dependent, identities, independent, verdict_on
@@ -21,9 +21,6 @@ from consistency.testing import ConsistencyError, assert_consistent, assert_not_
 from consistency.types import Array
 from consistency.verdicts.baselines import baseline_of_files, read_baseline, write_baseline
 from consistency.verdicts.curves import Curves, Errors
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import first_steps
 
 RUNS, STEPS, FIRST = 30, 40, 6
 SURE = 1e-5

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
+from single_log import errors
 
 from consistency.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.diagnostics.within import correlation_time, within
 from consistency.recording import read_recordings
 from consistency.types import Array
 from consistency.verdicts.files import analyse_recordings
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-from single_log import errors
 
 SETTINGS = Settings()
 SURE = 1e-5

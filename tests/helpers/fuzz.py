@@ -1,4 +1,4 @@
-"""Damaged files through every reader: ``python tests/fuzz.py CASES [SEED]``; CONTRIBUTING.md says more.
+"""Damaged files through every reader: ``python tests/helpers/fuzz.py CASES [SEED]``; CONTRIBUTING.md says more.
 
 Each case damages one file of a valid folder and has it read as the command line reads it. Allowed are exit status 2
 with one sentence on stderr, and status 0; a damage that must be refused may not end in status 0, and where a file has

@@ -7,7 +7,7 @@ from types import ModuleType
 
 from consistency.runs.findings import sibling
 
-FOLDER = Path(__file__).parents[1] / "experiments"
+FOLDER = Path(__file__).parents[2] / "experiments"
 
 
 def experiment(name: str) -> ModuleType:

@@ -15,7 +15,7 @@ import consistency as cs
 from consistency import cli
 from consistency.recording import read_recordings
 from consistency.reporting.blocks import Table, Text
-from consistency.reporting.drawing import Figure, Line
+from consistency.reporting.drawing import Band, Figure, Line, Points
 from consistency.reporting.files import clock_of, compose_files, observed_coverage, record_figures, shown_run, unit_of
 from consistency.verdicts.files import analyse_recordings
 
@@ -118,6 +118,39 @@ def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path: Path, rng: np.rando
     found = record_figures(record, cs.judge(cs.read(tmp_path / "e.npz")))
     assert [key.text for key in found[0].keys] == ["run 0", "2-sigma bounds"]
     assert found[1].caption.startswith("NEES; 2 is expected")
+
+
+def test_runs_of_one_step_stand_side_by_side(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A factor or a calibration: no curve along the steps, which would be a point."""
+    errors = rng.normal(size=(RUNS, 1, 2))
+    covariances = np.broadcast_to(np.diag([0.25, 4.0]), (RUNS, 1, 2, 2))
+    np.savez(tmp_path / "e.npz", errors=errors, covariances=covariances, axes=["x", "yaw"])
+    record = cs.read(tmp_path / "e.npz")
+    of_errors, of_nees, _ = record_figures(record, cs.judge(record))
+    for panel, factor, sigma, error in zip(
+        of_errors.panels, (1.0, 180 / np.pi), (0.5, 2.0), errors[:, 0].T, strict=True
+    ):
+        band, _, points = panel.marks
+        assert isinstance(band, Band)
+        assert isinstance(points, Points)
+        np.testing.assert_array_equal(points.x, np.arange(RUNS))
+        np.testing.assert_allclose(points.y, factor * error)
+        np.testing.assert_allclose((band.low, band.high), factor * np.full((2, RUNS), [[-2 * sigma], [2 * sigma]]))
+    band, _, points = of_nees.panels[0].marks
+    np.testing.assert_allclose(points.y, errors[:, 0] ** 2 @ [4.0, 0.25])
+    np.testing.assert_allclose(stats.chi2.cdf((band.low[0], band.high[0]), 2), (0.025, 0.975))
+
+
+@pytest.mark.parametrize("steps", [1, STEPS])
+def test_every_panel_of_a_plot_has_a_legend(steps: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    """One for all errors, and one each above NEES and coverage."""
+    np.savez(tmp_path / "e.npz", **{key: value[:, :steps] for key, value in errors_of(rng).items()})
+    record = cs.read(tmp_path / "e.npz")
+    for figure, others in ((record.plot(), 1), (cs.judge(record).plot(), 2)):
+        assert figure.legends
+        of_panels = [axes.get_legend() for axes in figure.axes if axes.axison]
+        assert [legend is not None for legend in of_panels] == [False, False, *(others * [True])]
+        assert [text.get_text() for text in of_panels[-1].get_texts()] == ["expected", "e1", "e2", "all together"]
 
 
 def test_what_is_not_there_is_not_drawn(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,16 @@ def test_what_the_files_do_not_tell_has_no_column(archive: Path) -> None:
     assert {"Filter", "Verdict", "Mean ANEES", "RMSE position (m)", "Failed runs"} <= set(heads)
     assert "NIS / dof" not in heads
     assert [len(row) for _, rows in shown.groups for row in rows] == [len(heads)]
+
+
+def test_the_cells_of_a_wide_table_name_their_heads(archive: Path, tmp_path: Path) -> None:
+    """A narrow screen shows each row by itself; a narrow table needs none."""
+    assert main(["analyse", str(archive), "--report", str(tmp_path / "r")]) == 0
+    source = (tmp_path / "r/report.html").read_text("utf-8")
+    (wide,) = re.findall(r'<table class="[^"]*\bwide">.*?</table>', source, re.S)
+    heads = [re.sub(r"<.*?>", "", head) for head in re.findall(r"<th scope=\"col\".*?>(.*?)</th>", wide)]
+    assert re.findall(r'data-head="(.*?)"', wide) == heads[1:]
+    assert source.count("data-head=") == len(heads) - 1
 
 
 def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive: Path) -> None:

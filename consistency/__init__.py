@@ -1,4 +1,4 @@
-"""The filter-consistency test bench: does an estimator tell the truth about its own uncertainty?"""
+"""The filter-consistency test bench: do the errors of an estimator have the covariance that it states?"""
 
 from consistency.extras import lazy_names
 

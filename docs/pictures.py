@@ -11,7 +11,7 @@ sys.path.insert(0, str(DOCS / "_extensions"))
 
 from figures import plain_look, save  # noqa: E402 - in the folder above
 
-PICTURES = ("nine_centimetres", "regime", "own_file", "ellipses")
+PICTURES = ("gtsam_imu", "nine_centimetres", "regime", "own_file", "ellipses")
 
 if __name__ == "__main__":
     for name in PICTURES:

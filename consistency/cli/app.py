@@ -19,7 +19,7 @@ FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENO
 
 app = typer.Typer(
     cls=Group,
-    help="Does your estimator tell the truth about its own uncertainty?",
+    help="Do the errors of your estimator have the covariance that it states? 'analyse' judges its files.",
     context_settings={"help_option_names": HELP},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -66,7 +66,7 @@ def analyse(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
 ) -> None:
-    """Judge results, or files of another estimator: consistent, overconfident, conservative, undecided ..., and why."""
+    """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.terminal.table import print_verdicts, verdicts_json
     from consistency.verdicts.files import analyse_recordings
     from consistency.verdicts.options import settings_of, skip_asked

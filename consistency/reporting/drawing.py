@@ -174,6 +174,7 @@ class Panel:
     equal: bool = False  # one metre is as long on both axes
     title: str = ""
     empty: str = ""  # said on paper in place of values where there are none
+    keys: tuple[Key, ...] = ()  # on paper: a legend of its own above the panel
 
     @property
     def has_values(self) -> bool:

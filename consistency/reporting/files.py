@@ -18,6 +18,7 @@ from consistency.reporting.clock import Clock, clock_of
 from consistency.reporting.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
 from consistency.reporting.looks import EXPECTED, LIMIT, SHADE, Look, style
 from consistency.reporting.model import Estimator, Judged, wide
+from consistency.reporting.one_step import errors_of_runs, has_one_step, nees_of_runs
 from consistency.reporting.sections import axes, questions, verdicts
 from consistency.reporting.sections.pose_errors import SIGMAS, ZERO
 from consistency.reporting.sections.provenance import facts
@@ -100,10 +101,11 @@ def record_sheet(record: Recording, verdict: Verdict | None = None) -> Sheet:
     found = [figure for figure in (_errors(record), nees, _coverage(record)) if figure is not None]
     if not found:
         raise InputError(f"{record.name}: has neither errors nor NEES to draw; give --truth, or truth= in Python")
-    panels = tuple(panel for figure in found for panel in figure.panels)
-    keys = dict.fromkeys(key for figure in found[:1] for key in figure.keys)
+    first, *others = found
+    own = (replace(panel, keys=figure.keys) for figure in others for panel in figure.panels)
+    panels = (*first.panels, *own)
     columns = _columns(len(panels))
-    return Sheet(panels, 0.3 + 1.6 * -(-len(panels) // columns), columns=columns, keys=tuple(keys), title=record.name)
+    return Sheet(panels, 0.3 + 1.6 * -(-len(panels) // columns), columns=columns, keys=first.keys, title=record.name)
 
 
 # --- errors -----------------------------------------------------------------------------------------
@@ -126,6 +128,9 @@ def _errors(record: Recording) -> Figure | None:
     """Error of each component of one run with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
     if record.error is None or record.covariance is None:
         return None
+    if has_one_step(record):
+        units = [unit_of(name) for name in record.axes[:MOST_PANELS]]
+        return errors_of_runs(record, units, _columns(len(units)))
     clock, row = clock_of(record.t), shown_run(record)
     others = [i for i in np.linspace(0, len(record.runs) - 1, MOST_RUNS + 1).astype(int) if i != row]
     names = record.axes[:MOST_PANELS]
@@ -175,6 +180,8 @@ def _nees(record: Recording, verdict: Verdict) -> Figure | None:
     scale, location = verdict.scale, verdict.location
     if record.independent:
         return _nees_of_windows(record)
+    if has_one_step(record):
+        return nees_of_runs(record)
     if scale is None or len(scale.anees) != len(record.t):
         return None
     clock, single = clock_of(record.t), verdict.runs == 1
@@ -258,14 +265,14 @@ def _coverage(record: Recording) -> Figure | None:
     window = (-0.02, 1.02)
     panel = Panel(
         Axis("stated probability", window=window), Axis("share of errors inside", window=window), (diagonal, *lines),
-        f"Coverage of {record.name}", height=340, shape="square",
+        f"Coverage of {record.name}", height=340,
     )  # fmt: skip
     keys = (Key("expected", EXPECTED), *(Key(name, look) for name, look in zip(found, looks, strict=True)))
     caption = (
         "Coverage: share of errors inside the interval that should hold them with the stated probability, over all "
         "steps of all runs. On the diagonal the covariance is right; below it is overconfident, above conservative."
     )
-    return Figure("Coverage", caption, (panel,), (Sheet((panel,), 2.6, keys=keys, beside=True),), keys)
+    return Figure("Coverage", caption, (panel,), (Sheet((panel,), 2.0, keys=keys),), keys)
 
 
 # --- innovations ------------------------------------------------------------------------------------

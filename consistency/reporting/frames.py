@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis as TickAxis
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
@@ -17,6 +19,7 @@ from consistency.reporting.drawing import Key, Sheet
 from consistency.reporting.looks import Look
 
 LINE = 0.16  # inches, a line of a legend
+SMALL = 0.14  # inches, a line of the legend of one panel
 BESIDE = 0.66  # of the figure's width is left of a legend that stands beside the axes
 WIDE = 200.0  # a log axis that spans more has room for powers of ten only
 
@@ -78,6 +81,31 @@ def legend(figure: Figure, sheet: Sheet) -> None:
         [_handle(key) for key in sheet.keys], [str(i) for i in range(len(labels))], ncols=columns, frameon=False,
         handlelength=2.6, columnspacing=1.4, borderaxespad=0.1, **place,
     )  # fmt: skip
+    _literally(drawn, labels)
+
+
+def panel_labels(keys: Sequence[Key], width: float) -> tuple[list[str], int, int]:
+    """Entries of the legend of one panel that is ``width`` inches wide, in how many columns, and lines of all."""
+    labels = [wrapped(key.text, 34) for key in keys]
+    longest = max((len(line) for label in labels for line in label.split("\n")), default=0)
+    columns = max(1, min(len(labels), int(19 * width / (longest + 9))))
+    tallest = max((label.count("\n") + 1 for label in labels), default=0)
+    return labels, columns, -(-len(labels) // columns) * tallest
+
+
+def panel_legend(axes: Axes, keys: Sequence[Key], labels: Sequence[str], columns: int) -> None:
+    """Legend above one panel; the layout makes room for it."""
+    if not keys:
+        return
+    drawn = axes.legend(
+        [_handle(key) for key in keys], [str(i) for i in range(len(keys))], ncols=columns, frameon=False,
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=2.0, columnspacing=1.0, borderaxespad=0.1,
+        borderpad=0.1, labelspacing=0.2, fontsize=6.5,
+    )  # fmt: skip
+    _literally(drawn, labels)
+
+
+def _literally(drawn: Legend, labels: Sequence[str]) -> None:
     for text, label in zip(drawn.get_texts(), labels, strict=True):
         text.set_parse_math(False)
         text.set_text(label)

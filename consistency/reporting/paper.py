@@ -32,7 +32,18 @@ from consistency.reporting.drawing import (
     Tiles,
     kept,
 )
-from consistency.reporting.frames import dots, frame, legend, plain_numbers, stroke, title, wrapped
+from consistency.reporting.frames import (
+    SMALL,
+    dots,
+    frame,
+    legend,
+    panel_labels,
+    panel_legend,
+    plain_numbers,
+    stroke,
+    title,
+    wrapped,
+)
 from consistency.reporting.thin import LIMIT
 
 Drawn: TypeAlias = Figure  # for rooms that do not draw themselves
@@ -82,12 +93,15 @@ def draw(sheet: Sheet) -> Figure:
     """The panels of a sheet with its title and legend."""
     panels, columns = sheet.panels, sheet.columns or len(sheet.panels)
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(WIDTH, sheet.height), layout="constrained")
+    own = [panel_labels(panel.keys, WIDTH / columns) for panel in panels]
+    room = SMALL * sum(max(lines for *_, lines in own[row * columns :][:columns]) for row in range(rows))
+    figure = Figure(figsize=(WIDTH, sheet.height + room), layout="constrained")
     shared = {f"share{side}": _same([getattr(panel, side) for panel in panels]) for side in "xy"}
     options: dict[str, Any] = {"squeeze": False, "width_ratios": sheet.widths or None} | shared
     grid = figure.subplots(rows, columns, **options)
-    for panel, axes in zip(panels, grid.flat, strict=False):
+    for panel, axes, (labels, many, _) in zip(panels, grid.flat, own, strict=False):
         draw_panel(axes, panel)
+        panel_legend(axes, panel.keys, labels, many)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     _outer(grid, len(panels), **shared)

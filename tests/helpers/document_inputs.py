@@ -29,6 +29,7 @@ DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 STUDY = "takes from half a minute to hours even with two runs; tests of its experiment run its parts"
 REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
 NOT_RUN = [
+    ("docs/case-studies.md", "python docs/case-studies", "needs gtsam; tests/oracle/test_gtsam_imu.py runs it"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
     ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and tests/unit/test_slurm.py stand in"),
     ("docs/compiling.md", "consistency compile", "compiles many filters; tests/smoke/test_compile_cli.py compiles one"),
@@ -103,12 +104,6 @@ def motions(folder: Path) -> None:
     e = errors()[1:]
     moved = poses(before.apply(np.diff(PLACE, axis=0)) - e[:, :3], Rotation.from_rotvec(-e[:, 3:]) * before * TURN[1:])
     write_rows(folder / "motions.tum", np.vstack([[0, 0, 0, 0, 0, 0, 1], moved]), P)
-
-
-def archive(at: Path) -> None:
-    """Errors of position and velocity, (60, 100, 2)."""
-    e, covariance = RNG.normal(size=(60, 100, 2)), np.broadcast_to(np.eye(2), (60, 100, 2, 2))
-    np.savez(at, truth=e, estimates=np.zeros_like(e), covariances=covariance)
 
 
 def table(at: Path, rows: list[dict[str, float]]) -> None:
@@ -237,15 +232,13 @@ def repository(folder: Path) -> None:
     shutil.copytree(ROOT / "docs/examples/repository", folder, dirs_exist_ok=True)
 
 
-def of_readme(folder: Path) -> None:
-    for prepare in (inline, motions, innovations, images, boards, log("LOG")):
-        prepare(folder)
-    archive(folder / "new.npz")
-    (folder / "sensor.toml").unlink()
+def case_studies(folder: Path) -> None:
+    shutil.copytree(ROOT / "docs/case-studies", folder / "docs/case-studies")
 
 
 PREPARE: dict[str, list[Callable[[Path], None]]] = {
-    "README.md": [of_readme],
+    "README.md": [case_studies],
+    "docs/case-studies.md": [case_studies],
     "docs/characterise.md": [log("drive"), images, boards],
     "docs/examples/repository/README.md": [repository],
     "docs/files.md": [inline],

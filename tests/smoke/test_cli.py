@@ -162,9 +162,9 @@ def _bad_files(folder: Path) -> None:
     (folder / "mine/thesis.txt").write_text("all of it")
 
 
-def test_the_readme_filter_runs(tmp_path: Path) -> None:
-    """The README's example of a filter of one's own, with fewer runs: too few to show that it is right."""
-    (example,) = (block.text for block in blocks("README.md", "python") if "class DeadReckoning" in block.text)
+def test_the_documented_filter_runs(tmp_path: Path) -> None:
+    """The example of a filter of one's own, with fewer runs: too few to show that it is right."""
+    (example,) = (block.text for block in blocks("docs/own-filter.md", "python") if "class DeadReckoning" in block.text)
     (tmp_path / "mine.py").write_text(example.replace("runs=50", "runs=4"))
     done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

@@ -34,7 +34,7 @@ SMALLER_CODE = {
 }  # fmt: skip
 STAND_INS = {"A": "ekf-uvd", "B": "ukf-uvd"}  # of placeholders that are no files
 PRINTED = {  # page: first words of a printed block whose first line has the form of one that the page's commands print
-    "README.md": "filter ",
+    "docs/laboratory.md": "filter ",
     "docs/tuning.md": "oc-ekf-xyz on",
 }
 

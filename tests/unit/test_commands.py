@@ -225,7 +225,7 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         mark = f"[{','.join(row.extras)}] " if row.extras else ""
         assert lines[name].startswith(mark), name
         assert row.extras or not lines[name].startswith("[")
-    assert "[bench,vision,report]: needs numba, bokeh: pip install " in after
+    assert "[report,bench,vision]: needs bokeh, numba: pip install " in after
     _, alone, _ = status_of(capsys, "-h")
     assert alone == after
 

@@ -247,6 +247,23 @@ def test_names_are_shown_literally():
     assert "&lt;script&gt;" in svg
 
 
+def test_a_panel_has_a_legend_of_its_own_and_room_for_it():
+    keys = (
+        *(Key(name, style(i)) for i, name in enumerate(ODD)),
+        Key("a name that is longer than a panel is wide", SHADE, "band"),
+    )
+    plain, keyed = panel(Rule("y", 1.0, EXPECTED)), replace(panel(Rule("y", 1.0, EXPECTED)), keys=keys)
+    alone, figure = (paper.draw(Sheet((plain, second), 2.0)) for second in (plain, keyed))
+    left, right = figure.axes
+    assert left.get_legend() is None
+    texts = [text.get_text() for text in right.get_legend().get_texts()]
+    assert [text.replace("\n", " ") for text in texts] == [key.text for key in keys]
+    assert "\n" in texts[-1]
+    assert figure.get_figheight() > alone.get_figheight()
+    figure.draw_without_rendering()
+    assert right.get_legend().get_window_extent().y0 >= right.get_window_extent().y1
+
+
 def test_the_same_sheet_gives_the_same_bytes():
     sheet = Sheet((panel(Line(STEPS, STEPS, style(0)), y=Axis("value", log=True)),), 2.0, keys=(Key("f", style(0)),))
     first, second = (paper.render(sheet) for _ in range(2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import consistency as cs
 from consistency import cli
 from consistency.recording import read_recordings
 from consistency.reporting.blocks import Table, Text
-from consistency.reporting.drawing import Figure, Line
+from consistency.reporting.drawing import Band, Figure, Line, Points
 from consistency.reporting.files import clock_of, compose_files, observed_coverage, record_figures, shown_run, unit_of
 from consistency.verdicts.files import analyse_recordings
 
@@ -73,6 +74,16 @@ def test_what_the_files_do_not_tell_has_no_column(archive: Path) -> None:
     assert [len(row) for _, rows in shown.groups for row in rows] == [len(heads)]
 
 
+def test_the_cells_of_a_wide_table_name_their_heads(archive: Path, tmp_path: Path) -> None:
+    """A narrow screen shows each row by itself; a narrow table needs none."""
+    assert main(["analyse", str(archive), "--report", str(tmp_path / "r")]) == 0
+    source = (tmp_path / "r/report.html").read_text("utf-8")
+    (wide,) = re.findall(r'<table class="[^"]*\bwide">.*?</table>', source, re.S)
+    heads = [re.sub(r"<.*?>", "", head) for head in re.findall(r"<th scope=\"col\".*?>(.*?)</th>", wide)]
+    assert re.findall(r'data-head="(.*?)"', wide) == heads[1:]
+    assert source.count("data-head=") == len(heads) - 1
+
+
 def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive: Path) -> None:
     record = read_recordings(archive)[0]
     panels = figures(document(archive))["Errors and stated bounds"].panels
@@ -118,6 +129,39 @@ def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path: Path, rng: np.rando
     found = record_figures(record, cs.judge(cs.read(tmp_path / "e.npz")))
     assert [key.text for key in found[0].keys] == ["run 0", "2-sigma bounds"]
     assert found[1].caption.startswith("NEES; 2 is expected")
+
+
+def test_runs_of_one_step_stand_side_by_side(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A factor or a calibration: no curve along the steps, which would be a point."""
+    errors = rng.normal(size=(RUNS, 1, 2))
+    covariances = np.broadcast_to(np.diag([0.25, 4.0]), (RUNS, 1, 2, 2))
+    np.savez(tmp_path / "e.npz", errors=errors, covariances=covariances, axes=["x", "yaw"])
+    record = cs.read(tmp_path / "e.npz")
+    of_errors, of_nees, _ = record_figures(record, cs.judge(record))
+    for panel, factor, sigma, error in zip(
+        of_errors.panels, (1.0, 180 / np.pi), (0.5, 2.0), errors[:, 0].T, strict=True
+    ):
+        band, _, points = panel.marks
+        assert isinstance(band, Band)
+        assert isinstance(points, Points)
+        np.testing.assert_array_equal(points.x, np.arange(RUNS))
+        np.testing.assert_allclose(points.y, factor * error)
+        np.testing.assert_allclose((band.low, band.high), factor * np.full((2, RUNS), [[-2 * sigma], [2 * sigma]]))
+    band, _, points = of_nees.panels[0].marks
+    np.testing.assert_allclose(points.y, errors[:, 0] ** 2 @ [4.0, 0.25])
+    np.testing.assert_allclose(stats.chi2.cdf((band.low[0], band.high[0]), 2), (0.025, 0.975))
+
+
+@pytest.mark.parametrize("steps", [1, STEPS])
+def test_every_panel_of_a_plot_has_a_legend(steps: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    """One for all errors, and one each above NEES and coverage."""
+    np.savez(tmp_path / "e.npz", **{key: value[:, :steps] for key, value in errors_of(rng).items()})
+    record = cs.read(tmp_path / "e.npz")
+    for figure, others in ((record.plot(), 1), (cs.judge(record).plot(), 2)):
+        assert figure.legends
+        of_panels = [axes.get_legend() for axes in figure.axes if axes.axison]
+        assert [legend is not None for legend in of_panels] == [False, False, *(others * [True])]
+        assert [text.get_text() for text in of_panels[-1].get_texts()] == ["expected", "e1", "e2", "all together"]
 
 
 def test_what_is_not_there_is_not_drawn(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -55,7 +55,7 @@ bench: .venv/.done
 	$(BIN)/python benchmarks/bench.py
 
 # what the core is, whose types are also checked for Python 3.10
-CORE := $(addprefix consistency/,errors.py extras.py types.py testing.py pytest_plugin.py reading geometry diagnostics recording gating \
+CORE := $(addprefix consistency/,defaults.py errors.py extras.py types.py testing.py pytest_plugin.py reading geometry diagnostics recording gating \
 	notebook terminal reporting/static.py \
 	$(addprefix cli/,app.py commands.py comparing.py files.py judging.py listing.py monitoring.py options.py) \
 	$(addprefix verdicts/,files.py options.py baselines.py comparison.py monitoring.py))

@@ -14,8 +14,8 @@ from consistency.challenging.bench import Bench
 from consistency.challenging.search import RUNGS, Budget, Candidate, ranked, search, standard_error
 from consistency.challenging.shrink import shrink
 from consistency.challenging.worlds import Point, Space, space_of
+from consistency.defaults import DETECT, FALSE_ALARM
 from consistency.diagnostics import Settings, Verdict, gate_runs
-from consistency.diagnostics.defaults import DETECT, FALSE_ALARM
 from consistency.diagnostics.questions import SCALE
 from consistency.errors import InputError
 from consistency.filters import get_filter

@@ -9,7 +9,7 @@ import typer
 
 from consistency.cli.files import FileOptions, reads_files, tell_notes
 from consistency.cli.options import FalseAlarm, Judged, Skip
-from consistency.diagnostics.defaults import FALSE_ALARM
+from consistency.defaults import FALSE_ALARM
 from consistency.errors import InputError
 
 

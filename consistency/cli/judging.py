@@ -21,7 +21,7 @@ from consistency.cli.options import (
     Skip,
     given,
 )
-from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
+from consistency.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.errors import InputError
 from consistency.extras import missing, remedy
 

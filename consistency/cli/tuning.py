@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from consistency.cli.options import SCENARIO, FalseAlarm, Jobs
-from consistency.diagnostics.defaults import DETECT, FALSE_ALARM
+from consistency.defaults import DETECT, FALSE_ALARM
 from consistency.errors import InputError
 
 

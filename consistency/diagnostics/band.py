@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special, stats
 
+from consistency.defaults import FALSE_ALARM
 from consistency.diagnostics.blocks import blocks
-from consistency.diagnostics.defaults import FALSE_ALARM
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.scale import FEW
 from consistency.types import Array, Indices

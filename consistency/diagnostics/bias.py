@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special, stats
 
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics.blocks import blocks
-from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.whitening import all_finite
 from consistency.types import Array, Indices
 

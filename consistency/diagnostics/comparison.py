@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
+from consistency.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics.blocks import by_runs
 from consistency.diagnostics.contrast import Contrast, contrast, margin
-from consistency.diagnostics.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics.scale import run_means
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.whitening import entries

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics.blocks import by_runs, of_runs
-from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.intervals import binomial_interval
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.diagnostics.whitening import entries, spread_steps, squared_length

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics.defaults import FALSE_ALARM
+from consistency.defaults import FALSE_ALARM
 from consistency.diagnostics.whitening import spread_steps
 from consistency.types import Array
 

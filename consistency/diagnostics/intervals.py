@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import special, stats
 
-from consistency.diagnostics.defaults import CONFIDENCE
+from consistency.defaults import CONFIDENCE
 from consistency.types import Array
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics.defaults import CONFIDENCE
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics.distribution import kolmogorov
 from consistency.diagnostics.landmarks import POSE
 from consistency.diagnostics.questions import JOINT, JOINT_DISTRIBUTION

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import stats
 
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics.band import Band
 from consistency.diagnostics.bias import hotelling
 from consistency.diagnostics.blocks import blocks, by_runs
 from consistency.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.diagnostics.credibility import noncredibility
-from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.hypothesis_tests import Tests
 from consistency.diagnostics.nees import anees
 from consistency.diagnostics.questions import BIAS, SCALE, SHAPE, STEP

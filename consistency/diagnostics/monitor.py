@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from consistency.diagnostics.defaults import GATE_FALSE_ALARM
+from consistency.defaults import GATE_FALSE_ALARM
 from consistency.diagnostics.gated import gate_limit, gated_scale, log_chi2_cdf
 
 RATIOS = (1.1, 1.25, 1.5, 2.0, 4.0)  # of an alternative to the edge of the tolerance

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special, stats
 
-from consistency.diagnostics.defaults import CONFIDENCE, FALSE_ALARM, POWER
+from consistency.defaults import CONFIDENCE, FALSE_ALARM, POWER
 from consistency.diagnostics.questions import MAIN, SHARES
 from consistency.diagnostics.scale import FEW, scale_test
 from consistency.types import Array

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
+from consistency.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics.ends import EarlyEnds
 from consistency.diagnostics.skipping import Skipped
 from consistency.diagnostics.symmetric import Symmetric

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics.defaults import CONFIDENCE
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics.intervals import binomial_interval
 from consistency.diagnostics.records import Interval, RejectionScore
 from consistency.types import Array, Indices

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special, stats
 
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics.blocks import by_runs, by_steps
-from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.records import Interval
 from consistency.types import Array
 

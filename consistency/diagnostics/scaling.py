@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.diagnostics.defaults import CONFIDENCE
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics.hypothesis_tests import Tests
 from consistency.diagnostics.intervals import anees_interval
 from consistency.diagnostics.nees import anees

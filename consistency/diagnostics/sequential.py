@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import takewhile
 
-from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
+from consistency.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics.eprocess import e_process, ever
 from consistency.diagnostics.questions import MAIN, SHARES
 from consistency.diagnostics.records import Evidence, Settings, Verdict

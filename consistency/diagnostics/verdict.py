@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics import wording
 from consistency.diagnostics.band import simultaneous_band
-from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.ends import early_ends
 from consistency.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.diagnostics.headline import at_share, status_of

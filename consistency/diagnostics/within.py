@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special, stats
 
-from consistency.diagnostics.defaults import CONFIDENCE
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics.equivalence import deciding_runs
 from consistency.diagnostics.planning import MARGIN
 from consistency.diagnostics.records import Interval, Settings, Within

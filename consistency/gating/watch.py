@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from consistency.diagnostics.defaults import DETECT, GATE_FALSE_ALARM, POWER
+from consistency.defaults import DETECT, GATE_FALSE_ALARM, POWER
 from consistency.gating.budget import in_place_rate
 
 # of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose

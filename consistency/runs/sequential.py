@@ -8,8 +8,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from consistency.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics import Design, Verdict, look, sequential_design, speaks
-from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.errors import InputError
 from consistency.protocols import Filter
 from consistency.reading.columns import POSE

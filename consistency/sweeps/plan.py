@@ -16,8 +16,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, field_validator
 
+from consistency.defaults import DETECT, POWER
 from consistency.diagnostics import Settings
-from consistency.diagnostics.defaults import DETECT, POWER
 from consistency.errors import InputError
 from consistency.filters import get_filter
 from consistency.reading import HUGE

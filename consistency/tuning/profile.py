@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics.defaults import CONFIDENCE
+from consistency.defaults import CONFIDENCE
 from consistency.types import Array
 
 UNITS = 20  # independent parts that an interval needs at least; fewer runs are cut into blocks of steps

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from consistency.defaults import CONFIDENCE
 from consistency.diagnostics import Verdict
-from consistency.diagnostics.defaults import CONFIDENCE
 from consistency.diagnostics.wording import short
 from consistency.scenario import Belief, scenario_text, toml_text
 from consistency.scenario.tables import SIGMA_UNITS

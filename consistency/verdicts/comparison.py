@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from consistency.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics import Comparison, compare
 from consistency.diagnostics.comparison import FailedRuns
-from consistency.diagnostics.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.errors import InputError
 from consistency.verdicts.baselines import Baseline
 

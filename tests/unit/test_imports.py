@@ -19,7 +19,8 @@ SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((
 # A room may import rooms of lower rank and itself; rooms of equal rank do not know each other. Rooms whose modules have
 # ranks of their own ("room.module") keep the direction inside, too.
 RANK = {
-    "types": 0, "errors": 0, "terminal.progress": 0, "store.atomic": 0, "store.machine": 0, "store.stopping": 0,
+    "types": 0, "errors": 0, "defaults": 0, "terminal.progress": 0, "store.atomic": 0, "store.machine": 0,
+    "store.stopping": 0,
     "extras": 1, "store.ending": 1, "store.provenance": 1,
     "geometry": 1, "reading": 1,
     "models": 2,
@@ -43,7 +44,7 @@ RANK = {
     "cli": 16, "notebook": 16, "testing": 16, "pytest_plugin": 16,
     "__main__": 17,
 }  # fmt: skip
-DIAGNOSTICS = {"types", "geometry", "errors", "diagnostics"}
+DIAGNOSTICS = {"types", "geometry", "errors", "defaults", "diagnostics"}
 DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}  # only reporting draws
 IN_EXPERIMENTS = {"consistency", "numpy", "pandas", "scipy"}
 PEERS = {"bench_peers": {"filterpy"}, "bench_stonesoup": {"stonesoup"}}  # what the bench sets beside ours

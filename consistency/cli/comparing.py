@@ -7,16 +7,17 @@ from typing import Annotated
 
 import typer
 
-from consistency.cli.files import FileOptions, reads_files, tell_notes
+from consistency.cli.files import are_files, read_files, reads_files, tell_notes
 from consistency.cli.options import FalseAlarm, Judged, Skip
 from consistency.defaults import FALSE_ALARM
 from consistency.errors import InputError
+from consistency.reading.options import Reading
 
 
 @reads_files
 def compare(
     path: Judged,
-    files: FileOptions,
+    files: Reading,
     other: Annotated[
         Path | None, typer.Argument(metavar="[OTHER]", help="Earlier ones in the same form, or a file of 'baseline'.")
     ] = None,
@@ -43,14 +44,14 @@ def compare(
         raise InputError(f"--false-alarm must lie between 0 and 1, got {false_alarm}")
     first = skip_asked(skip)
     sides = [each for each in (path, other) if each is not None]
-    estimates = [each for each in sides if not is_baseline(each) and files.are(each)]
+    estimates = [each for each in sides if not is_baseline(each) and are_files(each, files)]
     if not estimates and (unread := files.given()):
         raise InputError(f"{unread[0]}: is for files of another estimator, and none is named")
     if len(estimates) == 2 and files.covariance is not None:
         raise InputError(
             f"--covariance: would be read with {path} and with {other}; keep one of them with 'consistency baseline'"
         )
-    read = {each: files.read(each) for each in estimates}
+    read = {each: read_files(each, files) for each in estimates}
     new, *old = (
         baseline_of_files(read[each], str(each), files.truth, first) if each in read else read_baseline(each, first)
         for each in sides
@@ -72,15 +73,15 @@ def compare(
 def baseline(
     path: Judged,
     out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],
-    files: FileOptions,
+    files: Reading,
     skip: Skip = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Keep what a later 'compare' needs of results, one row a run."""
     from consistency.verdicts.baselines import baseline_of_files, write_baseline
 
-    if files.are(path):
-        recordings = files.read(path)
+    if are_files(path, files):
+        recordings = read_files(path, files)
         write_baseline(baseline_of_files(recordings, str(path), files.truth, skip), out, overwrite)
         tell_notes(recordings)
     else:

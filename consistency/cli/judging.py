@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.cli.files import FileOptions, reads_files, tell_notes
+from consistency.cli.files import are_files, read_files, reads_files, tell_notes
 from consistency.cli.options import (
     DETECT_HELP,
     ESTIMATES,
@@ -24,12 +24,13 @@ from consistency.cli.options import (
 from consistency.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.errors import InputError
 from consistency.extras import missing, remedy
+from consistency.reading.options import Reading
 
 
 @reads_files
 def analyse(
     path: Judged,
-    files: FileOptions,
+    files: Reading,
     filters: Annotated[
         list[str] | None, typer.Option("--filter", metavar="NAME", help="Only this filter; may be repeated.")
     ] = None,
@@ -81,8 +82,8 @@ def analyse(
     refused: InputError | None = None  # of a report, said below the verdict
     if overwrite and report is None:
         raise InputError("--overwrite goes with --report: nothing else is written")
-    if files.are(path):
-        recordings = [recording.without_first(first) for recording in files.read(path)]
+    if are_files(path, files):
+        recordings = [recording.without_first(first) for recording in read_files(path, files)]
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None:
@@ -135,7 +136,7 @@ def report(
     path: Annotated[
         Path, typer.Argument(metavar="PATH", help=f"Folder written by 'run' or 'reproduce', or estimates: {ESTIMATES}.")
     ],
-    files: FileOptions,
+    files: Reading,
     html: Annotated[
         Path | None,
         typer.Option("--html", help="HTML file [default: PATH/report.html; of estimates PATH-report.html]."),
@@ -147,13 +148,13 @@ def report(
     from consistency.reporting import require_pages, write_file_pages, write_reports
     from consistency.verdicts.files import analyse_recordings
 
-    estimates = files.are(path)
+    estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
     # one of the two named: only that one is written
     targets = (html, pdf) if html or pdf else (stem.with_name(f"{stem.name}.html"), stem.with_name(f"{stem.name}.pdf"))
     if estimates:
         require_pages(*targets, overwrite)
-        recordings = files.read(path)
+        recordings = read_files(path, files)
         write_file_pages(recordings, analyse_recordings(recordings), *targets, path.name)
         tell_notes(recordings)
     else:

@@ -11,7 +11,7 @@ from consistency.errors import InputError
 from consistency.reading import is_file, reading
 from consistency.reading.kitti import NANO, place_of, read_times
 from consistency.recording.kitti import BODIES, drive_poses, is_drive
-from consistency.recording.record import associate
+from consistency.recording.matching import associate
 from consistency.recording.tum import UNIT, read_trajectory
 from consistency.types import Array
 from consistency.vision.cameras import CAMERA_0, EUROC_BODY

@@ -13,6 +13,7 @@ from consistency.diagnostics.export import html_table
 from consistency.diagnostics.wording import plural
 from consistency.errors import InputError
 from consistency.extras import require
+from consistency.reading.options import Reading
 from consistency.recording import Recording, read_recordings
 from consistency.store.atomic import write_whole
 from consistency.verdicts.files import analyse_recordings
@@ -127,24 +128,12 @@ def read(
     InputError
         Something cannot be used: names file, line, column or option, and what is allowed.
     """
-    found = read_recordings(
-        Path(estimates),
-        None if truth is None else Path(truth),
-        None if covariance is None else Path(covariance),
-        error,
-        state=state,
-        covariance_order=covariance_order,
-        max_dt=max_dt,
-        time_offset=time_offset,
-        axes=axes,
-        topic=topic,
-        truth_topic=truth_topic,
-        body=body,
-        relative=relative,
-        motions=motions,
-        windows=windows,
-        align=align,
-    )
+    true, stated = (None if path is None else Path(path) for path in (truth, covariance))
+    reading = Reading(
+        true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
+        motions or None, windows, align,
+    )  # fmt: skip
+    found = read_recordings(Path(estimates), reading)
     named = {recording.name: recording for recording in found}
     if filter is None and len(named) > 1:
         raise InputError(f"{estimates}: holds several estimators ({', '.join(named)}); choose one with filter=")

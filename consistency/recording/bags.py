@@ -13,8 +13,9 @@ from consistency.errors import InputError
 from consistency.extras import MissingPackageError, remedy
 from consistency.geometry.conventions import SPATIAL
 from consistency.reading import reading
+from consistency.reading.options import Reading
 from consistency.recording.poses import Poses
-from consistency.recording.record import DEFAULT_DT, Recording, symmetric
+from consistency.recording.record import Recording, symmetric
 from consistency.recording.sheet import Places
 from consistency.recording.spatial import WHOLE, Source, recordings_of, require_axes
 from consistency.recording.tum import UNIT
@@ -43,36 +44,25 @@ def _is_one(path: Path) -> bool:
     return (path.suffix == ".bag" and path.is_file()) or (path.is_dir() and (path / "metadata.yaml").is_file())
 
 
-def read_bags(
-    path: Path,
-    topic: str | None,
-    truth: str | None,
-    convention: str | None,
-    max_dt: float | None,
-    time_offset: float | str | None,
-    axes: Sequence[str] | None,
-    align: str | None = None,
-) -> list[Recording]:
+def read_bags(path: Path, r: Reading) -> list[Recording]:
     """Recording of one estimator: a bag, or a folder with a bag for each run.
 
-    Parameters
-    ----------
-    topic : of PoseWithCovarianceStamped or Odometry; None where there is one
-    truth : topic of poses, or PARENT:CHILD, two frames of /tf that follow each other
+    The topic of the estimates is of PoseWithCovarianceStamped or Odometry, and need not be named where there is one;
+    that of the truth is of poses, or PARENT:CHILD, two frames of /tf that follow each other.
 
     Raises
     ------
     InputError
         A bag cannot be read, or lacks the topic; says which there are.
     """
-    if convention not in (None, *SPATIAL):
-        raise InputError(f"--error {convention}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    require_axes(axes)
+    if r.error not in (None, *SPATIAL):
+        raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
+    require_axes(r.axes)
     bags = [path] if _is_one(path) else sorted(part for part in path.iterdir() if _is_one(part))
-    poses = [_poses(bag, topic, truth, convention or "so3", DEFAULT_DT if max_dt is None else max_dt) for bag in bags]
-    why = "" if convention else "; as the ROS messages define it; declare yours with --error"
-    source = Source(path, [(bag, f"{truth} of {bag}") for bag in bags], path, why)
-    return recordings_of(source, poses, WHOLE, time_offset, axes, align=align)
+    poses = [_poses(bag, r.topic, r.truth_topic, r.error or "so3", r.tolerance) for bag in bags]
+    why = "" if r.error else "; as the ROS messages define it; declare yours with --error"
+    source = Source(path, [(bag, f"{r.truth_topic} of {bag}") for bag in bags], path, why)
+    return recordings_of(source, poses, WHOLE, r)
 
 
 def _poses(bag: Path, topic: str | None, truth: str | None, convention: str, max_dt: float) -> Poses:

@@ -18,8 +18,6 @@ from consistency.types import Array, Failure, Indices
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-DEFAULT_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
-
 
 @dataclass(frozen=True)
 class Recording:
@@ -178,50 +176,6 @@ def _require_different(file: str, tracks: Sequence[Track]) -> None:
                 f"{file}: the errors from {track.place[0]} on are those from {other.place[0]} on to the last digit: a "
                 "run that is there twice; leave one of them out"
             )
-
-
-def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
-    """Columns of every run and the step number of every column: the different steps, in order.
-
-    (k,) step numbers for each run -> (k,) columns for each run, and (steps,) numbers.
-    """
-    numbers = np.unique(np.concatenate(steps))
-    return [np.searchsorted(numbers, own).astype(np.int64) for own in steps], numbers
-
-
-def common_times(times: Sequence[Array], tolerance: float = 1e-6) -> tuple[list[Indices], Array]:
-    """Columns of every run and the time of every column, from timestamps in s.
-
-    (k,) times for each run -> (k,) columns for each run, and (steps,) times. Where every run keeps to the timestamps of
-    the longest one the columns are its timestamps. Otherwise, as with recordings of different days, estimates are
-    counted from the first on, and no column has a time.
-    """
-    longest = max(times, key=len)
-    columns = []
-    for own in times:
-        near = np.clip(np.searchsorted(longest, own - tolerance), 0, len(longest) - 1)
-        if (np.abs(longest[near] - own) > tolerance).any():
-            return [np.arange(len(each)) for each in times], np.full(len(longest), np.nan)
-        columns.append(near.astype(np.int64))
-    return columns, longest
-
-
-def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, Indices]:
-    """Indices (k,) of ``times`` (N,) and of their nearest neighbours in ``reference`` (M,), both increasing, in s.
-
-    Pairs further apart than ``max_dt`` are left out. Where two timestamps have the same neighbour the nearer one
-    keeps it.
-    """
-    right = np.clip(np.searchsorted(reference, times), 1, max(len(reference) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(reference) - 1)
-    nearest = np.where(np.abs(reference[left] - times) <= np.abs(reference[right] - times), left, right)
-    distance = np.abs(reference[nearest] - times)
-    order = np.lexsort((distance, nearest))
-    order = order[distance[order] <= max_dt + 1e-6]  # a double holds the seconds since 1970 to a quarter of that
-    _, first = np.unique(nearest[order], return_index=True)
-    own = np.sort(order[first])
-    return own, nearest[own]
 
 
 def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:

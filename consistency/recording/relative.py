@@ -16,7 +16,8 @@ from consistency.diagnostics.whitening import whiten
 from consistency.diagnostics.wording import p_text
 from consistency.errors import InputError
 from consistency.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
-from consistency.recording.record import Recording, Track, assemble, common_times, count
+from consistency.recording.matching import common_times
+from consistency.recording.record import Recording, Track, assemble, count
 from consistency.recording.sheet import Places
 from consistency.recording.windows import Relative, windows
 from consistency.types import Array, Indices

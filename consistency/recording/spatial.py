@@ -10,11 +10,13 @@ import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import SPATIAL
+from consistency.reading.options import Reading
 from consistency.recording.alignment import clocks_and_frames
 from consistency.recording.hints import hints
 from consistency.recording.interpolation import truth_at
+from consistency.recording.matching import common_times
 from consistency.recording.poses import Poses
-from consistency.recording.record import Recording, Track, assemble, common_times
+from consistency.recording.record import Recording, Track, assemble
 from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places
 from consistency.recording.windows import Relative
@@ -61,17 +63,14 @@ def recordings_of(
     source: Source,
     poses: Sequence[Poses],
     parts: Mapping[str, range],
-    time_offset: float | str | None,
-    axes: Sequence[str] | None,
+    r: Reading,
     relative: Relative | None = None,
-    align: str | None = None,
 ) -> list[Recording]:
     """The recording of one estimator, each of whose runs is one of ``poses``; clocks and mix-ups are looked for.
 
     Parameters
     ----------
     parts : ``WHOLE``, ``BLOCKS`` or ``SINGLE``: components whose covariance is known, each of which is a recording
-    time_offset, axes, align : as :func:`consistency.recording.read_recordings` has them
     relative : judge motions over windows in place of poses
 
     Raises
@@ -79,17 +78,16 @@ def recordings_of(
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
-    judged = [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
+    judged = [i for i, axis in enumerate(AXES) if r.axes is None or axis in r.axes]
     if relative is not None:
         if parts is not WHOLE:
             raise InputError(f"{source.path}: --relative needs covariances of whole poses; here parts are stated apart")
-        shift = time_offset if isinstance(time_offset, float) else 0.0
         stretches = [
-            _stretch(run, one, *files, shift, relative)
+            _stretch(run, one, *files, r.shift, relative)
             for run, (one, files) in enumerate(zip(poses, source.files, strict=True))
         ]
         return [relative_recording(source.path.stem, str(source.covariance), stretches, AXES, judged, relative)]
-    shift, clocks, moved = clocks_and_frames(source.path.name, poses, time_offset, align, judged)
+    shift, clocks, moved = clocks_and_frames(source.path.name, poses, r.time_offset, r.align, judged)
     poses = moved.runs
     matches = [_match(one, *files, shift) for one, files in zip(poses, source.files, strict=True)]
     columns, t = common_times([run.t for run in matches])

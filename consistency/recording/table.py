@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -14,22 +13,14 @@ from consistency.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
 from consistency.reading.columns import COVARIANCE, OWN_COVARIANCE
+from consistency.reading.options import Reading
 from consistency.recording.alignment import Aligned, clocks_and_frames
 from consistency.recording.hints import hints
 from consistency.recording.interpolation import Manifold, truth_at
 from consistency.recording.kitti import drive_sheet, is_drive
+from consistency.recording.matching import common_steps, common_times
 from consistency.recording.poses import Poses
-from consistency.recording.record import (
-    DEFAULT_DT,
-    Recording,
-    Track,
-    assemble,
-    common_steps,
-    common_times,
-    count,
-    listed,
-    symmetric,
-)
+from consistency.recording.record import Recording, Track, assemble, count, listed, symmetric
 from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places, Sheet, are_dof, read_sheet
 from consistency.recording.windows import Relative
@@ -39,17 +30,7 @@ POSE = ("x", "y", "heading")
 OWN_NAMES = {(POSE[i], POSE[j]): name for name, (i, j) in COVARIANCE.items()}
 
 
-def read_tables(
-    estimates: Path,
-    truth: Path | None,
-    convention: str | None,
-    state: Sequence[str] | None,
-    max_dt: float | None,
-    time_offset: float | str | None = None,
-    body: str | None = None,
-    relative: Relative | None = None,
-    align: str | None = None,
-) -> list[Recording]:
+def read_tables(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Recording]:
     """Recordings of the estimators in a table, one for each value of its column ``filter``.
 
     Raises
@@ -58,25 +39,25 @@ def read_tables(
         A file, column, line or option that cannot be used, and what is allowed.
     """
     sheet = read_sheet(estimates)
-    axes = tuple(state) if state else POSE
-    convention = _convention(convention, axes, truth)
+    truth, axes = r.truth, tuple(r.state) if r.state else POSE
+    convention = _convention(r.error, axes, truth)
     if relative is not None:
         require_poses(estimates, axes, convention, truth)
-    if align is not None and _manifold(convention) != "planar":
-        raise InputError(f"--align {align}: needs poses x,y,heading, and an error that is not 'vector'")
+    if r.align is not None and _manifold(convention) != "planar":
+        raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     other = None
     if truth is not None:
-        other = drive_sheet(truth, body) if is_drive(truth) else read_sheet(truth)
+        other = drive_sheet(truth, r.body) if is_drive(truth) else read_sheet(truth)
     if other is None and not {"nis", "nis_dof"} <= set(sheet.data):
         raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
-    key = _key(sheet, other, max_dt, time_offset)
+    key = _key(sheet, other, r)
     names = [estimates.stem]
     if "filter" in sheet:
         names = list(dict.fromkeys(sheet.texts("filter")))
     recordings = []
     for name in names:
         own = sheet.rows(sheet.texts("filter") == name) if "filter" in sheet else sheet
-        recordings.append(_recording(name, own, other, key, axes, convention, max_dt, time_offset, relative, align))
+        recordings.append(_recording(name, own, other, key, axes, convention, r, relative))
     return recordings
 
 
@@ -100,15 +81,15 @@ def require_poses(path: Path, axes: tuple[str, ...], convention: str, truth: Pat
         raise InputError(f"{path}: --relative needs poses x, y, heading, with --error so2, left or right")
 
 
-def _key(sheet: Sheet, truth: Sheet | None, max_dt: float | None, time_offset: float | str | None) -> str:
+def _key(sheet: Sheet, truth: Sheet | None, r: Reading) -> str:
     """The column that says which estimate belongs to which truth."""
-    if time_offset is not None:
+    if r.time_offset is not None:
         if "t" in sheet and truth is not None and "t" in truth:
             return "t"
         raise InputError("--time-offset: needs a column t in the estimates and in the truth")
     for key in ("step", "t"):
         if key in sheet and (truth is None or key in truth):
-            if max_dt is not None and not ("t" in sheet and truth is not None and "t" in truth):
+            if r.max_dt is not None and not ("t" in sheet and truth is not None and "t" in truth):
                 raise InputError("--max-dt: needs a column t in the estimates and in the truth")
             return key
     if truth is not None and ("step" in sheet or "t" in sheet):
@@ -124,10 +105,8 @@ def _recording(
     key: str,
     axes: tuple[str, ...],
     convention: str,
-    max_dt: float | None,
-    time_offset: float | str | None,
+    r: Reading,
     relative: Relative | None,
-    align: str | None,
 ) -> Recording:
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
     order = row_order(sheet, runs, key)
@@ -148,19 +127,21 @@ def _recording(
         samples = _samples(truth, axes, key)
         shift, clocks = 0.0, list[str]()
         if relative is not None:
-            shift = time_offset if isinstance(time_offset, float) else 0.0
-        elif key == "step" and align is None:
+            shift = r.shift
+        elif key == "step" and r.align is None:
             clocks = hints(name, axes, _poses(sheet, samples, runs, keys, estimate, covariance, convention, 0.0))
         else:
-            reach = _default_dt(max_dt) if key == "t" else 0.0
+            reach = r.tolerance if key == "t" else 0.0
             poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, reach)
-            shift, clocks, moved = clocks_and_frames(name, poses, time_offset, align, range(len(axes)))
+            shift, clocks, moved = clocks_and_frames(name, poses, r.time_offset, r.align, range(len(axes)))
             clocks += [*moved.notes, *hints(name, axes, moved.runs, shift)]
-            if align is not None:
+            if r.align is not None:
                 there = np.isin(runs, np.unique(samples.runs)) if samples.runs is not None else np.ones(len(runs), bool)
                 estimate[there] = np.concatenate([p.estimate for p in moved.runs])
                 covariance[there] = np.concatenate([p.covariance for p in moved.runs])
-        keep, true, notes = _matched(name, sheet, truth, samples, runs, keys + shift, key, axes, convention, max_dt)
+        keep, true, notes = _matched(
+            name, sheet, truth, samples, runs, keys + shift, key, axes, convention, r.tolerance
+        )
         if relative is not None:
             stretches = _stretches(sheet, runs, keep, true, estimate, covariance, convention, relative)
             record = relative_recording(name, str(sheet.path), stretches, axes, range(len(axes)), relative)
@@ -322,11 +303,11 @@ def _matched(
     key: str,
     axes: tuple[str, ...],
     convention: str,
-    max_dt: float | None,
+    max_dt: float,
 ) -> tuple[Array, Array, list[str]]:
     """Which rows have a truth, (N,), that truth, (N, n), and what to say about it."""
     true_runs = samples.runs
-    tolerance = 0.0 if key == "step" else _default_dt(max_dt)
+    tolerance = 0.0 if key == "step" else max_dt
     keep, true = np.zeros(len(keys), bool), np.full((len(keys), len(axes)), np.nan)
     partner, furthest = np.full(len(keys), -1), 0.0
     for run in np.unique(runs):
@@ -350,7 +331,7 @@ def _matched(
             )
         keep[rows[own]], true[rows[own]], partner[rows[own]] = True, found, there.row[match]
     if key == "step" and "t" in sheet and "t" in truth:
-        _same_instants(sheet, truth, keep, partner, _default_dt(max_dt))
+        _same_instants(sheet, truth, keep, partner, max_dt)
     notes = []
     absent = [] if true_runs is None else sorted({int(run) for run in true_runs} - {int(run) for run in runs})
     if absent:
@@ -369,10 +350,6 @@ def _equal(steps: Array, reference: Array) -> tuple[Indices, Indices]:
     """Indices of equal numbers in two increasing lists."""
     _, own, match = np.intersect1d(steps, reference, assume_unique=True, return_indices=True)
     return own, match
-
-
-def _default_dt(max_dt: float | None) -> float:
-    return DEFAULT_DT if max_dt is None else max_dt
 
 
 def _same_instants(sheet: Sheet, truth: Sheet, keep: Array, partner: Array, max_dt: float) -> None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from consistency.errors import InputError
 from consistency.geometry.conventions import SPATIAL
+from consistency.reading.options import Reading
 from consistency.recording.kitti import is_drive, read_drive
+from consistency.recording.matching import associate
 from consistency.recording.openvins import FULL as STATES
 from consistency.recording.openvins import LAYOUT, States, as_states, read_deviations
 from consistency.recording.poses import Poses
-from consistency.recording.record import DEFAULT_DT, Recording, associate, symmetric
+from consistency.recording.record import Recording, symmetric
 from consistency.recording.sheet import Lines, Places, read_numbers
 from consistency.recording.spatial import BLOCKS, SINGLE, WHOLE, Source, apart, recordings_of, require_axes
 from consistency.recording.windows import Relative
@@ -27,50 +29,39 @@ UNIT = 1e-3  # quaternions of four decimals pass
 SUFFIXES = (".txt", ".tum")
 
 
-def read_tum(
-    estimates: Path,
-    truth: Path | None,
-    covariance: Path | None,
-    convention: str | None,
-    order: str | None,
-    max_dt: float | None,
-    time_offset: float | str | None = None,
-    axes: Sequence[str] | None = None,
-    body: str | None = None,
-    relative: Relative | None = None,
-    align: str | None = None,
-) -> list[Recording]:
+def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Recording]:
     """Recording of one estimator: a file, or a folder with a file for each run.
 
-    With ``axes`` only these components of the error are judged, by their part of the covariance.
+    With axes named only these components of the error are judged, by their part of the covariance.
 
     With the 20 columns that the tools of OpenVINS write, position and rotation are two recordings: their
     cross-covariance is not in the file, so a joint NEES would be wrong. With the states and standard deviations of a
-    simulation each component is one. The truth may be a drive of KITTI, whose ``body`` is meant.
+    simulation each component is one. The truth may be a drive of KITTI.
     """
-    if convention not in (None, *SPATIAL):
-        raise InputError(f"--error {convention}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
+    order = r.covariance_order
+    if r.error not in (None, *SPATIAL):
+        raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     if order not in (None, *ORDERS):
         raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}")
-    require_axes(axes)
-    if truth is None:
+    require_axes(r.axes)
+    if r.truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
-    runs = _runs(estimates, truth, covariance)
+    runs = _runs(estimates, r.truth, r.covariance)
     parts: Mapping[str, range] = WHOLE
     poses: list[Poses] = []
     for path, true_path, P_path in runs:
         own = read_trajectory(path)
         if not poses:
             parts = _parts(own)
-            error_kind = convention or ("so3" if parts is WHOLE else "so3-body")
+            error_kind = r.error or ("so3" if parts is WHOLE else "so3-body")
         if parts is not WHOLE and order == ORDERS[0]:
             raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
         if _parts(own) is not parts:
             raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
-        poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], max_dt, body))
-    why = "" if convention else f"; the default of this layout, {_origin(parts)}"
-    source = Source(estimates, [(path, true) for path, true, _ in runs], covariance or estimates, why)
-    return recordings_of(source, poses, parts, time_offset, axes, relative, align)
+        poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], r.tolerance, r.body))
+    why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
+    source = Source(estimates, [(path, true) for path, true, _ in runs], r.covariance or estimates, why)
+    return recordings_of(source, poses, parts, r, relative)
 
 
 def _parts(own: Lines) -> Mapping[str, range]:
@@ -129,11 +120,10 @@ def _poses(
     covariance_path: Path | None,
     convention: str,
     order: str,
-    max_dt: float | None,
+    tolerance: float,
     body: str | None,
 ) -> Poses:
     """A run with its truth; the covariance is NaN where none is near."""
-    tolerance = DEFAULT_DT if max_dt is None else max_dt
     truth = read_drive(truth_path, body) if is_drive(truth_path) else read_trajectory(truth_path, true=True)
     covariance, source, cross = _inline(own, order), own, None
     rows = picked = np.arange(len(own.t))

@@ -14,8 +14,9 @@ import numpy as np
 from consistency.errors import InputError
 from consistency.extras import MissingPackageError, remedy
 from consistency.reading import is_file, reading
+from consistency.recording.matching import associate
 from consistency.recording.nis import NisLog, choose
-from consistency.recording.record import associate, count
+from consistency.recording.record import count
 from consistency.types import Array, Indices
 
 TOPICS = ("estimator_innovations", "estimator_innovation_variances")

@@ -14,6 +14,7 @@ import consistency as cs
 from consistency.errors import InputError
 from consistency.geometry import wrap
 from consistency.geometry.conventions import SPATIAL, se3_log, spatial_error
+from consistency.reading.options import Reading
 from consistency.recording import read_recordings
 from consistency.recording.hints import hints
 from consistency.recording.sheet import read_sheet
@@ -87,7 +88,7 @@ def test_an_estimate_that_is_not_finite_is_a_failed_run(column: str, value: str,
     cells[header.split(",").index(column)] = value
     lines[8] = ",".join(cells)
     path.write_text("\n".join([header, *lines]))
-    [recording] = read_recordings(path, tmp_path / "truth.csv")
+    [recording] = read_recordings(path, Reading(tmp_path / "truth.csv"))
     [failure] = recording.failures
     assert (failure.run, failure.step) == (1, 3)
     assert failure.reason.startswith("estimate is not finite")

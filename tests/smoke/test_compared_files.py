@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from command import consistency
+from recorded import read_recordings
 
 from consistency.cli import main
 from consistency.errors import InputError
-from consistency.recording import read_recordings
 from consistency.verdicts.baselines import baseline_of_files
 
 OPTIONS = ("--truth", "truth.csv", "--state", "a,b")

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.recording import read_recordings
 from consistency.types import Array
 
 pytest.importorskip("rosbags", reason="needs the extra 'ros'")
@@ -160,7 +160,7 @@ def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path: Path) -> None
             r"--topic /tf: is not there with poses and cov.*there are: /odom",
         ),
         ({"truth_topic": "map:body", "state": ["x"]}, r"--state: does not go with"),
-        ({"truth_topic": "map:body", "convention": "so2"}, r"--error so2: for a trajectory in space it is one of"),
+        ({"truth_topic": "map:body", "error": "so2"}, r"--error so2: for a trajectory in space it is one of"),
         ({"truth_topic": "map:body", "axes": ["w"]}, r"--axes w: 'w' is not one of"),
         ({"truth_topic": "map:body", "time_offset": 900.0}, r"no estimate has a truth within 0.01 s"),
     ],

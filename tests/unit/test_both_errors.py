@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from invariant import Invariant
+from recorded import read_recordings
 
 import consistency as cs
 from consistency.cli import main
@@ -19,7 +20,6 @@ from consistency.diagnostics.records import MapScore
 from consistency.diagnostics.scale import ratio_interval
 from consistency.filters.stepping import run_filter, step_through
 from consistency.reading.columns import OWN_COVARIANCE
-from consistency.recording import read_recordings
 from consistency.runs.sequential import run_until_decided
 from consistency.store.results import open_results
 from consistency.terminal.table import print_verdicts, verdicts_json
@@ -65,21 +65,21 @@ def exported(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> t
 def test_both_ways_in_give_the_same_nees_and_verdict(results: cs.Results, exported: tuple[Path, Path]) -> None:
     c = curves(results, "right")
     assert c.own is not None
-    [recording] = read_recordings(*exported, convention="right")
+    [recording] = read_recordings(*exported, error="right")
     np.testing.assert_allclose(recording.nees, c.own.nees, rtol=1e-9)
     np.testing.assert_allclose(recording.error[:, 1:], c.own.error[:, 1:], rtol=0, atol=1e-12)
     ours, theirs = cs.analyse(results)["right"], analyse_recordings([recording])["right"]
     assert (ours.status, ours.convention) == (theirs.status, theirs.convention)
     assert ours.statistic == pytest.approx(theirs.statistic, rel=1e-9)
     assert ours.inflation_interval == pytest.approx(theirs.inflation_interval, rel=1e-9)
-    [wrong] = read_recordings(*exported, convention="so2")
+    [wrong] = read_recordings(*exported, error="so2")
     assert np.nanmax(np.abs(wrong.nees - c.own.nees)) > 1.0, "negative control"
 
 
 def test_both_ways_of_the_invariant_filter_of_the_bench(uvd: cs.Scenario, tmp_path: Path) -> None:
     results = cs.run_trials(uvd, ["ri-ekf-uvd"], runs=RUNS, seed=5, jobs=1)
     c = curves(results, "ri-ekf-uvd")
-    [recording] = read_recordings(*export(results, "ri-ekf-uvd", tmp_path), convention="right")
+    [recording] = read_recordings(*export(results, "ri-ekf-uvd", tmp_path), error="right")
     np.testing.assert_allclose(recording.nees, c.judged.nees, rtol=1e-9)
     ours, theirs = cs.analyse(results)["ri-ekf-uvd"], analyse_recordings([recording])["ri-ekf-uvd"]
     assert (ours.status, ours.convention) == (theirs.status, "right")
@@ -119,7 +119,7 @@ def test_both_ways_by_the_command_line(
 
 def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder: Path) -> None:
     by_name = {
-        r.name: r for r in read_recordings(folder / "estimates.parquet", folder / "truth.parquet", convention="right")
+        r.name: r for r in read_recordings(folder / "estimates.parquet", folder / "truth.parquet", error="right")
     }
     c = curves(open_results(folder), "ekf-uvd")
     np.testing.assert_array_equal(by_name["ekf-uvd"].covariance[:, 1:], c.covariance[:, 1:])

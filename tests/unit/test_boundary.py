@@ -14,9 +14,10 @@ import pyarrow.parquet as pq
 import pytest
 from hostile import STEPS, write_all
 from mutations import bomb, claimed
+from recorded import read_recordings
 
 import consistency as cs
-from consistency.recording import Recording, read_recordings
+from consistency.recording import Recording
 from consistency.store.parquet import read_parquet
 from consistency.sweeps.plan import load_sweep
 from consistency.verdicts.baselines import read_baseline

@@ -16,10 +16,11 @@ import pytest
 from calibration_cases import Case, Claim
 from calibration_gates import Draw, Gate, joined, random_walk_filter, turned
 from calibration_rows import Row, kept
+from recorded import read_recordings
 from scipy import stats
 
 from consistency.diagnostics import nees, nis_of
-from consistency.recording import planar_error, read_recordings
+from consistency.recording import planar_error
 
 ROOT = Path(__file__).parents[2]
 TABLE = json.loads((ROOT / "reports/reference/calibration.json").read_text(encoding="utf-8"))
@@ -237,12 +238,12 @@ def test_poses_have_exactly_the_left_invariant_errors_that_were_drawn(tmp_path: 
     recording = worlds.recorded(truth, estimate, covariance)
     path = tmp_path / "poses.npz"
     np.savez(path, estimates=estimate, truth=truth, covariances=covariance)
-    (read,) = read_recordings(path, convention="left")
+    (read,) = read_recordings(path, error="left")
     np.testing.assert_array_equal(recording.error, read.error)
     np.testing.assert_array_equal(recording.covariance, read.covariance)
     np.testing.assert_array_equal(recording.nees, read.nees)
     assert recording.failures == read.failures == ()
-    (other,) = read_recordings(path, convention="so2")
+    (other,) = read_recordings(path, error="so2")
     assert np.abs(other.error - read.error).max() > 0.01
 
 

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recorded import read_recordings
 from scipy import optimize, special, stats
 
 import consistency as cs
@@ -17,7 +18,6 @@ from consistency.diagnostics import Comparison, RunSummary, compare, summary
 from consistency.diagnostics.contrast import Contrast, contrast, margin
 from consistency.gating.session import needed_at
 from consistency.gating.watch import Watch, watching
-from consistency.recording import read_recordings
 from consistency.testing import InsufficientTrials, assert_not_worse
 from consistency.types import Array
 from consistency.verdicts.baselines import baseline_of, baseline_of_files, read_baseline, write_baseline

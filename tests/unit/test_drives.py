@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drives import R_IV, R_VC, STEPS, T_IV, T_VC, write_drive, write_states
+from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.errors import InputError
 from consistency.geometry.conventions import planar_error, spatial_error
-from consistency.recording import read_recordings
 from consistency.recording.kitti import mercator, read_drive
 from consistency.types import Array
 

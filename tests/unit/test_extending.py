@@ -40,6 +40,30 @@ def python(folder: Path, code: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+def test_the_command_of_the_document_works(copy: Path) -> None:
+    """One new file and one row; it is in the help, reads files, and loads nothing heavy before it is called."""
+    module, row = code("Add a command")
+    assert row.count("\n") == 1
+    (copy / "consistency/cli/worst.py").write_text(module, encoding="utf-8")
+    table = copy / "consistency/cli/commands.py"
+    first = "    # the laboratory\n"
+    assert table.read_text(encoding="utf-8").count(first) == 1
+    table.write_text(table.read_text(encoding="utf-8").replace(first, row + first), encoding="utf-8")
+    (copy / "est.csv").write_text("run,step,a,P_a_a\n" + "".join(f"{r},{k},{r},1\n" for r in (3, 7) for k in (1, 2)))
+    (copy / "truth.csv").write_text("step,a\n1,0\n2,0\n")
+    told = python(
+        copy,
+        "import sys\nfrom consistency.cli import main\n"
+        "try:\n    main(['worst', '--help'])\nfinally:\n    print('numpy' in sys.modules)",
+    )
+    assert "The run with the largest mean NEES" in told.stdout
+    assert told.stdout.splitlines()[-1] == "False"
+    done = python(
+        copy, "from consistency.cli import main\nmain(['worst', 'est.csv', '--truth', 'truth.csv', '--state', 'a'])"
+    )
+    assert done.stdout == "est: run 7, mean NEES 49\n", done.stderr
+
+
 def test_the_bias_of_the_document_works(copy: Path) -> None:
     """One new file, one line elsewhere, a key in a scenario; and the document's own test passes."""
     effect, line, key, test = code("Add a sensor effect")

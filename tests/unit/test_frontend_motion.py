@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scene
+from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
@@ -17,7 +18,7 @@ from consistency.frontend import Options, write_frontend_log
 from consistency.frontend.planar import OPTICAL, in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.frontend.planar_log import relative
 from consistency.frontend.truth import read_truth
-from consistency.recording import read_recordings, spatial_error
+from consistency.recording import spatial_error
 from consistency.store.log import read_log
 from consistency.store.storage import read_manifest
 from consistency.types import Array

@@ -9,13 +9,13 @@ from pathlib import Path
 import hints as world
 import numpy as np
 import pytest
+from recorded import read_recordings
 from scipy.linalg import expm
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from consistency.geometry import wrap
 from consistency.geometry.conventions import planar_error, spatial_error
-from consistency.recording import read_recordings
 from consistency.recording.fits import FACTOR, Fit, fit_of
 from consistency.recording.frames import Frame, carried, fitted_frame, moved
 from consistency.recording.hints import _ned, decades, hints, turns
@@ -430,7 +430,7 @@ def test_files_that_know_steps_and_no_times_get_hints(
     write_steps(tmp_path / "est.csv", estimates, stated)
     np.savez(tmp_path / "est.npz", truth=truth, estimates=estimates, covariances=stated)
     (table,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
-    (archive,) = read_recordings(tmp_path / "est.npz", convention="so2")
+    (archive,) = read_recordings(tmp_path / "est.npz", error="so2")
     for record in (table, archive):
         hints_given = [note for note in record.notes if "about right if" in note]
         assert [note.partition("about right if ")[2] for note in hints_given] == ([] if said is None else [said])
@@ -460,7 +460,7 @@ def test_an_angle_whose_errors_jump_by_a_turn_is_named(wrapped: bool, tmp_path: 
         assert [note for note in record.notes if "2 pi" in note] == ([said] if wrapped else [])
     assert jumps == 0 or wrapped
     assert jumps > 2 or not wrapped
-    (judged,) = read_recordings(tmp_path / "poses.npz", convention="so2")
+    (judged,) = read_recordings(tmp_path / "poses.npz", error="so2")
     assert not any("2 pi" in note for note in judged.notes)
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
 from consistency.geometry import wrap
-from consistency.recording import read_recordings
 from consistency.recording.offset import clock_shift, offset_of, steps_of
 from consistency.recording.poses import Poses
 from consistency.recording.sheet import Places

@@ -14,6 +14,7 @@ import pytest
 from documents import blocks
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recorded import read_recordings
 from scipy import stats
 from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
@@ -24,12 +25,11 @@ from consistency.diagnostics import Settings, nees
 from consistency.errors import InputError
 from consistency.recording import (
     planar_error,
-    read_recordings,
     se2_log,
     se3_log,
     spatial_error,
 )
-from consistency.recording.record import associate, common_times
+from consistency.recording.matching import associate, common_times
 from consistency.types import Array
 from consistency.verdicts.files import analyse_recordings
 
@@ -409,7 +409,7 @@ def test_without_run_and_step(tmp_path: Path) -> None:
 @pytest.mark.parametrize("convention", ["left", "right"])
 def test_invariant_errors_of_planar_poses(convention: str, tmp_path: Path) -> None:
     est, true = poses()
-    r = one(*write(tmp_path), convention=convention)
+    r = one(*write(tmp_path), error=convention)
     one_, two = true[["x", "y", "heading"]].to_numpy()[7], est[["x", "y", "heading"]].to_numpy()[7]
     X, Y = matrix(one_), matrix(two)
     T = np.linalg.inv(Y) @ X if convention == "left" else X @ np.linalg.inv(Y)
@@ -578,7 +578,7 @@ def test_poses_in_an_archive_take_a_convention(tmp_path: Path) -> None:
     est, true = poses()
     estimates, truth = (table[["x", "y", "heading"]].to_numpy().reshape(3, 5, 3) for table in (est, true))
     path = archive(tmp_path, estimates=estimates, truth=truth, covariances=np.tile(np.eye(3), (3, 5, 1, 1)))
-    np.testing.assert_allclose(one(path, None, convention="left").error, planar_error(truth, estimates, "left"))
+    np.testing.assert_allclose(one(path, None, error="left").error, planar_error(truth, estimates, "left"))
     np.testing.assert_allclose(one(path, None).error, truth - estimates)
 
 

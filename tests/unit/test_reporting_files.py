@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.figure import Figure as Drawn
+from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
 from consistency import cli
-from consistency.recording import read_recordings
 from consistency.reporting.blocks import Table, Text
 from consistency.reporting.drawing import Band, Figure, Line, Points
 from consistency.reporting.files import clock_of, compose_files, observed_coverage, record_figures, shown_run, unit_of

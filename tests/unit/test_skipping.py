@@ -10,13 +10,13 @@ import first_steps
 import numpy as np
 import pytest
 from draws import autoregression, fully_dependent, identities, independent, verdict_on
+from recorded import read_recordings
 
 import consistency as cs
 from consistency.cli import main as command
 from consistency.diagnostics.skipping import Skip, skip_of
 from consistency.diagnostics.symmetric import Symmetric
 from consistency.errors import InputError
-from consistency.recording import read_recordings
 from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse
 from consistency.types import Array
 from consistency.verdicts.baselines import baseline_of_files, read_baseline, write_baseline

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from recorded import read_recordings
 from scipy import stats
 from single_log import errors
 
 from consistency.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.diagnostics.within import correlation_time, within
-from consistency.recording import read_recordings
 from consistency.types import Array
 from consistency.verdicts.files import analyse_recordings
 

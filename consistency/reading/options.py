@@ -1,0 +1,104 @@
+"""How files of another estimator are read: one record of options, for readers, commands and Python alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
+def _seconds(text: str) -> float | str:
+    """A number where the text is one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _shown(
+    help: str, metavar: str | None = None, parse: Callable[[str], Any] | None = None, flag: str | None = None
+) -> dict[str, Any]:
+    """How the command line shows an option, and what it makes of a text."""
+    return {"help": help, "metavar": metavar, "parse": parse, "flag": flag}
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them."""
+
+    truth: Path | None = field(
+        default=None, metadata=_shown("Truth of the estimates, in the same form, or a KITTI drive's folder.")
+    )
+    covariance: Path | None = field(
+        default=None, metadata=_shown("Covariances of a TUM trajectory: t and 36 or 21 numbers.")
+    )
+    error: str | None = field(
+        default=None, metadata=_shown("Error that the covariance is of: so2, vector, left, right, so3 or so3-body.")
+    )
+    state: Sequence[str] | None = field(
+        default=None, metadata=_shown("Columns that make up the state [x,y,heading].", "A,B,C", _names)
+    )
+    covariance_order: str | None = field(
+        default=None, metadata=_shown("translation-rotation [default] or rotation-translation.")
+    )
+    max_dt: float | None = field(
+        default=None, metadata=_shown(f"Seconds between an estimate and its truth at most [{MAX_DT:g}].")
+    )
+    time_offset: float | str | None = field(
+        default=None, metadata=_shown("Seconds to add to the estimates' timestamps.", "S|estimate", _seconds)
+    )
+    axes: Sequence[str] | None = field(
+        default=None, metadata=_shown("Components of a trajectory to judge, as x,y,yaw in the plane.", "A,B,C", _names)
+    )
+    topic: str | None = field(default=None, metadata=_shown("Of a ROS bag: Odometry or PoseWithCovarianceStamped."))
+    truth_topic: str | None = field(
+        default=None, metadata=_shown("Of a ROS bag: poses, or PARENT:CHILD, frames of /tf.")
+    )
+    body: str | None = field(
+        default=None, metadata=_shown("Of a KITTI drive as truth: imu [default], velodyne or camera.")
+    )
+    relative: str | float | None = field(
+        default=None,
+        metadata=_shown("Judge motions over windows: N steps, seconds (10s), metres (50m).", "N|Ns|Nm", str),
+    )
+    motions: bool | None = field(
+        default=None,
+        metadata=_shown("With --relative: each row is a motion with a covariance of its own.", flag="--motions/"),
+    )
+    windows: str | None = field(
+        default=None, metadata=_shown("'independent': errors of windows are, so that each is a run.")
+    )
+    align: str | None = field(
+        default=None,
+        metadata=_shown(
+            "Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
+            "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
+            "MODE",
+        ),
+    )
+
+    def given(self, names: Sequence[str] | None = None) -> list[str]:
+        """Those of ``names``, or of all, that are given, in order."""
+        return [name for name in names or [each.name for each in fields(self)] if getattr(self, name) is not None]
+
+    @property
+    def tolerance(self) -> float:
+        """Seconds between an estimate and its truth at most."""
+        return MAX_DT if self.max_dt is None else self.max_dt
+
+    @property
+    def shift(self) -> float:
+        """Seconds to add to the timestamps of the estimates, as far as that is said."""
+        return self.time_offset if isinstance(self.time_offset, float) else 0.0
+
+
+def flag_of(name: str) -> str:
+    """A name as the command line spells it: ``max_dt`` -> ``--max-dt``."""
+    return f"--{name.replace('_', '-')}"

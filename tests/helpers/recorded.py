@@ -1,0 +1,16 @@
+"""Files read with options by name, as Python's :func:`consistency.read` has them, but all estimators of a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from consistency import recording
+from consistency.reading.options import Reading
+from consistency.recording import Recording
+
+
+def read_recordings(
+    estimates: Path, truth: Path | None = None, covariance: Path | None = None, error: str | None = None, **options: Any
+) -> list[Recording]:
+    return recording.read_recordings(estimates, Reading(truth, covariance, error, **options))

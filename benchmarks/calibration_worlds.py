@@ -27,8 +27,9 @@ from calibration_gates import (
 )
 from scipy import special
 
+from consistency.diagnostics import Evidence
 from consistency.recording import planar_error
-from consistency.recording.record import Recording, Track, assemble, symmetric
+from consistency.recording.record import Track, assemble, symmetric
 from consistency.types import Array
 
 AXES = ("x", "y", "heading")
@@ -116,7 +117,7 @@ def body_frame(draw: Draw) -> Gate:
 def left_invariant(draw: Draw) -> Gate:
     """Errors and covariances as ``analyse --error left`` works them out of planar poses."""
     recording = recorded(*left_poses(draw))
-    return Gate(recording.error, recording.covariance)
+    return Gate(recording.error, np.asarray(recording.covariance))
 
 
 def ragged(draw: Draw) -> Gate:
@@ -212,7 +213,7 @@ def left_poses(draw: Draw) -> tuple[Array, Array, Array]:
     return truth, _composed(truth, _se2_exp(-error)), covariance
 
 
-def recorded(truth: Array, estimate: Array, covariance: Array) -> Recording:
+def recorded(truth: Array, estimate: Array, covariance: Array) -> Evidence:
     """What ``analyse --error left`` makes of poses, without the way through a file."""
     error, columns = planar_error(truth, estimate, "left"), np.arange(truth.shape[1])
     tracks = []

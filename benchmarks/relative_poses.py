@@ -20,11 +20,10 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import expm
 
-from consistency.diagnostics import Verdict
+from consistency.diagnostics import Evidence, Verdict
 from consistency.diagnostics.planning import power_of
 from consistency.diagnostics.questions import MAIN, SHARES
 from consistency.geometry.groups import carried, composed, to_left
-from consistency.recording import Recording
 from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places
 from consistency.recording.windows import relative_of
@@ -125,7 +124,7 @@ def pose_stretch(rng: np.random.Generator, group: str, poses: int, apart: int, r
     )  # fmt: skip
 
 
-def recorded(stretches: list[Stretch], size: str, motions: bool) -> Recording:
+def recorded(stretches: list[Stretch], size: str, motions: bool) -> Evidence:
     """Windows as ``consistency analyse --relative`` takes them."""
     axes = AXES["SE(2)" if stretches[0].d == 2 else "SE(3)"]
     relative = relative_of(size, motions)
@@ -133,7 +132,7 @@ def recorded(stretches: list[Stretch], size: str, motions: bool) -> Recording:
     return relative_recording("log", "log", stretches, axes, range(len(axes)), relative)
 
 
-def verdict_on(record: Recording) -> Verdict:
+def verdict_on(record: Evidence) -> Verdict:
     return analyse_recordings([record])["log"]
 
 

@@ -15,7 +15,7 @@ import typer
 from consistency.reading.options import Reading, flag_of
 
 if TYPE_CHECKING:
-    from consistency.recording import Recording
+    from consistency.diagnostics import Evidence
 
 
 def are_files(path: Path, files: Reading) -> bool:
@@ -25,14 +25,14 @@ def are_files(path: Path, files: Reading) -> bool:
     return is_recording(path, files)
 
 
-def read_files(path: Path, files: Reading) -> list[Recording]:
+def read_files(path: Path, files: Reading) -> list[Evidence]:
     """Files of another estimator."""
     from consistency.recording import read_recordings
 
     return read_recordings(path, files)
 
 
-def tell_notes(*read: list[Recording]) -> None:
+def tell_notes(*read: list[Evidence]) -> None:
     """What was assumed and left out, to standard error; said when nothing is refused any more."""
     from consistency.reading import one_line
 

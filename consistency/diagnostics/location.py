@@ -228,12 +228,12 @@ def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float)
     return Shape(tests.matrix, tests.shape_step, pair, actual, stated, wrong_sign, wrong_sign and right)
 
 
-def tails_of(tests: Tests, run_numbers: Indices | None) -> Tails:
+def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
     """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
     odd = tests.outlier
     if odd is None:
         return Tails(-1, 0, float("nan"), tests.pit.values, tests.pit.half_width)
-    run = int(run_numbers[odd.run]) if run_numbers is not None and odd.run >= 0 else odd.run
+    run = int(run_numbers[odd.run]) if odd.run >= 0 else odd.run
     return Tails(run, odd.step + 1, odd.distance, tests.pit.values, tests.pit.half_width)
 
 

@@ -51,7 +51,7 @@ def lost_of(evidence: Evidence, nees: Array, dof: int, settings: Settings, any_t
         judged at the rate / (i (i + 1))
     """
     means, counts = run_means(nees)
-    numbers = np.arange(len(nees)) if evidence.run_numbers is None else np.asarray(evidence.run_numbers)
+    numbers = np.asarray(evidence.run_numbers)
     failed = np.isin(numbers, [f.run for f in evidence.failures])
     there = failed | (counts > 0)
     runs = int(there.sum())

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from consistency.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.diagnostics.ends import EarlyEnds
-from consistency.diagnostics.skipping import Skipped
+from consistency.diagnostics.skipping import Skip, Skipped, without_first
 from consistency.diagnostics.symmetric import Symmetric
+from consistency.errors import InputError
 from consistency.types import Array, Failure, Indices
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 TINY = 1e-12  # ratio of an error that is rounding
 
@@ -60,28 +64,79 @@ class JointNees:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them."""
+    """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them.
+
+    What is judged, wherever it is from: arrays of a gate, files, or results of the bench. From the step of a failure on
+    everything is NaN. Where a start is known exactly its covariance is singular: NEES and, of files, covariance are NaN
+    in those steps, the error is not.
+    """
 
     name: str
-    error: Array | None = None  # (runs, steps, n), NaN where a run has no estimate
+    error: Array | None = None  # (runs, steps, n), truth minus estimate; NaN where a run has no estimate
     covariance: Array | Symmetric | None = None  # (runs, steps, n, n)
     nees: Array | None = None  # (runs, steps), NaN where it does not count; worked out from the errors if not given
-    dof: int | None = None  # dimension of the error, where NEES stands alone
+    dof: int = 0  # dimension of the error, where NEES stands alone; 0 where there is none
     nis: Array | None = None  # (runs, steps), NaN where there was no innovation
     nis_dof: Array | None = None  # (runs, steps)
     innovations: Array | None = None  # (runs, steps, m), for their whiteness; without them the NIS has to do
     innovation_covariances: Array | None = None  # (runs, steps, m, m)
     optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
-    failures: tuple[Failure, ...] = ()
-    axes: Sequence[str] | None = None  # names of the n components
-    run_numbers: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
+    failures: tuple[Failure, ...] = ()  # Failure.step counts the columns from 1, as the verdict does
+    axes: Sequence[str] = ()  # names of the n components, if they have any
+    runs: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
     unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
-    reduced: bool = False  # a fit to the truth may have made the errors smaller than the covariance says: no fault
-    unavailable: Collection[str] = ()  # questions that such a fit leaves no answer to, which are not asked
     skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
-    unseen: float = 0.0  # share of the NEES that such a fit may have taken: consistent is shown with it added
+
+    # what a fit to the truth leaves of the errors
+    align: str = "none"  # how the estimates were moved into the world of the truth
+    caption: str = ""  # what the verdict has to say of that
+    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
+    unavailable: Collection[str] = ()  # questions that it leaves no answer to, which are not asked
+    unseen: float = 0.0  # share of the NEES that it may have taken: consistent is shown with it added
+
+    # where it is from
+    t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
+    times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
+    convention: str = ""  # of the error
+    notes: tuple[str, ...] = ()  # what a reader must know: the convention, what was left out
+    window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
+    independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
+    unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
+
+    @property
+    def run_numbers(self) -> Indices:
+        """What to call the runs, (runs,)."""
+        if self.runs is not None:
+            return self.runs
+        there = (self.error, self.nees, self.nis, self.innovations)
+        return np.arange(next((len(array) for array in there if array is not None), 0))
+
+    def without_first(self, skip: Skip | None) -> Self:
+        """The first steps of each run left out of the statistics: covariance, NEES and NIS are NaN there.
+
+        Raises
+        ------
+        InputError
+            Nothing is left, or seconds are asked for and there are no times.
+        """
+        arrays = {"covariance": self.covariance, "nees": self.nees, "nis": self.nis, "nis_dof": self.nis_dof}
+        try:
+            rest, skipped = without_first(skip, arrays, self.name, self.t if self.times is None else self.times)
+        except ValueError as error:
+            raise InputError(f"--{error}") from None
+        return replace(self, **rest, skipped=skipped)
+
+    @property
+    def left_out_steps(self) -> list[int]:
+        """Steps, counted from 1, in which the covariance of some run is not of full rank yet."""
+        if self.error is None or self.nees is None:
+            return []
+        deficient = np.isfinite(self.error).all(axis=-1) & np.isnan(self.nees)
+        if self.skipped is not None:
+            deficient[:, : self.skipped.steps] = False
+        return [int(k) + 1 for k in np.flatnonzero(deficient.any(axis=0))]
 
 
 @dataclass(frozen=True)

@@ -133,11 +133,11 @@ def sample_of(evidence: Evidence, settings: Settings) -> Sample | None:
     if e.error is None or e.covariance is None:
         if e.nees is None:
             return None
-        if e.dof is None:
+        if not e.dof:
             raise ValueError("nees needs dof, the dimension of the error")
         return Sample(e.nees, e.dof)
     n, P = e.error.shape[-1], entries(e.covariance)
-    names = tuple(e.axes) if e.axes is not None else tuple(f"axis {i}" for i in range(n))
+    names = tuple(() if e.axes is None else e.axes) or tuple(f"axis {i}" for i in range(n))
     if len(names) != n:
         raise ValueError(f"{len(names)} names of axes for {n} components")
     groups = groups_of(names, settings.subsets)

@@ -153,7 +153,7 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
     location = location_of(sample, band, by_question, ordered=evidence.landmarks is None, detect=settings.factor)
     scale = scale_of(sample, tests, at_share(verdict), location, shown)
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
-        return replace(verdict, scale=scale, location=location, tails=tails_of(tests, None))
+        return replace(verdict, scale=scale, location=location, tails=tails_of(tests, evidence.run_numbers))
     odd = impossible(evidence, sample.counted)
     there = entries(evidence.covariance).where_all(np.isfinite)
     return replace(

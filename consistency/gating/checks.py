@@ -77,7 +77,7 @@ def evidence(
         unchecked.dof,
         unchecked.axes,
     )
-    arrays: dict[str, Any] = {"axes": axes}
+    arrays: dict[str, Any] = {"axes": () if axes is None else tuple(axes)}
     if (errors is None) != (covariances is None):
         there, missing = ("covariances", "errors") if errors is None else ("errors", "covariances")
         raise ValueError(f"{there} without {missing}: give both")

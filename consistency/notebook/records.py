@@ -8,13 +8,13 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from consistency.diagnostics import Verdict
+from consistency.diagnostics import Evidence, Verdict
 from consistency.diagnostics.export import html_table
 from consistency.diagnostics.wording import plural
 from consistency.errors import InputError
 from consistency.extras import require
 from consistency.reading.options import Reading
-from consistency.recording import Recording, read_recordings
+from consistency.recording import read_recordings
 from consistency.store.atomic import write_whole
 from consistency.verdicts.files import analyse_recordings
 from consistency.verdicts.options import settings_of, skip_asked
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Record(Recording):
+class Record(Evidence):
     """What one estimator said in files, beside the truth; made by :func:`read`."""
 
     def plot(self, path: str | Path | None = None) -> Drawn:
@@ -49,12 +49,13 @@ class Record(Recording):
         return _drawn(record_sheet(self), path)
 
     def __repr__(self) -> str:
-        size = f"{plural(len(self.runs), 'run')} x {plural(len(self.t), 'step' if self.window is None else 'window')}"
+        runs, unit = plural(len(self.run_numbers), "run"), "step" if self.window is None else "window"
+        size = f"{runs} x {plural(len(self.t), unit)}"
         return f"<Record {self.name}: {size}, error {self.convention or '-'} of {', '.join(self.axes)}>"
 
     def _repr_html_(self) -> str:
         rows = [
-            ("runs", str(len(self.runs))), ("steps", str(len(self.t))), ("error", self.convention or "-"),
+            ("runs", str(len(self.run_numbers))), ("steps", str(len(self.t))), ("error", self.convention or "-"),
             ("components", ", ".join(self.axes)), ("failed runs", str(len(self.failures))),
         ]  # fmt: skip
         notes = "".join(f"<li>{escape(note)}</li>" for note in self.notes)

@@ -9,6 +9,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+from consistency.diagnostics import Evidence
 from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
 from consistency.reading import require_name
@@ -17,7 +18,6 @@ from consistency.recording.alignment import ALIGNMENTS, require_alignment
 from consistency.recording.archive import read_archive
 from consistency.recording.bags import is_bag, read_bags
 from consistency.recording.kitti import BODIES, is_drive
-from consistency.recording.record import Recording
 from consistency.recording.relative import MARGINAL
 from consistency.recording.table import read_tables
 from consistency.recording.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
@@ -28,7 +28,6 @@ __all__ = [
     "BODIES",
     "CONVENTIONS",
     "ORDERS",
-    "Recording",
     "is_recording",
     "planar_error",
     "read_recordings",
@@ -62,7 +61,7 @@ def is_recording(path: Path, reading: Reading) -> bool:
     return recording
 
 
-def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Recording]:
+def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
     """What estimators said, from CSV, Parquet, TUM or NumPy files, or ROS bags: one recording for each estimator.
 
     Parameters
@@ -125,7 +124,7 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
     return replace(r, time_offset=offset, align=align)
 
 
-def _with_frame(recordings: list[Recording], r: Reading) -> list[Recording]:
+def _with_frame(recordings: list[Evidence], r: Reading) -> list[Evidence]:
     """Say whose poses a drive gives, and in which world."""
     if r.truth is None or not is_drive(r.truth):
         return recordings

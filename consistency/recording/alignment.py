@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from consistency.diagnostics import Evidence
 from consistency.diagnostics.fitted import ENOUGH, inflation_of_mean, left_covariances
 from consistency.diagnostics.questions import BIAS, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.errors import InputError
@@ -15,7 +16,6 @@ from consistency.recording.frames import Frame, moved
 from consistency.recording.offset import clock_shift
 from consistency.recording.origin import frame_of_first_pose, from_first_pose
 from consistency.recording.poses import Poses
-from consistency.recording.record import Recording
 
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
@@ -46,7 +46,7 @@ class Aligned:
     unavailable: tuple[str, ...] = ()  # questions that have no answer
     unseen: float = 0.0  # share of the NEES that a frame may have taken without its being made up for
 
-    def on(self, recording: Recording) -> Recording:
+    def on(self, recording: Evidence) -> Evidence:
         """The recording of these runs, which says how they were aligned."""
         return replace(
             recording,

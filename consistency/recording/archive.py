@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from consistency.diagnostics import Evidence
 from consistency.errors import InputError
 from consistency.geometry.conventions import PLANAR, planar_error
 from consistency.reading import is_file, reading, require_name, require_room
 from consistency.recording.hints import hints, turns
 from consistency.recording.interpolation import Manifold
 from consistency.recording.poses import Poses
-from consistency.recording.record import Recording, Track, assemble, symmetric
+from consistency.recording.record import Track, assemble, symmetric
 from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places, are_dof, bounded
 from consistency.recording.windows import Relative
@@ -25,7 +25,7 @@ NEEDED = (("errors", "covariances"), ("estimates", "truth", "covariances"), ("ne
 OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "cross_covariances"}
 
 
-def read_archive(path: Path, convention: str | None, relative: Relative | None = None) -> list[Recording]:
+def read_archive(path: Path, convention: str | None, relative: Relative | None = None) -> list[Evidence]:
     """The recording of an archive.
 
     ``errors`` (runs, steps, n) with ``covariances`` (runs, steps, n, n); or ``estimates`` and ``truth``, both
@@ -96,7 +96,7 @@ def _poses(place: Places, estimate: Array, covariance: Array, truth: Array, conv
 def _relative(
     path: Path, arrays: dict[str, Array], estimates: Array, truth: Array, covariances: Array, convention: str,
     relative: Relative,
-) -> Recording:  # fmt: skip
+) -> Evidence:  # fmt: skip
     """Motions over windows of planar poses, or of motions."""
     runs, steps, n = estimates.shape
     if n != 3 or convention == "vector":
@@ -233,7 +233,7 @@ def _axes(path: Path, arrays: dict[str, Array], n: int) -> tuple[str, ...]:
     return axes
 
 
-def _of_nees(path: Path, arrays: dict[str, Array]) -> Recording:
+def _of_nees(path: Path, arrays: dict[str, Array]) -> Evidence:
     """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
     nees = _array(path, arrays, "nees", 2).copy()
     dof = arrays["dof"]
@@ -257,5 +257,7 @@ def _of_nees(path: Path, arrays: dict[str, Array]) -> Recording:
             failures.append(Failure(path.stem, run, step + 1, "NEES is not finite"))
     axes = _axes(path, arrays, n)
     t = step_times(path, arrays, steps)
-    empty = Recording(path.stem, np.arange(runs), t, None, None, nees, n, nis, nis_dof, axes, ())
-    return replace(empty, failures=tuple(failures))
+    return Evidence(
+        path.stem, nees=nees, dof=n, nis=nis, nis_dof=nis_dof, failures=tuple(failures), axes=axes,
+        runs=np.arange(runs), t=t,
+    )  # fmt: skip

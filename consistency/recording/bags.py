@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from consistency.diagnostics import Evidence
 from consistency.errors import InputError
 from consistency.extras import MissingPackageError, remedy
 from consistency.geometry.conventions import SPATIAL
 from consistency.reading import reading
 from consistency.reading.options import Reading
 from consistency.recording.poses import Poses
-from consistency.recording.record import Recording, symmetric
+from consistency.recording.record import symmetric
 from consistency.recording.sheet import Places
 from consistency.recording.spatial import WHOLE, Source, recordings_of, require_axes
 from consistency.recording.tum import UNIT
@@ -44,8 +45,8 @@ def _is_one(path: Path) -> bool:
     return (path.suffix == ".bag" and path.is_file()) or (path.is_dir() and (path / "metadata.yaml").is_file())
 
 
-def read_bags(path: Path, r: Reading) -> list[Recording]:
-    """Recording of one estimator: a bag, or a folder with a bag for each run.
+def read_bags(path: Path, r: Reading) -> list[Evidence]:
+    """Evidence of one estimator: a bag, or a folder with a bag for each run.
 
     The topic of the estimates is of PoseWithCovarianceStamped or Odometry, and need not be named where there is one;
     that of the truth is of poses, or PARENT:CHILD, two frames of /tf that follow each other.

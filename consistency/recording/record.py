@@ -4,77 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
-from consistency.diagnostics import nees
-from consistency.diagnostics.skipping import Skip, Skipped, without_first
+from consistency.diagnostics import Evidence, nees
 from consistency.diagnostics.validity import ROUNDED, ZERO, Validity, asymmetric, classify, pieces
 from consistency.errors import InputError
 from consistency.types import Array, Failure, Indices
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What one estimator said in a number of runs, and how far it was from the truth.
-
-    Where the start is known exactly the covariance is singular: covariance and NEES are NaN in those steps, the
-    error is not. From the step of a failure on, everything is NaN.
-    """
-
-    name: str
-    runs: Indices  # (R,)
-    t: Array  # (T,), s; NaN where the runs have no common clock
-    error: Array | None  # (R, T, n), truth minus estimate in the declared convention; NaN where there is no estimate
-    covariance: Array | None  # (R, T, n, n)
-    nees: Array | None  # (R, T), NaN where the covariance is singular; from the file if that gives it and no error
-    dof: int  # n, of the NEES; 0 where only the NIS is known
-    nis: Array | None  # (R, T)
-    nis_dof: Array | None  # (R, T)
-    axes: tuple[str, ...]  # (n,)
-    failures: tuple[Failure, ...]  # Failure.step counts the columns from 1, as the verdict does
-    convention: str = ""
-    notes: tuple[str, ...] = ()  # what a reader must know: the convention, what was left out
-    window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
-    independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
-    align: str = "none"  # how the estimates were moved into the world of the truth
-    caption: str = ""  # what the verdict has to say of that
-    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
-    unavailable: tuple[str, ...] = ()  # questions of the verdict that this leaves no answer to
-    unseen: float = 0.0  # share of the NEES that a fit to the truth may have taken without its being made up for
-    unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
-    times: Array | None = None  # (R, T), s, of the steps of each run, or of the beginnings of windows; None with one t
-    skipped: Skipped | None = None  # first steps that are left out of the statistics
-
-    def without_first(self, skip: Skip | None) -> Self:
-        """The first steps of each run left out of the statistics: covariance, NEES and NIS are NaN there.
-
-        Raises
-        ------
-        InputError
-            Nothing is left, or seconds are asked for and there are no times.
-        """
-        arrays = {"covariance": self.covariance, "nees": self.nees, "nis": self.nis, "nis_dof": self.nis_dof}
-        try:
-            rest, skipped = without_first(skip, arrays, self.name, self.t if self.times is None else self.times)
-        except ValueError as error:
-            raise InputError(f"--{error}") from None
-        return replace(self, **rest, skipped=skipped)
-
-    @property
-    def left_out_steps(self) -> list[int]:
-        """Steps, counted from 1, in which the covariance of some run is not of full rank yet."""
-        if self.error is None or self.nees is None:
-            return []
-        deficient = np.isfinite(self.error).all(axis=-1) & np.isnan(self.nees)
-        if self.skipped is not None:
-            deficient[:, : self.skipped.steps] = False
-        return [int(k) + 1 for k in np.flatnonzero(deficient.any(axis=0))]
 
 
 @dataclass(frozen=True)
@@ -100,7 +37,7 @@ def assemble(
     file: str,
     convention: str = "",
     notes: Sequence[str] = (),
-) -> Recording:
+) -> Evidence:
     """Tracks on the common steps; failures found; exactly known starts left out.
 
     Parameters
@@ -146,7 +83,7 @@ def assemble(
         return out
 
     error = grid(lambda part: part.error)
-    return Recording(
+    return Evidence(
         name=name,
         runs=np.array([part.run for part in parts], dtype=np.int64),
         t=t,

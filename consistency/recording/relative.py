@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from consistency.diagnostics import Evidence
 from consistency.diagnostics.independence import ENOUGH, Independence, independence
 from consistency.diagnostics.whitening import whiten
 from consistency.diagnostics.wording import p_text
 from consistency.errors import InputError
 from consistency.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
 from consistency.recording.matching import common_times
-from consistency.recording.record import Recording, Track, assemble, count
+from consistency.recording.record import Track, assemble, count
 from consistency.recording.sheet import Places
 from consistency.recording.windows import Relative, windows
 from consistency.types import Array, Indices
@@ -143,7 +144,7 @@ def _of_poses(s: Stretch, T: Array, D: Array, first: Indices, last: Indices, rel
 
 def relative_recording(
     name: str, file: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
-) -> Recording:
+) -> Evidence:
     """The windows of some runs of one estimator as a recording, whose steps are windows.
 
     Parameters

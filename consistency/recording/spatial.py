@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from consistency.diagnostics import Evidence
 from consistency.errors import InputError
 from consistency.geometry.conventions import SPATIAL
 from consistency.reading.options import Reading
@@ -16,7 +17,7 @@ from consistency.recording.hints import hints
 from consistency.recording.interpolation import truth_at
 from consistency.recording.matching import common_times
 from consistency.recording.poses import Poses
-from consistency.recording.record import Recording, Track, assemble
+from consistency.recording.record import Track, assemble
 from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places
 from consistency.recording.windows import Relative
@@ -65,7 +66,7 @@ def recordings_of(
     parts: Mapping[str, range],
     r: Reading,
     relative: Relative | None = None,
-) -> list[Recording]:
+) -> list[Evidence]:
     """The recording of one estimator, each of whose runs is one of ``poses``; clocks and mix-ups are looked for.
 
     Parameters

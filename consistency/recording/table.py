@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.diagnostics import Evidence
 from consistency.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.errors import InputError
 from consistency.geometry.conventions import ADDITIVE, PLANAR, planar_error
@@ -20,7 +21,7 @@ from consistency.recording.interpolation import Manifold, truth_at
 from consistency.recording.kitti import drive_sheet, is_drive
 from consistency.recording.matching import common_steps, common_times
 from consistency.recording.poses import Poses
-from consistency.recording.record import Recording, Track, assemble, count, listed, symmetric
+from consistency.recording.record import Track, assemble, count, listed, symmetric
 from consistency.recording.relative import Stretch, relative_recording
 from consistency.recording.sheet import Places, Sheet, are_dof, read_sheet
 from consistency.recording.windows import Relative
@@ -30,7 +31,7 @@ POSE = ("x", "y", "heading")
 OWN_NAMES = {(POSE[i], POSE[j]): name for name, (i, j) in COVARIANCE.items()}
 
 
-def read_tables(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Recording]:
+def read_tables(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
     """Recordings of the estimators in a table, one for each value of its column ``filter``.
 
     Raises
@@ -107,7 +108,7 @@ def _recording(
     convention: str,
     r: Reading,
     relative: Relative | None,
-) -> Recording:
+) -> Evidence:
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
     order = row_order(sheet, runs, key)
     sheet, runs = sheet.rows(order), runs[order]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from consistency.diagnostics import Evidence
 from consistency.errors import InputError
 from consistency.geometry.conventions import SPATIAL
 from consistency.reading.options import Reading
@@ -15,7 +16,7 @@ from consistency.recording.matching import associate
 from consistency.recording.openvins import FULL as STATES
 from consistency.recording.openvins import LAYOUT, States, as_states, read_deviations
 from consistency.recording.poses import Poses
-from consistency.recording.record import Recording, symmetric
+from consistency.recording.record import symmetric
 from consistency.recording.sheet import Lines, Places, read_numbers
 from consistency.recording.spatial import BLOCKS, SINGLE, WHOLE, Source, apart, recordings_of, require_axes
 from consistency.recording.windows import Relative
@@ -29,8 +30,8 @@ UNIT = 1e-3  # quaternions of four decimals pass
 SUFFIXES = (".txt", ".tum")
 
 
-def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Recording]:
-    """Recording of one estimator: a file, or a folder with a file for each run.
+def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
+    """Evidence of one estimator: a file, or a folder with a file for each run.
 
     With axes named only these components of the error are judged, by their part of the covariance.
 

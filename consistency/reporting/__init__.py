@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from consistency.characterising.characterise import Characterisation
-    from consistency.diagnostics import Verdict
-    from consistency.recording import Recording
+    from consistency.diagnostics import Evidence, Verdict
     from consistency.reporting.blocks import Document
     from consistency.sweeps.regime import Regime
     from consistency.terminal.progress import Advance
@@ -88,7 +87,7 @@ def require_pages(html: Path | None, pdf: Path | None, overwrite: bool) -> None:
 
 
 def write_file_pages(
-    records: Sequence[Recording], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
+    records: Sequence[Evidence], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
 ) -> None:
     """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
     from consistency.reporting.files import compose_files
@@ -142,7 +141,7 @@ def write_sensor_reports(of: Characterisation, folder: Path, data: str, overwrit
 
 
 def write_file_reports(
-    records: Sequence[Recording],
+    records: Sequence[Evidence],
     judged: Mapping[str, Verdict],
     folder: Path,
     title: str,
@@ -179,7 +178,7 @@ def write_file_reports(
 
 
 def _pages(
-    records: Sequence[Recording], judged: Mapping[str, Verdict], title: str, manifest: dict[str, Any]
+    records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str, manifest: dict[str, Any]
 ) -> Callable[[Path], None]:
     from consistency.reporting.files import compose_files
 
@@ -187,7 +186,7 @@ def _pages(
     return lambda at: _write_document(document, at / "report.html", at / "report.pdf")
 
 
-def _static_page(records: Sequence[Recording], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
+def _static_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
     from consistency.reporting.static import verdicts_page
 
     text = verdicts_page(records, judged, title)

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from scipy import special, stats
 
-from consistency.diagnostics import Verdict
+from consistency.diagnostics import Evidence, Verdict
 from consistency.diagnostics.wording import plural
 from consistency.errors import InputError
-from consistency.recording import Recording
 from consistency.reporting.blocks import Block, Chapter, Document, Facts, Text
 from consistency.reporting.clock import Clock, clock_of
 from consistency.reporting.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
@@ -33,7 +32,7 @@ JOINT = Look("#333333", width=1.4)
 
 
 def compose_files(
-    records: Sequence[Recording], judged: Mapping[str, Verdict], title: str, manifest: Mapping[str, Any]
+    records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str, manifest: Mapping[str, Any]
 ) -> Document:
     """The document that HTML and PDF show; a chapter for each of the records that has a verdict."""
     named = {record.name: record for record in records}
@@ -71,25 +70,25 @@ def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
     return Judged(title, "", runs, 0, clock_of(np.full(steps, np.nan)), np.arange(1, steps + 1), tracks, False)
 
 
-def _counts(record: Recording, verdict: Verdict) -> str:
+def _counts(record: Evidence, verdict: Verdict) -> str:
     clock = clock_of(record.t)
     length = plural(verdict.steps, "step" if record.window is None else "window")
     size = f"{plural(verdict.runs, verdict.unit)} of {record.window if record.independent else length}"
     return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and len(record.t) > 1 else size
 
 
-def _of_one(record: Recording, verdict: Verdict, said: bool) -> tuple[Block, ...]:
+def _of_one(record: Evidence, verdict: Verdict, said: bool) -> tuple[Block, ...]:
     sentence = (Text(f"{record.name} is {_ended(verdict.reasons[0])}"),) if said else ()
     return (*sentence, *record_figures(record, verdict))
 
 
-def record_figures(record: Recording, verdict: Verdict) -> tuple[Figure, ...]:
+def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
     """Errors with their bounds, NEES with its band, coverage, and innovations; those that the record has."""
     found = (_errors(record), _nees(record, verdict), _coverage(record), _innovations(record, verdict))
     return tuple(figure for figure in found if figure is not None)
 
 
-def record_sheet(record: Recording, verdict: Verdict | None = None) -> Sheet:
+def record_sheet(record: Evidence, verdict: Verdict | None = None) -> Sheet:
     """Errors with their bounds, coverage, and with a ``verdict`` the NEES with its band, on one sheet.
 
     Raises
@@ -118,13 +117,13 @@ def unit_of(axis: str) -> tuple[str, float]:
     return ("m", 1.0) if axis in METRES else ("", 1.0)
 
 
-def shown_run(record: Recording) -> int:
+def shown_run(record: Evidence) -> int:
     """Row of the run that is drawn: the first that reaches furthest."""
     assert record.error is not None
     return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
 
 
-def _errors(record: Recording) -> Figure | None:
+def _errors(record: Evidence) -> Figure | None:
     """Error of each component of one run with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
     if record.error is None or record.covariance is None:
         return None
@@ -132,15 +131,18 @@ def _errors(record: Recording) -> Figure | None:
         units = [unit_of(name) for name in record.axes[:MOST_PANELS]]
         return errors_of_runs(record, units, _columns(len(units)))
     clock, row = clock_of(record.t), shown_run(record)
-    others = [i for i in np.linspace(0, len(record.runs) - 1, MOST_RUNS + 1).astype(int) if i != row]
+    others = [i for i in np.linspace(0, len(record.run_numbers) - 1, MOST_RUNS + 1).astype(int) if i != row]
     names = record.axes[:MOST_PANELS]
     panels = tuple(_error_panel(record, clock, row, list(dict.fromkeys(others)), i) for i in range(len(names)))
-    keys = [Key(f"run {record.runs[row]}", SHOWN), Key("2-sigma bounds", replace(SHOWN, dash=(4.0, 3.0), width=0.8))]
+    keys = [
+        Key(f"run {record.run_numbers[row]}", SHOWN),
+        Key("2-sigma bounds", replace(SHOWN, dash=(4.0, 3.0), width=0.8)),
+    ]
     keys += [Key("other runs", OTHERS)] if others else []
     left_out = len(record.axes) - len(names)
     caption = (
-        f"Error ({_meaning(record)}) of run {record.runs[row]} with the 2-sigma bounds that the estimator states "
-        "(dashed). Honest errors stay inside about 95 % of the time."
+        f"Error ({_meaning(record)}) of run {record.run_numbers[row]} with the 2-sigma bounds that the estimator "
+        "states (dashed). Honest errors stay inside about 95 % of the time."
         + (f" {plural(left_out, 'further component')} not drawn." if left_out else "")
         + clock.note
     )
@@ -149,7 +151,7 @@ def _errors(record: Recording) -> Figure | None:
     return Figure("Errors and stated bounds", caption, panels, (sheet,), tuple(keys))
 
 
-def _meaning(record: Recording) -> str:
+def _meaning(record: Evidence) -> str:
     return "truth minus estimate" if record.window is None else f"of the motion over each window of {record.window}"
 
 
@@ -157,7 +159,7 @@ def _columns(panels: int) -> int:
     return 2 if panels in (2, 4) else min(3, panels)
 
 
-def _error_panel(record: Recording, clock: Clock, row: int, others: list[int], i: int) -> Panel:
+def _error_panel(record: Evidence, clock: Clock, row: int, others: list[int], i: int) -> Panel:
     assert record.error is not None
     assert record.covariance is not None
     name = record.axes[i]
@@ -175,7 +177,7 @@ def _error_panel(record: Recording, clock: Clock, row: int, others: list[int], i
 # --- NEES -------------------------------------------------------------------------------------------
 
 
-def _nees(record: Recording, verdict: Verdict) -> Figure | None:
+def _nees(record: Evidence, verdict: Verdict) -> Figure | None:
     """NEES of one run, or its average over runs, with the bands of a right estimator."""
     scale, location = verdict.scale, verdict.location
     if record.independent:
@@ -204,7 +206,7 @@ def _nees(record: Recording, verdict: Verdict) -> Figure | None:
     return Figure("NEES", caption, (panel,), (Sheet((panel,), 2.2, keys=tuple(keys)),), tuple(keys))
 
 
-def _nees_of_windows(record: Recording) -> Figure | None:
+def _nees_of_windows(record: Evidence) -> Figure | None:
     """NEES of each window, independent of the others."""
     if record.nees is None or not np.isfinite(record.nees).any():
         return None
@@ -229,7 +231,7 @@ def _nees_of_windows(record: Recording) -> Figure | None:
 # --- coverage ---------------------------------------------------------------------------------------
 
 
-def observed_coverage(record: Recording, p: Array) -> dict[str, Array]:
+def observed_coverage(record: Evidence, p: Array) -> dict[str, Array]:
     """Share of errors inside the interval that should hold them with probability ``p`` (N,), by component and jointly.
 
     Of all steps of all runs; -> (N,) each.
@@ -251,7 +253,7 @@ def _shares(values: Array, limits: Array) -> Array:
     return np.searchsorted(known, limits, side="right") / len(known) if len(known) else np.full(len(limits), np.nan)
 
 
-def _coverage(record: Recording) -> Figure | None:
+def _coverage(record: Evidence) -> Figure | None:
     """Share of errors within an interval against the probability that it should hold them with."""
     p = np.linspace(0.0, 0.999, 200)
     found = observed_coverage(record, p)
@@ -278,7 +280,7 @@ def _coverage(record: Recording) -> Figure | None:
 # --- innovations ------------------------------------------------------------------------------------
 
 
-def _innovations(record: Recording, verdict: Verdict) -> Figure | None:
+def _innovations(record: Evidence, verdict: Verdict) -> Figure | None:
     """NIS over its degrees of freedom, averaged over runs."""
     if record.nis is None or record.nis_dof is None:
         return None

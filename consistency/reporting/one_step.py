@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from consistency.diagnostics import Evidence
 from consistency.diagnostics.wording import plural
-from consistency.recording import Recording
 from consistency.reporting.drawing import Axis, Band, Figure, Key, Mark, Panel, Points, Rule, Sheet
 from consistency.reporting.looks import EXPECTED, SHADE, style
 from consistency.reporting.model import wide
@@ -18,20 +18,20 @@ from consistency.reporting.sections.pose_errors import SIGMAS, ZERO
 EACH = replace(style(0), size=2.5, alpha=0.7)
 
 
-def has_one_step(record: Recording) -> bool:
+def has_one_step(record: Evidence) -> bool:
     """Whether a curve along the steps would be a point, and one along the runs is not."""
-    return len(record.t) == 1 and len(record.runs) > 1
+    return len(record.t) == 1 and len(record.run_numbers) > 1
 
 
-def _axis(record: Recording) -> Axis:
-    return Axis("run", share="run", window=(record.runs.min() - 0.5, record.runs.max() + 0.5))
+def _axis(record: Evidence) -> Axis:
+    return Axis("run", share="run", window=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
 
 
-def errors_of_runs(record: Recording, units: Sequence[tuple[str, float]], columns: int) -> Figure:
+def errors_of_runs(record: Evidence, units: Sequence[tuple[str, float]], columns: int) -> Figure:
     """Error of each run with its 2-sigma bounds, a panel for each of the components that have ``units``."""
     assert record.error is not None
     assert record.covariance is not None
-    runs, axis, panels = record.runs.astype(float), _axis(record), []
+    runs, axis, panels = record.run_numbers.astype(float), _axis(record), []
     for i, (unit, factor) in enumerate(units):
         error = factor * record.error[:, 0, i]
         bound = SIGMAS * factor * np.sqrt(np.maximum(record.covariance[:, 0, i, i], 0.0))
@@ -51,11 +51,11 @@ def errors_of_runs(record: Recording, units: Sequence[tuple[str, float]], column
     return Figure("Errors and stated bounds", caption, tuple(panels), (sheet,), keys)
 
 
-def nees_of_runs(record: Recording) -> Figure | None:
+def nees_of_runs(record: Evidence) -> Figure | None:
     """NEES of each run with the band of a right estimator."""
     if record.nees is None or not np.isfinite(record.nees).any():
         return None
-    runs, values = record.runs.astype(float), record.nees[:, 0]
+    runs, values = record.run_numbers.astype(float), record.nees[:, 0]
     low, high = (np.full(len(runs), stats.chi2.ppf(q, record.dof)) for q in (0.025, 0.975))
     marks: list[Mark] = [Band(runs, low, high, SHADE), Rule("y", float(record.dof), EXPECTED)]
     marks.append(Points(runs, values, EACH, tips=(("run", "@x"), ("NEES", "@y{0.000}"))))

@@ -11,8 +11,7 @@ from consistency.errors import InputError
 from consistency.extras import is_installed
 
 if TYPE_CHECKING:
-    from consistency.diagnostics import Verdict
-    from consistency.recording import Recording
+    from consistency.diagnostics import Evidence, Verdict
 
 # colours of the bench's report, and lighter ones on dark ground with a contrast above 4.5
 STYLE = """
@@ -65,7 +64,7 @@ def page(title: str, *body: str) -> str:
 """
 
 
-def verdicts_page(records: Sequence[Recording], judged: Mapping[str, Verdict], title: str) -> str:
+def verdicts_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> str:
     """Sentence and figures of each verdict, why, and what was read; pictures where Matplotlib is installed."""
     named = {record.name: record for record in records}
     parts = []
@@ -77,7 +76,7 @@ def verdicts_page(records: Sequence[Recording], judged: Mapping[str, Verdict], t
     return page(f"Estimator consistency: {title}", *parts, _listed([*notes]))
 
 
-def picture(record: Recording, verdict: Verdict) -> str | None:
+def picture(record: Evidence, verdict: Verdict) -> str | None:
     """Errors, NEES and coverage as the source of an image; None without Matplotlib or where nothing can be drawn."""
     if not is_installed("plot"):
         return None

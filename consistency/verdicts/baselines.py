@@ -16,7 +16,6 @@ from consistency.diagnostics.skipping import Skip
 from consistency.errors import InputError
 from consistency.reading import HUGE, read_json, reading
 from consistency.reading.columns import POSE
-from consistency.recording import Recording
 from consistency.store.atomic import write_whole
 from consistency.store.provenance import SCHEMA_VERSION, manifest_of, plain
 from consistency.verdicts.files import evidence_of_windows
@@ -78,7 +77,7 @@ def _option(skip: Skip | None) -> str | None:
 
 
 def baseline_of_files(
-    recordings: Sequence[Recording], name: str, truth: Path | None = None, skip: str | float | Skip | None = None
+    recordings: Sequence[Evidence], name: str, truth: Path | None = None, skip: str | float | Skip | None = None
 ) -> Baseline:
     """Summaries of estimators whose files were read, with the first steps left out where ``skip`` says so.
 
@@ -98,11 +97,12 @@ def baseline_of_files(
             raise InputError(f"{name}: has no truth of {r.name}; give it with --truth, as only a NEES can be compared")
         of = evidence_of_windows(r) if r.independent and not r.unshown else r
         assert of.nees is not None
-        numbers = of.run_numbers if isinstance(of, Evidence) else r.runs
-        filters[r.name] = summary(of.nees, r.dof, of.error, of.covariance, numbers)
+        filters[r.name] = summary(of.nees, r.dof, of.error, of.covariance, of.run_numbers)
     failures = {r.name: len(r.failures) for r in recordings}
     origin = (None if truth is None else _digest(truth), None)
-    return Baseline(name, None, origin, filters, failures, {}, {r.name: r.axes for r in recordings}, _option(first))
+    return Baseline(
+        name, None, origin, filters, failures, {}, {r.name: tuple(r.axes) for r in recordings}, _option(first)
+    )
 
 
 def _digest(truth: Path) -> str:

@@ -11,13 +11,12 @@ from consistency.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.diagnostics.questions import SHARES
 from consistency.diagnostics.wording import plain
 from consistency.errors import InputError
-from consistency.recording import Recording
 
 POSES = {"heading", "yaw", "pitch", "roll"}  # what a pose has beside its position
 
 
 def analyse_recordings(
-    recordings: Sequence[Recording],
+    recordings: Sequence[Evidence],
     filters: Sequence[str] | None = None,
     settings: Settings | None = None,
     optimal_gain: bool = False,
@@ -35,14 +34,7 @@ def analyse_recordings(
         if name not in named:
             raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
         r = named[name]
-        if r.independent:
-            evidence = evidence_of_windows(r)
-        else:
-            evidence = Evidence(
-                name, r.error, r.covariance, r.nees, r.dof or None, r.nis, r.nis_dof, optimal_gain=optimal_gain,
-                failures=r.failures, axes=r.axes, run_numbers=r.runs, reduced=r.reduced, unavailable=r.unavailable,
-                skipped=r.skipped, unseen=r.unseen,
-            )  # fmt: skip
+        evidence = evidence_of_windows(r) if r.independent else replace(r, optimal_gain=optimal_gain)
         verdict = _unshown(judge(evidence, settings), r.unshown)
         first, *rest = verdict.reasons
         verdicts[name] = replace(
@@ -66,11 +58,11 @@ def _unshown(verdict: Verdict, why: str) -> Verdict:
     return replace(verdict, status="undecided", scale=scale, reasons=reasons)
 
 
-def _other_ways(verdict: Verdict, r: Recording) -> list[str]:
+def _other_ways(verdict: Verdict, r: Evidence) -> list[str]:
     """What else would decide on a single log of poses."""
     if (
         verdict.status != "undecided"
-        or len(r.runs) != 1
+        or len(r.run_numbers) != 1
         or r.window is not None
         or not (r.convention and POSES & set(r.axes))
     ):
@@ -81,7 +73,7 @@ def _other_ways(verdict: Verdict, r: Recording) -> list[str]:
     ]
 
 
-def evidence_of_windows(r: Recording) -> Evidence:
+def evidence_of_windows(r: Evidence) -> Evidence:
     """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
     assert r.error is not None
     assert r.covariance is not None
@@ -89,11 +81,11 @@ def evidence_of_windows(r: Recording) -> Evidence:
     runs, steps = r.error.shape[:2]
     there = np.isfinite(r.nees)
     number = np.arange(1, runs * steps + 1).reshape(runs, steps)
-    failures = [(int(np.flatnonzero(r.runs == f.run)[0]), f) for f in r.failures]
+    failures = [(int(np.flatnonzero(r.run_numbers == f.run)[0]), f) for f in r.failures]
     for row, f in failures:
         there[row, f.step - 1] = True
     return Evidence(
         r.name, r.error[there][:, None], r.covariance[there][:, None], r.nees[there][:, None], r.dof,
         failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures), axes=r.axes,
-        run_numbers=number[there], unit="window", unavailable=tuple(SHARES) if r.unshown else (), skipped=r.skipped,
+        runs=number[there], unit="window", unavailable=tuple(SHARES) if r.unshown else (), skipped=r.skipped,
     )  # fmt: skip

@@ -148,7 +148,7 @@ def map_evidence(ends: Ends, landmarks: Landmarks | None) -> Evidence | None:
         dof=dof,
         failures=ends.failures,
         axes=POINT[:dof],
-        run_numbers=runs,
+        runs=runs,
         landmarks=labels[kept],
         joint=_joint(ends, some, dof, runs, row, column, kept),
     )
@@ -193,7 +193,7 @@ def evidence_of(c: Curves, runs: int | None = None, additive: bool = False) -> E
         optimal_gain=c.optimal_gain,
         failures=tuple(f for f in c.failures if f.run in numbers),
         axes=POSE,
-        run_numbers=numbers,
+        runs=numbers,
         skipped=c.skipped,
     )
 

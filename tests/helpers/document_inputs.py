@@ -251,6 +251,7 @@ PREPARE: dict[str, list[Callable[[Path], None]]] = {
     "docs/files.md Logs": [log("LOG")],
     "docs/files.md Relative poses": [motions],
     "docs/front-end.md": [images],
+    "docs/index.md": [case_studies],
     "docs/monitor.md": [innovations],
     "docs/referee.md": [results("results", "DIR", "NEW")],
     "docs/regime.md": [log("log")],

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from consistency import recording
+from consistency.diagnostics import Evidence
 from consistency.reading.options import Reading
-from consistency.recording import Recording
 
 
 def read_recordings(
     estimates: Path, truth: Path | None = None, covariance: Path | None = None, error: str | None = None, **options: Any
-) -> list[Recording]:
+) -> list[Evidence]:
     return recording.read_recordings(estimates, Reading(truth, covariance, error, **options))

@@ -17,13 +17,13 @@ from mutations import bomb, claimed
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.recording import Recording
+from consistency.diagnostics import Evidence
 from consistency.store.parquet import read_parquet
 from consistency.sweeps.plan import load_sweep
 from consistency.verdicts.baselines import read_baseline
 
 
-def read(path: Path, **options: Path) -> Recording:
+def read(path: Path, **options: Path) -> Evidence:
     """The recording of the first estimator."""
     return read_recordings(Path(path), **options)[0]
 

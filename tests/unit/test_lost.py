@@ -160,7 +160,7 @@ def test_a_lost_run_takes_more_runs() -> None:
 def test_failed_runs_are_lost_and_runs_without_a_value_are_none(rng: np.random.Generator) -> None:
     nees = right(60)
     nees[3], nees[5] = np.nan, np.nan
-    evidence = Evidence("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), run_numbers=np.arange(60) + 10)
+    evidence = Evidence("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), runs=np.arange(60) + 10)
     lost = lost_of(evidence, nees, 3, Settings())
     assert lost is not None
     assert (lost.count, lost.runs) == (1, 59)

@@ -17,12 +17,11 @@ from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stre
 
 import consistency as cs
 from consistency.cli import main as command
-from consistency.diagnostics import Verdict
+from consistency.diagnostics import Evidence, Verdict
 from consistency.diagnostics.independence import ENOUGH
 from consistency.geometry.conventions import PLANAR, SPATIAL, planar_error, spatial_error
 from consistency.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
 from consistency.notebook.records import Record
-from consistency.recording import Recording
 from consistency.recording.relative import Stretch, windows_of
 from consistency.recording.windows import Relative, relative_of, windows
 from consistency.store.provenance import plain
@@ -257,7 +256,7 @@ def test_right_motions_are_consistent_and_wrong_ones_are_found(group: str, rng: 
         assert "windows" in verdict.reasons[0] or status != "consistent"
 
 
-def cs_record(record: Recording) -> Record:
+def cs_record(record: Evidence) -> Record:
     return Record(**{name: getattr(record, name) for name in record.__dataclass_fields__})
 
 
@@ -321,7 +320,7 @@ def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None
     assert any("neighbouring windows go opposite ways" in note for note in notes)
 
 
-def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Recording:
+def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Evidence:
     """Independent windows of poses, by declaration only; true errors are 3 times what is stated."""
     runs = [pose_stretch(rng, "SE(2)", steps + 1, 5, 9.0, run) for run in range(windows // steps)]
     return world.relative_recording(

@@ -290,7 +290,7 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(sequential, "look", verdict_at)
     monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)
     bare = {"own": None, "landmarks": None, "rejections": None}
-    monkeypatch.setattr(sequential, "evidence_of", lambda c, runs: Evidence(c.name, run_numbers=[runs]))
+    monkeypatch.setattr(sequential, "evidence_of", lambda c, runs: Evidence(c.name, runs=[runs]))
     verdicts: dict[str, Verdict] = {}
     read = lambda runs, name: SimpleNamespace(name=name, **bare)  # noqa: E731
     counts = list(sequential.looks(sequential_design(3), ["early", "late"], read, verdicts))  # type: ignore[arg-type]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,10 +15,8 @@ from consistency.diagnostics.symmetric import Symmetric
 from consistency.errors import InputError
 from consistency.types import Array, Failure, Indices
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 TINY = 1e-12  # ratio of an error that is rounding
+E = TypeVar("E", bound="Evidence")
 
 # status -> what it means; the order is that of reports
 STATUSES = {
@@ -113,7 +111,7 @@ class Evidence:
         there = (self.error, self.nees, self.nis, self.innovations)
         return np.arange(next((len(array) for array in there if array is not None), 0))
 
-    def without_first(self, skip: Skip | None) -> Self:
+    def without_first(self: E, skip: Skip | None) -> E:
         """The first steps of each run left out of the statistics: covariance, NEES and NIS are NaN there.
 
         Raises

@@ -48,7 +48,7 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     table = copy / "consistency/cli/commands.py"
     first = "    # the laboratory\n"
     assert table.read_text(encoding="utf-8").count(first) == 1
-    table.write_text(table.read_text(encoding="utf-8").replace(first, row + first), encoding="utf-8")
+    table.write_text(table.read_text(encoding="utf-8").replace(first, f"{row.rstrip()},\n{first}"), encoding="utf-8")
     (copy / "est.csv").write_text("run,step,a,P_a_a\n" + "".join(f"{r},{k},{r},1\n" for r in (3, 7) for k in (1, 2)))
     (copy / "truth.csv").write_text("step,a\n1,0\n2,0\n")
     told = python(

@@ -11,7 +11,7 @@ from consistency.cli.files import are_files, read_files, reads_files, tell_notes
 from consistency.cli.options import FalseAlarm, Judged, Skip
 from consistency.defaults import FALSE_ALARM
 from consistency.errors import InputError
-from consistency.reading.options import Reading
+from consistency.reading.options import Reading, flag_of
 
 
 @reads_files
@@ -46,7 +46,7 @@ def compare(
     sides = [each for each in (path, other) if each is not None]
     estimates = [each for each in sides if not is_baseline(each) and are_files(each, files)]
     if not estimates and (unread := files.given()):
-        raise InputError(f"{unread[0]}: is for files of another estimator, and none is named")
+        raise InputError(f"{flag_of(unread[0])}: is for files of another estimator, and none is named")
     if len(estimates) == 2 and files.covariance is not None:
         raise InputError(
             f"--covariance: would be read with {path} and with {other}; keep one of them with 'consistency baseline'"

@@ -344,6 +344,13 @@ def test_association_by_brute_force(reference: list[float], seed: int) -> None:
         )
 
 
+def test_the_tolerance_of_times_is_inside() -> None:
+    """Also of seconds since 1970, which a double holds to a quarter of a microsecond."""
+    for start in (0.0, 1.7e9):
+        own, match = associate(start + np.array([0.5, 2.6]), start + np.array([0.0, 2.0]), 0.5)
+        assert (own.tolist(), match.tolist()) == ([0], [0])
+
+
 # --- tables: poses ---------------------------------------------------------------------------------
 
 

@@ -27,7 +27,7 @@ class Left:
 
     covariances: list[Array]  # (T_i, n, n) for each run
     oscillating: bool = False  # the errors are not what is assumed of them; the covariances are I
-    unseen: float = 0.0  # share of the NEES that the fit may have taken without its being made up for
+    unseen: float = 0.0  # share of the NEES that the fit may have absorbed without a correction
 
 
 def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared: bool) -> Left:

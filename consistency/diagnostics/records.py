@@ -91,16 +91,16 @@ class Evidence:
 
     # what a fit to the truth leaves of the errors
     align: str = "none"  # how the estimates were moved into the world of the truth
-    caption: str = ""  # what the verdict has to say of that
+    caption: str = ""  # note of the verdict on that
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
-    unavailable: Collection[str] = ()  # questions that it leaves no answer to, which are not asked
-    unseen: float = 0.0  # share of the NEES that it may have taken: consistent is shown with it added
+    unavailable: Collection[str] = ()  # questions that cannot be answered after the fit, which are not asked
+    unseen: float = 0.0  # share of the NEES that the fit may have absorbed: consistent is shown with it added
 
-    # where it is from
+    # origin
     t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
     times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
     convention: str = ""  # of the error
-    notes: tuple[str, ...] = ()  # what a reader must know: the convention, what was left out
+    notes: tuple[str, ...] = ()  # notes for the reader: the convention, left-out steps
     window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
     independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked

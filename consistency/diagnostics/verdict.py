@@ -54,8 +54,8 @@ def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = 
     any of the questions (``consistency.diagnostics.questions``) with probability ``false_alarm`` at most;
     half of that belongs to the mean NEES, for which :func:`gate_runs` plans. A filter is *consistent* if no question
     found a fault, and two one-sided tests put the ratio of true to stated covariance inside [1 / detect, detect]; with
-    ``lost``, the share of lost runs is shown to be at most that, too. If neither holds, the filter is undecided. A
-    filter with failed runs is never consistent.
+    ``lost``, the share of lost runs is shown to be at most that, too. Without a fault and without this evidence, the
+    filter is undecided. A filter with failed runs is never consistent.
 
     Innovations are judged where an optimal gain is declared, otherwise they are reported: only those of an optimal gain
     are white. Without truth they are judged alone.

@@ -44,7 +44,7 @@ class Aligned:
     caption: str = ""  # what the verdict has to say of it
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
     unavailable: tuple[str, ...] = ()  # questions that have no answer
-    unseen: float = 0.0  # share of the NEES that a frame may have taken without its being made up for
+    unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
 
     def on(self, recording: Evidence) -> Evidence:
         """Recording of these runs, with the notes on their alignment."""

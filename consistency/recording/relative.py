@@ -154,7 +154,7 @@ def relative_recording(
     Raises
     ------
     InputError
-        :func:`windows_of` finds no usable window, or the covariance is singular in every window.
+        Input that :func:`windows_of` refuses, or a covariance that is singular in every window.
     """
     found = [windows_of(stretch, relative) for stretch in stretches]
     times = [one.t for one in found]
@@ -242,7 +242,7 @@ def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:
 def _too_few(of: Independence, relative: Relative) -> str:
     """Why windows that are only declared to be independent are too few to decide; "" where they are enough.
 
-    Independent motions are not checked: their covariance over a window assumes independence, and is judged with it.
+    Independent motions are never too few: their covariance over a window assumes independence, and is judged with it.
     """
     if relative.motions or of.pieces >= ENOUGH:
         return ""

@@ -1,4 +1,4 @@
-"""What a verdict is asked where nobody says otherwise; each number stands here alone."""
+"""Default settings of a verdict; each number is defined only here."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The one error a user can mend: unusable input."""
+"""The one error that a user can correct: unusable input."""
 
 
 class InputError(ValueError):
-    """Input that cannot be used: says which file or argument, which key, and what is allowed.
+    """Unusable input; the message names the file or argument, the key, and the allowed values.
 
     The command line prints it as one line and ends with exit status 2.
     """

@@ -1,4 +1,4 @@
-"""What can be plugged in: a filter, step by step or a whole trial at once."""
+"""Protocols of filters, run step by step or a whole trial at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from consistency.types import Array, Control, Estimates, Gaussian, Info, Observa
 
 @dataclass(frozen=True)
 class Truth:
-    """Where robot and landmarks of a trial are."""
+    """True poses and landmarks of a trial."""
 
     path: Array  # (T + 1, 3)
     landmarks: Array  # (N, 3)
@@ -19,7 +19,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Problem:
-    """What a filter is told before step 1."""
+    """Information given to a filter before step 1."""
 
     belief: Belief
     start: Array  # (3,), pose at step 0, known exactly
@@ -31,13 +31,13 @@ class Problem:
 class Filter(Protocol):
     """Any object with these four; ``name`` is optional and defaults to the class name.
 
-    ``update`` may return None in the place of Info: then there is no NIS. An attribute ``innovations = "optimal"``
+    ``update`` may return None in place of Info: then there is no NIS. An attribute ``innovations = "optimal"``
     declares that the gain is optimal and no measurement is gated away, so that innovations are white if the
     filter is right; they are then judged, and otherwise only reported.
 
-    ``pose`` gives the covariance of the additive error in the world. A filter whose own error is another declares
-    it in an attribute ``error``, one of ``PLANAR`` in ``consistency.geometry.conventions``, and gives the
-    covariance of that error by ``own_covariance(state)``, (3, 3). It is then judged in its own error.
+    ``pose`` gives the covariance of the additive error in the world. A filter with another error declares it in an
+    attribute ``error``, one of ``PLANAR`` in ``consistency.geometry.conventions``, and gives the covariance of that
+    error by ``own_covariance(state)``, (3, 3). It is then judged in its own error.
 
     An attribute ``realisable = False`` marks a bound: a filter that is told the truth (``Problem.truth``) and so runs
     on trials whose truth is known, and on no other. ``causal = False`` marks another: a smoother, which gives each pose
@@ -48,10 +48,11 @@ class Filter(Protocol):
     the pose and these K points, in the order of ``map``, as one Gaussian, (3 + 3 K,) and (3 + 3 K, 3 + 3 K), of the
     additive errors.
 
-    ``rejected(state)`` is for filters that leave out observations: which of all so far, (M,), in the order in which
-    they were offered. It is asked in each step, and the rejections are scored. An attribute ``innovates = False`` says
-    that ``update`` gives no innovations, so that no guard can be put before the filter. ``forget(state, label)`` gives
-    the state without a landmark; a guard asks for it where the second sighting does not agree with the first.
+    ``rejected(state)`` is for filters that reject observations: a mask (M,) over all observations so far, in the order
+    in which they were offered. It is called in each step, and the rejections are scored. An attribute
+    ``innovates = False`` says that ``update`` gives no innovations, so that no guard can be put before the filter.
+    ``forget(state, label)`` gives the state without a landmark; a guard asks for it where the second sighting does not
+    agree with the first.
     """
 
     def init(self, problem: Problem) -> Any: ...

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class ConsistencyError(AssertionError):
-    """A fault at the stated false-alarm rate, or runs that failed; carries the verdict and, of two, the comparison."""
+    """A fault at the stated false-alarm rate, or failed runs; has the verdict, and the comparison of two filters."""
 
     def __init__(self, message: str, verdict: Verdict | None = None, comparison: Comparison | None = None) -> None:
         super().__init__(message)
@@ -77,19 +77,19 @@ def assert_consistent(
         with ``filter`` the name of one in them
     covariances : (runs, steps, n, n), in the squared units of the errors
     nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances
-    false_alarm : chance to fail a right filter; 0.001 where neither argument, marker nor session says
+    false_alarm : chance to fail a right filter; 0.001 unless an argument, marker or session sets it
     detect : ratio of true to stated covariance, in all steps, that must not pass (1.5)
-    power : chance that it does not (0.95)
+    power : chance that a filter at ``detect`` does not pass (0.95)
     tolerance : a ratio shown to lie in [1 / tolerance, tolerance] is no fault; nothing is tolerated by default
     allow : "conservative" accepts a covariance that is too large
-    lost : share of lost runs that must not pass: of runs that failed, or whose mean NEES is beyond
-        :func:`consistency.diagnostics.lost_bound` at ``false_alarm`` over their number. Nothing is asked by default
+    lost : share of lost runs that must not pass. A run is lost if it failed, or if its mean NEES is above
+        :func:`consistency.diagnostics.lost_bound` at ``false_alarm`` over the number of runs. No limit by default
     axes : names of the n components
     subsets : further groups of components to look at, name -> indices
     method : of the band over all steps, see :func:`consistency.diagnostics.simultaneous_band`
     innovations, innovation_covariances : (runs, steps, m), (runs, steps, m, m); all NaN in steps without any
     nis, nis_dof : (runs, steps); nis_dof is 0 in steps without any, and may be one number
-    optimal_gain : the innovations are those of an optimal gain, and none was gated away: judge them, not only report
+    optimal_gain : True judges the innovations: they are those of an optimal gain, and none was gated away
     skip : first steps of each run to leave out of the statistics (20), of results also seconds ("2s"); a number that
         was chosen on the same runs voids the false-alarm rate
     name : of the estimator, for messages
@@ -103,8 +103,8 @@ def assert_consistent(
     ConsistencyError
         A fault at the stated false-alarm rate, however few the runs; or failed runs in results.
     InsufficientTrials
-        No fault, and too few runs to show that the ratio is inside, or that few runs are lost;
-        :func:`consistency.diagnostics.gate_runs` are enough for nearly every right filter.
+        No fault, and too few runs to show that the ratio is in [1 / ``detect``, ``detect``], or that few runs are lost;
+        :func:`consistency.diagnostics.gate_runs` gives a number that suffices for nearly every right filter.
     ValueError
         Input that cannot be judged, named by run (from 0) and step (from 1); options that do not fit.
     """
@@ -165,7 +165,7 @@ def assert_not_worse(
     ----------
     errors_a, covariances_a, errors_b, covariances_b : as in :func:`assert_consistent`; row i of both is one trial
     nees_a, nees_b, dof : (runs, steps) and the dimension of the error, in place of them
-    filter, than : names in results given as ``errors_a``: the candidate and its reference
+    filter, than : names of the candidate and its reference, in results given as ``errors_a``
     reference : other results, or a baseline or its file, in place of the same results; ``than`` is then ``filter``
         unless it is given. Trials of another scenario or seed are compared as independent samples.
     false_alarm : chance to fail a candidate that is as consistent as the reference
@@ -180,9 +180,9 @@ def assert_not_worse(
     ConsistencyError
         The candidate is worse at the stated false-alarm rate, or has more failed runs on the same trials.
     InsufficientTrials
-        Not worse, and fewer runs than ``detect`` and ``power`` take at the spread between these.
+        Not worse, and fewer runs than ``detect`` and ``power`` need, given the spread between these runs.
     ValueError
-        As :func:`assert_consistent`; different numbers of runs.
+        Input that :func:`assert_consistent` refuses, or different numbers of runs.
     """
     __tracebackhide__ = True
     demand = terms(false_alarm, detect, power, None)
@@ -232,12 +232,12 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
     return result.comparison
 
 
-# --- what both do ----------------------------------------------------------------------------------
+# --- code of both gates ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Look:
-    """What is found at one false-alarm rate."""
+    """The result of a gate at one false-alarm rate."""
 
     bad: bool
     sure: bool  # bad at any rate
@@ -251,7 +251,7 @@ class _Look:
 def _settle(
     gate: str, candidate: Candidate, demand: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
 ) -> _Look:
-    """Record what a gate found, and raise where that is settled now."""
+    """Record the result of a gate, and raise if it is already decided."""
     __tracebackhide__ = True
     result, late = look(demand.false_alarm), None
     fault = result.bad and (demand.may_fail or result.sure)
@@ -277,7 +277,7 @@ def _settle(
 
 
 def _marker_text(dof: int, runs: int) -> str:
-    """The marker that a test lacks whose fixture has planned for more dimensions than its error has."""
+    """Advice to add a marker, where the fixture has planned for another dimension than that of the error."""
     plan = current().plan
     if plan is None or dof >= DEFAULTS["dof"] or (planned := plan(dof)) <= runs:
         return ""
@@ -288,7 +288,7 @@ def _marker_text(dof: int, runs: int) -> str:
 
 
 def _deciding(result: _Look, runs: int) -> int:
-    """Runs that would probably decide, more than there are; 0 for a comparison, which says so itself."""
+    """Number of runs that would probably decide, above the present one; 0 for a comparison, which gives its own."""
     if result.verdict is None:
         return 0
     shown, lost = result.verdict.equivalence, result.verdict.lost

@@ -1,4 +1,4 @@
-"""Frozen records that the rooms of the house hand to each other; shapes stand on each field."""
+"""Frozen records shared by all packages, with the shape of each field."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Gaussian:
 
 @dataclass(frozen=True)
 class Control:
-    """What the filter is told about one step of motion."""
+    """Odometry of one step, as given to the filter."""
 
     dt: float  # s
     v: float  # m/s, along the heading
@@ -39,7 +39,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class Info:
-    """What an update observed about itself; diagnostics read this and never the filter's inside."""
+    """Innovation of an update; diagnostics read this and never the internals of a filter."""
 
     innovation: Array  # (k,), z minus predicted z of the landmarks already in the state
     S: Array  # (k, k), innovation covariance
@@ -58,14 +58,14 @@ class Info:
 
 @dataclass(frozen=True)
 class Trial:
-    """One data set, simulated or recorded: what a filter is given, and the truth where known.
+    """One data set, simulated or recorded: the input of a filter, and the truth where known.
 
     Step k = 1..T moves the robot from k-1 to k, then observes. The observations of step k are the
     rows ``first[k-1]:first[k]``.
 
-    A filter is told the ids in ``landmark``. Row i of ``landmarks`` is where landmark i is; ids from N on are things
-    that are no landmark and look like one. ``source`` is for scoring alone: the landmark that a row is really of, -1
-    if it is of none. Where it is None each row is of its ``landmark``.
+    A filter gets the ids in ``landmark``. Row i of ``landmarks`` is the position of landmark i; ids from N on are false
+    landmarks. ``source`` is for scoring alone: the true landmark of a row, -1 if there is none. If it is None, each row
+    is of its ``landmark``.
     """
 
     run: int
@@ -99,7 +99,7 @@ class Trial:
 
     @property
     def spurious(self) -> Array:
-        """Whether a row is not of the landmark that it says, shape (M,)."""
+        """Whether a row is not of the landmark that it states, shape (M,)."""
         return np.zeros(len(self.landmark), bool) if self.source is None else self.source != self.landmark
 
     @property
@@ -121,7 +121,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Failure:
-    """A run that did not end well, with the step in which it broke."""
+    """A failed run, with the step of its failure."""
 
     filter: str
     run: int
@@ -161,7 +161,7 @@ OURS = "this project"  # how the source of a question begins that no paper asks
 
 
 def outcome(source: str, verdict: str) -> str:
-    """The verdict on a finding in words: what nobody published holds or does not, and is not reproduced."""
+    """The verdict on a finding in words: an unpublished one holds or does not hold, and is never reproduced."""
     if not source.startswith(OURS):
         return verdict
     return "holds" if verdict == "reproduced" else "does not hold"

@@ -40,7 +40,7 @@ EVERY = 5.0  # seconds between lines of progress
 
 @dataclass(frozen=True)
 class Plan:
-    """What a challenge is given, and what follows from it before the first trial.
+    """Arguments of a challenge, and the values that follow from them before the first trial.
 
     Raises
     ------
@@ -85,7 +85,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Challenge:
-    """What came of a challenge. ``world`` was put to the test: the smallest one, or if not ``clear`` the worst one."""
+    """Result of a challenge. ``world`` is the tested world: the smallest one, or if not ``clear`` the worst one."""
 
     filter: str
     plan: Plan

@@ -1,4 +1,4 @@
-"""What came of a challenge, in words, for programs, and as a scenario file."""
+"""Result of a challenge in words, for programs, and as a scenario file."""
 
 from __future__ import annotations
 

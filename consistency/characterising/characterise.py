@@ -1,4 +1,4 @@
-"""From residuals to what is known of a sensor."""
+"""Estimation of a sensor model from residuals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LEAST_TRACKS = 5
 
 @dataclass(frozen=True)
 class Coordinate:
-    """What is known of u, v or d."""
+    """Estimates for one coordinate, u, v or d."""
 
     name: str
     sigma: Estimate  # px, of what is drawn anew
@@ -67,7 +67,7 @@ class Growth:
 
 @dataclass(frozen=True)
 class Characterisation:
-    """All that is known of a sensor, with the data it is known from."""
+    """Estimated model of a sensor, with its data."""
 
     sensor: PicturedSensor  # as believed so far: model, calibration, image, mount
     source: str

@@ -63,7 +63,7 @@ class Fitted:
 
     @property
     def residuals(self) -> Residuals:
-        """The same as residuals about a truth."""
+        """Residuals of the fit, in the form of residuals about a truth."""
         return Residuals(self.r, self.ideal, self.seen.track, self.seen.step, self.seen.moving)
 
 
@@ -103,7 +103,7 @@ def fit_points(seen: Seen, f: float, B: float, parts: Indices, start: Array, fre
 
 
 def _moved(seen: Seen, moves: Array) -> Seen:
-    """The same with poses moved by shifts and rotation vectors (N, 6) in sensor axes."""
+    """A copy with poses moved by shifts and rotation vectors (N, 6) in sensor axes."""
     t = seen.t + np.einsum("nij,nj->ni", seen.R, moves[:, :3])
     return replace(seen, R=seen.R @ Rotation.from_rotvec(moves[:, 3:]).as_matrix(), t=t)
 

@@ -1,6 +1,6 @@
 """Restricted likelihood of one coordinate: bias as regression, an offset of each track, noise with memory.
 
-Residual i of track t is ``X_i beta + o_t + e_i``: ``o_t`` is drawn once a track with variance tau^2, ``e_i`` in each
+Residual i of track t is ``X_i beta + o_t + e_i``: ``o_t`` is drawn once per track with variance tau^2, ``e_i`` in each
 observation with standard deviation ``G_i a`` and correlation rho^gap with the one before. Patterson & Thompson (1971)
 maximise the likelihood of what the regression leaves, so that the degrees of freedom that it costs are paid for.
 """

@@ -66,7 +66,7 @@ def characterise_images(folder: Path, sources: Sources) -> Characterisation:
 
 
 def _poses(sequence: Sequence, sources: Sources) -> tuple[Array, Array]:
-    """Poses (n, 3, 3), (n, 3) of the left camera: all the same at rest."""
+    """Poses (n, 3, 3), (n, 3) of the left camera; equal poses at rest."""
     if sources.at_rest:
         return np.broadcast_to(np.eye(3), (len(sequence), 3, 3)), np.zeros((len(sequence), 3))
     path = sources.truth or find_truth(sequence)

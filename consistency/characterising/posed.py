@@ -1,4 +1,4 @@
-"""A characterisation where poses are known, or all the same, and landmarks are not."""
+"""Characterisation with known poses, or a camera at rest, and unknown landmarks."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Is the filter honest? Arrays in, records out; needs numpy and scipy only.
+"""Statistics of filter consistency: arrays in, records out; needs numpy and scipy only.
 
-No table, no plot and no file belongs here.
+Tables, plots and files do not belong here.
 """
 
 from consistency.diagnostics.band import Band, simultaneous_band

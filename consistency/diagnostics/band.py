@@ -1,4 +1,4 @@
-"""Is the covariance too small or too large in some step? A band that holds in all steps at once."""
+"""Test of the covariance in single steps: a band for the ANEES that holds in all steps at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from consistency.types import Array, Indices
 
 @dataclass(frozen=True)
 class Band:
-    """Where the ANEES curve of a consistent filter stays in all steps at once."""
+    """Band in which the ANEES curve of a consistent filter stays in all steps at once."""
 
     low: Array  # (steps,), NaN where no run has a value
     high: Array  # (steps,)

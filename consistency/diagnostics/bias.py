@@ -1,4 +1,4 @@
-"""Does the error have a mean? Hotelling's T-squared, which does not mind a wrong scale."""
+"""Test of bias: Hotelling's T-squared, which is not affected by a wrong scale."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def hotelling(sample: Array, confidence: float = CONFIDENCE) -> Hotelling:
 
 
 def t_squared(whitened: Array, known: Moments | None = None) -> tuple[Array, Array]:
-    """T-squared and p value of every step by itself, (runs, steps, n) -> (steps,), (steps,).
+    """T-squared and p value of each step, (runs, steps, n) -> (steps,), (steps,).
 
     T^2 (N - n) / (n (N - 1)) is F(n, N - n) distributed (Anderson 2003, Theorem 5.2.2). NaN where fewer
-    than n + 1 runs are left. ``known`` are the moments, where they are.
+    than n + 1 runs are left. ``known`` are the moments, if already computed.
     """
     N, mean, S = moments(whitened) if known is None else known
     n = whitened.shape[-1]
@@ -71,7 +71,7 @@ class Moments(NamedTuple):
 
 
 def moments(whitened: Array) -> Moments:
-    """Those of whitened errors (runs, steps, n)."""
+    """Moments of whitened errors (runs, steps, n)."""
     runs, steps = whitened.shape[:2]
     N, mean, S = zip(*(_moments(whitened[:, here]) for here in blocks(steps, runs)), strict=True)
     return Moments(np.concatenate(N), np.concatenate(mean), np.concatenate(S))

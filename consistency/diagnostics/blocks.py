@@ -1,4 +1,4 @@
-"""Large arrays a block at a time, so that what is worked out on the way needs little memory."""
+"""Large arrays processed block by block, so that intermediate results need little memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FEWER = 2**16  # in a block of whole runs, which lies together in memory: what i
 
 
 def blocks(count: int, each: int, rows: int | None = None) -> Iterator[slice]:
-    """Slices of an axis of ``count`` places with ``each`` rows at a place; one slice, if of nothing, at least."""
+    """Slices of an axis of ``count`` places with ``each`` rows at a place; at least one slice, which may be empty."""
     size = max((ROWS if rows is None else rows) // max(each, 1), 1)
     return (slice(k, k + size) for k in range(0, max(count, 1), size))
 
@@ -26,7 +26,7 @@ def of_runs(array: Array) -> Iterator[slice]:
 
 
 def by_runs(function: Callable[..., Array], first: Array, *others: Array | Symmetric) -> Array:
-    """``function`` of arrays (runs, ...), which works on each run by itself, block by block."""
+    """Apply ``function``, which works on each run separately, to arrays (runs, ...) block by block."""
     runs = len(first)
     parts = list(of_runs(first))
     if len(parts) == 1:
@@ -42,6 +42,6 @@ def by_runs(function: Callable[..., Array], first: Array, *others: Array | Symme
 
 
 def by_steps(function: Callable[..., Array], *arrays: Array) -> Array:
-    """``function`` of arrays (runs, steps, ...), which works on each step by itself, block by block: (steps, ...)."""
+    """Apply ``function``, which works on each step separately, to arrays (runs, steps, ...) block by block."""
     runs, steps = arrays[0].shape[:2]
     return np.concatenate([function(*(array[:, here] for array in arrays)) for here in blocks(steps, runs)])

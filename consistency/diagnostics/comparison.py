@@ -1,4 +1,4 @@
-"""Is one filter less consistent than another? Run by run on the same trials, or against a stored baseline."""
+"""Comparison of the consistency of two filters: run by run on the same trials, or against a stored baseline."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOST = 10**15  # runs that a plan asks for; where these do not suffice, nothing 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a comparison needs of a filter: one row a run. NaN where a run has no value."""
+    """Data of a filter for a comparison, with one row for each run. NaN where a run has no value."""
 
     runs: Indices  # (R,), run numbers
     dof: int
@@ -33,7 +33,7 @@ class RunSummary:
 
 @dataclass(frozen=True)
 class Difference:
-    """One quantity of two filters, and how sure the difference is."""
+    """Difference of two filters in one quantity, with its confidence interval."""
 
     name: str
     a: float
@@ -44,7 +44,7 @@ class Difference:
 
 
 class FailedRuns(NamedTuple):
-    """How many runs of either filter failed."""
+    """Number of failed runs of each filter."""
 
     a: int
     b: int
@@ -68,17 +68,17 @@ class Comparison:
 
     @property
     def conservative(self) -> bool:
-        """The p value is of an a that is farther off because its covariance is too large."""
+        """Whether the p value is for an ``a`` that is farther off because its covariance is too large."""
         return self.side < 0.0
 
     @property
     def unseen(self) -> float:
-        """Largest share of runs, 95 %, that may be of a kind of which not one is among these."""
+        """Upper limit (95 %) of the share of a kind of run that does not occur among these runs."""
         return float(1.0 - 0.05 ** (1.0 / self.runs))
 
     @property
     def worse(self) -> bool:
-        """a is less consistent than b at the stated false-alarm rate."""
+        """Whether ``a`` is less consistent than ``b`` at the stated false-alarm rate."""
         return self.p_value <= self.false_alarm
 
     def needed_runs(self, detect: float = DETECT, power: float = POWER) -> int:
@@ -86,7 +86,7 @@ class Comparison:
 
         Planned with the test of :func:`compare` and the spread between these runs, for an ``a`` that errs to the side
         to which ``b`` errs. Both logarithms have to be significant, so each may be missed with (1 - ``power``) / 2.
-        If these runs already show that ``a`` is not farther by ``detect``, no more than these are asked for.
+        If these runs already show that ``a`` is not farther by ``detect``, their own number is returned.
         """
         least = abs(float(np.log(detect)))
         sizes = (self.standard_error, least), (self.sum_error, least + 2.0 * self.reference)
@@ -140,14 +140,14 @@ def compare(
 
     'Worse' compares abs(log ratio) with ratio = ANEES / dof: too small and too large a covariance count alike. It is
     an intersection-union test (Berger 1982) in both directions: ``a`` is worse if log ratio_a > log ratio_b and
-    log ratio_a > -log ratio_b, or if both hold with < in place of >. Of a direction the larger of its two one-sided p
-    values counts, and the p value is twice the smaller of the two directions. So the false-alarm rate is
-    ``false_alarm`` at most wherever the ratios are, and half of it where both filters err to the same side. The
-    one-sided tests are those of ``consistency.diagnostics.contrast``.
+    log ratio_a > -log ratio_b, or if both hold with < in place of >. For each direction the larger of its two one-sided
+    p values counts, and the p value is twice the smaller of the two. So the false-alarm rate is ``false_alarm`` at most
+    wherever the ratios are, and half of it where both filters err to the same side. The one-sided tests are those of
+    ``consistency.diagnostics.contrast``.
 
-    What is compared are expectations. No test of these holds for every law of heavy tails (Bahadur & Savage 1956): rare
-    runs with a large NEES that are not among these make a covariance look larger than it is. So that ``a`` is worse
-    because it is ``conservative`` holds for run means without such tails only.
+    The comparison is of expectations. No such test holds for every distribution with heavy tails (Bahadur & Savage
+    1956): if rare runs with a large NEES are missing from the sample, a covariance looks larger than it is. So a result
+    that ``a`` is worse because it is ``conservative`` is valid only for run means without such tails.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ LARGEST = 50.0  # growth of the log variance at most, so that the exponential is
 
 @dataclass(frozen=True)
 class Contrast:
-    """log ratio_a plus or minus log ratio_b, and how sure it is."""
+    """log ratio_a plus or minus log ratio_b, with its variance."""
 
     value: float
     variance: float
@@ -37,7 +37,7 @@ class Contrast:
         return float(special.stdtr(self.freedom, -t)), float(special.stdtr(self.freedom, t))
 
     def half_width(self, tail: float) -> float:
-        """From the value to a one-sided confidence limit, missed with probability ``tail`` at most."""
+        """Distance from the value to a one-sided confidence limit, missed with probability ``tail`` at most."""
         widest = self._error(abs(self.slope) * REACH * self.error)
         return -float(special.stdtrit(self.freedom, tail)) * widest
 
@@ -53,10 +53,10 @@ def contrast(a: Array, b: Array, sign: float, paired: bool) -> Contrast:
     Student's t of it errs too often, because run means are skewed: a sample without large values has a small mean
     and a small spread. Therefore
 
-    - the spread of the run means of a filter is at least that of a gamma distribution with their mean and
-      mean logarithm, which shows from the small values that some runs are slow;
-    - the variance is moved to where it would be if the tested hypothesis were true, upwards only. To first
-      order its logarithm moves by ``slope`` times the value (Johnson 1978 corrects t for the same dependence);
+    - the spread of the run means of a filter is at least that of a gamma distribution with their mean and mean
+      logarithm, which reveals slow runs by their small values;
+    - the variance is replaced by its value under the tested hypothesis, if that is larger. To first order its logarithm
+      changes by ``slope`` times the value (Johnson 1978 corrects t for the same dependence);
     - it is taken one standard error to the safe side, see :func:`margin`.
 
     These corrections were chosen by simulation and then measured on fresh draws; they are not derived.

@@ -1,4 +1,4 @@
-"""How often the truth lies within the stated bounds, and how large the error is."""
+"""Coverage of the stated bounds, and root mean square errors."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ def coverage_interval(
 ) -> tuple[Array, Array]:
     """Coverage of one step of each run and its exact binomial interval (Clopper & Pearson 1934), for each axis.
 
-    One step a run, spread over the trajectory (:func:`spread_steps`): independent draws, which pooled steps
-    are not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2); rows with NaN, or not ``counted``
-    (runs, steps), are not drawn.
+    One step of each run, spread over the trajectory (:func:`spread_steps`), gives independent draws; pooled steps would
+    not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2); rows with NaN, or not ``counted`` (runs, steps),
+    are not drawn.
     """
     error, P = np.asarray(error, float), entries(covariance)
     there = by_runs(_usable, error, P)

@@ -15,7 +15,7 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
     10 / N times the sum over runs of log10(NEES / NEES*), with absolute value for the first and with sign for
     the second; NEES* is that with the actual mean squared error matrix of the step in place of the stated
     covariance. 0 is credible; 10 is a covariance wrong by a factor of 10. Inclination above 0 is
-    overconfident. Both are relative to errors of the same runs, so that they need many more runs than dimensions.
+    overconfident. Both are relative to errors of the same runs, so they need many more runs than dimensions.
 
     Parameters
     ----------

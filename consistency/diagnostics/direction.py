@@ -1,4 +1,4 @@
-"""Is the covariance too small in any direction? What a covariance that may be too large is asked."""
+"""Test of the covariance in all directions, for estimators whose covariance may be too large."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def largest_direction(whitened: Array) -> Largest:
 
     A covariance is conservative if P >= E e e' in every direction (Forsling, Julier & Hendeby 2025), so that the
     largest eigenvalue of the whitened second moment is at most 1; the trace, which is the mean NEES, cannot tell.
-    The leading eigenvector of every other run is the direction in which the remaining runs are judged, and the other
-    way round: runs are independent, so each half knows nothing of the errors that chose its direction, and the
-    test of a single component holds (:func:`scale_test`). Both halves count, Bonferroni.
+    The leading eigenvector of one half of the runs (every other run) is the direction in which the other half is
+    judged, and vice versa. Runs are independent, so the errors of each half are independent of its direction, and the
+    test of a single component holds (:func:`scale_test`). Both halves count (Bonferroni).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Does the NEES follow its chi-square, with nothing fitted?"""
+"""Test that the NEES has its chi-square distribution, without fitted parameters."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def pit(nees: Array, dof: int, false_alarm: float = FALSE_ALARM) -> Pit:
     Parameters
     ----------
     nees : (runs, steps), NaN where a run has no value
-    dof : degrees of freedom, which no data are used to choose
+    dof : degrees of freedom, not fitted to the data
     """
     steps = spread_steps(np.isfinite(nees))
     rows = np.flatnonzero(steps >= 0)

@@ -1,4 +1,4 @@
-"""Runs that end before the others: were they lost? Then what is left of the runs is no fair sample of their errors."""
+"""Test whether runs that end early were lost; if so, the remaining steps are a biased sample of the errors."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ class EarlyEnds:
 
     @property
     def lost(self) -> bool:
-        """Runs end with clearly larger errors than those that go on have."""
+        """Whether runs that end early have clearly larger errors than those that go on."""
         return self.p_value <= RATE
 
 
 def early_ends(nees: Array) -> EarlyEnds:
-    """Is the NEES of runs that end early larger, in their last step, than that of the runs that go on?
+    """Test whether runs that end early have a larger NEES in their last step than the runs that go on.
 
-    In each step in which runs end, the NEES of all that have reached it are ranked: given these, the runs that end are
-    any of them if ends do not depend on errors, however the steps depend on each other. So the sum of their ranks has
-    the mean and variance of Wilcoxon (1945), and those of different steps are uncorrelated (Prentice 1978, Biometrika
-    65). The sum over all steps is taken as normal, which for few runs is on the safe side.
+    In each step in which runs end, the NEES of all runs that have reached it are ranked. Given these values, each run
+    is equally likely to end if ends do not depend on errors, however the steps depend on each other. So the sum of
+    their ranks has the mean and variance of Wilcoxon (1945), and those of different steps are uncorrelated (Prentice
+    1978, Biometrika 65). The sum over all steps is taken as normal, which for few runs is on the safe side.
 
     Parameters
     ----------

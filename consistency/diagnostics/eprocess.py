@@ -1,4 +1,4 @@
-"""Evidence on the scale that is valid under any dependence between steps, whenever it is looked at."""
+"""E-process for the scale, valid at any stopping time and under any dependence between steps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KEPT = 0.02  # of a stake, so that no single run ends the game
 class EProcess:
     """Betting on run means of the NEES; N runs in the order in which they came.
 
-    Of a filter whose covariance is right, or errs in the other direction only, each of ``up`` and ``down`` ever
+    For a filter whose covariance is right, or errs in the other direction only, each of ``up`` and ``down`` ever
     reaches 1 / alpha with probability alpha at most (Ville 1939), and so does ``both``.
     """
 
@@ -41,8 +41,8 @@ def e_process(means: Array, dof: int | Array) -> EProcess:
 
     Each factor is convex in Y_i, and Y_i is an average over steps of chi-squares over n, so by Jensen's inequality
     its mean is at most that of a single step, 1, however the steps depend on each other and however many there
-    are. Runs only have to be independent; they may differ in length, in dependence and in dimension. (Waudby-Smith
-    & Ramdas 2024 have betting on means; the mixture over stakes is of this project.)
+    are. Runs only have to be independent; they may differ in length, in dependence and in dimension. (Waudby-Smith &
+    Ramdas 2024 describe betting on means; the mixture over stakes is of this project.)
 
     Parameters
     ----------

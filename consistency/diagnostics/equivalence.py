@@ -1,4 +1,4 @@
-"""Is the scale shown to be right? Absence of evidence is not it."""
+"""Tests that show the scale to be right; the absence of a fault does not show it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def equivalence(
     means : (runs,), mean NEES of each run over ``dof``
     steps : of the longest run
     factor : ``settings.factor`` where it is not given
-    low_is_fault : more runs may also find that the ratio is below 1
+    low_is_fault : whether a ratio below 1 is a fault, which more runs may find
     unseen : share of the NEES that ``means`` may lack; the ratio is then as much larger on its upper side
     """
     factor = settings.factor if factor is None else factor
@@ -74,9 +74,9 @@ def _result(below: float, above: float, factor: float, settings: Settings, runs:
 
 
 def deciding_runs(test: MeanTest, factor: float, settings: Settings, low_is_fault: bool = True) -> int | None:
-    """Runs that would probably show the ratio inside, or find it at fault, if it is what it seems to be.
+    """Number of runs that would probably show the ratio inside, or find it at fault, at its present estimate.
 
-    Fewer than 20 runs do not know their ratio: then it is taken to be right. Chi-square of k degrees of freedom
+    From fewer than 20 runs the ratio is not known and is assumed to be right. Chi-square of k degrees of freedom
     is judged by its logarithm, of variance 2 / k; each with probability ``power``.
     """
     if not test.runs or not test.ratio > 0:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def flat(v: Verdict) -> dict[str, Any]:
-    """Every number of a verdict under one name each; parts that could not be looked at are left out."""
+    """Every number of a verdict by name; parts that could not be computed are left out."""
     s: dict[str, Any] = {
         "runs": v.runs, "steps": v.steps, "unit": v.unit, "false_alarm": v.settings.false_alarm,
         "confidence": 1.0 - v.settings.false_alarm, "detect": v.settings.detect, "power": v.settings.power,

@@ -1,4 +1,4 @@
-"""What a fit to the truth leaves of errors: the covariance of residuals whose steps depend on each other."""
+"""Degrees of freedom lost to a fit: the covariance of residuals whose steps depend on each other."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ LONGEST, WIDER = (
 
 @dataclass(frozen=True)
 class Left:
-    """Covariances of what a fit leaves."""
+    """Covariances of the residuals of a fit."""
 
     covariances: list[Array]  # (T_i, n, n) for each run
     oscillating: bool = False  # the errors are not what is assumed of them; the covariances are I
-    unseen: float = 0.0  # share of the NEES that the fit may have taken without its being made up for
+    unseen: float = 0.0  # share of the NEES that the fit may have absorbed without a correction
 
 
 def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared: bool) -> Left:
@@ -39,12 +39,12 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
     from the lagged products of the residuals, whose expectation is linear in C (the bias that the fit gives to them is
     so taken out), by non-negative least squares, in the same units whatever the size of the errors is.
 
-    A fit of its own in each run looks as an error does that is constant over the run. So correlations longer than a
-    part of the run are not looked for then; the result is moved ``MARGIN`` standard errors (jackknife over runs)
-    towards I, and is too large rather than too small where errors are correlated for longer. Errors that alternate or
-    oscillate lose less to such a fit than the model says. They are told by a correlation at some lag that is smaller
-    than any sum of exponentials, of any length, makes it: Student's t over runs for each bin of lags, in each component
-    and in all together, at ``DOUBT`` (Bonferroni). Then I is returned, which is never too small.
+    A fit for each run cannot be told from an error that is constant over the run. So correlations longer than a part of
+    the run are not looked for then; the result is moved ``MARGIN`` standard errors (jackknife over runs) towards I, and
+    is too large rather than too small where errors are correlated for longer. Errors that alternate or oscillate lose
+    less to such a fit than the model says. They are detected by a correlation at some lag that is smaller than any sum
+    of exponentials, of any length, allows: Student's t over runs for each bin of lags, in each component and in all
+    together, at ``DOUBT`` (Bonferroni). Then I is returned, which is never too small.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def _oscillate(seen: Array, expected: Array, pairs: Array) -> bool:
 
 
 def _at_most(residuals: Sequence[Array], bases: Sequence[Array]) -> float:
-    """Share of the NEES that a fit takes at most: of each component the largest value of its mean periodogram."""
+    """Largest share of the NEES that a fit can absorb: of each component the largest value of its mean periodogram."""
     size = _size(max(map(len, residuals)))
     periodograms = sum(np.square(np.abs(fft.rfft(r, size, axis=0))) for r in residuals)
     squares = sum(np.square(r).sum(axis=0) for r in residuals)

@@ -1,4 +1,4 @@
-"""The chi-square distribution behind a validation gate: only values up to a limit are seen."""
+"""The chi-square distribution truncated by a validation gate: only values up to a limit are observed."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def gated_mean(scale: float, dof: float, limit: float) -> float:
 def gated_scale(mean: float, dof: float, gate: float | None) -> float:
     """The scale at which the mean NIS behind the gate is ``mean``: its maximum-likelihood estimate.
 
-    ``dof`` may be an average. Infinite where the mean is larger than that of any scale up to 1,000: the values
-    then say no more than that they were accepted.
+    ``dof`` may be an average. Infinite where the mean is larger than that of any scale up to 1,000: the values then
+    show only that they were accepted.
     """
     if gate is None or mean == 0.0:
         return mean / dof

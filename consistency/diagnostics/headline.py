@@ -1,4 +1,4 @@
-"""The headline of a verdict: one word for what its questions found."""
+"""The headline of a verdict: one word for the result of its questions."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ GRID = 9  # ratios within the tolerance at which the distribution is compared
 
 @dataclass(frozen=True)
 class Tests:
-    """p value of each question, NaN where it cannot be asked, and what was worked out on the way."""
+    """p value of each question, NaN where it cannot be asked, and intermediate results."""
 
     p_values: Mapping[str, float]
     main: MeanTest
@@ -40,7 +40,7 @@ class Tests:
 
 
 def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: float | None = None) -> Tests:
-    """Ask everything that can be asked of a sample.
+    """Test every question that the sample allows.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Do errors that follow each other in a log seem to be independent? Their signs and sizes, at all lags at once."""
+"""Test of independence for consecutive errors of a log: their signs and sizes, at all lags at once."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ class Independence:
 
     @property
     def p_value(self) -> float:
-        """That pieces are independent; NaN where there are too few."""
+        """p value of the hypothesis that pieces are independent; NaN where there are too few."""
         return min(self.sizes, self.signs)
 
     @property
     def doubtful(self) -> bool:
-        """Pieces do not seem to be independent; of independent ones at most 0.5 % are."""
+        """Whether pieces seem to be dependent; at most 0.5 % of logs with independent pieces are called so."""
         return self.p_value <= RATE
 
     @property
     def of_sizes(self) -> bool:
-        """The sizes are clearer than the signs."""
+        """Whether the sizes show the dependence more clearly than the signs."""
         return self.sizes <= self.signs
 
 
 def independence(whitened: Array) -> Independence:
-    """Are the errors of pieces of a log independent of each other?
+    """Test whether the errors of pieces of a log are independent of each other.
 
-    What makes a mean over W pieces less sure than W independent ones is the sum of their autocorrelations over all
-    lags, which is the spectrum at its low end. So the periodogram is summed over its lowest b frequencies, b = 1, 2,
-    4, ... up to a quarter of W, and compared with the rest: for white Gaussian series the ratio has exactly the F
-    distribution (Priestley 1981, Spectral Analysis and Time Series, ch. 6). It is asked of
+    The variance of a mean over W pieces, relative to W independent ones, is the sum of their autocorrelations over all
+    lags, which is the spectrum at its low end. So the periodogram is summed over its lowest b frequencies, b = 1, 2, 4,
+    ... up to a quarter of W, and compared with the rest: for white Gaussian series the ratio has exactly the F
+    distribution (Priestley 1981, Spectral Analysis and Time Series, ch. 6). It is applied to
 
-    - the errors, with the mean 0 that they should have: a bias counts as what goes on for ever;
+    - the errors, with the mean 0 that they should have: a bias counts as a correlation that never decays;
     - the cube roots of their NEES, which are nearly Gaussian (Wilson & Hilferty 1931), about their mean over the
       pieces, so that the size of the covariance is no matter.
 

@@ -1,4 +1,4 @@
-"""Innovations of a right filter are white, with the covariance it states."""
+"""Tests that innovations are white and have the stated covariance, as those of a right filter."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def nis_test(nis: Array, dof: Array) -> NisTest:
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Autocorrelation over steps, and whether all of it is zero."""
+    """Autocorrelation over steps, and the test that it is zero."""
 
     correlation: Array  # (lags,), of lag 1, 2, ...; mean over components
     bound: float  # that 95 % of each stay within, if white
@@ -64,7 +64,7 @@ class Whiteness:
 
 
 def whiteness(innovations: Array, covariances: Array, lags: int = LAGS) -> Whiteness:
-    """Are innovations independent over steps? Portmanteau test of their autocorrelation matrices.
+    """Portmanteau test that innovations are independent over steps, from their autocorrelation matrices.
 
     With u the innovations in units of their stated covariance and C_l the mean of u_k u_{k+l}' over the M
     pairs of all runs, sum M ``|C_l|^2`` / s^4 is chi-square with lags m^2 degrees of freedom (Box & Pierce 1970;
@@ -82,7 +82,7 @@ def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
 
     The cube root of the NIS is nearly Gaussian (Wilson & Hilferty 1931). It is standardised by its exact mean and
     standard deviation, because autocorrelations are about a mean of 0; the mean of Wilson and Hilferty is 5 % of a
-    standard deviation off with one degree of freedom, which over many steps looks like correlation. What mean is left
+    standard deviation off with one degree of freedom, which over many steps looks like correlation. The remaining mean
     is removed, so that white innovations that are not Gaussian do not count as correlated.
 
     Correlated innovations show in their squares, with the correlation squared.

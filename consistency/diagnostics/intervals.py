@@ -42,7 +42,7 @@ def chi2_mean_interval(dof: float, confidence: float = CONFIDENCE) -> tuple[floa
 def binomial_interval(count: Any, draws: Any, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
     """Exact interval of a share, Clopper & Pearson (1934), of ``count`` in ``draws``.
 
-    Numbers or arrays that go together, whole or not; low and high have their shape. Where nothing is drawn: 0 and 1.
+    Numbers or arrays that broadcast, whole or not; low and high have their shape. Without draws the interval is [0, 1].
     """
     count, draws = np.broadcast_arrays(np.asarray(count, float), np.asarray(draws, float))
     tail = 0.5 * (1.0 - confidence)

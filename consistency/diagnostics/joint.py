@@ -20,7 +20,7 @@ SURE = 0.04  # false-alarm rate of naming a landmark that does not stand out
 
 @dataclass(frozen=True)
 class JointTest:
-    """What the joint NEES of N runs says."""
+    """Result of the test of the joint NEES of N runs."""
 
     p_values: dict[str, float]
     score: JointScore
@@ -40,7 +40,7 @@ def joint_test(
 
     Parameters
     ----------
-    run_numbers, landmarks : (N,) and (L,), what to call the runs and the columns of ``joint.landmarks``
+    run_numbers, landmarks : (N,) and (L,), labels of the runs and of the columns of ``joint.landmarks``
     """
     total = joint.pose + joint.map
     given = ~np.isnan(total) & (joint.dof > 0)
@@ -82,7 +82,7 @@ def _chief(joint: JointNees, labels: Indices | None) -> tuple[int, ...]:
 
 
 def near(test: JointTest, settings: Settings) -> bool:
-    """Is the ratio shown to lie within the tolerance, by two one-sided chi-square tests at 1 - ``power``?"""
+    """Whether two one-sided chi-square tests at 1 - ``power`` show the ratio to lie within the tolerance."""
     if settings.tolerance is None or not test.score.runs:
         return False
     R, D, level = settings.tolerated, test.score.dof, 1.0 - settings.power

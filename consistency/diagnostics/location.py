@@ -1,4 +1,4 @@
-"""Since when, by how much and where a filter is wrong. Nothing here decides: the answers have."""
+"""Beginning, size and place of a fault. Nothing here decides whether there is one: the answers have."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ Answers = Mapping[str, Answer]
 
 
 def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = True, detect: float = DETECT) -> Location:
-    """Steps outside the band, since when or until when, and which axes.
+    """Steps outside the band, beginning or end of the fault, and its axes.
 
-    A fault of what is not ``ordered`` in time begins and ends nowhere. ``detect`` is that of the settings.
+    Without ``ordered`` steps a fault has no beginning or end. ``detect`` is that of the settings.
     """
     outside = band.outside
     first = int(np.argmax(outside)) if outside.any() else None
@@ -72,14 +72,14 @@ def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = Tr
 
 
 def _lasting(sample: Sample, first: int, sign: int) -> bool:
-    """Is the ANEES on that side of its pointwise band in most steps from ``first`` on?"""
+    """Whether the ANEES is on that side of its pointwise band in most steps from ``first`` on."""
     curve, band = anees(sample.nees)[first:], pointwise_band(sample.counted.sum(axis=0), sample.dof)[first:]
     beyond = curve > band[:, 1] if sign > 0 else curve < band[:, 0]
     return bool(beyond[np.isfinite(curve)].mean() > 0.5)
 
 
 def _absent_before(sample: Sample, first: int, sign: int) -> bool:
-    """Are the steps before ``first`` shown to have less than half of the fault, on the logarithm?
+    """Whether the steps before ``first`` are shown to have less than half of the fault, on the logarithm.
 
     One-sided Student's t of the log mean before, with the standard error of the runs.
     """
@@ -134,7 +134,7 @@ def _splits(sample: Sample) -> tuple[Indices, Array, Array]:
 
 
 def chief_axes(sample: Sample, steps: slice = slice(None)) -> str | None:
-    """Axes that carry the fault: those farther from 1 than the others together, beyond what chance makes.
+    """Axes that carry the fault: those farther from 1 than the others together, beyond chance.
 
     With Y_ij the mean NEES of axis j alone in run i and O_ij that of the other axes, each over its mean over runs,
     D_i = Y_ij - O_ij has the standard error of log mean Y_j - log mean O_j to first order; Student's t, two-sided,
@@ -183,7 +183,7 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
 
 
 def bias_of(sample: Sample, tests: Tests, location: Location, answers: Answers) -> Bias:
-    """Mean error of each axis, and what the scale is without it."""
+    """Mean error of each axis, and the scale without it."""
     errors, late = _errors(sample), _late(location)
     of_runs = by_runs(_standard_means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]

@@ -1,4 +1,4 @@
-"""Lost runs: those that failed or are off beyond chance, and the share of them that is not excluded."""
+"""Lost runs: those that failed or have a NEES beyond chance, and the share of them that is not excluded."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def lost_evidence(is_lost: Array, share: float) -> Array:
 
 
 def lost_of(evidence: Evidence, nees: Array, dof: int, settings: Settings, any_time: bool = False) -> Lost | None:
-    """Lost runs among those that failed or have a NEES, and what share is not excluded; None without such a run.
+    """Lost runs among those that failed or have a NEES, and the share not excluded; None without such a run.
 
     Parameters
     ----------
     nees : (runs, steps), NaN where nothing counts
-    any_time : the limit holds whenever it is looked at, and what is lost does not depend on when that is: run i is
-        judged at the rate / (i (i + 1))
+    any_time : the limit holds at any stopping time, and a run is lost or not regardless of that time: run i is judged
+        at the rate / (i (i + 1))
     """
     means, counts = run_means(nees)
     numbers = np.asarray(evidence.run_numbers)

@@ -1,4 +1,4 @@
-"""A test of the NIS as it comes, for a filter in service."""
+"""Sequential test of the NIS, for a filter in service."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def alternatives(tolerance: float) -> tuple[Alternative, ...]:
 
 
 def bet_on(dof: int, tolerance: float = 1.2, gate: float | None = None) -> Bet:
-    """What an innovation of ``dof`` degrees of freedom is judged by; see :class:`Monitor` for the formula."""
+    """Bet for an innovation of ``dof`` degrees of freedom; see :class:`Monitor` for the formula."""
     limit = math.inf if gate is None else gate_limit(gate, dof)
     terms = []
     for scale, edge in alternatives(tolerance):
@@ -197,7 +197,7 @@ class Monitor:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew, as after construction: the next alarm is false with probability ``false_alarm`` again."""
+        """Restart, as after construction: the next alarm is false with probability ``false_alarm`` again."""
         count = 2 * len(RATIOS)
         self.steps = self.measurements = self.rejections = self.innovations = 0
         self.evidence = self.largest = 1.0
@@ -209,9 +209,9 @@ class Monitor:
         self._resets = [START] * count
 
     def update(self, nis: float | None, dof: int) -> Alarm | None:
-        """Take the NIS of a step; the alarm in the step in which it is raised, else None.
+        """Process the NIS of a step; return the alarm in the step that raises it, otherwise None.
 
-        The alarm is returned once and stays in ``alarm``; the evidence goes on to be counted. Takes microseconds.
+        The alarm is returned once and stays in ``alarm``; the evidence is still updated. Takes microseconds.
 
         Parameters
         ----------

@@ -65,7 +65,7 @@ def _mean_over_runs(values: Array) -> Array:
 
 
 def _require(good: Array, what: str, last: int) -> None:
-    """Refuse, with the first index of the batch, what is not all true over the ``last`` axes."""
+    """Raise ValueError, with the first index of the batch, unless all is true over the ``last`` axes."""
     if not good.all():
         bad = ~good.all(axis=tuple(range(-last, 0)))
         index = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0])

@@ -1,4 +1,4 @@
-"""Is a sample Gaussian? Moments and a test that needs no fitted distribution function."""
+"""Normality of a sample: moments, and a test that needs no fitted distribution function."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers as a sentence has them."""
+"""Numbers formatted for sentences."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 
 
 def short(value: float) -> str:
-    """Three digits, as a person says them."""
+    """A positive number with two or three digits, for a sentence."""
     return (
         f"{value:.2g}"
         if value < 0.1
@@ -42,7 +42,7 @@ def plain(interval: Interval) -> str:
 
 
 def p_text(p: float) -> str:
-    """A p value without digits that nobody needs."""
+    """A p value without superfluous digits."""
     return f"{p:.2g}" if p >= 1e-6 else "below 1e-6"
 
 

@@ -33,7 +33,7 @@ def outliers(whitened: Array, known: Moments | None = None) -> Outlier:
     Parameters
     ----------
     whitened : (runs, steps, n), NaN where a run has no value
-    known : its moments, where they are
+    known : moments of ``whitened``, if already computed
     """
     N, mean, S = moments(whitened) if known is None else known
     n = whitened.shape[-1]

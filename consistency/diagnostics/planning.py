@@ -1,4 +1,4 @@
-"""How many runs a verdict takes, and what a number of runs can find."""
+"""Number of runs that a verdict needs, and the smallest fault that a number of runs can find."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def gate_runs(
 ) -> int:
     """Runs with which a verdict (:func:`judge`) finds a covariance wrong by ``detect`` in all steps with ``power``.
 
-    As :func:`required_runs` with the half of ``false_alarm`` that a verdict gives to the mean NEES, and at least
-    :func:`lost_runs` where a share ``lost`` of lost runs is to be excluded. Raises as those.
+    This is :func:`required_runs` at the half of ``false_alarm`` that a verdict gives to the mean NEES, and at least
+    :func:`lost_runs` where a share ``lost`` of lost runs is to be excluded. Raises the same exceptions.
     """
     _require(dof, false_alarm, power)
     runs = required_runs(dof, detect, SHARES[MAIN] * false_alarm, power, two_sided=allow is None)
@@ -97,7 +97,7 @@ def lost_runs(share: float, power: float = POWER, lost: int = 0) -> int:
 
 @dataclass(frozen=True)
 class PilotPlan:
-    """What a pilot says of the runs that a verdict takes."""
+    """Number of runs that a verdict needs, according to a pilot."""
 
     pilot_runs: int
     effective_dof: float  # of one run, one standard error to the safe side
@@ -115,11 +115,11 @@ def pilot_plan(
     allow: str | None = None,
     lost: float | None = None,
 ) -> PilotPlan:
-    """Runs that :func:`judge` takes where steps depend on each other as in a pilot, and not completely.
+    """Runs that :func:`judge` needs if steps depend on each other as in a pilot, and not completely.
 
     :func:`gate_runs` at the pilot's effective degrees of freedom, one standard error to the safe side, times 1.15: a
-    verdict estimates them again from its own runs. At least 20 runs, with which it does. Scale and bias of the pilot
-    do not matter, only how its run means spread.
+    verdict estimates them again from its own runs. At least 20 runs, as it needs for that. Scale and bias of the pilot
+    do not matter, only the spread of its run means.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def pilot_plan(
     Raises
     ------
     ValueError
-        As :func:`required_runs` and :func:`lost_runs`; too few runs.
+        Fewer than 20 runs, or an argument that :func:`required_runs` or :func:`lost_runs` refuses.
     """
     _require(dof, false_alarm, power)
     if len(means) < FEW:

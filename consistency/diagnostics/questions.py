@@ -1,4 +1,4 @@
-"""The questions a verdict asks, what each may cost, and the correction for asking them all."""
+"""The questions of a verdict, the share of the false-alarm rate of each, and the correction for multiple tests."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ ABOUT = {
 
 
 def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answer]:
-    """Answers corrected for the number of questions: weighted Holm (1979), any dependence.
+    """Answers corrected for the number of questions: weighted Holm (1979), valid under any dependence.
 
     The chance that a right filter is found at fault in any question is at most ``false_alarm``. The main question
     keeps its share; the shares of questions that cannot be asked (p is NaN) go to the other ones. The

@@ -1,4 +1,4 @@
-"""What the referee is given, what it is asked, and what it says: frozen records, shapes on each field."""
+"""Input, settings and output of the referee: frozen records, with the shape of each field."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Interval(NamedTuple):
         return self.low <= value <= self.high
 
 
-# --- what the referee is given -----------------------------------------------------------------------
+# --- input of the referee -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class JointNees:
 class Evidence:
     """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them.
 
-    What is judged, wherever it is from: arrays of a gate, files, or results of the bench. From the step of a failure on
-    everything is NaN. Where a start is known exactly its covariance is singular: NEES and, of files, covariance are NaN
-    in those steps, the error is not.
+    This is the input of every verdict, from arrays of a gate, files, or results of the bench. From the step of a
+    failure on all values are NaN. If the start is known exactly, its covariance is singular: in those steps the NEES
+    and, for files, the covariance are NaN, and the error is not.
     """
 
     name: str
@@ -89,23 +89,23 @@ class Evidence:
 
     # what a fit to the truth leaves of the errors
     align: str = "none"  # how the estimates were moved into the world of the truth
-    caption: str = ""  # what the verdict has to say of that
+    caption: str = ""  # note of the verdict on that
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
-    unavailable: Collection[str] = ()  # questions that it leaves no answer to, which are not asked
-    unseen: float = 0.0  # share of the NEES that it may have taken: consistent is shown with it added
+    unavailable: Collection[str] = ()  # questions that cannot be answered after the fit, which are not asked
+    unseen: float = 0.0  # share of the NEES that the fit may have absorbed: consistent is shown with it added
 
-    # where it is from
+    # origin
     t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
     times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
     convention: str = ""  # of the error
-    notes: tuple[str, ...] = ()  # what a reader must know: the convention, what was left out
+    notes: tuple[str, ...] = ()  # notes for the reader: the convention, left-out steps
     window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
     independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
 
     @property
     def run_numbers(self) -> Indices:
-        """What to call the runs, (runs,)."""
+        """Labels of the runs, (runs,)."""
         if self.runs is not None:
             return self.runs
         there = (self.error, self.nees, self.nis, self.innovations)
@@ -139,7 +139,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a verdict is asked, and how sure it has to be.
+    """Questions of a verdict, and its error rates.
 
     Raises
     ------
@@ -187,12 +187,12 @@ class Settings:
         return self.allow == "conservative"
 
 
-# --- what the referee says ---------------------------------------------------------------------------
+# --- output of the referee ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What one question found."""
+    """Result of one question."""
 
     question: str
     p_value: float
@@ -204,7 +204,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Equivalence:
-    """Is the ratio of true to stated covariance shown to lie near 1? Two one-sided tests (Schuirmann 1987)."""
+    """Two one-sided tests that the ratio of true to stated covariance lies near 1 (Schuirmann 1987)."""
 
     factor: float  # the interval is [1 / factor, factor]
     p_value: float  # the larger of both; NaN where there is nothing to judge
@@ -219,7 +219,7 @@ class Equivalence:
 
 @dataclass(frozen=True)
 class Within:
-    """What a single run says of the scale, if errors go on to decorrelate as within it; reported, not judged."""
+    """Scale of a single run, if errors go on to decorrelate as within it; reported, not judged."""
 
     ratio: Interval  # of true to stated covariance, 95 %
     correlation: float  # time over which the NEES decorrelates, in steps
@@ -265,7 +265,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class Lost:
-    """Runs that failed, or whose mean NEES is beyond what a right run has."""
+    """Runs that failed, or whose mean NEES is beyond the limit for a right run."""
 
     count: int
     runs: int  # that failed or have a NEES
@@ -301,7 +301,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Tails:
-    """Errors that are too rare, and the whole distribution."""
+    """Outliers among the errors, and the distribution of the NEES."""
 
     run: int  # of the error farthest from the other runs; -1 if none is
     step: int  # 1..T
@@ -312,7 +312,7 @@ class Tails:
 
 @dataclass(frozen=True)
 class Innovations:
-    """What the filter sees of its own errors."""
+    """Size and whiteness of the innovations."""
 
     ratio: float  # total NIS over its degrees of freedom
     interval: tuple[float, float]  # 95 % expected of white innovations
@@ -325,7 +325,7 @@ class Innovations:
 
 @dataclass(frozen=True)
 class Until:
-    """The last of the first steps that carry a fault, 1..T, and what the ratio is in them and after them."""
+    """The last of the first steps that carry a fault, 1..T, and the ratio in these steps and after them."""
 
     step: int
     early: float  # mean NEES over dof
@@ -334,7 +334,7 @@ class Until:
 
 @dataclass(frozen=True)
 class Location:
-    """Since when, and where; T steps."""
+    """Beginning and place of a fault; T steps."""
 
     simultaneous: Array  # (T, 2), where the ANEES of a consistent filter lies in all steps at once
     above: int  # steps above it
@@ -386,7 +386,7 @@ class RejectionScore:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Size of the errors by themselves, and other people's indices."""
+    """Size of the errors, coverage, and credibility indices from the literature."""
 
     coverage: Array  # (n,), share of errors within 2 stated standard deviations, all steps
     coverage_one_step: Array  # (n,), of one step of each run
@@ -402,7 +402,7 @@ class Accuracy:
 class Verdict:
     """The referee's answer for one filter.
 
-    ``print`` shows the sentence and a short table. Every part is None where it could not be looked at.
+    ``print`` shows the sentence and a short table. A part is None if it could not be computed.
     """
 
     filter: str
@@ -451,12 +451,12 @@ class Verdict:
 
     @property
     def places(self) -> str:
-        """What stands in the place of steps."""
+        """Noun for the second axis of the arrays: steps, or landmarks of a map."""
         return "steps" if self.landmarks is None else "landmarks"
 
     @property
     def worst_axis(self) -> tuple[str, Interval] | None:
-        """Component whose ratio is farthest from 1, of a verdict on the scale to its side; None of a single one."""
+        """Component whose ratio is farthest from 1, on the side of a fault of the scale; None if there is only one."""
         if self.axes is None or len(self.axes.names) < 2:
             return None
         logs = {a: np.log(max(i.value, TINY)) for a, i in self.axes.inflation.items() if a in self.axes.names}
@@ -503,7 +503,7 @@ class Verdict:
 
     @property
     def equivalence(self) -> Equivalence | None:
-        """What was shown of the scale: of the NEES, without truth of the NIS."""
+        """Equivalence of the scale of the NEES, or of the NIS without truth."""
         if self.scale is not None:
             return self.scale.equivalence
         return self.innovations.equivalence if self.innovations is not None else None

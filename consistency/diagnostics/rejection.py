@@ -1,4 +1,4 @@
-"""How well a guard tells spurious observations from right ones: precision and recall, with intervals."""
+"""Precision and recall of a guard that rejects spurious observations, with intervals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evidence in the form in which it is judged: whitened errors, the NEES that counts, run means."""
+"""Evidence prepared for the tests: whitened errors, the NEES that counts, run means."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors and what they were called; N runs, T steps, n components."""
+    """Errors and the names of their components; N runs, T steps, n components."""
 
     error: Array  # (N, T, n)
     covariance: Symmetric  # (N, T, n, n)
@@ -34,7 +34,7 @@ class Errors:
 
 
 class Centre(NamedTuple):
-    """Mean of the errors of N runs in each step, and the factor that makes their variance what it was without it."""
+    """Mean of the errors of N runs in each step, and the factor that restores their variance about it."""
 
     mean: Array  # (T, n)
     factor: Array  # (T, 1), NaN in a step of a single run
@@ -51,8 +51,7 @@ class Centre(NamedTuple):
 class Sample:
     """NEES of N runs in T steps; with errors where they are known.
 
-    The arrays may be large: they are worked on by blocks of runs or steps, and nothing of their size is kept beside
-    them.
+    The arrays may be large: they are processed in blocks of runs or steps, and no other array of their size is kept.
     """
 
     nees: Array  # (N, T), NaN where nothing counts
@@ -75,7 +74,7 @@ class Sample:
         return int(self.counted.sum(axis=1).max(initial=0))
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None)) -> Array:
-        """Mean NEES of a group of components by itself, over its number of components."""
+        """Mean NEES of a group of components alone, over its number of components."""
         assert self.errors is not None
         e, index = self.errors, list(index)
         centre = None if e.centre is None else e.centre.of_steps(steps)
@@ -110,7 +109,7 @@ class Sample:
     def centred(self) -> Sample:
         """Errors less their mean over runs in each step, with the variance that they would have without a bias.
 
-        In the place of this sample's NEES and whitened errors, so that it is of no more use.
+        Overwrites this sample's NEES and whitened errors in place; do not use it afterwards.
         """
         assert self.errors is not None
         e, centre = self.errors, self.centre()
@@ -122,7 +121,7 @@ class Sample:
 
 
 def sample_of(evidence: Evidence, settings: Settings) -> Sample | None:
-    """What there is of errors, or of NEES; None without either.
+    """Sample of the errors, or of the NEES alone; None without either.
 
     Raises
     ------
@@ -201,7 +200,7 @@ def shape_of(e: Evidence) -> tuple[int, int]:
 
 
 def impossible(e: Evidence, counted: Array) -> Array:
-    """(runs, steps) of bool: what no filter may say, an infinite error or a covariance with a negative variance."""
+    """(runs, steps) of bool: impossible values, an infinite error or a covariance with a negative variance."""
     assert e.error is not None
     assert e.covariance is not None
 

@@ -1,4 +1,4 @@
-"""Is the covariance too small or too large? Trials are the unit: they are independent, steps are not."""
+"""Test of the scale of the covariance. Trials are the unit: they are independent, steps are not."""
 
 from __future__ import annotations
 
@@ -52,18 +52,18 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
     """Test that run means of the NEES over its degrees of freedom, Y_i (runs,), have the mean 1.
 
     A run's mean NEES is a sum of dependent chi-squares. It is approximated by chi-square(nu) / nu with
-    the same mean and variance (Satterthwaite 1946; Box 1954, Theorem 3.1). Nothing is assumed of how the steps of a
-    run depend on each other, nor that they do so in the same way in every run: nu comes from the run means alone,
-    which are independent. Two estimates are taken, each one standard error to the safe side, and the smaller counts:
+    the same mean and variance (Satterthwaite 1946; Box 1954, Theorem 3.1). No assumption is made about the dependence
+    between the steps of a run, which may differ from run to run: nu comes from the run means alone, which are
+    independent. Two estimates are taken, each one standard error to the safe side, and the smaller counts:
 
-    - from the coefficient of variation, nu = 2 / CV^2 less its first-order bias. The jackknife over runs says how
-      well it is known and how it moves with the mean; where that lowers it, it is taken at a mean of 1;
+    - from the coefficient of variation, nu = 2 / CV^2 less its first-order bias. The jackknife over runs gives its
+      variance and its change with the mean; where that lowers nu, its value at a mean of 1 is used;
     - from the likelihood of a Gamma distribution of shape a = nu / 2, log a - digamma(a) = log mean Y - mean log Y
       (Fisher 1922), which small values enter as strongly as large ones.
 
-    What doubt remains makes Student's t of the normal. nu lies between ``dof``, its value where all steps of a
-    run are one and the same, and that times ``steps``. With fewer than 20 runs nu is ``dof``: the test is the
-    chi-square of one step.
+    Student's t in place of the normal allows for the remaining uncertainty. nu lies between ``dof``, its value where
+    all steps of a run are one and the same, and that times ``steps``. With fewer than 20 runs nu is ``dof``: the test
+    is the chi-square of one step.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True) -> Mea
 
 
 def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
-    """Do run means (runs,) differ more than those of Gaussian errors can? Of such, nu is ``dof`` at least.
+    """Whether run means (runs,) differ more than those of Gaussian errors can, for which nu is ``dof`` at least.
 
     Either estimate of nu (:func:`scale_test`) lies more than ``errors`` standard errors below; not asked of fewer than
     20 runs.
@@ -101,7 +101,7 @@ def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
 
 
 def spreads_more_in_steps(nees: Array, dof: int) -> bool:
-    """Does the NEES (runs, steps) differ more between runs, step by step, than that of Gaussian errors can?
+    """Whether the NEES (runs, steps) differs more between runs, step by step, than that of Gaussian errors can.
 
     The mean of log nu over the steps is compared, with the standard error of one step. Steps need not be independent.
     Those in which a run has no value, or none of the runs an error, do not count.
@@ -120,7 +120,7 @@ def run_means(nees: Array) -> tuple[Array, Array]:
 
 
 def means_and_counts(nees: Array) -> Array:
-    """What :func:`run_means` says, (runs, steps) -> (runs, 2)."""
+    """Means and counts of :func:`run_means` as one array, (runs, steps) -> (runs, 2)."""
     present = np.isfinite(nees)
     count = present.sum(axis=1)
     total = np.where(present, nees, 0.0).sum(axis=1)
@@ -141,8 +141,8 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -
     """Ratio of true to stated covariance (1 is right) and its interval, from the runs' mean NEES over dof (runs,).
 
     From 20 runs on the spread between the runs is taken as it is, so that neither dependence between steps nor heavy
-    tails make the interval too short. Fewer runs do not know their spread well: it is taken as that of runs whose
-    steps are all one and the same, or as the larger one that is seen. Without a run the interval is NaN.
+    tails make the interval too short. Fewer runs do not determine their spread well: then the spread of runs whose
+    steps are all the same is used, or the observed one if it is larger. Without a run the interval is NaN.
     """
     means = np.asarray(means, float)
     if not len(means):

@@ -1,4 +1,4 @@
-"""The scale of a filter as a verdict reports it."""
+"""Assembly of the scale that a verdict reports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOTHING = (float("nan"), float("nan"))
 
 
 def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence) -> Scale:
-    """Put together what is known of the scale; the inflation is that since the fault began, if it began late."""
+    """Assemble the record of the scale; the inflation is that since the fault began, if it began late."""
     dof, means = sample.dof, sample.means()
     alive = sample.counted.sum(axis=0)
     curve, band = anees(sample.nees), pointwise_band(alive, dof)
@@ -48,6 +48,6 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
 
 
 def pointwise_band(alive: Indices, dof: int) -> Array:
-    """95 % interval of the ANEES of each step by itself, (steps,) -> (steps, 2); NaN without a run."""
+    """95 % interval of the ANEES of each single step, (steps,) -> (steps, 2); NaN without a run."""
     intervals = {int(m): anees_interval(dof, int(m), CONFIDENCE) for m in set(alive[alive > 0])}
     return np.array([intervals.get(int(m), NOTHING) for m in alive]).reshape(-1, 2)

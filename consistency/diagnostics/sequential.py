@@ -1,4 +1,4 @@
-"""Looking at the runs while they come, with error rates that hold whenever it stops."""
+"""Sequential verdicts on runs as they finish, with error rates that hold at any stopping time."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ PARTS = 4  # times that the scale is looked at from one look to the next
 
 @dataclass(frozen=True)
 class Design:
-    """When to look, and what each look may cost.
+    """Plan of looks, with the share of the false-alarm rate of each.
 
-    The scale is carried by an e-process, which is valid whenever it is looked at. All other questions are asked at
-    looks after 12, 24, 48, ... runs; look j = 0, 1, ... may cost the part 1 / ((j + 1) (j + 2)) of their false-alarm
-    rate, which adds to 1 however many looks it takes (Bonferroni).
+    The scale is tested by an e-process, which is valid at any time. All other questions are asked at looks after 12,
+    24, 48, ... runs; look j = 0, 1, ... has the share 1 / ((j + 1) (j + 2)) of their false-alarm rate. The shares add
+    to 1 at most, however many looks there are (Bonferroni).
     """
 
     dof: int
@@ -42,11 +42,11 @@ class Design:
 
     @property
     def settings(self) -> Settings:
-        """What each look is asked."""
+        """Settings of each look."""
         return Settings(self.false_alarm, self.detect, self.power, lost=self.lost)
 
     def inspections(self) -> Iterator[tuple[int, float | None]]:
-        """Runs after which to look, and what the look may cost; None where only the scale is looked at."""
+        """Numbers of runs at which to look, and the share of each look; None where only the scale is tested."""
         runs, j, last = FIRST, 0, self.max_runs
         while True:
             spent = 1.0 / ((j + 1) * (j + 2))
@@ -75,7 +75,7 @@ def look(design: Design, evidence: Evidence, spent: float | None) -> Verdict:
 
 
 def speaks(design: Design, evidence: Evidence, spent: float | None) -> bool:
-    """Can this inspection decide? Between looks only a scale at fault does."""
+    """Whether this inspection can decide. Between looks only a fault of the scale does."""
     return spent is not None or _scale(design, evidence) <= SHARES[MAIN] * design.false_alarm
 
 
@@ -86,12 +86,12 @@ def _scale(design: Design, evidence: Evidence) -> float:
 
 
 def follow(design: Design, evidence_of: Callable[[int], Evidence], limit: int | None = None) -> tuple[Verdict, int]:
-    """Look until decided: the verdict, and the runs that it took.
+    """Inspect runs until decided; return the verdict and the number of runs used.
 
     Parameters
     ----------
-    evidence_of : the first runs of a filter, as many as it is asked for
-    limit : runs that there are; the last inspection within them speaks, or all of them where they are fewer than 12
+    evidence_of : function that returns the first k runs of a filter
+    limit : number of available runs; the last inspection within it decides, or all runs if they are fewer than 12
     """
     inspections = list(takewhile(lambda each: each[0] <= limit, design.inspections())) if limit is not None else None
     if inspections == []:

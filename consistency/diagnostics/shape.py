@@ -1,4 +1,4 @@
-"""Has the covariance the right shape: relative sizes of the components and their correlations?"""
+"""Tests of the shape of the covariance: relative sizes of the components and their correlations."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def identity_statistic(whitened: Array) -> tuple[float, float]:
     """Likelihood ratio that whitened errors (N, n) have covariance I, mean zero: statistic and p value.
 
     N (tr S - ln det S - n) with S the mean of w w', chi-square with n (n + 1) / 2 degrees of freedom after
-    Bartlett's correction (Anderson 2003, sec. 10.8). It sees scale and shape together;
-    :func:`sphericity` sees the shape alone.
+    Bartlett's correction (Anderson 2003, sec. 10.8). It tests scale and shape together; :func:`sphericity` tests the
+    shape alone.
     """
     w = np.asarray(whitened, float)
     N, n = w.shape
@@ -35,8 +35,8 @@ def sphericity(whitened: Array, known: Moments | None = None) -> tuple[Array, Ar
     """Mauchly's (1940) test of every step: covariance of the whitened errors proportional to I.
 
     (runs, steps, n) -> statistic and p value, (steps,) each; the mean and the scale may be anything. Box's
-    second-order expansion of the null distribution (Anderson 2003, sec. 10.7.4). NaN where fewer than
-    4 n runs are left, or n is 1. ``known`` are the moments, where they are.
+    second-order expansion of the null distribution (Anderson 2003, sec. 10.7.4). NaN where fewer than 4 n runs are
+    left, or n is 1. ``known`` are the moments, if already computed.
     """
     N, _, S = moments(whitened) if known is None else known
     n = whitened.shape[-1]
@@ -82,13 +82,13 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
 def products_test(products: Array) -> float:
     """p value of the mean of run means of products (runs, numbers) being zero.
 
-    Products of Gaussian errors have heavy tails. Hotelling's T-squared stands them with up to three numbers. With
-    more of them its inverse of a sample covariance does not: with 15 numbers and 50 runs it errs at 2.5 times a rate of
-    1/400. Then two tests at half the rate each find a fault in a few numbers and one in many:
+    Products of Gaussian errors have heavy tails. Hotelling's T-squared is robust to them with up to three numbers. With
+    more numbers it is not, because of its inverse of a sample covariance: with 15 numbers and 50 runs it errs at 2.5
+    times a rate of 1/400. Then two tests at half the rate each find a fault in a few numbers and one in many:
 
-    - the largest Student's t, Bonferroni over the numbers. Given one factor a product is a Gaussian, with a variance of
-      its own for each run, and for those t errs at most as it does for equal variances (Bakirov & Szekely 2006,
-      Theorem 1), whatever the steps of a run have to do with each other;
+    - the largest Student's t, Bonferroni over the numbers. Given one factor a product is Gaussian, with a variance of
+      its own for each run. For such products t errs at most as often as for equal variances (Bakirov & Szekely 2006,
+      Theorem 1), however the steps of a run depend on each other;
     - the sum of the squares of the normal scores of these t, against sum l_j chi-square(1), with l the eigenvalues of
       the correlations between the numbers over the runs. Chance makes these eigenvalues differ more than they do,
       which errs on the safe side.

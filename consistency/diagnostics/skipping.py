@@ -1,6 +1,6 @@
 """The first steps of each run left out of the statistics: a start that is not meant to be judged.
 
-What is left out is NaN, so that every other step keeps its number. Alignment and time offsets have had it before.
+Values of skipped steps are NaN, so that every other step keeps its number. Alignment and time offsets use them before.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
 
 @dataclass(frozen=True)
 class Skip:
-    """How much of the beginning of each run is left out."""
+    """Length of the beginning of each run that is left out."""
 
     size: float
     unit: str = "step"  # or "s"
 
     @property
     def option(self) -> str:
-        """As it is asked for: 20, 2s."""
+        """Value of the option: 20, 2s."""
         return f"{self.size:g}{'s' * (self.unit == 's')}"
 
     @property
@@ -66,7 +66,7 @@ class Skip:
 
 @dataclass(frozen=True)
 class Skipped:
-    """What was left out."""
+    """The steps that were left out."""
 
     skip: Skip
     steps: int  # of the run that lost most
@@ -74,7 +74,7 @@ class Skipped:
 
 
 def skip_of(given: str | float | Skip | None) -> Skip | None:
-    """What ``--skip 20`` or ``--skip 2s`` asks for; None for nothing.
+    """Parse the value of ``--skip``, such as 20 or "2s"; None for nothing.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def skip_of(given: str | float | Skip | None) -> Skip | None:
 def without_first(
     skip: Skip | None, arrays: Mapping[str, Any], name: str, t: Array | None = None
 ) -> tuple[dict[str, Any], Skipped | None]:
-    """Arrays over (runs, steps, ...) of one estimator without the first steps, and what that left out.
+    """Arrays over (runs, steps, ...) of one estimator without the first steps, and the record of those steps.
 
     Errors need not be among them: where covariance and NEES are NaN they do not count.
 

@@ -1,4 +1,4 @@
-"""Many symmetric matrices, an array an entry: a covariance of three components in six numbers, not nine."""
+"""Arrays of symmetric matrices, stored by entry: a covariance of three components in six numbers, not nine."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from consistency.types import Array
 class Symmetric:
     """Matrices (..., n, n) as one array (...) for each entry, where (i, j) and (j, i) may be the same array.
 
-    An entry of all matrices lies together in memory, so that what needs the variances alone reads no more. Indices
-    of the leading axes give the matrices there; ``np.asarray`` gives all of them as (..., n, n).
+    Each entry of all matrices is contiguous in memory, so that code that needs only the variances reads no more.
+    Indices of the leading axes select matrices; ``np.asarray`` gives all of them as (..., n, n).
     """
 
     def __init__(self, entries: Sequence[Sequence[Array]]) -> None:
@@ -22,7 +22,7 @@ class Symmetric:
 
     @classmethod
     def of(cls, matrices: Array | Symmetric) -> Symmetric:
-        """Those of an array (..., n, n), which is not copied."""
+        """Matrices of an array (..., n, n), which is not copied."""
         if isinstance(matrices, Symmetric):
             return matrices
         n = matrices.shape[-1]
@@ -63,7 +63,7 @@ class Symmetric:
         return Symmetric([[self.entry(i, j) for j in index] for i in index])
 
     def broadcast(self, shape: tuple[int, ...]) -> Symmetric:
-        """The same with leading axes ``shape``."""
+        """Matrices broadcast to leading axes ``shape``."""
         return self._each(lambda entry: np.broadcast_to(entry, shape))
 
     @property

@@ -1,4 +1,4 @@
-"""Which matrices can be judged as covariances; what follows from a matrix that cannot is for the caller to say."""
+"""Validity of matrices as covariances; the caller decides what to do with an invalid one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROWS = 65_536  # matrices that are looked at together: a million take no more me
 
 
 class Validity(IntEnum):
-    """What :func:`classify` finds; where several hold, the last of them."""
+    """Classes of :func:`classify`; where several hold, the last of them."""
 
     VALID = 0
     DEFICIENT = 1  # positive semidefinite: a direction carries no uncertainty
@@ -27,7 +27,7 @@ class Validity(IntEnum):
 
 
 class Tolerance(NamedTuple):
-    """What counts as rounding."""
+    """Limits of rounding errors."""
 
     asymmetry: float  # of the largest entry
     indefinite: float  # eigenvalue of a correlation matrix, below zero
@@ -76,7 +76,7 @@ def asymmetric(covariance: Array, tolerance: Tolerance = EXACT) -> Array:
 def negative(covariance: Array) -> Array:
     """Which finite matrices (N, n, n) have a negative variance in some direction that is no rounding in any unit.
 
-    More lenient than :attr:`Validity.INDEFINITE`, so that a filter whose covariance lost its rank is not accused.
+    More lenient than :attr:`Validity.INDEFINITE`, so that a covariance that lost its rank is not called impossible.
     """
     if not len(covariance):
         return np.zeros(0, bool)

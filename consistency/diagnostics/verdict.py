@@ -47,23 +47,23 @@ class Look:
 
 
 def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = None) -> Verdict:
-    """Say what a filter is, with reasons; see ``records.STATUSES``.
+    """Judge one filter: a status of ``records.STATUSES``, with reasons.
 
     Runs are independent, steps are not: every test takes a run as one observation, or holds under any
     dependence between steps. A filter whose errors are Gaussian with the stated covariance is found at fault in
     any of the questions (``consistency.diagnostics.questions``) with probability ``false_alarm`` at most;
-    half of that belongs to the mean NEES, for which :func:`gate_runs` plans. *Consistent* is shown: no question found a
-    fault, and two one-sided tests put the ratio of true to stated covariance inside [1 / detect, detect]; where
-    ``lost`` is asked for, the share of lost runs is shown to be that at most, too. With neither a fault nor that the
+    half of that belongs to the mean NEES, for which :func:`gate_runs` plans. A filter is *consistent* if no question
+    found a fault, and two one-sided tests put the ratio of true to stated covariance inside [1 / detect, detect]; with
+    ``lost``, the share of lost runs is shown to be at most that, too. Without a fault and without this evidence, the
     filter is undecided. A filter with failed runs is never consistent.
 
     Innovations are judged where an optimal gain is declared, otherwise they are reported: only those of an optimal gain
     are white. Without truth they are judged alone.
 
-    Where a fit to the truth took of the errors (``Evidence.reduced``) what is not known, a covariance that is too large
-    is no fault, as with ``allow="conservative"``; but consistent is shown on both sides, with the share of the NEES
-    added that it may have taken at most (``Evidence.unseen``). Questions that it leaves no answer to
-    (``Evidence.unavailable``) are not asked.
+    If a fit to the truth absorbed an unknown part of the errors (``Evidence.reduced``), a covariance that is too large
+    is no fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the largest
+    share of the NEES that the fit may have absorbed (``Evidence.unseen``). Questions that cannot be answered after the
+    fit (``Evidence.unavailable``) are not asked.
 
     A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
     pose and map together, where it is given.
@@ -137,7 +137,7 @@ def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | 
     return record, {"innovation scale": test.p_value, "innovation whiteness": white.p_value}
 
 
-# --- what is known beside the p values -----------------------------------------------------------------
+# --- results beside the p values -----------------------------------------------------------------
 
 
 def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: Tests, shown: Equivalence) -> Verdict:
@@ -185,7 +185,7 @@ def _excused(all_answers: Iterable[Answer], questions: set[str]) -> tuple[Answer
 
 
 def _near(innovations: Innovations, settings: Settings) -> bool:
-    """Is the scale of the innovations shown to lie within the tolerance?"""
+    """Whether the scale of the innovations is shown to lie within the tolerance."""
     if settings.tolerance is None or not innovations.judged:
         return False
     test = NisTest(innovations.ratio, innovations.dof, float("nan"), float("nan"))

@@ -1,4 +1,4 @@
-"""Errors in units of what the covariance says."""
+"""Errors in units of their stated covariance."""
 
 from __future__ import annotations
 

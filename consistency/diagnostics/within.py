@@ -1,4 +1,4 @@
-"""What a single log says of its scale, if errors go on to decorrelate as they do within it. Reported, never judged."""
+"""Scale of a single log, if errors go on to decorrelate as they do within it. Reported, never judged."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ def within(nees: Array, dof: int, settings: Settings, factor: float, confidence:
 
     The mean of T values Y_k = NEES_k / dof has the variance s^2 tau / T with the integrated autocorrelation time tau,
     summed over a window of at least 5 tau (Madras & Sokal 1988; Sokal 1997, "Monte Carlo methods in statistical
-    mechanics", sec. 3). It is taken as chi-square(nu) / nu with nu = 2 T mean^2 / (s^2 tau), one standard error to the
-    safe side, and Student's t for the doubt that remains. What is constant over the log is not seen.
+    mechanics", sec. 3). Its distribution is taken as chi-square(nu) / nu with nu = 2 T mean^2 / (s^2 tau), one standard
+    error to the safe side, and Student's t for the remaining uncertainty. An error that is constant over the log is not
+    detected.
 
     Parameters
     ----------

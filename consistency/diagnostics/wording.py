@@ -1,4 +1,4 @@
-"""What a verdict says in words: a sentence to act on, then what stands behind it."""
+"""A verdict in words: a sentence to act on, then the figures behind it."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ def _without_first(v: Verdict) -> str:
 
 
 def _whole(v: Verdict) -> str:
-    """What steps belong to: a log, where its windows stand as runs."""
+    """Noun for the whole that steps belong to: a run, or a log whose windows are runs."""
     return "run" if v.unit == "run" else "log"
 
 
 def _first_steps(v: Verdict) -> list[str]:
-    """What was left out of the beginning, or might be."""
+    """Steps left out of the beginning, or that might be."""
     if v.skipped is not None:
         gone = f"; nothing is left of {plural(v.skipped.empty, 'run')}" if v.skipped.empty else ""
         return [
@@ -229,7 +229,7 @@ def _early_ends(v: Verdict) -> list[str]:
 
 
 def _within_one(v: Verdict) -> list[str]:
-    """How far a single run is off, and what would decide."""
+    """Ratio of a single run, and the data that would decide."""
     assert v.scale is not None
     if v.runs != 1 or v.landmarks is not None or v.unit != "run":
         return []

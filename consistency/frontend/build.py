@@ -30,7 +30,7 @@ AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 @dataclass(frozen=True)
 class Options:
-    """What of a sequence becomes a log."""
+    """Options for the part of a sequence that becomes a log."""
 
     calibration: Path | None = None
     truth: Path | None = None
@@ -47,7 +47,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Logged:
-    """What of a sequence is in a log."""
+    """The part of a sequence that is in a log."""
 
     landmarks: int
     observations: int
@@ -67,7 +67,7 @@ class Logged:
 
 @dataclass(frozen=True)
 class Summary:
-    """What came of it."""
+    """Summary of a built log."""
 
     frames: int
     log: Logged | None  # None of fewer pairs than a log takes, and where the motions leave the plane

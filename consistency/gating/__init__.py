@@ -1,4 +1,4 @@
-"""What stands behind the gates of ``consistency.testing``: checks of input, the session's watch, budget and report.
+"""Implementation of the gates of ``consistency.testing``: checks of input, the session's watch, budget and report.
 
-No statistic belongs here; those are in ``diagnostics``.
+Statistics do not belong here; they are in ``diagnostics``.
 """

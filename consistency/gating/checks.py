@@ -1,4 +1,4 @@
-"""What a gate is given: checked, named by run and step where it cannot be used, and put before the referee."""
+"""Checks of the input of a gate, with messages that name run and step; checked input goes to the referee."""
 
 from __future__ import annotations
 

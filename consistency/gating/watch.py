@@ -55,7 +55,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Terms:
-    """What a gate asks, once arguments, marker, budget and defaults are put together."""
+    """Settings of a gate, from arguments, marker, budget and defaults."""
 
     false_alarm: float
     detect: float

@@ -1,4 +1,4 @@
-"""What a gate says when it does not pass."""
+"""Messages of a gate that does not pass."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Record(Evidence):
-    """What one estimator said in files, beside the truth; made by :func:`read`."""
+    """Estimates of one estimator from files, beside the truth; made by :func:`read`."""
 
     def plot(self, path: str | Path | None = None) -> Drawn:
         """Error of each component in one run with the stated 2-sigma bounds, and the coverage.
@@ -69,7 +69,7 @@ class Judgement(Verdict):
     record: Record | None = None
 
     def plot(self, path: str | Path | None = None) -> Drawn:
-        """Errors with their bounds, NEES with its band, and coverage; as :meth:`Record.plot`."""
+        """Errors with their bounds, NEES with its band, and coverage; arguments of :meth:`Record.plot`."""
         from consistency.reporting.files import record_sheet
 
         assert self.record is not None
@@ -103,14 +103,14 @@ def read(
     align: str | None = None,
     filter: str | None = None,
 ) -> Record:
-    """Files of another estimator, as ``consistency analyse FILES`` reads them; docs/files.md has the forms.
+    """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
 
     Parameters
     ----------
     estimates : .csv, .parquet, .npz, a TUM trajectory, or a folder of these with one for each run
     truth : of the same kind, or the folder of a KITTI drive; not with .npz
     covariance : of a TUM trajectory: t and 36 or 21 numbers
-    error : what the covariance is of: so2, vector, left, right, so3 or so3-body; None is the default of the kind
+    error : error that the covariance describes: so2, vector, left, right, so3 or so3-body; None is the default
     state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
     covariance_order : translation-rotation or rotation-translation, of a trajectory
     max_dt : s, between an estimate and its truth; None is 0.01
@@ -120,7 +120,7 @@ def read(
     body : whose poses a KITTI drive gives as truth: imu (default), velodyne or camera
     relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m")
     motions : with ``relative``: each row is a motion with a covariance of its own, not a pose
-    windows : "independent": errors of different windows are, so that each is a run
+    windows : "independent" declares errors of different windows independent, so that each is a run
     align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
     filter : which estimator, where the files hold several
 
@@ -145,11 +145,11 @@ def read(
 
 
 def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | None = None, **settings: Any) -> Judgement:
-    """The verdict on a record: consistent, overconfident, conservative, undecided ..., and why.
+    """Judge a record: consistent, overconfident, conservative, undecided, ..., with reasons.
 
     Parameters
     ----------
-    optimal_gain : the filter declares one and gates nothing away, so that its innovations are judged
+    optimal_gain : True if the filter has an optimal gain and gates nothing away: its innovations are then judged
     skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
     settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow``, ``lost`` of
         :class:`consistency.diagnostics.Settings`

@@ -85,7 +85,7 @@ class Reading:
     )
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
-        """Those of ``names``, or of all, that are given, in order."""
+        """Options among ``names``, or among all, that are given, in order."""
         return [name for name in names or [each.name for each in fields(self)] if getattr(self, name) is not None]
 
     @property

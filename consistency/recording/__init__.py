@@ -1,6 +1,6 @@
-"""Files of estimators that are not ours, read as errors and covariances; docs/files.md describes them.
+"""Files of other estimators, read as errors and covariances; docs/files.md describes the formats.
 
-No filter, no scenario and no results folder of this package belongs here.
+Filters, scenarios and results folders of this package do not belong here.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def is_recording(path: Path, reading: Reading) -> bool:
     Raises
     ------
     InputError
-        It is such a folder, and an option of other files is given with it; or it is a folder of neither.
+        The path is a results folder, with an option for other files; or a folder of neither kind.
     """
     given = reading.given()
     if path.is_dir() and not (path / "manifest.json").exists():
@@ -62,7 +62,7 @@ def is_recording(path: Path, reading: Reading) -> bool:
 
 
 def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
-    """What estimators said, from CSV, Parquet, TUM or NumPy files, or ROS bags: one recording for each estimator.
+    """Read CSV, Parquet, TUM or NumPy files, or ROS bags: one recording for each estimator.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
 
 
 def _with_frame(recordings: list[Evidence], r: Reading) -> list[Evidence]:
-    """Say whose poses a drive gives, and in which world."""
+    """Add a note on the body and the world frame of the poses of a drive."""
     if r.truth is None or not is_drive(r.truth):
         return recordings
     note = (

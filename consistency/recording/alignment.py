@@ -1,4 +1,4 @@
-"""Estimates in a world of their own, moved into that of the truth, and what is left of their errors."""
+"""Estimates moved from their own world frame into that of the truth, and the covariances of the residual errors."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, tu
     ("posyaw", "planar"): np.eye(6)[[0, 1, 5]],
     ("se3", "spatial"): np.eye(6),
 }
-LEAST = 0.05  # of its NEES that a run keeps at least; one of a step or two may have none left
-COMMON = 0.25  # of the variance of the mean error of all runs: that of the frame, beyond which it spoils single steps
+LEAST = 0.05  # least share of its NEES that a run keeps; a run of a step or two might keep none
+COMMON = 0.25  # largest variance of the frame, over that of the mean error of all runs, to judge single steps
 ALL_BUT_SCALE = tuple(q for q in SHARES if q != MAIN and q not in INNOVATIONS)
 OF_RUNS = "what is constant over a run, a covariance that is too large, and single steps and axes are not judged"
 OF_ALL = "an error that is the same in all runs and steps is not judged"
@@ -36,18 +36,18 @@ ROUNDS, SETTLED = 5, 1e-4  # of clocks and frames in turn, and the change of the
 
 @dataclass(frozen=True)
 class Aligned:
-    """Runs in the world of the truth, and what is to be said of it."""
+    """Runs in the world of the truth, with notes on the alignment."""
 
-    runs: Sequence[Poses]  # estimates moved; covariances those of the errors that are left
+    runs: Sequence[Poses]  # moved estimates, with covariances of the residual errors
     mode: str = "none"
     notes: tuple[str, ...] = ()
     caption: str = ""  # what the verdict has to say of it
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
     unavailable: tuple[str, ...] = ()  # questions that have no answer
-    unseen: float = 0.0  # share of the NEES that a frame may have taken without its being made up for
+    unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
 
     def on(self, recording: Evidence) -> Evidence:
-        """The recording of these runs, which says how they were aligned."""
+        """Recording of these runs, with the notes on their alignment."""
         return replace(
             recording,
             align=self.mode,
@@ -78,7 +78,7 @@ def require_alignment(mode: str | None, truth: object) -> str | None:
 def clocks_and_frames(
     name: str, runs: Sequence[Poses], time_offset: float | str | None, align: str | None, judged: Sequence[int]
 ) -> tuple[float, list[str], Aligned]:
-    """Time to add to the timestamps, s, what to say of it, and the runs in the world of the truth.
+    """Time to add to the timestamps, s, notes on it, and the runs in the world of the truth.
 
     Parameters
     ----------
@@ -128,19 +128,18 @@ def aligned(
     """Runs moved into the world of the truth by frames of least NEES, or by their first poses (``origin``).
 
     The covariance is multiplied by the share of the NEES that a run keeps, which
-    :func:`consistency.diagnostics.fitted.left_covariances` finds. The sum of the NEES of a run is all that is known: a
-    frame may make errors larger in some steps or axes. Fewer than ``ENOUGH`` runs do not show the share; their
-    covariance stays, and is too large. After ``origin`` it is a bound, as files lack the correlation with the first
-    pose.
+    :func:`consistency.diagnostics.fitted.left_covariances` finds. Only the sum of the NEES of a run is known: a frame
+    may make errors larger in some steps or axes. Fewer than ``ENOUGH`` runs do not show the share; their covariance is
+    unchanged, and too large. After ``origin`` it is a bound, as files lack the correlation with the first pose.
 
     Parameters
     ----------
-    frames : of each run, where they are known
+    frames : frame of each run, if known
 
     Raises
     ------
     InputError
-        As :func:`frames_of`.
+        The errors have no such frame, or no estimate can be aligned, as in :func:`frames_of`.
     """
     frames = frames_of(name, runs, mode, judged) if frames is None else frames
     there = [moved(p, frame) for p, frame in zip(runs, frames, strict=True)]
@@ -148,11 +147,11 @@ def aligned(
     return replace(found, mode=mode, notes=(_sizes(name, mode, frames), *found.notes))
 
 
-# --- what is left -------------------------------------------------------------------------------------------
+# --- residual errors -------------------------------------------------------------------------------------------
 
 
 def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> Aligned:
-    """Covariances of what a fit leaves; as they are where that is not known."""
+    """Covariances of the residuals of a fit; unchanged where these are not known."""
     base, _, for_all = mode.partition("-")
     found = [sound_of(p, judged) for p in runs]
     some = [i for i, sound in enumerate(found) if len(sound.rows)]
@@ -191,7 +190,7 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
-    """Covariances of what first poses leave, or bounds of them."""
+    """Covariances of the errors relative to the first poses, or bounds of them."""
     out, factors = zip(*(from_first_pose(name, p, judged) for p in runs), strict=True)
     every = np.concatenate(factors)
     larger = float(np.median(every)) if len(every) else 1.0

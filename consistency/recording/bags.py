@@ -155,7 +155,7 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]
 
 
 def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Track:
-    """Poses by their stamps, of two with one stamp the first."""
+    """Poses in order of their stamps; of several with the same stamp only the first."""
     rows = [_row(header, content) for header, content in messages]
     if not rows:
         raise InputError(f"{bag}: {topic} holds no message")
@@ -172,7 +172,7 @@ def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Track:
 
 
 def _row(header: Any, content: Any) -> tuple[float, list[float], Array]:
-    """Stamp, s, pose (7,) and covariance (36,) of a message; NaN without one."""
+    """Stamp, s, pose (7,) and covariance (36,) of a message; NaN without a covariance."""
     covariance = getattr(content, "covariance", None)
     pose = content if covariance is None else content.pose
     position = getattr(pose, "position", None) or pose.translation

@@ -1,4 +1,4 @@
-"""How well errors go with the covariance as it is read, and with simple faults of a filter in place of a mix-up."""
+"""Likelihood of errors under one reading of the covariance, and under simple faults of a filter instead of a mix-up."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Fit:
 
     @cached_property
     def size(self) -> float:
-        """Independent estimates that say as much of the scale as these.
+        """Effective number of independent estimates, for the scale.
 
         Squares of Gaussian errors with the autocorrelation rho have that of rho^2, so that K of them say as much as
         K / (1 + 2 sum (1 - l / k) rho_l^2) independent ones; the mean is 0 by assumption, and an error that is constant
@@ -61,7 +61,7 @@ class Fit:
         return max(float(size), 1.0)
 
     def right(self) -> bool:
-        """Whether scale, mean, correlations and median of the errors are as the covariance says."""
+        """Whether scale, mean, correlations and median of the errors agree with the covariance."""
         n, size = self.n, self.size
         ratios = np.append(np.square(self.own).mean(axis=0), np.square(self.w).mean())
         pairs = np.triu_indices(n, 1)

@@ -30,7 +30,7 @@ class Sound:
 
 
 def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sound:
-    """What can be aligned by; ``known`` is the truth at all timestamps, where that is at hand."""
+    """Estimates usable for an alignment; ``known`` is the truth at all timestamps, if already computed."""
     known = p.known() if known is None else known
     w = _whitened(p, known.rows, p.error_of(known.rows, known.truth), judged)
     fine = np.isfinite(w).all(axis=1) & p.stated[known.rows]

@@ -16,7 +16,7 @@ from consistency.types import Array
 
 @dataclass(frozen=True)
 class Frame:
-    """Carries a point x of the world of the estimates to turn x + shift in that of the truth."""
+    """Maps a point x of the world of the estimates to turn x + shift in that of the truth."""
 
     turn: Rotation
     shift: Array  # (3,), m; 0 along z in the plane
@@ -32,7 +32,7 @@ class Frame:
         return float(self.turn.as_rotvec()[2])
 
     def after(self, other: Frame) -> Frame:
-        """First ``other``, then this."""
+        """Composition of frames: first ``other``, then this one."""
         return Frame(self.turn * other.turn, self.turn.apply(other.shift) + self.shift)
 
     def placed(self, values: Array, manifold: Manifold) -> Array:
@@ -60,7 +60,7 @@ def moved(p: Poses, frame: Frame) -> Poses:
 def carried(convention: str, frame: Frame, n: int) -> Array:
     """Matrix (n, n) that carries an error of a pose over to another world.
 
-    An error in the frame of the body stays; that of ``right`` goes by the adjoint (Sola et al. 2018, eq. 159 and 175).
+    An error in the body frame is unchanged; that of ``right`` maps by the adjoint (Sola et al. 2018, eq. 159 and 175).
     """
     T, d = np.eye(n), n // 2 if n == 6 else 2
     if convention == "left":

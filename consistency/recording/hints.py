@@ -1,4 +1,4 @@
-"""Errors that no estimator makes: a unit, order, side or frame with which they are as large as the covariance says."""
+"""Hints on mix-ups in files with impossible errors: a unit, order, side or frame that makes the covariance fit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Change = Callable[[Poses], Poses]
 
 @dataclass(frozen=True)
 class Guess:
-    """What the files may be, in words, and how they read then."""
+    """A possible mix-up in words, and the files read without it."""
 
     text: str
     change: Change
@@ -47,11 +47,11 @@ class Guess:
 
 
 def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 0.0) -> list[str]:
-    """What the files may really be, where the covariance does not fit and one other reading of them does; or none.
+    """Hints on a probable mix-up, where the covariance does not fit and one other reading of the files does; or none.
 
     Where the NEES of a median estimate is off by a decade or more, the guess that brings it nearest to a right one is
-    named. Where it is off by less, a guess is named with which everything is as the covariance says, and no simple
-    fault of a filter explains as much (:mod:`consistency.recording.fits`).
+    named. Where it is off by less, a guess is named if all errors then agree with the covariance, and no simple fault
+    of a filter explains as much (:mod:`consistency.recording.fits`).
     """
     if not runs:
         return []
@@ -139,7 +139,7 @@ def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: Fit) -> Gue
 
 
 def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
-    """Components of errors (runs, steps, n) that are angles: where they are far off, it is by whole turns."""
+    """Components of errors (runs, steps, n) that look like angles: their large errors are whole turns."""
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
         far = (np.abs(error) > np.pi) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < SHARP)
@@ -154,7 +154,7 @@ def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remed
 
 
 def decades(runs: Sequence[Poses]) -> Array:
-    """log10 of the median NEES over that of chi-square, of all n components and of each by itself, (1 + n,).
+    """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,).
 
     NaN without any.
     """
@@ -177,7 +177,7 @@ def decades(runs: Sequence[Poses]) -> Array:
 
 
 def _guesses(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
-    """What may be, the likelier first."""
+    """Possible mix-ups, the likelier first."""
     kind, convention = runs[0].manifold, runs[0].convention
     guesses = [*_covariances()]
     if kind == "spatial":

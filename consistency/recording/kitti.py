@@ -42,7 +42,7 @@ def read_drive(folder: Path, body: str | None = None) -> Lines:
     Raises
     ------
     InputError
-        A file is missing, damaged, or does not go with the others; names it.
+        A file is missing, damaged, or inconsistent with the others; the message names it.
     """
     if body not in (None, *BODIES):
         raise InputError(f"--body {body}: must be one of {', '.join(BODIES)}")

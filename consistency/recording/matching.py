@@ -1,4 +1,4 @@
-"""Which estimate belongs to which truth, and to which step of other runs: by step or by time."""
+"""Matching of estimates to the truth, and to the steps of other runs, by step or by time."""
 
 from __future__ import annotations
 

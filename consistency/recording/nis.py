@@ -23,7 +23,7 @@ SUFFIXES = (".csv", ".parquet", ".pq", ".npz")
 
 @dataclass(frozen=True)
 class NisLog:
-    """What a filter says of its innovations in one run."""
+    """NIS and degrees of freedom of the innovations of one run."""
 
     name: str
     step: Array  # (N,), as the file numbers them
@@ -62,12 +62,12 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
 
 
 def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
-    """The wanted one of those there, or the only one; ``what`` they are, where the option's name does not say it.
+    """The wanted item, or the only one; ``what`` describes the items in messages, if the option's name does not.
 
     Raises
     ------
     InputError
-        It is not there, or there are several and none is named.
+        The item is missing, or there are several and none is named.
     """
     if choice is None and len(there) == 1:
         return there[0]

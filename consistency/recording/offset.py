@@ -42,11 +42,11 @@ class Offset:
 
 
 def clock_shift(name: str, runs: Sequence[Poses], wanted: float | str | None) -> tuple[float, list[str]]:
-    """Time to add to the timestamps of the estimates, s, and what to say of it.
+    """Time to add to the timestamps of the estimates, s, and notes on it.
 
     Parameters
     ----------
-    wanted : s; "estimate"; or None, with which nothing is added, but an offset that is found is named
+    wanted : seconds to add; "estimate"; or None, which adds nothing but reports an offset if one is found
 
     Raises
     ------
@@ -74,7 +74,7 @@ def _named(name: str, found: Offset) -> str:
 
 
 def offset_of(runs: Sequence[Poses]) -> Offset | None:
-    """The offset of the clocks that fits best; None where nothing moves, or too little is there to tell.
+    """The offset of the clocks that fits best; None where nothing moves, or the data are too few.
 
     The offset minimises the NEES (capped) within a second; one step of Gauss and Newton in each run, or in each of
     ``PARTS`` parts of a single one, tells how far runs agree on it (Student's t).

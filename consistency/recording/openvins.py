@@ -26,7 +26,7 @@ class States(Lines):
 
 
 def as_states(lines: Lines) -> States | None:
-    """The poses in lines of whole states; None where they are none.
+    """The poses in lines of whole states; None if the lines are not states.
 
     A state is t, the quaternion x, y, z, w, position, velocity, biases of gyroscope and accelerometer (three each), the
     offset of the clocks, the number of cameras, and their calibration. OpenVINS states the rotation from the world into

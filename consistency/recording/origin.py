@@ -1,4 +1,4 @@
-"""Runs moved so that their first poses are the true ones, and what then is known of the other errors."""
+"""Runs moved so that their first poses are the true ones, with bounds for the covariances of the other errors."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _first(name: str, p: Poses) -> tuple[int, Array]:
 
 
 def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, Array]:
-    """A run whose first pose is the true one, with bounds of the covariances of the errors that are left.
+    """A run whose first pose is the true one, with bounds of the covariances of the residual errors.
 
     The error of step k less that of the first pose, seen in step k with covariance R_k, has a covariance of at most
     (1 + t) P_k + (1 + 1/t) R_k for any t > 0, whatever their correlation (Young's inequality); t^2 = tr(P_k^-1 R_k) / n
@@ -75,7 +75,7 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
 
 
 def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
-    """Covariance (k, n, n) of what the error of the pose in ``row`` makes of those in all sound rows."""
+    """Covariance (k, n, n) of the error that the pose in ``row`` causes in each sound row."""
     n = p.covariance.shape[-1]
     free = np.eye(6) if n == 6 else np.eye(6)[[0, 1, 5]]
     plain = replace(p, covariance=np.tile(np.eye(n), (len(p.t), 1, 1)))

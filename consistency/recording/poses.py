@@ -16,7 +16,7 @@ from consistency.types import Array, Indices
 class Poses:
     """One run; N estimates and M samples of the truth.
 
-    ``convention`` is that of the error, of which the covariance is. What is broken is NaN.
+    ``convention`` is that of the error which the covariance describes. Broken values are NaN.
     """
 
     place: Places  # (N,), "est.csv, line 7"

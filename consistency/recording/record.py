@@ -1,4 +1,4 @@
-"""Runs of an estimator as arrays over (runs, steps), with what failed and what was left out."""
+"""Runs of an estimator as arrays over (runs, steps), with failures and left-out steps."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def assemble(
     convention: str = "",
     notes: Sequence[str] = (),
 ) -> Evidence:
-    """Tracks on the common steps; failures found; exactly known starts left out.
+    """Assemble tracks on the common steps, find failures, and leave out exactly known starts.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
 
 
 def _without(axes: tuple[str, ...], none: Array) -> str:
-    """How to leave out the components whose variance is zero."""
+    """Advice on the option that leaves out components whose variance is zero."""
     left = ",".join(axis for axis, zero in zip(axes, none, strict=True) if not zero)
     return f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
 

@@ -1,7 +1,7 @@
-"""Motions over windows of a log, beside the true ones: they need no world that estimate and truth share.
+"""Motions over windows of a log, beside the true ones; estimate and truth need no common world frame.
 
 The error of a window is Log(D^-1 M) of its estimated motion D = est_i^-1 est_j and its true one M = truth_i^-1 truth_j.
-Another world of either changes neither. Log(M D^-1) is the adjoint of it and has the same NEES.
+A change of either world frame changes neither. Log(M D^-1) is the adjoint of it and has the same NEES.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def relative_recording(
     Raises
     ------
     InputError
-        As :func:`windows_of`; the covariance is singular in every window.
+        Input that :func:`windows_of` refuses, or a covariance that is singular in every window.
     """
     found = [windows_of(stretch, relative) for stretch in stretches]
     times = [one.t for one in found]
@@ -224,7 +224,7 @@ def _independence(found: Sequence[Windows]) -> Independence:
 
 
 def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:
-    """That windows go together, or against each other, though they are declared to be independent."""
+    """Note that windows are correlated, positively or negatively, though they are declared to be independent."""
     if not of.doubtful:
         return []
     if of.of_sizes:
@@ -240,9 +240,9 @@ def _doubt(name: str, of: Independence, relative: Relative) -> list[str]:
 
 
 def _too_few(of: Independence, relative: Relative) -> str:
-    """Why windows that are only declared to be independent decide nothing; "" where they are enough.
+    """Why windows that are only declared to be independent are too few to decide; "" where they are enough.
 
-    Independent motions are another matter: their covariance over a window rests on it, and is judged with it.
+    Independent motions are never too few: their covariance over a window assumes independence, and is judged with it.
     """
     if relative.motions or of.pieces >= ENOUGH:
         return ""

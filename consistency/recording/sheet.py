@@ -47,7 +47,7 @@ TRUTHS = {text: value for value in (True, False) for text in (str(value), str(va
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table of N rows, and where each of them stands in the file."""
+    """A table of N rows, with the place of each row in the file."""
 
     path: Path
     data: dict[str, Column]
@@ -123,7 +123,7 @@ class Lines:
 
 
 class Places(Sequence[str]):
-    """Where some rows of a file stand, put into words when asked for."""
+    """Places of some rows of a file, put into words when asked for."""
 
     def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
         self._of, self._rows = of, rows
@@ -141,12 +141,12 @@ class Places(Sequence[str]):
         return len(self._rows)
 
     def at(self, rows: Indices) -> Places:
-        """Those of some of the rows."""
+        """Places of some of the rows."""
         return Places(self._of, self._rows[rows])
 
 
 def bounded(values: Array) -> Array:
-    """Numbers, where those that no sensor measures are infinite: what a filter that broke down writes."""
+    """Numbers, with infinity for those too large for any measurement, as a filter that broke down writes."""
     return np.where(np.abs(values) > HUGE, np.copysign(np.inf, values), values)
 
 
@@ -228,7 +228,7 @@ def _rows(
 
 
 def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[str, Column], Indices] | None:
-    """The same of a block that every line of is a row; None where that has to be looked at."""
+    """Rows of a block in which every line is a row; None where the block must be parsed line by line."""
     if len(names) == 1 or not block.plain or b"\n\t" in block.data or block.data[:1] == b"\t":
         return None
     if (block.count_of(separator.encode()) != len(names) - 1).any():
@@ -328,7 +328,7 @@ def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
 def _number_rows(
     path: Path, lines: list[tuple[int, str]], widths: Sequence[int], width: int, layout: str
 ) -> tuple[Array, Indices]:
-    """The same of some lines, after lines of ``width`` columns if it is not 0; refused with the number of the line."""
+    """Numbers of some lines, after lines of ``width`` columns if it is not 0; refused with the number of the line."""
     rows: list[list[float]] = []
     for number, line in lines:
         fields = line.replace(",", " ").split()

@@ -1,4 +1,4 @@
-"""Trajectories in space, whatever file they are from: errors of poses with their 6 x 6 covariances."""
+"""Trajectories in space from any kind of file: errors of poses with their 6 x 6 covariances."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, 
 
 @dataclass(frozen=True)
 class Source:
-    """Where trajectories are from, for names and messages."""
+    """Origin of trajectories, for names and messages."""
 
     path: Path
     files: Sequence[tuple[Path | str, Path | str]]  # of each run: its estimates, its truth
@@ -160,7 +160,7 @@ def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift:
 
 
 def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, tolerance: float, what: str) -> InputError:
-    """That no timestamp of one is near one of the other."""
+    """Message that no timestamp of one is near one of the other."""
     own_span, span = (f"{each[0]:.10g} to {each[-1]:.10g}" for each in (t, other_t))
     return InputError(
         f"{path}: no estimate has a {what} within {tolerance:g} s (--max-dt): t is {own_span}, but {span} in {other}"
@@ -177,7 +177,7 @@ def _doubts(error: Array, P: Array, bend: Array) -> tuple[float, float]:
 
 
 def _notes(estimates: Path, matches: Sequence[Match], max_dt: float) -> list[str]:
-    """What was left out, and what looks like a matter of clocks or of conventions."""
+    """Notes on left-out rows, and on probable mix-ups of clocks or conventions."""
     notes = []
     total = sum(run.left_out + len(run.t) for run in matches)
     if left_out := sum(run.left_out for run in matches):

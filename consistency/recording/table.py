@@ -1,4 +1,4 @@
-"""Estimates and truth as CSV or Parquet tables, one row a run and step."""
+"""Estimates and truth as CSV or Parquet tables, with a row for each step of each run."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | Non
 
 
 def require_poses(path: Path, axes: tuple[str, ...], convention: str, truth: Path | None) -> None:
-    """Refuse windows of what are no planar poses beside a truth."""
+    """Refuse windows unless the table has planar poses beside a truth."""
     if truth is None:
         raise InputError(f"{path}: --relative needs --truth FILE, poses in any world")
     if axes != POSE or convention == "vector":
@@ -250,7 +250,7 @@ class Samples(NamedTuple):
     runs: Indices | None  # (M,); None: it serves all
 
     def of(self, run: int) -> Samples:
-        """Those of one run."""
+        """Samples of one run."""
         if self.runs is None:
             return self
         here = self.runs == run
@@ -306,7 +306,7 @@ def _matched(
     convention: str,
     max_dt: float,
 ) -> tuple[Array, Array, list[str]]:
-    """Which rows have a truth, (N,), that truth, (N, n), and what to say about it."""
+    """Which rows have a truth, (N,), that truth, (N, n), and notes on the matching."""
     true_runs = samples.runs
     tolerance = 0.0 if key == "step" else max_dt
     keep, true = np.zeros(len(keys), bool), np.full((len(keys), len(axes)), np.nan)

@@ -60,7 +60,7 @@ class Block:
     def numbers(self, separator: bytes = b",") -> tuple[Array, Indices] | None:
         """Rows of numbers (N, columns), separators taken as spaces, and the numbers (N,) of their lines.
 
-        None where it holds anything else, or lines of unequal length: it is to be read line by line then.
+        None if the block holds anything else, or lines of unequal length: it must then be read line by line.
         """
         if not self.plain or b"_" in self.data:
             return None
@@ -95,7 +95,7 @@ def blocks(path: Path) -> Iterator[Block]:
     Raises
     ------
     InputError
-        It is missing, or no file (a pipe would be waited for).
+        The path is missing, or not a file (reading a pipe would block).
     """
     if not path.exists():
         raise InputError(f"{path}: no such file")

@@ -42,10 +42,10 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
     """Innovations of one sensor of the EKF2 as NIS: the sum over its components of innovation^2 / variance.
 
     The log has no covariance between the components of a sensor, which the EKF2 fuses one after the other: they are
-    taken as independent. ``gps_hpos[0]`` in place of ``gps_hpos`` is one component by itself.
+    taken as independent. ``gps_hpos[0]`` in place of ``gps_hpos`` selects one component.
 
     A message that repeats the innovations before it is a step without a measurement: the EKF2 publishes what it fused
-    last. So is one without an innovation (NaN), or with a variance of zero, which a sensor has that is not fused.
+    last. So is one without an innovation (NaN), or with a variance of zero, as for a sensor that is not fused.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _nis(pairs: Pairs, parts: list[str]) -> tuple[Array, Array, int]:
 
 
 def _notes(path: Path, name: str, pairs: Pairs, dof: Array, held: int, log: Any) -> list[str]:
-    """What was left out, and what is missing in the log."""
+    """Notes on left-out messages, and on data missing in the log."""
     notes = [f"{path}: {name}: {int((dof > 0).sum())} innovations in {len(dof)} messages"]
     if held:
         notes[0] += f"; {count(held, 'message')} repeat the innovation before, as no measurement came between"

@@ -1,4 +1,4 @@
-"""Which windows of a log are judged: consecutive ones of so many steps, seconds or metres."""
+"""Windows of a log that are judged: consecutive ones of a number of steps, seconds or metres."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OVERSHOOT = 0.5  # of its size that a window may be too long, where rows or trut
 
 @dataclass(frozen=True)
 class Relative:
-    """How a log is cut into windows, and what its file holds."""
+    """Division of a log into windows, and the content of its file."""
 
     size: float
     unit: str  # step | s | m
@@ -33,17 +33,17 @@ class Relative:
 
     @property
     def option(self) -> str:
-        """As the command takes it: 100, 10s, 50m."""
+        """Value of the option: 100, 10s, 50m."""
         return f"{self.size:g}{'' if self.unit == 'step' else self.unit}"
 
 
 def relative_of(size: str | float | None, motions: bool = False, windows: str | None = None) -> Relative | None:
-    """What ``--relative``, ``--motions`` and ``--windows`` ask for; None without the first.
+    """Parse ``--relative``, ``--motions`` and ``--windows``; None without the first.
 
     Raises
     ------
     InputError
-        The size is none, or the other options stand without it.
+        The size is not valid, or another of the options is given without it.
     """
     if windows not in (None, "independent"):
         raise InputError(f"--windows must be 'independent', got '{windows}'")
@@ -77,7 +77,7 @@ def windows(t: Array, position: Array, rows: Indices, relative: Relative, file: 
     t : (N,), s, NaN where it is not known
     position : (k, d), true positions at ``rows``, m
     rows : (k,), rows whose truth is known, increasing
-    file : where they are from, for messages
+    file : name of the file, for messages
 
     Raises
     ------

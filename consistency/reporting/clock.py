@@ -1,4 +1,4 @@
-"""What stands on the axis along the runs: seconds where steps have a time, else steps."""
+"""Axis along the runs: seconds where steps have a time, otherwise steps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Clock:
 
     @property
     def whole(self) -> Axis:
-        """The same, from zero to the last step."""
+        """Axis over the range from zero to the last step."""
         last = float(self.values[-1]) if len(self.values) else 1.0
         return Axis(self.label, window=(min(0.0, float(self.values[:1].sum())), last), share="clock")
 

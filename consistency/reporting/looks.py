@@ -46,5 +46,5 @@ def style(index: int) -> Look:
 
 
 def solid(look: Look) -> Look:
-    """The same look without dashes, for panels of one filter each."""
+    """A copy of this look without dashes, for panels of one filter each."""
     return replace(look, dash=())

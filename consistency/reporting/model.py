@@ -56,7 +56,7 @@ class Track(Estimator):
 
     @property
     def curves(self) -> Curves:
-        """All R runs, read anew each time: a report holds those of one filter at a time, if any."""
+        """Curves of all R runs, read again at each access: a report holds those of one filter at a time, if any."""
         from consistency.verdicts.curves import curves
 
         return curves(self.results, self.name)

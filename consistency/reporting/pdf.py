@@ -142,7 +142,7 @@ def _reason(reason: blocks.Reason) -> dict[str, Any]:
 
 
 def soft(text: str) -> str:
-    """The same text with room to break inside long words and none before %, so that nothing runs over an edge."""
+    """Add break points inside long words, and forbid breaks before %, so that no text runs over an edge."""
     return LONG_WORD.sub(lambda match: match.group() + "\u200b", text.replace(" %", "\u00a0%"))
 
 

@@ -93,7 +93,7 @@ def method(regime: Regime) -> str:
 
 
 def _summary(regime: Regime) -> Table:
-    """One row a filter: cells by verdict, and the median cost."""
+    """Table with a row for each filter: cells by verdict, and the median cost."""
     by_filter = {name: [r for (_, n), r in regime.results.items() if n == name] for name in regime.sweep.filters}
     counts = {name: Counter(r.status for r in results) for name, results in by_filter.items()}
     statuses = [status for status in STATUSES if any(count[status] for count in counts.values())]
@@ -108,7 +108,7 @@ def _summary(regime: Regime) -> Table:
 
 
 def _rigs(regime: Regime) -> Table:
-    """One row a cell: the filters that are consistent there, by RMSE and then cost."""
+    """Table with a row for each cell: the filters that are consistent there, by RMSE and then cost."""
     shown, facets = _shown(regime)
     columns = (
         *(Column(_short(axis.key).capitalize(), number=True) for axis in shown),

@@ -1,4 +1,4 @@
-"""Published findings beside measured ones: what the scripts of ``experiments/`` hand back."""
+"""Published findings beside measured ones: the results of the scripts of ``experiments/``."""
 
 from __future__ import annotations
 
@@ -289,7 +289,7 @@ def _guarded(
 
 
 def script(main: Callable[[Study], list[Finding]], arguments: Sequence[str] | None = None) -> None:
-    """What an experiment does when it is run by itself: ``python experiments/eNN_….py [RUNS] [SEED]``."""
+    """Main function of an experiment that is run alone: ``python experiments/eNN_….py [RUNS] [SEED]``."""
     try:
         values = [int(value) for value in (sys.argv[1:] if arguments is None else arguments)]
         print_findings(main(Study(*values)))

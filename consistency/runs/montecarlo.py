@@ -1,4 +1,4 @@
-"""How many times: trials through filters, in parallel, with the same bits whatever the number of workers."""
+"""Monte Carlo studies: trials through filters, in parallel, with the same bits for any number of workers."""
 
 from __future__ import annotations
 
@@ -66,20 +66,20 @@ def run_trials(
     ----------
     filters : names of built-in filters, or objects with ``init``, ``predict``, ``update`` and ``pose``
     seed : the results are a function of (scenario, filter, seed, run) alone
-    jobs : workers; -1 for one a core. Compiled filters share threads, each other filter has processes of its own.
-    timeout : seconds a trial, after which the process of a filter that is not compiled is killed
+    jobs : workers; -1 for one per core. Compiled filters share threads, each other filter has processes of its own.
+    timeout : seconds per trial, after which the process of a filter that is not compiled is killed
     previous : results of the same scenario, filters and seed to go on from; its runs are not done again
     out : folder for the results, which appears as a whole at the end. Finished runs are kept in a journal beside it
         as they come, so that memory does not grow with the runs, and none is lost, whatever ends the process
     overwrite : replace ``out``, where it is an output folder of this bench, and drop unfinished work on it; that of
         ``previous`` is replaced anyway
-    resume : go on with what is in ``out`` and in its journal
+    resume : continue from the runs in ``out`` and in its journal
     memory : GiB that a filter that is not compiled may allocate in a trial; Linux only
-    backend : where the runs are done, if not by ``jobs`` workers of this machine
+    backend : machines that do the runs, in place of ``jobs`` workers of this machine
 
     Returns
     -------
-    Results in memory; with ``out`` those in the folder, which are read when they are asked for
+    Results in memory; with ``out`` those in the folder, which are read on demand
 
     Raises
     ------
@@ -87,7 +87,7 @@ def run_trials(
         An unknown filter, one that does not fit the sensor, a number out of range, nothing in view, or a folder that
         cannot be written, holds unfinished work, or is worked on by another process.
     Interrupted
-        Ctrl-C, or a signal that is taken as such; carries what is finished, and the folder, if any, is written.
+        Ctrl-C, or a signal that is taken as such; carries the finished runs, and the folder, if any, is written.
     """
     _require_counts(runs, seed)
     with studied(
@@ -127,8 +127,8 @@ def run_log(
 ) -> Results | StoredResults:
     """Put every run of a recorded log through every filter.
 
-    Parameters and exceptions are those of :func:`run_trials`. A resume is refused if a file of the log has changed,
-    or how it was screened.
+    Parameters and exceptions are those of :func:`run_trials`. A resume is refused if a file of the log or its screening
+    has changed.
     """
     instances = resolve_filters(filters, log.belief, log.name)
     trials = {trial.run: trial for trial in log.trials}
@@ -155,7 +155,7 @@ def studied(
     plan: Mapping[str, Any] | None = None,
     journal: Journal | None = None,
 ) -> Iterator[Campaign]:
-    """Runs of a scenario, with what is there of it; see :func:`run_trials`, which raises the same.
+    """Runs of a scenario, continued from earlier ones; see :func:`run_trials`, which raises the same exceptions.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Where results go, and what is there already to go on from."""
+"""Place of the results, and earlier runs to resume from."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KEYS = {
 
 @dataclass(frozen=True)
 class Place:
-    """Where results go, and what is there: the runs ``kept`` of previous results, and those in the journal.
+    """Place of the results, with the runs ``kept`` of previous results, and those in the journal.
 
     ``machines`` are those that computed a part of the results, this one last.
     """
@@ -37,7 +37,7 @@ class Place:
 
     @property
     def is_complete(self) -> bool:
-        """Whether what is there are complete results and nothing else."""
+        """Whether the place holds complete results and nothing else."""
         more = self.journal is not None and self.journal.runs
         return self.previous is not None and bool(self.previous.manifest["complete"]) and not more
 

@@ -49,8 +49,8 @@ def run_until_decided(
     """Simulate and judge at the inspections of a :class:`Design` until every filter is decided.
 
     A filter is decided at the first inspection that finds a fault, or shows the ratio of true to stated covariance to
-    lie in [1 / detect, detect] and, where ``lost`` is given, the share of lost runs to be that at most; what is said
-    then stands, however many runs other filters take. With ``max_runs`` what is open after so many runs ends undecided.
+    lie in [1 / detect, detect] and, where ``lost`` is given, the share of lost runs to be that at most. This verdict is
+    final, however many runs other filters take. With ``max_runs``, a filter still open after that many is undecided.
     Which runs are drawn does not depend on the looks.
 
     Parameters

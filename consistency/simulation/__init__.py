@@ -1,6 +1,6 @@
-"""What the world does: truth, controls and observations from a scenario and random generators.
+"""The simulated world: truth, controls and observations from a scenario and random generators.
 
-Nothing here knows a filter.
+Nothing here imports a filter.
 """
 
 from consistency.simulation.path import planned_controls, planned_path

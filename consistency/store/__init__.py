@@ -1,5 +1,5 @@
-"""What is kept: files that appear whole, Parquet tables, output folders with a manifest, results and logs.
+"""Storage: files that appear whole, Parquet tables, output folders with a manifest, results and logs.
 
-Here belongs how tables are laid out, written, read and checked. What a verdict makes of them is in ``verdicts``; who
-produces them is in ``runs``; files of other people's estimators are read in ``recording``.
+The layout of tables, and their writing, reading and checks belong here. Verdicts on them are in ``verdicts``, the code
+that produces them is in ``runs``, and files of other estimators are read in ``recording``.
 """

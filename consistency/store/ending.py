@@ -182,7 +182,7 @@ def _say_stopped() -> None:
 
 
 def _die_by(number: int) -> NoReturn:
-    """As the child did, without a core of its own."""
+    """Die by signal ``number``, as the child did, without a core dump."""
     with suppress(ImportError, ValueError, OSError):
         import resource
 

@@ -200,7 +200,7 @@ def open_parquet(path: Path, refusal: str = "cannot be read, damaged or cut shor
 
 
 def read_frame(path: Path, refusal: str) -> pd.DataFrame:
-    """All of a Parquet file of unknown columns, by columns alone; raises :class:`InputError`."""
+    """Read a whole Parquet file of unknown columns, by columns alone; raises :class:`InputError`."""
     file = open_parquet(path, refusal)
     with reading(path, refusal):
         table: pd.DataFrame = _plain(file.read()).to_pandas()
@@ -208,7 +208,9 @@ def read_frame(path: Path, refusal: str) -> pd.DataFrame:
 
 
 def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
-    """The same as arrays, floats with NaN where a cell is empty, or objects with None there; and the number of rows.
+    """Read a whole Parquet file: its columns as arrays, and the number of rows.
+
+    Arrays are floats with NaN where a cell is empty, or objects with None there.
 
     Raises
     ------

@@ -47,7 +47,7 @@ class Rejected(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run leaves: rows of the tables, by filter, and failures; ``machine`` did it, None for this one."""
+    """Results of one run: rows of the tables, by filter, and failures; ``machine`` did it, None for this one."""
 
     run: int
     estimates: dict[str, Columns]
@@ -59,7 +59,7 @@ class Outcome:
 
 
 class Tables(ABC):
-    """What filters said in a number of runs, wherever it is kept."""
+    """Tables of the estimates of filters over a number of runs, in memory or in a folder."""
 
     manifest: dict[str, Any]
     failures: pd.DataFrame
@@ -119,7 +119,7 @@ class Tables(ABC):
             raise InputError(f"manifest.json: key 'scenario': holds what cannot be used ({error})") from None
 
     def _repr_html_(self) -> str:
-        """What is there, for a notebook; ``consistency.analyse`` judges it."""
+        """Summary of the results for a notebook; ``consistency.analyse`` judges them."""
         world = self.manifest.get("scenario") or {}
         title = f"Results of {world.get('name') or self.manifest.get('log') or 'runs'}"
         rows = "".join(
@@ -147,7 +147,7 @@ class Tables(ABC):
 
 @dataclass(frozen=True)
 class Results(Tables):
-    """What filters said in a number of runs; tables in memory, as in the files."""
+    """Estimates of filters over a number of runs, as tables in memory, laid out as in the files."""
 
     estimates: pd.DataFrame
     failures: pd.DataFrame
@@ -183,7 +183,7 @@ class Results(Tables):
 
 @dataclass(frozen=True)
 class StoredResults(Tables):
-    """The same in a folder: ``estimates``, ``truth`` and ``map`` are read each time they are asked for."""
+    """Results in a folder: ``estimates``, ``truth`` and ``map`` are read at each access."""
 
     folder: Path
     failures: pd.DataFrame

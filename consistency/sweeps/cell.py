@@ -120,7 +120,7 @@ def result_of(verdict: Verdict, cost: float = np.nan, step_us: float = np.nan) -
 
 
 def runs_table(found: Curves) -> pd.DataFrame:
-    """One row a run: mean NEES, RMSE of position (m) and heading (rad) in judged steps, and where and why it failed."""
+    """A row for each run: mean NEES, RMSE of position (m) and heading (rad) in judged steps, and failure."""
     assert found.error is not None
     assert found.judged.nees is not None
     failed = {failure.run: failure for failure in found.failures}

@@ -46,7 +46,7 @@ class Rule(Table):
 
     @property
     def settings(self) -> Settings:
-        """The same rule for a fixed number of runs."""
+        """Settings of the verdict for a fixed number of runs."""
         return Settings(self.false_alarm, self.detect, self.power)
 
 

@@ -21,7 +21,7 @@ MOST_CELLS = 48  # for a table of all cells on a terminal; map.csv has any numbe
 
 
 def print_regime(regime: Regime) -> None:
-    """One row a filter: in how many cells it has which verdict, and what its step costs."""
+    """Print a row for each filter: number of cells by verdict, and the cost of a step."""
     counts = {
         name: Counter(r.status for (_, n), r in regime.results.items() if n == name) for name in regime.sweep.filters
     }
@@ -50,7 +50,7 @@ def print_regime(regime: Regime) -> None:
 
 
 def _cells_table(regime: Regime) -> RichTable:
-    """One row a cell: its values, and of each filter the verdict and the covariance ratio."""
+    """Print a row for each cell: its values, and the verdict and covariance ratio of each filter."""
     table = RichTable(box=None, pad_edge=False)
     axes = [axis for axis in regime.sweep.axes if len(axis.values) > 1] or list(regime.sweep.axes)
     for axis in axes:
@@ -181,7 +181,7 @@ def _contradiction(advice: Advice, c: Candidate) -> str:
 
 
 def advice_json(advice: Advice) -> dict[str, Any]:
-    """The same for programs; NaN becomes null."""
+    """The advice for programs; NaN becomes null."""
     best = advice.best
     return {
         "rig": advice.rig.name, "map": advice.regime.sweep.name, "inside": advice.inside,

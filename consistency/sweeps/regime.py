@@ -51,7 +51,7 @@ class Regime:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """One row a cell and filter: the value on each axis, the filter, and the fields of :class:`CellResult`."""
+        """Rows by cell and filter: the value on each axis, the filter, and the fields of :class:`CellResult`."""
         rows = [
             [*(_text(axis.values[i]) for axis, i in zip(self.sweep.axes, cell.indices, strict=True)), name,
              *(getattr(result, field) for field in FIELDS)]

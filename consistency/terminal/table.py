@@ -39,7 +39,7 @@ def open_console() -> Console:
 
 
 def print_verdicts(verdicts: dict[str, Verdict], reasons: bool = False) -> None:
-    """One row a filter; with ``reasons`` also why. ``ratio``: of true to stated covariance, with its 95 % interval.
+    """Print a row for each filter; with ``reasons`` also why. ``ratio``: true over stated covariance, 95 % interval.
 
     A filter that is judged in an error of its own has a second row, in the additive error of the world. Scores of maps
     stand in a line below the table.

@@ -33,7 +33,7 @@ class Scores:
 
     @property
     def total(self) -> float:
-        """Sum over all runs; minus infinity where a run failed, for nobody knows what it would have come to."""
+        """Sum over all runs; minus infinity where a run failed, because its value is unknown."""
         return -np.inf if self.failures else float(self.log_density.sum())
 
 

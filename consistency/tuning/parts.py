@@ -35,7 +35,7 @@ class Parts:
 
     @property
     def belief(self) -> Belief:
-        """As it was before the fit."""
+        """Belief before the fit."""
         return self.world.belief
 
     @property

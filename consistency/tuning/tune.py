@@ -36,7 +36,7 @@ MOST_TOLERATED = 1.1  # ratio of true to stated covariance: what a verdict may e
 
 @dataclass(frozen=True)
 class Factor:
-    """By what the variances of a group of noises are to be multiplied, with a 95 % interval, NaN without one.
+    """Factor on the variances of a group of noises, with a 95 % interval, NaN without one.
 
     The interval is open, with an end of 0 or infinity, on a side on which the data do not bound the factor.
     ``edge`` is -1 or 1 where the factor lies at the lower or upper limit of what is tried, which is then no estimate.
@@ -65,12 +65,12 @@ Explanation = tuple[Setting | None, int, bool, tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Tuning:
-    """What came of a fit.
+    """Result of a fit, with the verdicts before and after it.
 
-    ``chosen`` is the setting that was asked for. Where a fault is found in it and the truth is known, ``other`` is, of
-    settings at which errors have the size that is stated, the one that comes nearest to consistent on the runs of the
-    fit; ``tried`` is the number of those settings. ``no_setting`` says that a fault is found in both, and also in other
-    runs of a scenario with its true noises believed.
+    ``chosen`` is the fitted setting. If a fault is found in it and the truth is known, ``other`` is the setting nearest
+    to consistent on the runs of the fit, among settings whose errors have the stated size; ``tried`` is the number of
+    those settings. ``no_setting`` is true if a fault is found in both, and also in other runs of a scenario with its
+    true noises believed.
     """
 
     filter: str

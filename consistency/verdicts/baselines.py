@@ -1,4 +1,4 @@
-"""One row a run of every filter, kept as a small file for later comparisons."""
+"""Baselines: a row for each run of every filter, kept as a small file for later comparisons."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")
 
 @dataclass(frozen=True)
 class Baseline:
-    """One row a run of every filter: what a later comparison needs, and where it came from."""
+    """A row for each run of every filter: the data for a later comparison, and their origin."""
 
     name: str
     scenario: str | None

@@ -26,7 +26,7 @@ class Compared:
 
     @property
     def sentence(self) -> str:
-        """What the comparison says."""
+        """Result of the comparison in a sentence."""
         c = self.comparison
         way = "run by run on the same trials" if c.paired else "as independent samples"
         text = f"{self.a} is {'less consistent' if c.worse else 'not found less consistent'} than {self._reference}"

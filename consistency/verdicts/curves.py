@@ -51,7 +51,7 @@ class Landmarks(NamedTuple):
         return self.where(self.run < (np.inf if runs is None else runs))
 
     def where(self, some: Array) -> Landmarks:
-        """Those for which ``some`` (M,) is true."""
+        """Rows for which ``some`` (M,) is true."""
         columns: tuple[Any, ...] = self
         return Landmarks(*(column[some] for column in columns))
 

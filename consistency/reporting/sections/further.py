@@ -31,7 +31,7 @@ def read(study: Study) -> Study | None:
 
 
 def show(study: Study) -> tuple[Block, ...]:
-    """One row a filter."""
+    """Table with a row for each filter."""
     rows = [_cells(track) for track in study.tracks]
     label = f"Further figures of {study.name}"
     whole = len(rows) <= LONG

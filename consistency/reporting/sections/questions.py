@@ -44,7 +44,7 @@ def read(study: Judged) -> Questions:
 
 
 def show(questions: Questions) -> tuple[Block, ...]:
-    """One row a question, one column a filter."""
+    """Table with a row for each question and a column for each filter."""
     study = questions.study
     heading = Heading("Diagnosis", paper=f"Diagnosis of {study.name}")
     if not questions.asked:

@@ -83,7 +83,7 @@ class Observations:
         return Observations(self.step[chosen], self.landmark[chosen], z, self.ids, source)
 
     def with_z(self, z: Array, source: Indices | None = None) -> Observations:
-        """The same rows with other values ``z`` (M, s), and another ``source`` (M,) where one is given."""
+        """A copy of the rows with other values ``z`` (M, s), and another ``source`` (M,) where one is given."""
         return Observations(self.step, self.landmark, z, self.ids, self.source if source is None else source)
 
     def add(self, step: Indices, thing: Indices, z: Array) -> Observations:

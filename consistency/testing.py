@@ -277,7 +277,7 @@ def _settle(
 
 
 def _marker_text(dof: int, runs: int) -> str:
-    """Advice to add a marker, where the fixture has planned for another dimension than that of the error."""
+    """Advice to add a marker, where the fixture has planned for more dimensions than the error has."""
     plan = current().plan
     if plan is None or dof >= DEFAULTS["dof"] or (planned := plan(dof)) <= runs:
         return ""

@@ -63,6 +63,14 @@ def test_windows_are_moved_by_an_offset(tmp_path: Path) -> None:
     np.testing.assert_allclose(record.error, np.zeros((1, 5, 3)), atol=1e-12)
 
 
+def test_motions_has_no_opposite(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["analyse", "--help"])
+    shown = capsys.readouterr().out
+    assert "--motions " in shown
+    assert "--no-motions" not in shown
+
+
 def test_names_on_the_command_line_may_have_spaces(tables: tuple[Path, Path]) -> None:
     with pytest.raises(SystemExit) as end:
         main(["analyse", str(tables[0]), "--truth", str(tables[1]), "--state", "a, b", "--time-offset", "-0.3"])

@@ -349,6 +349,8 @@ def test_the_tolerance_of_times_is_inside() -> None:
     for start in (0.0, 1.7e9):
         own, match = associate(start + np.array([0.5, 2.6]), start + np.array([0.0, 2.0]), 0.5)
         assert (own.tolist(), match.tolist()) == ([0], [0])
+    own, _ = associate(np.array([1.7e9 + 0.4]), np.array([1.7e9 + 0.3]), 0.1)  # apart by 0.1 and a rounding error
+    assert own.tolist() == [0]
 
 
 # --- tables: poses ---------------------------------------------------------------------------------

@@ -208,6 +208,8 @@ def test_a_filter_keeps_its_process_and_takes_each_belief(uvd: cs.Scenario) -> N
                 assert estimates.pose[-1, 0] == belief.motion.sigma_v
                 said.add(estimates.covariance[-1, 0, 0])
     assert len(said) == 1
+    with pytest.raises(RuntimeError, match="the study has ended"):
+        bench._isolation.run(trials[0])
 
 
 # --- parts -------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from consistency.errors import InputError
 from consistency.types import Array, Failure, Indices
 
 TINY = 1e-12  # ratio of an error that is rounding
-E = TypeVar("E", bound="Evidence")
 
 # status -> what it means; the order is that of reports
 STATUSES = {
@@ -111,7 +110,7 @@ class Evidence:
         there = (self.error, self.nees, self.nis, self.innovations)
         return np.arange(next((len(array) for array in there if array is not None), 0))
 
-    def without_first(self: E, skip: Skip | None) -> E:
+    def without_first(self, skip: Skip | None) -> Evidence:
         """The first steps of each run left out of the statistics: covariance, NEES and NIS are NaN there.
 
         Raises

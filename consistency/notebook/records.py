@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from consistency.diagnostics import Evidence, Verdict
 from consistency.diagnostics.export import html_table
@@ -159,7 +159,7 @@ def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | Non
     InputError
         A setting out of its range, or nothing is left.
     """
-    record = record.without_first(skip_asked(skip))
+    record = cast(Record, record.without_first(skip_asked(skip)))
     verdict = analyse_recordings([record], None, settings_of(**settings), optimal_gain)[record.name]
     return Judgement(**_parts(verdict), record=record)
 

@@ -427,8 +427,10 @@ def test_an_error_in_the_middle_leaves_the_finished_runs(
     monkeypatch.setattr(World, "trial", lambda self, run, seed: (done.append(run), trial(self, run, seed))[1])
     cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=1, out=out, resume=True)
     assert 5 in done
-    assert {5, 6, 7, 8} <= set(done)
-    assert len(set(done) - {5, 6, 7, 8}) < jobs  # what the other thread had begun is given up
+    if jobs == 1:
+        assert set(done) == {5, 6, 7, 8}
+    else:  # the other thread may be ahead, or behind with what is then given up; the system decides
+        assert len(set(done)) < 8
     assert content(out) == content(written)
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from consistency.cli.options import Seed
+from consistency.defaults import DETECT, FALSE_ALARM
 from consistency.errors import InputError
 
 
@@ -31,10 +32,10 @@ def challenge(
     jobs: Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core.")] = -1,
     false_alarm: Annotated[
         float, typer.Option("--false-alarm", help="Chance that a right filter is found overconfident.")
-    ] = 0.05,
+    ] = FALSE_ALARM,
     detect: Annotated[
         float, typer.Option("--detect", help="Ratio of true to stated covariance that the confirmation must find.")
-    ] = 1.5,
+    ] = DETECT,
     out: Annotated[
         Path | None, typer.Option("--out", help="Scenario file to write [default: challenge-FILTER.toml].")
     ] = None,

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from consistency.cli.options import given
+from consistency.defaults import GATE_FALSE_ALARM
 from consistency.errors import InputError
 
 
@@ -26,7 +27,7 @@ def monitor(
     ] = None,
     false_alarm: Annotated[
         float, typer.Option("--false-alarm", help="Chance that a right filter ever raises an alarm.")
-    ] = 1e-3,
+    ] = GATE_FALSE_ALARM,
     tolerance: Annotated[
         float, typer.Option("--tolerance", help="Scales of the NIS up to this ratio are no fault; 1 is the exact test.")
     ] = 1.2,

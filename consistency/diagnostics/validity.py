@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
+from consistency.diagnostics.blocks import by_runs
 from consistency.types import Array, Indices
 
 DEFICIENT = 1e-12  # eigenvalue of a correlation matrix below which a direction carries no uncertainty
-ZERO = 1e-24  # variance that counts as none, as in the filters of this package
 NEGATIVE = 1e-9  # of the largest entry: an eigenvalue further below zero is not rounding, in any unit
-ROWS = 65_536  # matrices that are looked at together: a million take no more memory than so many
 
 
 class Validity(IntEnum):
@@ -31,10 +29,12 @@ class Tolerance(NamedTuple):
 
     asymmetry: float  # of the largest entry
     indefinite: float  # eigenvalue of a correlation matrix, below zero
+    zero: float  # variance that counts as none, in its own unit
 
 
-EXACT = Tolerance(asymmetry=1e-8, indefinite=DEFICIENT)  # arrays of doubles
-ROUNDED = Tolerance(asymmetry=1e-6, indefinite=1e-4)  # text files of seven digits; of fewer, a singular matrix
+EXACT = Tolerance(asymmetry=1e-8, indefinite=DEFICIENT, zero=0.0)  # arrays of doubles
+# text files of seven digits; of fewer, a singular matrix; variances of nothing as in the filters of this package
+ROUNDED = Tolerance(asymmetry=1e-6, indefinite=1e-4, zero=1e-24)
 
 
 def classify(covariance: Array, tolerance: Tolerance = EXACT) -> Indices:
@@ -44,10 +44,7 @@ def classify(covariance: Array, tolerance: Tolerance = EXACT) -> Indices:
     the variance 1 and the covariances that it has.
     """
     P = covariance.reshape(-1, *covariance.shape[-2:])
-    out = np.empty(len(P), np.int64)
-    for piece in pieces(len(P)):
-        out[piece] = _classify(P[piece], tolerance)
-    return out.reshape(covariance.shape[:-2])
+    return by_runs(lambda some: _classify(some, tolerance), P).reshape(covariance.shape[:-2])
 
 
 def _classify(P: Array, tolerance: Tolerance) -> Indices:
@@ -55,7 +52,7 @@ def _classify(P: Array, tolerance: Tolerance) -> Indices:
     out = np.full(len(P), Validity.NOT_FINITE, dtype=np.int64)
     P = P[finite]
     variance = np.diagonal(P, axis1=-2, axis2=-1)
-    none = np.abs(variance) <= ZERO
+    none = np.abs(variance) <= tolerance.zero
     scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
     smallest = np.linalg.eigvalsh(P / (scale[..., :, None] * scale[..., None, :]))[:, 0]
     smallest = np.where(none.any(axis=-1), np.minimum(smallest, 0.0), smallest)
@@ -81,8 +78,3 @@ def negative(covariance: Array) -> Array:
     if not len(covariance):
         return np.zeros(0, bool)
     return np.asarray(np.linalg.eigvalsh(covariance)[:, 0] < -NEGATIVE * np.abs(covariance).max(axis=(-2, -1)))
-
-
-def pieces(rows: int) -> Iterator[slice]:
-    """``ROWS`` at a time."""
-    return (slice(start, start + ROWS) for start in range(0, rows, ROWS))

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.diagnostics import Evidence, nees
-from consistency.diagnostics.validity import ROUNDED, ZERO, Validity, asymmetric, classify, pieces
+from consistency.diagnostics.blocks import of_runs
+from consistency.diagnostics.validity import ROUNDED, Validity, asymmetric, classify
 from consistency.errors import InputError
 from consistency.types import Array, Failure, Indices
 
@@ -119,7 +120,7 @@ def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     """The matrices (k, n, n) made exactly symmetric; refused where they are not nearly so already."""
     out = np.empty(covariance.shape)
     with np.errstate(invalid="ignore"):  # of infinite ones
-        for piece in pieces(len(out)):
+        for piece in of_runs(out):
             P = covariance[piece]
             bad = np.flatnonzero(asymmetric(P, ROUNDED))
             if len(bad):
@@ -166,7 +167,7 @@ def _cut(track: Track, start: int, end: int) -> Track:
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     variances = [np.diagonal(t.covariance, axis1=-2, axis2=-1) for t in tracks if t.covariance is not None]
-    none = (np.abs(np.concatenate(variances)) <= ZERO).all(axis=0)
+    none = (np.abs(np.concatenate(variances)) <= ROUNDED.zero).all(axis=0)
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"
     of = f" (variance zero: {', '.join(a for a, zero in zip(axes, none, strict=True) if zero)})" * bool(none.any())

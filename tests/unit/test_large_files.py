@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from consistency.diagnostics.validity import ROWS
+from consistency.diagnostics.blocks import FEWER as ROWS
 from consistency.errors import InputError
 from consistency.recording import text
 from consistency.recording.record import symmetric

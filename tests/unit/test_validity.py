@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from consistency.diagnostics.blocks import FEWER as ROWS
 from consistency.diagnostics.validity import (
     DEFICIENT,
     EXACT,
     NEGATIVE,
     ROUNDED,
-    ROWS,
     Tolerance,
     Validity,
     asymmetric,
@@ -80,3 +80,10 @@ def test_negative_is_more_lenient_than_indefinite() -> None:
     assert negative(np.stack([FULL, lost, wrong])).tolist() == [False, False, True]
     assert classify(lost) == Validity.INDEFINITE
     assert negative(np.empty((0, 3, 3))).shape == (0,)
+
+
+def test_only_files_have_a_variance_below_which_there_is_none() -> None:
+    """A clock error in seconds has such variances; arrays state them to all digits."""
+    small = 1e-13**2 * FULL
+    assert classify(small, EXACT) == Validity.VALID
+    assert classify(small, ROUNDED) == Validity.DEFICIENT

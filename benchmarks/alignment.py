@@ -22,13 +22,13 @@ from pathlib import Path
 import numpy as np
 from scipy import signal, stats
 
-from consistency.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.geometry import wrap
-from consistency.recording.alignment import Aligned, clocks_and_frames
-from consistency.recording.frames import Frame, moved
-from consistency.recording.poses import Poses
-from consistency.recording.sheet import Places
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
+from consistency.referee.geometry import wrap
+from consistency.referee.sources.alignment import Aligned, clocks_and_frames
+from consistency.referee.sources.frames import Frame, moved
+from consistency.referee.sources.poses import Poses
+from consistency.referee.sources.sheet import Places
+from consistency.referee.types import Array
 
 SEED, RUNS, STEPS, DRAWS, OFTEN, FEWER, QUICK = 20261123, 60, 400, 500, 400, 100, 20
 FALSE_ALARM = 0.05

@@ -29,9 +29,9 @@ from bench_trials import LANDMARKS, SEEN, Case, Work, growing, grown, interleave
 from scipy.linalg import blas, lapack
 
 import consistency as cs
-from consistency.errors import InputError
-from consistency.filters.stepping import run_filter
-from consistency.types import Estimates
+from consistency.bench.filters.stepping import run_filter
+from consistency.bench.types import Estimates
+from consistency.referee.errors import InputError
 
 NAMES = {"ekf": "ekf-uvd", "ukf": "ukf-uvd"}
 AGAINST_FILTERPY = {"ekf": 25.0, "ukf": 120.0}

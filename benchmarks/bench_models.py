@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from bench_trials import Case, twin_state
 
-from consistency.filters.plain import Unicycle, process_noise
-from consistency.filters.plain_sensors import PointSensor
-from consistency.models import point, stereo
-from consistency.scenario import Belief
-from consistency.types import Array, Control
+from consistency.bench.filters.plain import Unicycle, process_noise
+from consistency.bench.filters.plain_sensors import PointSensor
+from consistency.bench.models import point, stereo
+from consistency.bench.scenario import Belief
+from consistency.bench.types import Control
+from consistency.referee.types import Array
 
 WARM = 5  # steps before the peers take over: the start is known exactly, and their roots need full rank
 Said = tuple[Array, Array]  # poses (K, 3), covariances (K, 3, 3)

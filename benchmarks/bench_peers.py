@@ -2,7 +2,7 @@
 
 Each is written to be fast: one filter object for the whole trial, models in NumPy over all landmarks at once,
 the library's own Cholesky root. For the sigma points to be ours the state is put in our order (robot, seen, rest)
-before a step, which costs a copy of P. The adapters in ``consistency/filters`` are written to be read instead.
+before a step, which costs a copy of P. The adapters in ``consistency/bench/filters`` are written to be read instead.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from bench_models import Peer, Said
 from bench_trials import Case
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from consistency.types import Array, Control
+from consistency.bench.types import Control
+from consistency.referee.types import Array
 
 
 class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]

@@ -15,7 +15,8 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, UnscentedKalmanUpdater
 
-from consistency.types import Array, Control
+from consistency.bench.types import Control
+from consistency.referee.types import Array
 
 
 def _flat(state: Any) -> Array:

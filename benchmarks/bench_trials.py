@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 import consistency as cs
-from consistency.filters.compiled import problem_of
-from consistency.models import point, stereo
-from consistency.models.motion import dead_reckoning
-from consistency.scenario import Belief
-from consistency.types import Array, Estimates
+from consistency.bench.filters.compiled import problem_of
+from consistency.bench.models import point, stereo
+from consistency.bench.models.motion import dead_reckoning
+from consistency.bench.scenario import Belief
+from consistency.bench.types import Estimates
+from consistency.referee.types import Array
 
 LANDMARKS, SEEN = 57, 12  # in the state and in each step: the sizes that the targets are stated for
 SHIFT = 5  # landmarks by which the window of the seen ones moves on in each step

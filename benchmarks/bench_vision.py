@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from bench_trials import SEED, Work, interleaved
 
-from consistency.errors import InputError
-from consistency.vision import register_svd, registration_covariance, triangulate, triangulation_covariance
-from consistency.vision.odometry import visual_odometry
-from consistency.vision.registration import rigid_motions
-from consistency.vision.sequence import Sequence, read_sequence
-from consistency.vision.synthetic import MOTION, common_points, published_rig
+from consistency.referee.errors import InputError
+from consistency.stereo.vision import register_svd, registration_covariance, triangulate, triangulation_covariance
+from consistency.stereo.vision.odometry import visual_odometry
+from consistency.stereo.vision.registration import rigid_motions
+from consistency.stereo.vision.sequence import Sequence, read_sequence
+from consistency.stereo.vision.synthetic import MOTION, common_points, published_rig
 
 NOISE, NEAR, FAR = 2.0, 1.5, 3.0  # px, m, m: of e10's fig. 2.3
 OFTEN = 20  # covariances in a measurement

@@ -23,8 +23,8 @@ import numpy as np
 from bench_trials import Work, interleaved
 
 import consistency as cs
-from consistency.filters.compiled import Compiled
-from consistency.simulation import World
+from consistency.bench.filters.compiled import Compiled
+from consistency.bench.simulation import World
 
 WORLD, FILTERS = "herath2007-stereo", ["ekf-uvd", "ukf-uvd"]
 MIB = 2.0**20

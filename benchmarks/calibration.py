@@ -33,9 +33,18 @@ from calibration_rows import CONFIDENCE, Row, document, kept, write_docs
 from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
 
 import consistency as cs
-from consistency.diagnostics import Evidence, Settings, Verdict, e_process, follow, judge, nees, sequential_design
-from consistency.types import Array
-from consistency.verdicts.curves import curves
+from consistency.bench.store.curves import curves
+from consistency.referee.diagnostics import (
+    Evidence,
+    Settings,
+    Verdict,
+    e_process,
+    follow,
+    judge,
+    nees,
+    sequential_design,
+)
+from consistency.referee.types import Array
 
 BATCH = 25  # gates handed to a worker at once
 CHUNK = 2000  # runs of the Kalman filter in memory at once

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.diagnostics import RunSummary, compare
+from consistency.referee.diagnostics import RunSummary, compare
 
 STEPS = 100
 RUNS = (8, 21, 100)

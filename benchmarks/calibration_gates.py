@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.types import Array
+from consistency.referee.types import Array
 
 STEPS, DOF, SEED = 100, 3, 20070101
 
@@ -35,7 +35,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Gate:
-    """Arrays of one gate, named as those of ``consistency.diagnostics.Evidence``; R runs, T steps."""
+    """Arrays of one gate, named as those of ``consistency.referee.diagnostics.Evidence``; R runs, T steps."""
 
     error: Array | None = None  # (R, T, n)
     covariance: Array | None = None  # (R, T, n, n)

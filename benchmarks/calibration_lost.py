@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from consistency.diagnostics import Evidence, Settings, Verdict, follow, gate_runs, judge, sequential_design
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, Settings, Verdict, follow, gate_runs, judge, sequential_design
+from consistency.referee.types import Array
 
 STEPS, DOF, SHARE, DETECT = 20, 3, 0.05, 1.5
 SIZE = 1.0 + (DETECT - 1.0) / SHARE  # ratio of a lost run

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from consistency.diagnostics import Evidence, JointNees, Verdict, judge
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, JointNees, Verdict, judge
+from consistency.referee.types import Array
 
 LANDMARKS, POSE = 12, 3
 NUMBER = POSE + 3 * LANDMARKS

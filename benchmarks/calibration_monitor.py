@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from consistency.diagnostics.monitor import EXPONENT, LARGEST, bet_on, rest_after_rejection, start_share
+from consistency.referee.diagnostics.monitor import EXPONENT, LARGEST, bet_on, rest_after_rejection, start_share
 
 Array = NDArray[Any]
 

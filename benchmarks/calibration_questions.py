@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.diagnostics import Evidence, Verdict, judge, mean_shape
-from consistency.diagnostics.questions import SHARES, STEP
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, Verdict, judge, mean_shape
+from consistency.referee.diagnostics.questions import SHARES, STEP
+from consistency.referee.types import Array
 
 RATES = (0.05, 1e-3)  # of commands and of gates
 GATES, DRAWS = 2000, 40_000

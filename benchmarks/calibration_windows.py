@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from scipy import signal, stats
 
-from consistency.diagnostics import Evidence, judge
-from consistency.diagnostics.independence import ENOUGH, independence
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, judge
+from consistency.referee.diagnostics.independence import ENOUGH, independence
+from consistency.referee.types import Array
 
 DOF = 3
 MEMORIES = (0.3, 0.5, 0.8, 0.95)  # correlation of the normal scores of neighbouring sizes

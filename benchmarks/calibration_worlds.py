@@ -27,10 +27,10 @@ from calibration_gates import (
 )
 from scipy import special
 
-from consistency.diagnostics import Evidence
-from consistency.recording import planar_error
-from consistency.recording.record import Track, assemble, symmetric
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.sources import planar_error
+from consistency.referee.sources.record import Track, assemble, symmetric
+from consistency.referee.types import Array
 
 AXES = ("x", "y", "heading")
 SLOW = "{} % of the runs have one error in all steps, the others independent steps"

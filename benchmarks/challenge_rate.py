@@ -13,7 +13,7 @@ import sys
 
 from scipy import stats
 
-from consistency.challenging.challenge import Plan, challenge
+from consistency.bench.challenging.challenge import Plan, challenge
 
 SURE = 0.01  # chance that a rate exactly as stated is called broken
 

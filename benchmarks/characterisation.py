@@ -19,15 +19,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import consistency as cs
-from consistency.characterising.characterise import Characterisation, characterise
-from consistency.characterising.residuals import residuals_of
-from consistency.characterising.writing import believed
-from consistency.models import point, stereo
-from consistency.scenario import PicturedSensor, Scenario, UvdSensor
-from consistency.scenario.effects.bias_map import BiasMap
-from consistency.scenario.effects.disparity_growth import DisparityGrowth
-from consistency.simulation import World
-from consistency.types import Array, Trial
+from consistency.bench.models import point, stereo
+from consistency.bench.scenario import PicturedSensor, Scenario, UvdSensor
+from consistency.bench.scenario.effects.bias_map import BiasMap
+from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
+from consistency.bench.simulation import World
+from consistency.bench.types import Trial
+from consistency.referee.types import Array
+from consistency.stereo.characterising.characterise import Characterisation, characterise
+from consistency.stereo.characterising.residuals import residuals_of
+from consistency.stereo.characterising.writing import believed
 
 SCENARIO = "herath2007-stereo"
 EVERYTHING = (1e-6, 1e6)  # px: a search range that leaves nothing out

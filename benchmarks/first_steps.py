@@ -15,8 +15,8 @@ import sys
 import numpy as np
 from scipy import signal, stats
 
-from consistency.diagnostics import Evidence, Settings, judge
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, Settings, judge
+from consistency.referee.types import Array
 
 WORLDS = {"independent": 0.0, "AR(0.9)": 0.9, "AR(0.99)": 0.99, "one error a run": 1.0}
 RATIOS, BIASES = (0.3, 0.7, 1.0, 1.4, 4.0), (0.0, 0.5, 1.5)

@@ -21,11 +21,11 @@ import numpy as np
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from consistency.geometry import wrap
-from consistency.recording.hints import hints
-from consistency.recording.poses import Poses
-from consistency.recording.sheet import Places
-from consistency.types import Array
+from consistency.referee.geometry import wrap
+from consistency.referee.sources.hints import hints
+from consistency.referee.sources.poses import Poses
+from consistency.referee.sources.sheet import Places
+from consistency.referee.types import Array
 
 AXES = {
     "spatial": ("x", "y", "z", "roll", "pitch", "yaw"), "planar": ("x", "y", "heading"),

@@ -20,8 +20,8 @@ from calibration_monitor import Monitors, Velocity
 from calibration_windows import undoubted, windows_of
 from scipy import stats
 
-from consistency.diagnostics import Evidence, RunSummary, compare, e_process, judge
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, RunSummary, compare, e_process, judge
+from consistency.referee.types import Array
 
 Rng = np.random.Generator
 SEED, GATES, RATE, DOF, STEPS = 20070101, 400, 0.05, 3, 100

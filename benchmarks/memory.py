@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import consistency as cs
-from consistency.runs.footprint import trial_bytes
-from consistency.store.results import outcome_of
+from consistency.bench.runs.footprint import trial_bytes
+from consistency.bench.store.results import outcome_of
 
 MIB = 2**20
 OFF = 0.25

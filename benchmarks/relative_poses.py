@@ -20,15 +20,15 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import expm
 
-from consistency.diagnostics import Evidence, Verdict
-from consistency.diagnostics.planning import power_of
-from consistency.diagnostics.questions import MAIN, SHARES
-from consistency.geometry.groups import carried, composed, to_left
-from consistency.recording.relative import Stretch, relative_recording
-from consistency.recording.sheet import Places
-from consistency.recording.windows import relative_of
-from consistency.types import Array
-from consistency.verdicts.files import analyse_recordings
+from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics.planning import power_of
+from consistency.referee.diagnostics.questions import MAIN, SHARES
+from consistency.referee.geometry.groups import carried, composed, to_left
+from consistency.referee.sources.relative import Stretch, relative_recording
+from consistency.referee.sources.sheet import Places
+from consistency.referee.sources.windows import relative_of
+from consistency.referee.types import Array
+from consistency.referee.verdicts.files import analyse_recordings
 
 DT, SPEED = 0.1, 1.5  # s, m/s
 TURN = 0.03  # rad a step, and its spread

@@ -24,8 +24,8 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.store.ending import LEAVE
-from consistency.store.stopping import STOPS
+from consistency.referee.system.ending import LEAVE
+from consistency.referee.system.stopping import STOPS
 
 LIMIT = 2.0  # s
 LONGEST = 20.0  # s after which a signal comes at the latest

@@ -19,9 +19,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import signal, stats
 
-from consistency.diagnostics import Evidence, Settings, judge
-from consistency.diagnostics.within import within
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, Settings, judge
+from consistency.referee.diagnostics.within import within
+from consistency.referee.types import Array
 
 WORLDS = [
     (0.0, 100, 3), (0.0, 1000, 3), (0.0, 1000, 1), (0.9, 1000, 3), (0.95, 1000, 1), (0.95, 1000, 3), (0.95, 1000, 6),

@@ -22,13 +22,14 @@ import numpy as np
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import Settings
-from consistency.tuning.bench import Bench
-from consistency.tuning.fit import Fit
-from consistency.tuning.groups import groups_of, scaled
-from consistency.tuning.parts import parts_of
-from consistency.tuning.tune import _Tuner
-from consistency.types import Array, Trial
+from consistency.bench.tuning.bench import Bench
+from consistency.bench.tuning.fit import Fit
+from consistency.bench.tuning.groups import groups_of, scaled
+from consistency.bench.tuning.parts import parts_of
+from consistency.bench.tuning.tune import _Tuner
+from consistency.bench.types import Trial
+from consistency.referee.diagnostics import Settings
+from consistency.referee.types import Array
 
 SURE = 0.01  # chance that a rate exactly as stated is called broken
 COVERAGE, FALSE_ALARM = 0.95, 0.05

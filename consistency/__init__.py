@@ -1,6 +1,6 @@
 """The filter-consistency test bench: do the errors of an estimator have the covariance that it states?"""
 
-from consistency.extras import lazy_names
+from consistency.referee.extras import lazy_names
 
 # the names stand in __init__.pyi; each is loaded on first use, so that `import consistency` and `--help` stay fast
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

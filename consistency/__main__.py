@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from consistency.store.ending import supervised
+from consistency.referee.system.ending import supervised
 
 
 def main() -> Any:
@@ -11,7 +11,7 @@ def main() -> Any:
 
 
 def _command() -> Any:
-    from consistency.cli import main
+    from consistency.referee.cli import main
 
     return main()
 

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
-from consistency.gating.budget import in_place_rate
-from consistency.gating.report import refusal, write
-from consistency.gating.session import PROPERTY, STATISTICS, Ledger, lines, to_property
-from consistency.gating.watch import DEFAULTS, Entry, Watch, current, watching
+from consistency.referee.gating.budget import in_place_rate
+from consistency.referee.gating.report import refusal, write
+from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, lines, to_property
+from consistency.referee.gating.watch import DEFAULTS, Entry, Watch, current, watching
 
 NAME = "consistency-gates"
 MARKER = (
@@ -106,7 +106,7 @@ class Gates:
 
     def runs_of(self, item: pytest.Item, dof: int | None = None) -> int:
         """Runs given on the command line, or planned for the marker of a test, or as if it had ``dof``."""
-        from consistency.diagnostics import gate_runs
+        from consistency.referee.diagnostics import gate_runs
 
         if self.runs is not None:
             return self.runs
@@ -133,7 +133,7 @@ class Gates:
     def _keep(self, item: pytest.Item, entry: Entry) -> None:
         item.user_properties.append(to_property(entry))
         if self.path is not None and self.path.suffix.lower() == ".json":
-            from consistency.store.provenance import plain
+            from consistency.referee.system.provenance import plain
 
             self.statistics.append(plain(entry.statistics))
 

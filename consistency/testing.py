@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.diagnostics import Comparison, Verdict, gate_runs
-from consistency.diagnostics.comparison import FEWEST
-from consistency.gating.checks import Arrays, Candidate, evidence, of_results
-from consistency.gating.comparing import Sides, of_arrays, of_filters
-from consistency.gating.watch import DEFAULTS, Entry, Terms, current, terms
-from consistency.gating.wording import fault_text, few_to_compare, undecided_text
+from consistency.referee.diagnostics import Comparison, Verdict, gate_runs
+from consistency.referee.diagnostics.comparison import FEWEST
+from consistency.referee.gating.checks import Arrays, Candidate, evidence, of_results
+from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
+from consistency.referee.gating.watch import DEFAULTS, Entry, Terms, current, terms
+from consistency.referee.gating.wording import fault_text, few_to_compare, undecided_text
 
 if TYPE_CHECKING:
-    from consistency.store.results import Results
-    from consistency.verdicts.baselines import Baseline
+    from consistency.bench.store.results import Results
+    from consistency.referee.verdicts.baselines import Baseline
 
 
 class ConsistencyError(AssertionError):

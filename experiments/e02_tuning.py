@@ -6,9 +6,9 @@ import numpy as np
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics.coverage import TWO_SIGMA
-from consistency.runs.findings import script
-from consistency.verdicts.curves import Curves
+from consistency.bench.runs.findings import script
+from consistency.bench.store.curves import Curves
+from consistency.referee.diagnostics.coverage import TWO_SIGMA
 
 FINDINGS = ("fig2b", "fig2c")
 KERNELS = {"herath2007-xyz": ("ekf-xyz",)}

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import consistency as cs
-from consistency.diagnostics import detectable_ratio, simultaneous_band
-from consistency.runs.findings import script
+from consistency.bench.runs.findings import script
+from consistency.referee.diagnostics import detectable_ratio, simultaneous_band
 
 FINDINGS = ("fig11a",)
 KERNELS = {"herath2007-xyz": ("ekf-xyz",), "linear-gaussian": ("kf",)}

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import consistency as cs
-from consistency.runs.findings import script
-from consistency.verdicts.curves import run_means
+from consistency.bench.runs.findings import script
+from consistency.bench.store.curves import run_means
 
 FINDINGS = ("baseline-reduces-nonlinearity",)
 KERNELS = {"herath2007-stereo": ("ekf-xyz", "ekf-uvd")}

@@ -24,18 +24,19 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.diagnostics import anees_interval, chi2_mean_interval, coverage
-from consistency.models import point, stereo
-from consistency.models.motion import dead_reckoning
-from consistency.runs.findings import command_line, sibling
-from consistency.runs.montecarlo import run_log
-from consistency.store.log import Log, write_log
-from consistency.store.provenance import manifest_of
-from consistency.store.results import Results, joined
-from consistency.store.storage import require_free
-from consistency.terminal.table import print_findings
-from consistency.types import Array, Trial
-from consistency.verdicts.curves import curves
+from consistency.bench.models import point, stereo
+from consistency.bench.models.motion import dead_reckoning
+from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.runs.montecarlo import run_log
+from consistency.bench.store.curves import curves
+from consistency.bench.store.log import Log, write_log
+from consistency.bench.store.results import Results, joined
+from consistency.bench.store.storage import require_free
+from consistency.bench.types import Trial
+from consistency.referee.diagnostics import anees_interval, chi2_mean_interval, coverage
+from consistency.referee.system.provenance import manifest_of
+from consistency.referee.terminal.table import print_findings
+from consistency.referee.types import Array
 
 if TYPE_CHECKING:
     import kitti07_log as conversion

@@ -1,7 +1,7 @@
 """Is the stereo front-end's first-order covariance right, as simulations of points and of poses say it is?
 
 Valencia & Andrade-Cetto (2018) sec. 2.3.3.1 print the rig's pose, the pixel noise and how many points and samples there
-are. Camera matrices and motion are not, and are those of ``consistency.vision.synthetic``; where points are is below.
+are. Camera matrices and motion are not, and are those of ``consistency.stereo.vision.synthetic``; where points are is below.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import chi2_mean_interval
-from consistency.runs.findings import OURS, script
-from consistency.types import Array
-from consistency.vision import (
+from consistency.bench.runs.findings import OURS, script
+from consistency.referee.diagnostics import chi2_mean_interval
+from consistency.referee.types import Array
+from consistency.stereo.vision import (
     register_svd,
     registration_covariance,
     triangulate,
     triangulation_covariance,
 )
-from consistency.vision.pose import euler_angles
-from consistency.vision.registration import rigid_motions
-from consistency.vision.synthetic import MOTION, common_points, disparity_noise, published_rig
+from consistency.stereo.vision.pose import euler_angles
+from consistency.stereo.vision.registration import rigid_motions
+from consistency.stereo.vision.synthetic import MOTION, common_points, disparity_noise, published_rig
 
 FINDINGS = ("frontend-interval", "frontend-fig2.2", "frontend-fig2.3", "frontend-rate")
 OWN_PROCESS = True  # runs no filter

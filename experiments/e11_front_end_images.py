@@ -21,14 +21,14 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import Evidence, Verdict, judge, nees
-from consistency.reporting.front_end import matches_png, samples_png
-from consistency.runs.findings import OURS, command_line, sibling
-from consistency.store.atomic import write_whole
-from consistency.store.storage import require_free
-from consistency.terminal.table import print_findings
-from consistency.types import Array
-from consistency.vision import (
+from consistency.bench.pages.front_end import matches_png, samples_png
+from consistency.bench.runs.findings import OURS, command_line, sibling
+from consistency.bench.store.storage import require_free
+from consistency.referee.diagnostics import Evidence, Verdict, judge, nees
+from consistency.referee.system.atomic import write_whole
+from consistency.referee.terminal.table import print_findings
+from consistency.referee.types import Array
+from consistency.stereo.vision import (
     RelativePose,
     StereoRig,
     refine_reprojection,
@@ -37,8 +37,8 @@ from consistency.vision import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.vision.motion import RelativeMotion, Settings, diagonal
-from consistency.vision.shared import SHARED, fit_shared, sensitivities
+from consistency.stereo.vision.motion import RelativeMotion, Settings, diagonal
+from consistency.stereo.vision.shared import SHARED, fit_shared, sensitivities
 
 if TYPE_CHECKING:
     import front_end_data as data

@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.diagnostics import Evidence, Settings, detectable_ratio, judge
-from consistency.errors import InputError
-from consistency.runs.findings import OURS, script
-from consistency.types import Array, Failure
-from consistency.vision import (
+from consistency.bench.runs.findings import OURS, script
+from consistency.referee.diagnostics import Evidence, Settings, detectable_ratio, judge
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array, Failure
+from consistency.stereo.vision import (
     RelativePose,
     StereoRig,
     refine_reprojection,
@@ -29,7 +29,7 @@ from consistency.vision import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.vision.synthetic import MOTION, common_points, disparity_noise, published_rig
+from consistency.stereo.vision.synthetic import MOTION, common_points, disparity_noise, published_rig
 
 ROUTES = ("svd", "horn", "weighted", "reprojection")
 FINDINGS = tuple(f"first-order-{name}" for name in ("triangulation", *ROUTES))

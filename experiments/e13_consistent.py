@@ -10,12 +10,12 @@ import pandas as pd
 from scipy.stats import fisher_exact, ttest_rel
 
 import consistency as cs
-from consistency.filters.centred import Corrections
-from consistency.filters.methods.robocentric import PARKED, RobotCentredKalman, compiled
-from consistency.runs.findings import script, sibling
-from consistency.scenario import UniformLandmarks
-from consistency.terminal.progress import each
-from consistency.verdicts.curves import curves, log_rmse
+from consistency.bench.filters.centred import Corrections
+from consistency.bench.filters.methods.robocentric import PARKED, RobotCentredKalman, compiled
+from consistency.bench.runs.findings import script, sibling
+from consistency.bench.scenario import UniformLandmarks
+from consistency.bench.store.curves import curves, log_rmse
+from consistency.referee.terminal.progress import each
 
 FINDINGS = (
     "consistent-at-9cm",

@@ -14,9 +14,9 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.runs.findings import script
-from consistency.terminal.progress import each
-from consistency.types import Array
+from consistency.bench.runs.findings import script
+from consistency.referee.terminal.progress import each
+from consistency.referee.types import Array
 
 FINDINGS = ("planar-esde", "planar-iekf-slam", "planar-ocekf-slam", "planar-theory", "planar-limit")
 LONG = True

@@ -21,13 +21,13 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.runs.findings import command_line, sibling
-from consistency.runs.montecarlo import run_log
-from consistency.store.log import Log, write_log
-from consistency.store.provenance import manifest_of
-from consistency.store.storage import require_free
-from consistency.terminal.table import print_findings
-from consistency.verdicts.curves import Curves, curves
+from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.runs.montecarlo import run_log
+from consistency.bench.store.curves import Curves, curves
+from consistency.bench.store.log import Log, write_log
+from consistency.bench.store.storage import require_free
+from consistency.referee.system.provenance import manifest_of
+from consistency.referee.terminal.table import print_findings
 
 if TYPE_CHECKING:
     import mrclam_log as conversion

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.filters import filter_names, get_filter
-from consistency.filters.compiled import is_realisable, one_blas_thread
-from consistency.filters.stepping import run_filter
-from consistency.runs.findings import OURS, script
+from consistency.bench.filters import filter_names, get_filter
+from consistency.bench.filters.compiled import is_realisable, one_blas_thread
+from consistency.bench.filters.stepping import run_filter
+from consistency.bench.runs.findings import OURS, script
 
 FINDINGS = ("consistent-map", "cost-of-consistency")
 LONG = True

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.runs.findings import script, sibling
-from consistency.terminal.progress import each
-from consistency.types import Array
+from consistency.bench.runs.findings import script, sibling
+from consistency.referee.terminal.progress import each
+from consistency.referee.types import Array
 
 FINDINGS = ("map-ceiling",)
 LONG = True

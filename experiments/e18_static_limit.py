@@ -11,8 +11,9 @@ import numpy as np
 from scipy import special, stats
 
 import consistency as cs
-from consistency.runs.findings import OURS, script
-from consistency.types import Array, Trial
+from consistency.bench.runs.findings import OURS, script
+from consistency.bench.types import Trial
+from consistency.referee.types import Array
 
 FINDINGS = ("static-limit", "static-growth", "static-lateral", "static-predicted")
 

@@ -13,10 +13,10 @@ from scipy.optimize import brentq
 from scipy.stats import bootstrap
 
 import consistency as cs
-from consistency.runs.findings import OURS, script
-from consistency.scenario.effects.distortion import Distortion
-from consistency.types import Array
-from consistency.verdicts.curves import Curves, run_means
+from consistency.bench.runs.findings import OURS, script
+from consistency.bench.scenario.effects.distortion import Distortion
+from consistency.bench.store.curves import Curves, run_means
+from consistency.referee.types import Array
 
 FINDINGS = ("bias-or-noise", "bias-survivors")
 LONG = True

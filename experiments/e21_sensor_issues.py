@@ -10,10 +10,10 @@ import pandas as pd
 from scipy.stats import ttest_rel
 
 import consistency as cs
-from consistency.runs.findings import OURS, script
-from consistency.terminal.progress import each
-from consistency.types import Array
-from consistency.verdicts.curves import Curves, log_rmse
+from consistency.bench.runs.findings import OURS, script
+from consistency.bench.store.curves import Curves, log_rmse
+from consistency.referee.terminal.progress import each
+from consistency.referee.types import Array
 
 FINDINGS = ("fig10a", "fig10b", "guarded", "fov", "feature-count", "near-far-mix")
 LONG = True

@@ -12,16 +12,16 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.errors import InputError
-from consistency.imaging.calibration import track_means
-from consistency.imaging.camera import Camera, Lens, StereoCamera
-from consistency.imaging.chain import MISMATCH, Chain, Tracks
-from consistency.imaging.filtering import LeftRightCheck
-from consistency.imaging.protocols import Stops, stand
-from consistency.runs.findings import script
-from consistency.terminal.progress import each
-from consistency.types import Array
-from consistency.vision.features import opencv
+from consistency.bench.runs.findings import script
+from consistency.referee.errors import InputError
+from consistency.referee.terminal.progress import each
+from consistency.referee.types import Array
+from consistency.stereo.imaging.calibration import track_means
+from consistency.stereo.imaging.camera import Camera, Lens, StereoCamera
+from consistency.stereo.imaging.chain import MISMATCH, Chain, Tracks
+from consistency.stereo.imaging.filtering import LeftRightCheck
+from consistency.stereo.imaging.protocols import Stops, stand
+from consistency.stereo.vision.features import opencv
 
 FINDINGS = ("fig4-protocol", "fig5a", "fig5b", "fig5c", "fig7-8")
 LONG = True

@@ -15,18 +15,27 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.errors import InputError
-from consistency.imaging.camera import Camera, Lens, StereoCamera
-from consistency.imaging.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
-from consistency.imaging.correspondence import KnownDisparity
-from consistency.imaging.filtering import LeftRightCheck, TrackResidual
-from consistency.imaging.protocols import Stops, drive, office, partition, pose_at, retreat, rigid_residual, stand
-from consistency.imaging.selection import Spread
-from consistency.imaging.tracking import KnownProjection
-from consistency.runs.findings import OURS, script
-from consistency.terminal.progress import each
-from consistency.types import Array
-from consistency.vision.features import opencv
+from consistency.bench.runs.findings import OURS, script
+from consistency.referee.errors import InputError
+from consistency.referee.terminal.progress import each
+from consistency.referee.types import Array
+from consistency.stereo.imaging.camera import Camera, Lens, StereoCamera
+from consistency.stereo.imaging.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
+from consistency.stereo.imaging.correspondence import KnownDisparity
+from consistency.stereo.imaging.filtering import LeftRightCheck, TrackResidual
+from consistency.stereo.imaging.protocols import (
+    Stops,
+    drive,
+    office,
+    partition,
+    pose_at,
+    retreat,
+    rigid_residual,
+    stand,
+)
+from consistency.stereo.imaging.selection import Spread
+from consistency.stereo.imaging.tracking import KnownProjection
+from consistency.stereo.vision.features import opencv
 
 FINDINGS = ("fig6", "fig6-shake", "fig9", "fig9-dissimilarity", "exp1-tracks", "static-vs-dynamic", "fig3-chain")
 LONG = True

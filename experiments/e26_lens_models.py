@@ -19,18 +19,18 @@ import pandas as pd
 from scipy.stats import ttest_rel
 
 import consistency as cs
-from consistency.characterising.bias import GRID
-from consistency.characterising.boards import MODELS, find_corners
-from consistency.characterising.characterise import Characterisation
-from consistency.characterising.plane import of_model
-from consistency.characterising.writing import sensor_text
-from consistency.errors import InputError
-from consistency.runs.findings import OURS, script
-from consistency.sweeps.rig import Request, read_rig
-from consistency.terminal.progress import each
-from consistency.types import Array
-from consistency.verdicts.curves import run_means
-from consistency.vision.features import opencv
+from consistency.bench.runs.findings import OURS, script
+from consistency.bench.store.curves import run_means
+from consistency.bench.sweeps.rig import Request, read_rig
+from consistency.referee.errors import InputError
+from consistency.referee.terminal.progress import each
+from consistency.referee.types import Array
+from consistency.stereo.characterising.bias import GRID
+from consistency.stereo.characterising.boards import MODELS, find_corners
+from consistency.stereo.characterising.characterise import Characterisation
+from consistency.stereo.characterising.plane import of_model
+from consistency.stereo.characterising.writing import sensor_text
+from consistency.stereo.vision.features import opencv
 
 FINDINGS = ("chessboard-map", "chessboard-noise")
 LONG = True
@@ -81,7 +81,7 @@ def sensors(folder: Path) -> dict[str, Characterisation]:
     Raises
     ------
     InputError
-        As :func:`consistency.characterising.boards.find_corners`.
+        As :func:`consistency.stereo.characterising.boards.find_corners`.
     """
     corners = find_corners(folder, BOARD, SQUARE)
     return {model: of_model(corners, model, DATA, GRID) for model in MODELS}

@@ -23,15 +23,15 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.runs.findings import OURS, command_line, sibling
-from consistency.store.storage import require_free
-from consistency.terminal.progress import each
-from consistency.terminal.table import print_findings
-from consistency.types import Array
-from consistency.vision import RelativePose, StereoRig, triangulate
-from consistency.vision.errors import ConsensusError
-from consistency.vision.features import opencv
-from consistency.vision.motion import Settings, estimate_motion
+from consistency.bench.runs.findings import OURS, command_line, sibling
+from consistency.bench.store.storage import require_free
+from consistency.referee.terminal.progress import each
+from consistency.referee.terminal.table import print_findings
+from consistency.referee.types import Array
+from consistency.stereo.vision import RelativePose, StereoRig, triangulate
+from consistency.stereo.vision.errors import ConsensusError
+from consistency.stereo.vision.features import opencv
+from consistency.stereo.vision.motion import Settings, estimate_motion
 
 if TYPE_CHECKING:
     import front_end_data as data

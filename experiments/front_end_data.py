@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.frontend.planar_log import relative
-from consistency.frontend.truth import read_truth
-from consistency.types import Array
-from consistency.vision import RelativePose, StereoRig, relative_motion
-from consistency.vision.calibration import read_opencv
-from consistency.vision.motion import RelativeMotion
-from consistency.vision.odometry import visual_odometry
-from consistency.vision.pose import angular
-from consistency.vision.sequence import read_image, read_sequence
+from consistency.referee.types import Array
+from consistency.stereo.frontend.planar_log import relative
+from consistency.stereo.frontend.truth import read_truth
+from consistency.stereo.vision import RelativePose, StereoRig, relative_motion
+from consistency.stereo.vision.calibration import read_opencv
+from consistency.stereo.vision.motion import RelativeMotion
+from consistency.stereo.vision.odometry import visual_odometry
+from consistency.stereo.vision.pose import angular
+from consistency.stereo.vision.sequence import read_image, read_sequence
 
 KITTI, EUROC, MINNIE = "kitti06_f0-50", "euroc_static", "minnie_quad"
 MINNIE_K = np.array([[1018.6, 0.0, 956.501], [0.0, 1018.6, 617.314], [0.0, 0.0, 1.0]])  # px, of the .meta files

@@ -18,17 +18,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.errors import InputError
-from consistency.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
-from consistency.frontend.planar_log import CAMERA, relative
-from consistency.frontend.tum import trajectory_text
-from consistency.runs.findings import command_line, sibling
-from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
-from consistency.store.log import write_log
-from consistency.store.provenance import manifest_of
-from consistency.store.storage import require_free
-from consistency.types import Array, Trial
-from consistency.vision.sequence import read_table
+from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
+from consistency.bench.store.log import write_log
+from consistency.bench.store.storage import require_free
+from consistency.bench.types import Trial
+from consistency.referee.errors import InputError
+from consistency.referee.system.provenance import manifest_of
+from consistency.referee.types import Array
+from consistency.stereo.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
+from consistency.stereo.frontend.planar_log import CAMERA, relative
+from consistency.stereo.frontend.tum import trajectory_text
+from consistency.stereo.vision.sequence import read_table
 
 if TYPE_CHECKING:
     import kitti07_log as conversion

@@ -13,15 +13,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from consistency.errors import InputError
-from consistency.geometry import rotation
-from consistency.reading import reading
-from consistency.scenario import Belief, BelievedMotion, BelievedSensor, Mount
-from consistency.types import Array, Trial
-from consistency.vision import tracks
-from consistency.vision.common_motion import screened
-from consistency.vision.sequence import read_table
-from consistency.vision.tracks import PIXELS
+from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
+from consistency.bench.types import Trial
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import rotation
+from consistency.referee.reading import reading
+from consistency.referee.types import Array
+from consistency.stereo.vision import tracks
+from consistency.stereo.vision.common_motion import screened
+from consistency.stereo.vision.sequence import read_table
+from consistency.stereo.vision.tracks import PIXELS
 
 SIGMA_V, SIGMA_OMEGA = 0.5, 0.05  # m/s, rad/s: white noise that the course added to the velocities
 SIGMA_PX = (1.0, 3.3, 0.7)  # rms of u, v, d against the planar truth; v carries pitch and roll

@@ -15,10 +15,11 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from consistency.errors import InputError
-from consistency.models import planar
-from consistency.scenario import Belief, BelievedMotion, BelievedSensor
-from consistency.types import Array, Indices, Trial
+from consistency.bench.models import planar
+from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor
+from consistency.bench.types import Trial
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array, Indices
 
 DT = 0.1  # s, a step: the robots turn by 0.06 rad in it at most
 CALIBRATION = 300.0  # s at the beginning of a recording

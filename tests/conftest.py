@@ -11,8 +11,8 @@ import pytest
 from hypothesis import settings
 
 import consistency as cs
-from consistency.filters.compiled import Compiled
-from consistency.filters.kernel import jit
+from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.kernel import jit
 
 pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
 

@@ -13,8 +13,8 @@ from documents import ROOT
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.runs.montecarlo import simulate_log
-from consistency.types import Array
+from consistency.bench.runs.montecarlo import simulate_log
+from consistency.referee.types import Array
 
 RNG = np.random.default_rng(20070)  # what is judged right or wrong is not asserted
 DT, STEPS, RUNS = 0.5, 120, 12
@@ -31,26 +31,26 @@ REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
 NOT_RUN = [
     ("docs/case-studies.md", "python docs/case-studies", "needs gtsam; tests/oracle/test_gtsam_imu.py runs it"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
-    ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and tests/unit/test_slurm.py stand in"),
+    ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and tests/unit/bench/test_slurm.py stand in"),
     ("docs/compiling.md", "consistency compile", "compiles many filters; tests/smoke/test_compile_cli.py compiles one"),
     ("docs/consistent.md", "consistency reproduce", STUDY),
-    ("docs/conventions.md", "", "tests/unit/test_conventions.py runs all of it"),
+    ("docs/conventions.md", "", "tests/unit/referee/test_conventions.py runs all of it"),
     ("docs/extending.md", "", "tests/unit/test_extending.py follows it in a copy of the package"),
-    ("docs/files.md", "consistency analyse drive.bag", "tests/unit/test_bags.py writes and judges such bags"),
-    ("docs/files.md", "consistency analyse drive --truth-topic", "tests/unit/test_bags.py"),
-    ("docs/files.md", "consistency analyse drives --truth-topic", "tests/unit/test_bags.py"),
-    ("docs/files.md", "consistency analyse keyframes.csv", "tests/unit/test_relative.py has cross-covariances"),
+    ("docs/files.md", "consistency analyse drive.bag", "tests/unit/referee/test_bags.py writes and judges such bags"),
+    ("docs/files.md", "consistency analyse drive --truth-topic", "tests/unit/referee/test_bags.py"),
+    ("docs/files.md", "consistency analyse drives --truth-topic", "tests/unit/referee/test_bags.py"),
+    ("docs/files.md", "consistency analyse keyframes.csv", "tests/unit/referee/test_relative.py has cross-covariances"),
     ("docs/files.md", "consistency analyse est.tum", "tests/oracle/test_gtsam_windows.py has such marginals"),
     ("docs/files.md", "joint = marginals", "tests/oracle/test_gtsam_windows.py does the same"),
-    ("docs/front-end.md", "from consistency.vision.shared", "tests/unit/test_vision_shared.py has its inputs"),
+    ("docs/front-end.md", "from consistency.stereo.vision.shared", "tests/unit/stereo/test_vision_shared.py has its inputs"),
     ("docs/front-end.md", "python experiments/e11", REAL),
-    ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/test_guards.py runs such"),
+    ("docs/guards.md", "consistency run", "compiles two guarded filters; tests/unit/bench/test_guards.py runs such"),
     ("docs/kitti07.md", "", REAL),
     ("docs/planar.md", "", f"{STUDY}; e15: {REAL}"),
     ("docs/regime.md", "consistency sweep regime --out regime --filter", "compiles two more filters for one cell"),
     ("docs/sensor.md", "consistency reproduce", STUDY),
     ("docs/static-limit.md", "consistency reproduce", STUDY),
-    ("docs/tuning.md", "import numpy", "tests/unit/test_tuning.py runs it with two runs of six steps"),
+    ("docs/tuning.md", "import numpy", "tests/unit/bench/test_tuning.py runs it with two runs of six steps"),
     ("docs/tuning.md", "consistency tune --log OUT", REAL),
     ("docs/tuning.md", "python experiments/e15", REAL),
 ]  # fmt: skip
@@ -282,8 +282,8 @@ def names_of(page: str, folder: Path) -> dict[str, Any]:
     """Variables that the code of a page does not make itself."""
     world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     if page == "docs/gates.md":
+        from consistency.referee.verdicts.baselines import write_baseline
         from consistency.testing import assert_not_worse
-        from consistency.verdicts.baselines import write_baseline
 
         done = cs.run_trials(world, ["ekf-uvd", "ekf-xyz"], runs=60, seed=5, jobs=1)
         write_baseline(done, folder / "baseline.json")

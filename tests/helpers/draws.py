@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from consistency.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.types import Array
+from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
+from consistency.referee.types import Array
 
 
 def independent(rng: np.random.Generator, runs: int, steps: int, n: int) -> Array:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.types import Array
+from consistency.referee.types import Array
 
 STEPS = 60
 R_IV, T_IV = Rotation.from_euler("ZYX", [0.015, -0.002, 0.008]).as_matrix(), np.array([-0.81, 0.32, -0.8])

@@ -21,12 +21,12 @@ from edited import accept_changes
 from flight import Flight
 
 import consistency as cs
-from consistency.cli import main
-from consistency.recording.kitti import read_drive
-from consistency.store.log import read_log
-from consistency.store.provenance import manifest_of
-from consistency.store.results import Rejected, failures_table, rejections_table
-from consistency.types import Failure
+from consistency.bench.store.log import read_log
+from consistency.bench.store.results import Rejected, failures_table, rejections_table
+from consistency.referee.cli import main
+from consistency.referee.sources.kitti import read_drive
+from consistency.referee.system.provenance import manifest_of
+from consistency.referee.types import Failure
 
 RUNS, STEPS, LANDMARKS = 9, 12, 5
 FILTERS = ("one", "two")
@@ -279,7 +279,7 @@ def _log(folder: Path) -> None:
 
 
 def _scenario(folder: Path) -> None:
-    from consistency.simulation import require_landmarks_in_view
+    from consistency.bench.simulation import require_landmarks_in_view
 
     scenario = cs.load_scenario(folder / "world.toml")
     print(scenario.hash)
@@ -288,21 +288,21 @@ def _scenario(folder: Path) -> None:
 
 
 def _sweep(folder: Path) -> None:
-    from consistency.sweeps.plan import load_sweep
+    from consistency.bench.sweeps.plan import load_sweep
 
     print([cell.scenario.hash for cell in load_sweep(folder / "sweep.toml").cells])
 
 
 def _findings(folder: Path) -> None:
-    from consistency.runs.findings import read_findings
+    from consistency.bench.runs.findings import read_findings
 
     print(read_findings(folder))
 
 
 def _cameras(calibration: str | None = None) -> Callable[[Path], object]:
     def read(folder: Path) -> None:
-        from consistency.frontend.truth import find_truth, read_truth
-        from consistency.vision.sequence import read_sequence
+        from consistency.stereo.frontend.truth import find_truth, read_truth
+        from consistency.stereo.vision.sequence import read_sequence
 
         sequence = read_sequence(folder, None if calibration is None else folder / calibration)
         rig = sequence.rectification.rig

@@ -14,13 +14,13 @@ import tomli_w
 from hostile import LINE_TWICE, OPENCV, OPTIMAL, RESULTS, TOML, TREE, TWICE, Target, command, quietly
 
 import consistency as cs
-from consistency.simulation import World
-from consistency.store.results import open_results
-from consistency.sweeps.cell import CellResult, Outcome, runs_table
-from consistency.sweeps.folder import SweepFolder, Work
-from consistency.sweeps.plan import load_sweep
-from consistency.sweeps.regime import regime_of, write_regime
-from consistency.verdicts.curves import curves
+from consistency.bench.simulation import World
+from consistency.bench.store.curves import curves
+from consistency.bench.store.results import open_results
+from consistency.bench.sweeps.cell import CellResult, Outcome, runs_table
+from consistency.bench.sweeps.folder import SweepFolder, Work
+from consistency.bench.sweeps.plan import load_sweep
+from consistency.bench.sweeps.regime import regime_of, write_regime
 
 STUDY, RUNS = ("--filter", "kf", "--jobs", "1", "--seed", "4"), 4
 SIZE = (160, 120)  # px

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import consistency as cs
-from consistency.types import Array
+from consistency.referee.types import Array
 
 
 class Invariant:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import consistency as cs
-from consistency.types import Control, Gaussian, Observation
+from consistency.bench.types import Control, Gaussian, Observation
 
 STEP = 7  # in which they misbehave
 MEMORY = 0.0625  # GiB that they have

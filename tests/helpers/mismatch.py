@@ -8,9 +8,9 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from consistency.scenario.effects.effect import ListedEffect
-from consistency.scenario.effects.observations import Context, Observations
-from consistency.types import Trial
+from consistency.bench.scenario.effects.effect import ListedEffect
+from consistency.bench.scenario.effects.observations import Context, Observations
+from consistency.bench.types import Trial
 
 RATE = 0.05
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.types import Array
-from consistency.vision import RelativePose, StereoRig
+from consistency.referee.types import Array
+from consistency.stereo.vision import RelativePose, StereoRig
 
 SIZE = (480, 320)  # px
 F, BASELINE = 320.0, 0.2  # px, m

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import ModuleType
 
-from consistency.runs.findings import sibling
+from consistency.bench.runs.findings import sibling
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters import MODULES, usable_names
-from consistency.filters.plain_sensors import sensor_noise
-from consistency.filters.stepping import run_filter, step_through
-from consistency.protocols import Problem
-from consistency.scenario import BelievedSensor, BiasMap
-from consistency.types import Array, Control, Estimates, Gaussian, Observation, Trial
+from consistency.bench.filters import MODULES, usable_names
+from consistency.bench.filters.plain_sensors import sensor_noise
+from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.protocols import Problem
+from consistency.bench.scenario import BelievedSensor, BiasMap
+from consistency.bench.types import Control, Estimates, Gaussian, Observation, Trial
+from consistency.referee.types import Array
 
 pytestmark = pytest.mark.usefixtures("dense")
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters import plain, usable_names
-from consistency.filters.compiled import Compiled, problem_for
-from consistency.filters.kernel.dispatch import require_fitting
-from consistency.filters.kernel.gain import linearise_seen
-from consistency.filters.kernel.slam import (
+from consistency.bench.filters import plain, usable_names
+from consistency.bench.filters.compiled import Compiled, problem_for
+from consistency.bench.filters.kernel.dispatch import require_fitting
+from consistency.bench.filters.kernel.gain import linearise_seen
+from consistency.bench.filters.kernel.slam import (
     State,
     insert_error,
     landmark_width,
@@ -30,14 +30,15 @@ from consistency.filters.kernel.slam import (
     retract,
     stands_apart,
 )
-from consistency.filters.kernel.work import make_work
-from consistency.filters.motion.unicycle import Unicycle
-from consistency.filters.plain import SlamState
-from consistency.filters.plain_sensors import sensor_noise, view
-from consistency.filters.point.truth import AtTruth
-from consistency.filters.stepping import step_through
-from consistency.protocols import Problem
-from consistency.types import Array, Control, Estimates, Gaussian, Info, Observation, Trial
+from consistency.bench.filters.kernel.work import make_work
+from consistency.bench.filters.motion.unicycle import Unicycle
+from consistency.bench.filters.plain import SlamState
+from consistency.bench.filters.plain_sensors import sensor_noise, view
+from consistency.bench.filters.point.truth import AtTruth
+from consistency.bench.filters.stepping import step_through
+from consistency.bench.protocols import Problem
+from consistency.bench.types import Control, Estimates, Gaussian, Info, Observation, Trial
+from consistency.referee.types import Array
 
 pytestmark = pytest.mark.usefixtures("dense")  # test_local_updating.py compares it with local updating
 

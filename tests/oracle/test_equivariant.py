@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from consistency.filters.error.polar import to_polar
-from consistency.filters.kernel.slam import measure, measure_jacobian
-from consistency.filters.landmark.sensor_point import sight
-from consistency.filters.methods import equivariant
-from consistency.filters.sensor.uvd import Uvd
-from consistency.models.point import Mounting
-from consistency.types import Array
+from consistency.bench.filters.error.polar import to_polar
+from consistency.bench.filters.kernel.slam import measure, measure_jacobian
+from consistency.bench.filters.landmark.sensor_point import sight
+from consistency.bench.filters.methods import equivariant
+from consistency.bench.filters.sensor.uvd import Uvd
+from consistency.bench.models.point import Mounting
+from consistency.referee.types import Array
 
 SENSOR = Uvd(150.0, 0.09, Mounting(0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1))
 Q, EPS = np.array([3.0, 0.7, -0.4]), np.array([0.2, -0.1, 0.15])  # m; rad, rad, logarithm

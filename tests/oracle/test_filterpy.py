@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.filters.stepping import run_filter
-from consistency.types import Estimates
+from consistency.bench.filters.stepping import run_filter
+from consistency.bench.types import Estimates
 
 Small = Callable[..., cs.Scenario]
 MERWE = {"belief__sigma_points": {"alpha": 0.5, "beta": 2.0, "kappa": 1.0}}

@@ -14,18 +14,19 @@ import pytest
 from scipy.stats import truncnorm
 
 import consistency as cs
-from consistency.filters import EXTRAS, SMOOTHERS, filter_names, plain, usable_names
-from consistency.filters.plain_sensors import PointSensor
-from consistency.filters.stepping import run_filter, step_through
-from consistency.models import motion, point, stereo
-from consistency.protocols import Problem
-from consistency.types import Array, Control, Estimates, Gaussian, Observation, Trial
+from consistency.bench.filters import EXTRAS, SMOOTHERS, filter_names, plain, usable_names
+from consistency.bench.filters.plain_sensors import PointSensor
+from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.models import motion, point, stereo
+from consistency.bench.protocols import Problem
+from consistency.bench.types import Control, Estimates, Gaussian, Observation, Trial
+from consistency.referee.types import Array
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
 
-from consistency.filters.external import planar_factors  # noqa: E402
-from consistency.filters.external.gtsam import FixedLag, Incremental, WholeTrialSmoother  # noqa: E402
-from consistency.filters.external.planar_factors import PlanarStereo, factor, landmark_key, pose_key  # noqa: E402
+from consistency.bench.filters.external import planar_factors  # noqa: E402
+from consistency.bench.filters.external.gtsam import FixedLag, Incremental, WholeTrialSmoother  # noqa: E402
+from consistency.bench.filters.external.planar_factors import PlanarStereo, factor, landmark_key, pose_key  # noqa: E402
 
 Small = Callable[..., cs.Scenario]
 NAMES = ("gtsam-batch-uvd", "gtsam-lag-uvd", "gtsam-map-uvd")

@@ -13,15 +13,16 @@ from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
-from consistency.filters.compiled import Compiled, problem_of
-from consistency.filters.guard import deciding, joint
-from consistency.filters.guard.deciding import kept
-from consistency.filters.guard.parts import guard_part
-from consistency.filters.guard.settings import KINDS, limits_of
-from consistency.filters.kernel.slam import keep_some, make_watch
-from consistency.filters.stepping import step_through
-from consistency.scenario import GuardSettings
-from consistency.types import Array, Estimates, Indices, Observation
+from consistency.bench.filters.compiled import Compiled, problem_of
+from consistency.bench.filters.guard import deciding, joint
+from consistency.bench.filters.guard.deciding import kept
+from consistency.bench.filters.guard.parts import guard_part
+from consistency.bench.filters.guard.settings import KINDS, limits_of
+from consistency.bench.filters.kernel.slam import keep_some, make_watch
+from consistency.bench.filters.stepping import step_through
+from consistency.bench.scenario import GuardSettings
+from consistency.bench.types import Estimates, Observation
+from consistency.referee.types import Array, Indices
 
 Small = Callable[..., cs.Scenario]
 SETTINGS = GuardSettings(confidence=0.95, threshold=1.5)

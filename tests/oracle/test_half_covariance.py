@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters.kernel.linalg import ROUNDING
-from consistency.filters.stepping import step_through
-from consistency.types import Estimates
+from consistency.bench.filters.kernel.linalg import ROUNDING
+from consistency.bench.filters.stepping import step_through
+from consistency.bench.types import Estimates
 
 Small = Callable[..., cs.Scenario]
 MANY = {"truth__landmarks__count": 600, "truth__steps": 25}

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.runs.montecarlo import simulate_log
+from consistency.bench.runs.montecarlo import simulate_log
 
 RUNS, SEED = 3, 5
 # filter, its observation model, scenario, steps

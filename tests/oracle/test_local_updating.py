@@ -10,9 +10,9 @@ import pytest
 from bench_trials import growing, grown
 
 import consistency as cs
-from consistency.filters.stepping import step_through
-from consistency.scenario import Belief
-from consistency.types import Estimates, Trial
+from consistency.bench.filters.stepping import step_through
+from consistency.bench.scenario import Belief
+from consistency.bench.types import Estimates, Trial
 
 NEVER = 10**9
 ALL = [

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters.compiled import problem_for
-from consistency.filters.plain import SlamState
-from consistency.types import Array, Control, Observation, Trial
+from consistency.bench.filters.compiled import problem_for
+from consistency.bench.filters.plain import SlamState
+from consistency.bench.types import Control, Observation, Trial
+from consistency.referee.types import Array
 
 Small = Callable[..., cs.Scenario]
 WORLDS = {"xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline"}

@@ -11,17 +11,17 @@ import pytest
 from scipy.stats import truncnorm
 
 import consistency as cs
-from consistency.filters import centred, plain
-from consistency.filters.compiled import problem_of
-from consistency.filters.covariance_update.parking import Parking, _is_worth_it, make_clones, unpark
-from consistency.filters.kernel.slam import State
-from consistency.filters.methods import robocentric as rc
-from consistency.filters.sensor.conversion import Pixels
-from consistency.filters.sensor.growth import Growth
-from consistency.filters.stepping import step_through
-from consistency.filters.update.converting import Converting, converting_room
-from consistency.filters.update.retraction_chain import aim_chained, cast_columns, cast_rows, unchain
-from consistency.types import Array
+from consistency.bench.filters import centred, plain
+from consistency.bench.filters.compiled import problem_of
+from consistency.bench.filters.covariance_update.parking import Parking, _is_worth_it, make_clones, unpark
+from consistency.bench.filters.kernel.slam import State
+from consistency.bench.filters.methods import robocentric as rc
+from consistency.bench.filters.sensor.conversion import Pixels
+from consistency.bench.filters.sensor.growth import Growth
+from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.update.converting import Converting, converting_room
+from consistency.bench.filters.update.retraction_chain import aim_chained, cast_columns, cast_rows, unchain
+from consistency.referee.types import Array
 
 Small = Callable[..., cs.Scenario]
 Y = np.array([[0.3, -0.2, 0.4], [-0.6, 0.1, 0.15], [2.4, 0.3, 0.9]])  # the last one is behind the robot

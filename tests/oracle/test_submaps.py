@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters.methods.submaps import SubmapKalman, joined
-from consistency.filters.stepping import step_through
-from consistency.protocols import Problem
-from consistency.types import Array
+from consistency.bench.filters.methods.submaps import SubmapKalman, joined
+from consistency.bench.filters.stepping import step_through
+from consistency.bench.protocols import Problem
+from consistency.referee.types import Array
 
 Small = Callable[..., cs.Scenario]
 STEPS = 20

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.filters.kernel.loop import trial_kernel
-from consistency.filters.methods.ckf import CUBATURE
-from consistency.filters.methods.ukf import sigma_points
-from consistency.filters.stepping import step_through
-from consistency.scenario import Belief
-from consistency.simulation import planned_path
-from consistency.types import Array, Estimates, Trial
+from consistency.bench.filters.kernel.loop import trial_kernel
+from consistency.bench.filters.methods.ckf import CUBATURE
+from consistency.bench.filters.methods.ukf import sigma_points
+from consistency.bench.filters.stepping import step_through
+from consistency.bench.scenario import Belief
+from consistency.bench.simulation import planned_path
+from consistency.bench.types import Estimates, Trial
+from consistency.referee.types import Array
 
 Small = Callable[..., cs.Scenario]
 MERWE = {"belief__sigma_points": {"alpha": 0.5, "beta": 2.0, "kappa": 1.0}}

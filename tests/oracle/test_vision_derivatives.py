@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from hyperdual import HyperDual, derivatives
 
-from consistency.geometry import rotation
-from consistency.vision import RelativePose, StereoRig, register_svd, triangulate
-from consistency.vision.propagation import registration_derivatives, triangulation_derivatives
-from consistency.vision.refinement import _profile
-from consistency.vision.rig import solved
-from consistency.vision.robust import loss
-from consistency.vision.twoframe import Measure, Pixels, Points, TwoFrames
-from consistency.vision.twoframe import derivatives as two_frame_derivatives
+from consistency.referee.geometry import rotation
+from consistency.stereo.vision import RelativePose, StereoRig, register_svd, triangulate
+from consistency.stereo.vision.propagation import registration_derivatives, triangulation_derivatives
+from consistency.stereo.vision.refinement import _profile
+from consistency.stereo.vision.rig import solved
+from consistency.stereo.vision.robust import loss
+from consistency.stereo.vision.twoframe import Measure, Pixels, Points, TwoFrames
+from consistency.stereo.vision.twoframe import derivatives as two_frame_derivatives
 
 Array = np.ndarray[Any, Any]
 TOLERANCE = 1e-8  # of the largest entry

@@ -11,7 +11,7 @@ from typing import Any
 import inputs
 import pytest
 
-from consistency.cli import main
+from consistency.referee.cli import main
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,14 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.errors import InputError
-from consistency.geometry import wrap
-from consistency.geometry.conventions import SPATIAL, se3_log, spatial_error
-from consistency.reading.options import Reading
-from consistency.recording import read_recordings
-from consistency.recording.hints import hints
-from consistency.recording.sheet import read_sheet
-from consistency.verdicts.baselines import _known
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import wrap
+from consistency.referee.geometry.conventions import SPATIAL, se3_log, spatial_error
+from consistency.referee.reading.options import Reading
+from consistency.referee.sources import read_recordings
+from consistency.referee.sources.hints import hints
+from consistency.referee.sources.sheet import read_sheet
+from consistency.referee.verdicts.baselines import _known
 
 
 def test_a_table_has_the_errors_that_were_written(tmp_path: Path) -> None:

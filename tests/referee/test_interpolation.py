@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from consistency.geometry import wrap
-from consistency.recording.interpolation import BRIDGED, truth_at
-from consistency.types import Array
+from consistency.referee.geometry import wrap
+from consistency.referee.sources.interpolation import BRIDGED, truth_at
+from consistency.referee.types import Array
 
 T = 100.0 + 0.1 * np.arange(30)
 

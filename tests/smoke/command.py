@@ -35,8 +35,8 @@ def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.Compl
 
 STARTER = """
 import gc, json, os, sys
-import consistency.cli, consistency.reporting.html, consistency.reporting.paper, consistency.runs.montecarlo
-import consistency.reporting.pdf, consistency.verdicts.comparison
+import consistency.referee.cli, consistency.bench.pages.html, consistency.bench.pages.paper, consistency.bench.runs.montecarlo
+import consistency.bench.pages.pdf, consistency.referee.verdicts.comparison
 from consistency.__main__ import main
 
 consistency.get_filter("ekf-uvd")
@@ -99,7 +99,7 @@ def begun(*arguments: str, cwd: Path, **popen: Any) -> subprocess.Popen[str]:
     """The command line in a session of its own, with signals as in a terminal (nohup ignores SIGHUP)."""
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     code += "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
-    code += "from consistency.cli import main; main()"
+    code += "from consistency.referee.cli import main; main()"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | popen
     process = subprocess.Popen(
         [sys.executable, "-c", code, *arguments], cwd=cwd, text=True, start_new_session=True, **pipes

@@ -12,13 +12,13 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.characterising.characterise import characterise
-from consistency.characterising.residuals import Residuals
-from consistency.characterising.writing import believed, sensor_text
-from consistency.cli.app import main
-from consistency.runs.montecarlo import simulate_log
-from consistency.scenario import Belief, PicturedSensor, read_table
-from consistency.store.log import SensorFile, read_log
+from consistency.bench.runs.montecarlo import simulate_log
+from consistency.bench.scenario import Belief, PicturedSensor, read_table
+from consistency.bench.store.log import SensorFile, read_log
+from consistency.referee.cli.app import main
+from consistency.stereo.characterising.characterise import characterise
+from consistency.stereo.characterising.residuals import Residuals
+from consistency.stereo.characterising.writing import believed, sensor_text
 
 
 def run(*arguments: object) -> int:

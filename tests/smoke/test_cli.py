@@ -18,7 +18,7 @@ from documents import blocks
 from scipy import stats
 
 import consistency as cs
-from consistency.scenario import data_folder
+from consistency.bench.scenario import data_folder
 
 ROOT = Path(__file__).parents[2]
 RUNS = 6
@@ -216,8 +216,8 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, name: str) -> None:
     """Interrupted after the first runs, then resumed: the bytes of an uninterrupted run."""
     code = f"""
 import signal, sys
-from consistency.cli import main
-from consistency.runs.work import Work
+from consistency.referee.cli import main
+from consistency.bench.runs.work import Work
 one, count = Work.__call__, []
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell runs in the background
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup

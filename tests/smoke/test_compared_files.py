@@ -11,9 +11,9 @@ import pytest
 from command import consistency
 from recorded import read_recordings
 
-from consistency.cli import main
-from consistency.errors import InputError
-from consistency.verdicts.baselines import baseline_of_files
+from consistency.referee.cli import main
+from consistency.referee.errors import InputError
+from consistency.referee.verdicts.baselines import baseline_of_files
 
 OPTIONS = ("--truth", "truth.csv", "--state", "a,b")
 RUNS, STEPS = 24, 15

@@ -22,7 +22,7 @@ import pytest
 import scene
 from documents import PAGES, SHELL, Block, Command, blocks, typed
 
-from consistency.cli import main
+from consistency.referee.cli import main
 
 pytestmark = pytest.mark.slow
 

@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 from command import LIMIT, begun, consistency, size_of
 
-from consistency.scenario import data_folder
-from consistency.store.journal import Journal
-from consistency.store.results import open_results
+from consistency.bench.scenario import data_folder
+from consistency.bench.store.journal import Journal
+from consistency.bench.store.results import open_results
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="signals")]
 FILTER = ("--filter", "kf")

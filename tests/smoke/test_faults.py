@@ -1,7 +1,7 @@
 """Whatever ends the process, at random moments: finished runs are kept, and a resume gives the bytes of one go.
 
 A process of the command line each; all but the first take a minute or more in all. The same faults inside one process
-are in ``tests/unit/test_journal.py``.
+are in ``tests/unit/bench/test_journal.py``.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from typing import Any
 import pytest
 from command import COMPILING, LIMIT, begun, size_of
 
-from consistency.scenario import data_folder
-from consistency.store.journal import Journal
-from consistency.store.results import open_results
+from consistency.bench.scenario import data_folder
+from consistency.bench.store.journal import Journal
+from consistency.bench.store.results import open_results
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals")
 RUNS = 1000  # of some milliseconds each
@@ -200,7 +200,7 @@ def test_output_that_nobody_reads(fresh: Path, how: str) -> None:
         process.stdout.close()
         assert process.wait(LIMIT) == 141
     else:
-        code = "from consistency.cli import main; main()"
+        code = "from consistency.referee.cli import main; main()"
         command = f"{sys.executable} -c '{code}' run world.toml --filter {FILTER} --out out --runs {RUNS} >&- 2>&-"
         assert subprocess.run(["bash", "-c", command], cwd=fresh, timeout=LIMIT, check=False).returncode == 0
     require_same(fresh)

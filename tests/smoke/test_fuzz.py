@@ -15,7 +15,7 @@ from hostile_work import TARGETS, write_all
 from mutations import bomb, copied, long_run
 
 import consistency as cs
-from consistency.store.parquet import read_parquet
+from consistency.bench.store.parquet import read_parquet
 
 
 def test_a_few_hundred_damaged_files() -> None:
@@ -92,7 +92,7 @@ import sys
 from pathlib import Path
 import numpy as np
 import consistency as cs
-from consistency.store.parquet import read_batches
+from consistency.bench.store.parquet import read_batches
 
 path, rng, refused = Path("estimates.parquet"), np.random.default_rng(), 0
 content = path.read_bytes()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command import consistency
 
-from consistency.scenario import data_folder
+from consistency.bench.scenario import data_folder
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 import consistency as cs
-from consistency.diagnostics.records import STATUSES
-from consistency.reporting import write_reports
-from consistency.reporting.sections.questions import MARKS
+from consistency.bench.pages import write_reports
+from consistency.bench.pages.sections.questions import MARKS
+from consistency.referee.diagnostics.records import STATUSES
 
 pytestmark = pytest.mark.browser
 

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 from command import consistency
 
-from consistency.cli import main
-from consistency.scenario import data_folder
+from consistency.bench.scenario import data_folder
+from consistency.referee.cli import main
 
 SWEEP = """
 summary = "Two densities"

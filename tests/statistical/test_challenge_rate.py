@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from scipy import stats
 
-from consistency.challenging.challenge import Plan, challenge
+from consistency.bench.challenging.challenge import Plan, challenge
 
 SEARCHES, STATED = 20, 0.05
 SHORT = ("steps=50:100",)

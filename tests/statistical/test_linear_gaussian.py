@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 import consistency as cs
-from consistency.verdicts.curves import Curves, curves
+from consistency.bench.store.curves import Curves, curves
 
 pytestmark = pytest.mark.slow
 

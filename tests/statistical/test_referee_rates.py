@@ -13,8 +13,8 @@ import pytest
 from referee import judge
 from scipy import stats
 
-from consistency.diagnostics import mean_shape, mean_test, nis_whiteness, simultaneous_band
-from consistency.types import Array
+from consistency.referee.diagnostics import mean_shape, mean_test, nis_whiteness, simultaneous_band
+from consistency.referee.types import Array
 
 pytestmark = pytest.mark.slow
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.runs.findings import reproduce
-from consistency.verdicts.curves import curves
+from consistency.bench.runs.findings import reproduce
+from consistency.bench.store.curves import curves
 
 REFERENCE = Path(__file__).parents[2] / "reports" / "reference"
 

@@ -13,7 +13,7 @@ import pytest
 from rigs import RIG
 from scipy import stats
 
-from consistency.vision import (
+from consistency.stereo.vision import (
     RelativePose,
     refine_reprojection,
     register_svd,
@@ -22,7 +22,7 @@ from consistency.vision import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.vision.registration import rigid_motions
+from consistency.stereo.vision.registration import rigid_motions
 
 pytestmark = pytest.mark.slow
 

@@ -13,8 +13,8 @@ import pytest
 from draws import autoregression, fully_dependent, independent, slow_axis, verdict_on
 from scipy import stats
 
-from consistency.diagnostics import e_process, largest_direction
-from consistency.types import Array
+from consistency.referee.diagnostics import e_process, largest_direction
+from consistency.referee.types import Array
 
 pytestmark = pytest.mark.slow
 

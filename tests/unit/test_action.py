@@ -21,8 +21,8 @@ import pytest
 import typer
 from documents import ROOT
 
-from consistency.cli.app import app
-from consistency.runs.findings import sibling
+from consistency.bench.runs.findings import sibling
+from consistency.referee.cli.app import app
 
 pytest.importorskip("yaml", reason="PyYAML (the extra vision) is not installed")
 import action

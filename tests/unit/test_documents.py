@@ -27,11 +27,11 @@ from document_inputs import NOT_RUN
 from documents import PAGES, PROGRAMS, ROOT, SHELL, Block, Command, blocks, commands, parsed, read, typed
 
 import consistency as cs
-from consistency.filters import filter_names
-from consistency.filters.guard.settings import KINDS
-from consistency.runs.findings import experiments
-from consistency.scenario import data_folder, scenario_names
-from consistency.sweeps.plan import load_sweep, sweep_names
+from consistency.bench.filters import filter_names
+from consistency.bench.filters.guard.settings import KINDS
+from consistency.bench.runs.findings import experiments
+from consistency.bench.scenario import data_folder, scenario_names
+from consistency.bench.sweeps.plan import load_sweep, sweep_names
 
 PYTHON = ("python", "python notebook")
 SITE = re.compile(r"\{[\w-]+\}.*")  # directives of the site
@@ -201,7 +201,7 @@ def names_of_the_package(tree: ast.Module, imports: bool = True) -> None:
 
 @pytest.mark.parametrize("text", ["cs.load_scenarios('a')", "from consistency.testing import assert_consistency",
     "from consistency.nothing import a", "cs.run_trials(s, f, rums=3)",
-    "from consistency.challenging.challenge import Plan\nPlan(minute=1)"])  # fmt: skip
+    "from consistency.bench.challenging.challenge import Plan\nPlan(minute=1)"])  # fmt: skip
 def test_names_that_do_not_exist_are_seen(text: str) -> None:
     with pytest.raises((AttributeError, ImportError, AssertionError)):
         names_of_the_package(ast.parse(text))

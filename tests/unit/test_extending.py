@@ -13,11 +13,11 @@ import pytest
 from documents import blocks
 
 import consistency
-import consistency.filters
+import consistency.bench.filters
 
 PACKAGE = Path(consistency.__file__).parent
 PAGE = "docs/extending.md"
-EFFECTS = Path("consistency/scenario/effects")
+EFFECTS = Path("consistency/bench/scenario/effects")
 
 
 def code(heading: str) -> list[str]:
@@ -44,8 +44,8 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     """One new file and one row; it is in the help, reads files, and loads nothing heavy before it is called."""
     module, row = code("Add a command")
     assert row.count("\n") == 1
-    (copy / "consistency/cli/worst.py").write_text(module, encoding="utf-8")
-    table = copy / "consistency/cli/commands.py"
+    (copy / "consistency/referee/cli/worst.py").write_text(module, encoding="utf-8")
+    table = copy / "consistency/referee/cli/commands.py"
     first = "    # the laboratory\n"
     assert table.read_text(encoding="utf-8").count(first) == 1
     table.write_text(table.read_text(encoding="utf-8").replace(first, f"{row.rstrip()},\n{first}"), encoding="utf-8")
@@ -53,13 +53,14 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     (copy / "truth.csv").write_text("step,a\n1,0\n2,0\n")
     told = python(
         copy,
-        "import sys\nfrom consistency.cli import main\n"
+        "import sys\nfrom consistency.referee.cli import main\n"
         "try:\n    main(['worst', '--help'])\nfinally:\n    print('numpy' in sys.modules)",
     )
     assert "The run with the largest mean NEES" in told.stdout
     assert told.stdout.splitlines()[-1] == "False"
     done = python(
-        copy, "from consistency.cli import main\nmain(['worst', 'est.csv', '--truth', 'truth.csv', '--state', 'a'])"
+        copy,
+        "from consistency.referee.cli import main\nmain(['worst', 'est.csv', '--truth', 'truth.csv', '--state', 'a'])",
     )
     assert done.stdout == "est: run 7, mean NEES 49\n", done.stderr
 
@@ -70,7 +71,7 @@ def test_the_bias_of_the_document_works(copy: Path) -> None:
     assert line.count("\n") == 1
     (copy / EFFECTS / "bias.py").write_text(effect, encoding="utf-8")
     names = copy / EFFECTS / "__init__.py"
-    first = "from consistency.scenario.effects.effect"
+    first = "from consistency.bench.scenario.effects.effect"
     assert names.read_text(encoding="utf-8").count(first) == 1
     names.write_text(names.read_text(encoding="utf-8").replace(first, line + first), encoding="utf-8")
     scenario = (copy / "scenarios" / "herath2007-stereo.toml").read_text(encoding="utf-8")
@@ -107,7 +108,7 @@ def test_excerpts_of_filters_are_the_code_that_runs() -> None:
 )
 def test_a_filter_is_one_file_and_a_line_for_each_name(method: str, names: set[str]) -> None:
     """Nothing else in the package knows the file or what it defines."""
-    registered = {name: module for name, (module, _, _) in consistency.filters.MODULES.items()}
+    registered = {name: module for name, (module, _, _) in consistency.bench.filters.MODULES.items()}
     mine = {name for name, module in registered.items() if module == f"methods.{method}"}
     assert {name.rpartition("-")[0] for name in mine} == names
     source = (METHODS / f"{method}.py").read_text(encoding="utf-8")

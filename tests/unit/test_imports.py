@@ -125,28 +125,28 @@ def test_a_room_imports_only_rooms_below_it(room: str, path: Path) -> None:
 
 
 FORBIDDEN = [
-    ("filters", "from consistency.simulation import simulate"),
-    ("simulation", "import consistency.filters.plain"),
+    ("filters", "from consistency.bench.simulation import simulate"),
+    ("simulation", "import consistency.bench.filters.plain"),
     ("simulation", "def f():\n    from consistency import filters"),
-    ("models", "from consistency.scenario import Truth"),
+    ("models", "from consistency.bench.scenario import Truth"),
     ("scenario", "import consistency as cs"),
-    ("types", "from consistency.errors import InputError"),
+    ("types", "from consistency.referee.errors import InputError"),
     ("diagnostics", "import pandas as pd"),
     ("diagnostics", "from matplotlib.axes import Axes"),
-    ("diagnostics", "from consistency.scenario import Belief"),
-    ("runs.montecarlo", "from consistency.verdicts.judge import analyse"),
+    ("diagnostics", "from consistency.bench.scenario import Belief"),
+    ("runs.montecarlo", "from consistency.bench.store.judge import analyse"),
     ("runs.montecarlo", "import matplotlib.pyplot as plt"),
-    ("terminal.table", "from consistency.reporting import write_reports"),
+    ("terminal.table", "from consistency.bench.pages import write_reports"),
     ("gating", "from consistency.testing import assert_consistent"),
     ("testing", "from consistency.pytest_plugin import Gates"),
-    ("store.results", "if TYPE_CHECKING:\n    from consistency.store.log import Log"),
-    ("store.parquet", "from consistency.store import storage"),
-    ("store", "from consistency.store.atomic import write_whole"),
-    ("verdicts.judge", "import consistency.store"),
-    ("verdicts.judge", "from consistency.verdicts.comparison import Compared"),
-    ("imaging", "from consistency.runs.findings import Study"),
-    ("vision", "from consistency.imaging.chain import Chain"),
-    ("vision", "from consistency.terminal.table import print_findings"),
+    ("store.results", "if TYPE_CHECKING:\n    from consistency.bench.store.log import Log"),
+    ("store.parquet", "from consistency.bench.store import storage"),
+    ("store", "from consistency.referee.system.atomic import write_whole"),
+    ("verdicts.judge", "import consistency.bench.store"),
+    ("verdicts.judge", "from consistency.referee.verdicts.comparison import Compared"),
+    ("imaging", "from consistency.bench.runs.findings import Study"),
+    ("vision", "from consistency.stereo.imaging.chain import Chain"),
+    ("vision", "from consistency.referee.terminal.table import print_findings"),
 ]
 
 
@@ -203,7 +203,7 @@ def loaded(statement: str) -> set[str]:
 
 
 def test_diagnostics_load_arrays_and_distributions_only() -> None:
-    modules_ = loaded("import consistency.diagnostics")
+    modules_ = loaded("import consistency.referee.diagnostics")
     assert {"numpy", "scipy"} <= modules_
     assert not modules_ & {"pandas", "matplotlib", "numba", "pydantic", "joblib", "bokeh"}
 
@@ -226,26 +226,26 @@ def test_the_package_itself_loads_nothing_heavy() -> None:
 
 def test_engines_of_clusters_are_loaded_when_they_are_chosen() -> None:
     engines = {"dask", "distributed", "submitit"}
-    choose = "import consistency.runs.montecarlo\nfrom consistency.runs.backends import choosing\n"
+    choose = "import consistency.bench.runs.montecarlo\nfrom consistency.bench.runs.backends import choosing\n"
     choose += "choosing.backend_for({!r})"
     assert not loaded(choose.format("local")) & engines
     assert loaded(choose.format("dask")) & engines == {"dask", "distributed"}
     assert loaded(choose.format("slurm")) & engines == {"submitit"}
 
 
-@pytest.mark.parametrize("package", ["consistency", "consistency.vision"])
+@pytest.mark.parametrize("package", ["consistency", "consistency.stereo.vision"])
 def test_a_new_session_lists_the_public_names(package: str) -> None:
     """``dir``, and so tab completion, without loading what the names stand for."""
     code = f"import sys, {package} as package; print(*dir(package)); print(*sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     names, modules_ = (set(line.split()) for line in out.stdout.splitlines())
-    expected = {"consistency": {"analyse", "run_trials", "Verdict"}, "consistency.vision": {"relative_motion"}}
+    expected = {"consistency": {"analyse", "run_trials", "Verdict"}, "consistency.stereo.vision": {"relative_motion"}}
     assert expected[package] <= names
     assert not modules_ & {"numpy", "cv2"}
 
 
 def test_the_help_loads_nothing_heavy() -> None:
-    modules_ = loaded("from consistency.cli.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
+    modules_ = loaded("from consistency.referee.cli.app import app\ntry: app(['--help'])\nexcept SystemExit: pass")
     assert "typer" in modules_
     assert not modules_ & {"numpy", "scipy", "pandas", "numba", "pydantic", "matplotlib", "joblib", "bokeh"}
 

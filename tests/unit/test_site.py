@@ -15,8 +15,10 @@ import pytest
 from matplotlib.figure import Figure
 
 import consistency
-from consistency import diagnostics, testing, vision
-from consistency.cli.commands import COMMANDS
+from consistency import testing
+from consistency.referee import diagnostics
+from consistency.referee.cli.commands import COMMANDS
+from consistency.stereo import vision
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -97,7 +99,7 @@ def test_an_empty_folder_is_no_site(tmp_path: Path) -> None:
     [
         ("docs/method.md", "docs/method.md", "[a](../scenarios/README.md#keys)", "[a](generated/scenarios.md#keys)"),
         ("docs/method.md", "docs/method.md", "[a](files.md#b)", "[a](files.md#b)"),
-        ("docs/method.md", "docs/method.md", "[`x`](../consistency/types.py)", "`x`"),
+        ("docs/method.md", "docs/method.md", "[`x`](../consistency/bench/types.py)", "`x`"),
         ("docs/method.md", "docs/method.md", "[a](https://example.org/b.md)", "[a](https://example.org/b.md)"),
         ("scenarios/README.md", "docs/generated/scenarios", "[a](../docs/sensor.md#b)", "[a](../sensor.md#b)"),
         ("scenarios/README.md", "docs/generated/scenarios", "[a](../experiments/README.md)", "[a](experiments.md)"),
@@ -150,10 +152,10 @@ def test_every_public_name_stands_in_the_reference() -> None:
     gates = [name for name, value in vars(testing).items() if getattr(value, "__module__", "") == testing.__name__]
     public = {f"consistency.{name}" for name in consistency.__all__}
     public |= {f"consistency.testing.{name}" for name in gates if not name.startswith("_")}
-    public |= {f"consistency.vision.{name}" for name in vision.__all__}
+    public |= {f"consistency.stereo.vision.{name}" for name in vision.__all__}
     at_top = {id(getattr(consistency, name)) for name in consistency.__all__}
     public |= {
-        f"consistency.diagnostics.{name}"
+        f"consistency.referee.diagnostics.{name}"
         for name in diagnostics.__all__
         if id(getattr(diagnostics, name)) not in at_top
     }
@@ -248,7 +250,12 @@ def test_a_script_stands_by_itself_and_leaves_a_figure(script: Path) -> None:
     assert re.match(r'"""\n(.+)\n=+\n\n[^"]+\n"""\n', text)
     assert re.search(r"^figure(, .*)? = ", text, re.MULTILINE)
     modules = re.findall(r"^(?:from|import) (consistency\S*)", text, re.MULTILINE)
-    public = {"consistency", "consistency.diagnostics", "consistency.vision", "consistency.sweeps.regime"}
+    public = {
+        "consistency",
+        "consistency.referee.diagnostics",
+        "consistency.stereo.vision",
+        "consistency.bench.sweeps.regime",
+    }
     assert set(modules) <= public
 
 

@@ -20,11 +20,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from consistency.diagnostics import Evidence, Interval, Settings, Verdict, judge, outliers
-from consistency.diagnostics.records import STATUSES
-from consistency.diagnostics.wording import off_by, p_text, plural, short
-from consistency.store.provenance import plain
-from consistency.types import Array, Failure
+from consistency.referee.diagnostics import Evidence, Interval, Settings, Verdict, judge, outliers
+from consistency.referee.diagnostics.records import STATUSES
+from consistency.referee.diagnostics.wording import off_by, p_text, plural, short
+from consistency.referee.system.provenance import plain
+from consistency.referee.types import Array, Failure
 
 SURE = 1e-5
 ALARMS = ("overconfident", "conservative", "biased", "heavy-tailed", "inconsistent")

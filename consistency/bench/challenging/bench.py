@@ -1,0 +1,110 @@
+"""How overconfident is a filter in a world? Scores of trials, on all workers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import joblib
+import numpy as np
+
+from consistency.bench.filters.compiled import one_blas_thread
+from consistency.bench.protocols import Filter
+from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.compiling import compile_all, first_trials
+from consistency.bench.runs.isolating import Isolation
+from consistency.bench.scenario import Scenario
+from consistency.bench.simulation import require_landmarks_in_view
+from consistency.bench.simulation.world import World
+from consistency.bench.store.results import outcome_of
+from consistency.referee.errors import InputError
+from consistency.referee.reading.columns import POSE
+
+WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not
+PATIENCE = 60.0  # s beyond the end of the search, after which a trial of a filter that is not compiled is killed
+Job = tuple[Scenario, Sequence[int]]  # a world, and the trials in it
+
+
+@dataclass(frozen=True)
+class Done:
+    """Scores of the trials of a world, fewer than were asked for where the time was up."""
+
+    scores: tuple[float, ...]
+    seconds: float  # of the fastest trial; others may have waited for a busy machine
+
+
+class Bench:
+    """Scores one filter; to be used in a ``with``, which holds the workers.
+
+    The score of a trial is log(mean NEES of the run / 3), which is 0 or a little less for a right filter. The logarithm
+    keeps one diverged run among many from deciding which of two worlds is worse.
+    """
+
+    def __init__(self, filter_: Filter, jobs: int = -1) -> None:
+        self.filter, self.workers = filter_, worker_count(jobs)
+        self._stack = ExitStack()
+        self._parallel: Any = None
+
+    def __enter__(self) -> Bench:
+        self._stack.enter_context(one_blas_thread())
+        if self.workers > 1:  # kernels release the GIL; other filters run in processes, for which threads wait
+            self._stack.enter_context(joblib.parallel_config("threading", n_jobs=self.workers))
+            self._parallel = self._stack.enter_context(joblib.Parallel())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def compile(self, worlds: Sequence[Scenario]) -> None:
+        """Compile what the filter needs in these worlds, so that a search spends no time on it."""
+        compile_all(first_trials((self.filter, world) for world in worlds), self.workers)
+
+    def __call__(self, jobs: Sequence[Job], seed: int, until: float = np.inf) -> list[Done | None]:
+        """Scores of each job in its order; None for a world in which no landmark comes into view.
+
+        No trial begins after ``until``, a time of ``time.monotonic``.
+        """
+        if self._parallel is None:
+            return [_score(self.filter, *job, seed, until) for job in jobs]
+        tasks = (joblib.delayed(_score)(self.filter, *job, seed, until) for job in jobs)
+        return list(self._parallel(tasks))
+
+    def split(self, world: Scenario, runs: Sequence[int]) -> list[Job]:
+        """The trials of one world as a job for each worker."""
+        return [(world, part) for part in (runs[i :: self.workers] for i in range(self.workers)) if part]
+
+
+def _score(filter_: Filter, scenario: Scenario, runs: Sequence[int], seed: int, until: float) -> Done | None:
+    if time.monotonic() >= until:
+        return Done((), 0.0)
+    try:
+        world = require_landmarks_in_view(scenario)
+    except InputError:
+        return None
+    scores, fastest = [], np.inf
+    timeout = until - time.monotonic() + PATIENCE if np.isfinite(until) else None
+    with Isolation([filter_], scenario.belief, timeout) as isolation:
+        for run in runs:
+            began = time.monotonic()
+            if began >= until:
+                break
+            scores.append(score_of_run(isolation, world, run, seed))
+            fastest = min(fastest, time.monotonic() - began)
+    return Done(tuple(scores), fastest if scores else 0.0)
+
+
+def score_of_run(isolation: Isolation, world: World, run: int, seed: int) -> float:
+    """log(mean NEES / 3) of a run of the one filter, in its own error; :data:`WORST` where it failed."""
+    trial = world.trial(run, seed)
+    outcome = outcome_of(trial, isolation.run(trial))
+    if outcome.failures:
+        return WORST
+    [columns] = outcome.estimates.values()
+    nees = np.asarray(columns.get("own_nees", columns["nees"]), float)
+    nees = nees[np.isfinite(nees)]
+    if not len(nees):
+        return WORST
+    return min(float(np.log(max(nees.mean() / len(POSE), 1.0 / np.exp(WORST)))), WORST)

@@ -1,0 +1,307 @@
+"""The space of worlds around a base scenario: a few dimensions, each with bounds and the value of the base."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from consistency.bench.scenario import (
+    Circle,
+    FigureOfEight,
+    Path_,
+    RoundedRectangle,
+    Scenario,
+    Truth,
+    UniformLandmarks,
+    UvdSensor,
+    misbelief,
+)
+from consistency.bench.simulation.path import lap_length, planned_path
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+
+Value = float | int | str
+Point = tuple[Value, ...]  # a value of every dimension
+
+SHAPES = ("circle", "rounded-rectangle", "figure-of-eight")
+SEEDS = 64  # sets of landmarks beside that of the base
+DIGITS = 2  # significant ones of a value that is not the base's: a file is read by people
+# bounds as factors of the base's value: twice the noise, three times the range; a denser world costs too much
+FACTORS = {
+    "odometry": (0.5, 2.0), "sensor": (0.5, 2.0), "density": (0.125, 1.0), "steps": (0.2, 2.0),
+    "baseline": (1 / 3, 3.0), "range": (0.5, 3.0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A number on a logarithmic scale."""
+
+    name: str
+    base: float  # value in the base scenario
+    low: float
+    high: float
+    unit: str = ""
+    whole: bool = False
+
+    @property
+    def plain(self) -> float:
+        """The value of the base, or the nearest one within the bounds."""
+        return self._number(min(max(self.base, self.low), self.high))
+
+    def at(self, u: float) -> float:
+        """Value at ``u`` in [0, 1], rounded to a few digits."""
+        value = self.low * (self.high / self.low) ** u
+        return self._number(min(max(float(f"{value:.{DIGITS}g}"), self.low), self.high))
+
+    def where(self, value: Value) -> float:
+        """Place of a value in [0, 1]."""
+        width = np.log(self.high / self.low)
+        return float(np.log(float(value) / self.low) / width) if width > 0 else 0.0
+
+    def between(self, value: Value) -> Value:
+        """A value half the way to the plain one."""
+        return self.at(0.5 * (self.where(value) + self.where(self.plain)))
+
+    def within(self, text: str) -> Scale:
+        """The dimension with the bounds ``LOW:HIGH``, or fixed at ``VALUE``."""
+        try:
+            low, high = (self._number(float(part)) for part in (text.split(":") if ":" in text else (text, text)))
+        except (ValueError, OverflowError):
+            raise self._refused(text) from None
+        if not 0.0 < low <= high < np.inf:
+            raise self._refused(text)
+        return replace(self, low=low, high=high)
+
+    def text(self, value: Value) -> str:
+        """A value with its unit."""
+        return f"{value:g}{self.unit}"
+
+    def _number(self, value: float) -> float:
+        return round(value) if self.whole else value
+
+    def _refused(self, text: str) -> InputError:
+        return InputError(
+            f"--within {self.name}={text}: give bounds as {self.name}=LOW:HIGH, positive numbers with low <= high"
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of a few values that have no order."""
+
+    name: str
+    base: Value
+    values: tuple[Value, ...]
+
+    @property
+    def plain(self) -> Value:
+        """The value of the base, or the first of those that are left."""
+        return self.base if self.base in self.values else self.values[0]
+
+    def at(self, u: float) -> Value:
+        """Value at ``u`` in [0, 1]."""
+        return self.values[min(int(u * len(self.values)), len(self.values) - 1)]
+
+    def where(self, value: Value) -> float:
+        """Place of a value in [0, 1]."""
+        return (self.values.index(value) + 0.5) / len(self.values)
+
+    def between(self, value: Value) -> Value:
+        """Nothing lies between two values."""
+        return value
+
+    def within(self, text: str) -> Choice:
+        """The dimension with fewer values, ``A,B``."""
+        known = {str(value): value for value in self.values}
+        parts = [part.strip() for part in text.split(",")]
+        if unknown := [part for part in parts if part not in known]:
+            some = list(known) if len(known) <= len(SHAPES) + 1 else [*list(known)[:3], "...", list(known)[-1]]
+            raise InputError(
+                f"--within {self.name}={text}: '{unknown[0]}' is not one of its values; choose from {', '.join(some)}"
+            )
+        return replace(self, values=tuple(known[part] for part in dict.fromkeys(parts)))
+
+    def text(self, value: Value) -> str:
+        """A value."""
+        return str(value)
+
+
+Dimension = Scale | Choice
+
+
+@dataclass(frozen=True)
+class Space:
+    """Worlds that differ from ``base`` in some of the ``dimensions``."""
+
+    base: Scenario
+    dimensions: tuple[Dimension, ...]
+
+    @property
+    def plain(self) -> Point:
+        """The point of the base, or the one nearest to it within the bounds."""
+        return tuple(d.plain for d in self.dimensions)
+
+    def at(self, u: Array) -> Point:
+        """Point at ``u`` (number of dimensions,) in [0, 1]."""
+        return tuple(d.at(float(x)) for d, x in zip(self.dimensions, u, strict=True))
+
+    def where(self, point: Point) -> Array:
+        """Place of a point in the unit cube, (number of dimensions,)."""
+        return np.array([d.where(value) for d, value in zip(self.dimensions, point, strict=True)])
+
+    def world(self, point: Point, name: str = "world", summary: str = "") -> Scenario:
+        """The scenario of a point.
+
+        Raises
+        ------
+        ValueError
+            There is no such world: the scenario is refused.
+        """
+        values = {d.name: value for d, value in zip(self.dimensions, point, strict=True) if value != d.base}
+        return self.base.variant(name, summary=summary or self.text(point), **_changes(self.base, values))
+
+    def text(self, point: Point) -> str:
+        """What of a point differs from the base, in words."""
+        parts = [
+            f"{d.name} {d.text(value)} instead of {d.text(d.base)}"
+            for d, value in zip(self.dimensions, point, strict=True)
+            if value != d.base
+        ]
+        return f"{self.base.name} with {', '.join(parts)}" if parts else f"{self.base.name} as it is"
+
+    def values(self, point: Point) -> dict[str, Value]:
+        """Values of a point by the names of the dimensions."""
+        return {d.name: value for d, value in zip(self.dimensions, point, strict=True)}
+
+
+def space_of(base: Scenario, within: Sequence[str] = ()) -> Space:
+    """The worlds around a scenario.
+
+    Parameters
+    ----------
+    within : bounds of some dimensions: ``NAME=LOW:HIGH``, ``NAME=A,B`` where values have no order, or ``NAME=VALUE``
+
+    Raises
+    ------
+    InputError
+        The belief of the base is not right, or bounds mean nothing.
+    """
+    require_right_belief(base)
+    dimensions = {d.name: d for d in _dimensions(base)}
+    for text in within:
+        name, separator, bounds = text.partition("=")
+        if name not in dimensions or not separator:
+            raise InputError(f"--within {text}: give it as NAME=LOW:HIGH with a NAME out of {', '.join(dimensions)}")
+        dimensions[name] = dimensions[name].within(bounds)
+    return Space(base, tuple(dimensions.values()))
+
+
+def require_right_belief(base: Scenario) -> None:
+    """Refuse a scenario whose belief is wrong: a filter that is told wrong noise may be overconfident by no fault.
+
+    Raises
+    ------
+    InputError
+        A key of the belief differs from that of the truth, or the sensor errs in a way that no belief holds.
+    """
+    if wrong := misbelief(base):
+        raise InputError(f"scenario '{base.name}': {wrong}, for only the filter's own approximation is challenged")
+
+
+def _dimensions(base: Scenario) -> list[Dimension]:
+    """In the order in which shrinking tries to do without them."""
+    truth = base.truth
+    found: list[Dimension] = []
+    if isinstance(truth.landmarks, UniformLandmarks):
+        seed = truth.landmarks.seed
+        found += [Choice("seed", seed, (seed, *(s for s in range(SEEDS) if s != seed)))]
+    found += [_scale("sensor", 1.0, "x")]
+    if truth.motion.sigma_v > 0 or truth.motion.sigma_omega > 0:
+        found += [_scale("odometry", 1.0, "x")]
+    found += [_scale("steps", truth.steps, whole=True)]
+    if isinstance(truth.landmarks, UniformLandmarks):
+        own = truth.path.shape
+        found += [Choice("path", own, (own, *(shape for shape in SHAPES if shape != own)))]
+        found += [_scale("density", 1.0, "x")]
+    if isinstance(truth.sensor, UvdSensor):
+        found += [_scale("baseline", truth.sensor.B, " m")]
+    return [*found, _scale("range", truth.sensor.range[1], " m")]
+
+
+def _scale(name: str, base: float, unit: str = "", whole: bool = False) -> Scale:
+    low, high = (float(f"{factor * base:.{DIGITS}g}") for factor in FACTORS[name])
+    return Scale(name, base, max(1, round(low)) if whole else low, round(high) if whole else high, unit, whole)
+
+
+# --- from values to keys of a scenario -----------------------------------------------------------------
+
+
+def _changes(base: Scenario, values: Mapping[str, Value]) -> dict[str, Any]:
+    """Keys of the scenario that change, in truth and belief alike."""
+    truth, changes = base.truth, _landmarks(base.truth, values)
+    for name, keys in {"odometry": ("sigma_v", "sigma_omega")}.items():
+        for key in keys if name in values else ():
+            sigma = float(values[name]) * getattr(truth.motion, key)
+            changes |= {f"{half}__motion__{key}": sigma for half in ("truth", "belief")}
+    if "sensor" in values:
+        sigmas = tuple(float(values["sensor"]) * sigma for sigma in truth.sensor.sigma)
+        changes |= {f"{half}__sensor__sigma": sigmas for half in ("truth", "belief")}
+    if "steps" in values:
+        changes["truth__steps"] = int(values["steps"])
+    if "range" in values:
+        changes["truth__sensor__range"] = (truth.sensor.range[0], float(values["range"]))
+    if "baseline" in values and isinstance(truth.sensor, UvdSensor):
+        B = float(values["baseline"])
+        low, high = truth.sensor.disparity
+        search = (low, round(high * B / truth.sensor.B, 1))  # the nearest depth stays
+        changes |= {f"{half}__sensor__B": B for half in ("truth", "belief")}
+        halves = ("truth",) if base.belief.sensor.disparity is None else ("truth", "belief")
+        changes |= {f"{half}__sensor__disparity": search for half in halves}
+    return changes
+
+
+def _landmarks(truth: Truth, values: Mapping[str, Value]) -> dict[str, Any]:
+    """Path and landmarks: as dense as in the base times ``density``, as far beyond the path as there."""
+    landmarks, changes = truth.landmarks, dict[str, Any]()
+    if not isinstance(landmarks, UniformLandmarks):
+        return changes
+    box, area = np.array([landmarks.x, landmarks.y]), 1.0
+    if "path" in values:
+        path = _path(str(values["path"]), truth)
+        margin = box - _extent(truth)
+        other = np.round(_extent(truth.model_copy(update={"path": path})) + margin.mean(axis=0), 1)
+        area = float(np.prod(other[:, 1] - other[:, 0]) / np.prod(box[:, 1] - box[:, 0]))
+        changes |= {"truth__path": path.model_dump()}
+        changes |= {f"truth__landmarks__{axis}": tuple(map(float, other[i])) for i, axis in enumerate("xy")}
+    count = max(1, round(landmarks.count * area * float(values.get("density", 1.0))))
+    changes |= {"truth__landmarks__count": count} if count != landmarks.count else {}
+    return changes | ({"truth__landmarks__seed": int(values["seed"])} if "seed" in values else {})
+
+
+def _path(shape: str, truth: Truth) -> Path_:
+    """A path of another shape, as long as that of the base and about the same centre, with sides of 8 to 5."""
+    length, (x, y) = lap_length(truth.path), np.round(_extent(truth).mean(axis=1), 1)
+    speed = truth.path.speed
+    if shape == "circle":
+        radius = round(length / (2 * np.pi), 2)
+        return Circle(shape="circle", radius=radius, start=(x + radius, y), heading=np.pi / 2, speed=speed)
+    if shape == "figure-of-eight":
+        radius = round(length / (4 * np.pi), 2)
+        return FigureOfEight(shape="figure-of-eight", radius=radius, start=(x, y), heading=0.0, speed=speed)
+    corner = round(length / 25, 2)
+    long, wide = (round((length + (8 - 2 * np.pi) * corner) * side / 26, 2) for side in (8, 5))
+    return RoundedRectangle(
+        shape="rounded-rectangle", length=long, width=wide, corner_radius=corner, start=(x, y - wide / 2), heading=0.0,
+        speed=speed,
+    )  # fmt: skip
+
+
+def _extent(truth: Truth) -> Array:
+    """Smallest and largest x and y of one lap of the path, (2, 2)."""
+    steps = int(np.ceil(lap_length(truth.path) / truth.path.speed / truth.dt))
+    path = planned_path(truth.model_copy(update={"steps": steps}))
+    return np.column_stack([path[:, :2].min(axis=0), path[:, :2].max(axis=0)])

@@ -1,0 +1,222 @@
+"""Geometry and conversion of a robot-centred map of inverse ranges, in plain NumPy.
+
+The methods and their sources are in :mod:`consistency.filters.methods.robocentric`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import log_ndtr
+from scipy.stats import norm
+
+from consistency.bench.filters import plain
+from consistency.bench.filters.plain_sensors import disparity_sigma
+from consistency.bench.scenario.sensor import BelievedSensor
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+
+BESIDE = 0.1  # cosine of the angle to the optical axis below which a prediction is in no image
+BEYOND = 4.0  # standard deviations outside the search range at which a predicted disparity is held
+
+
+class Corrections(NamedTuple):
+    """What tells this filter from a plain robot-centred one; each can be left out, to see what it is worth."""
+
+    parking: bool = True
+    turning: bool = True  # the motion between clones has the errors that a return leaves it, in its own frame
+    truncation: bool = True
+    debiasing: bool = True
+    prediction: bool = True  # noise of what is observed taken where it is predicted, not where it was measured
+    iteration: bool = True
+    waiting: bool = True  # what returns in doubt, and is all that is seen, stays parked
+
+
+# --- geometry ----------------------------------------------------------------------------------------
+
+
+def rays(y: Array) -> tuple[Array, Array]:
+    """Unit vectors (..., 3) of azimuth and elevation, and their derivatives (..., 3, 2)."""
+    (sa, se), (ca, ce) = np.sin(y[..., :2]).T, np.cos(y[..., :2]).T
+    sa, se, ca, ce = sa.T, se.T, ca.T, ce.T
+    m = np.stack([ce * ca, ce * sa, se], axis=-1)
+    by_azimuth = np.stack([-ce * sa, ce * ca, np.zeros_like(ca)], axis=-1)
+    by_elevation = np.stack([-se * ca, -se * sa, ce], axis=-1)
+    return m, np.stack([by_azimuth, by_elevation], axis=-1)
+
+
+def carried(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array, Array, Array, Array]:
+    """Landmarks y (m, 3) in the frame of the sensor after a change b -> R b + t of the robot's frame.
+
+    Returns
+    -------
+    y' (m, 3), dy'/dy (m, 3, 3), dy'/db' (m, 3, 3), and rho times the point in the new frame of the robot, b' (m, 3)
+    """
+    mount = sensor.mount.packed()
+    offset, axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
+    m, dm = rays(y)
+    rho = y[:, 2:]
+    b = (m @ axes.T + rho * offset) @ R.T + rho * t
+    q = (b - rho * offset) @ axes
+    by_range = np.broadcast_to((axes.T @ (R @ offset + t - offset))[:, None], (len(y), 3, 1))
+    dq = np.concatenate([axes.T @ R @ axes @ dm, by_range], axis=2)
+    h2, r2 = q[:, 0] ** 2 + q[:, 1] ** 2, (q**2).sum(axis=1)
+    h, r = np.sqrt(h2), np.sqrt(r2)
+    D = np.zeros((len(y), 3, 3))
+    D[:, 0, 0], D[:, 0, 1] = -q[:, 1] / h2, q[:, 0] / h2
+    D[:, 1, 0], D[:, 1, 1], D[:, 1, 2] = -q[:, 2] * q[:, 0] / (h * r2), -q[:, 2] * q[:, 1] / (h * r2), h / r2
+    D[:, 2] = -(rho[:, 0] / (r * r2))[:, None] * q
+    J = D @ dq
+    J[:, 2, 2] += 1.0 / r
+    there = np.stack([np.arctan2(q[:, 1], q[:, 0]), np.arctan2(q[:, 2], h), rho[:, 0] / r], axis=1)
+    return there, J, D @ axes.T, b
+
+
+def exponential(xi: Array) -> tuple[Array, Array]:
+    """Exp of SE(2): rotation (2, 2) and translation (2,) of xi = (x, y, angle)."""
+    angle = xi[2]
+    along = np.sinc(angle / np.pi)
+    across = 0.5 * angle if abs(angle) < 1e-4 else (1.0 - np.cos(angle)) / angle
+    V = np.array([[along, -across], [across, along]])
+    return plain.heading_matrix(angle)[:2, :2], V @ xi[:2]
+
+
+def moved(pose: Array, xi: Array) -> Array:
+    """Exp(xi) T of a pose (3,)."""
+    R, t = exponential(xi)
+    return np.array([*(R @ pose[:2] + t), pose[2] + xi[2]])
+
+
+def shift_matrix(pose: Array) -> Array:
+    """M (3, 3) with xi = M (dp, dheading)."""
+    return np.array([[1.0, 0.0, pose[1]], [0.0, 1.0, -pose[0]], [0.0, 0.0, 1.0]])
+
+
+def left_jacobian(xi: Array) -> Array:
+    """J_l of SE(2) to second order, (3, 3)."""
+    ad = np.array([[0.0, -xi[2], xi[1]], [xi[2], 0.0, -xi[0]], [0.0, 0.0, 0.0]])
+    return np.asarray(np.eye(3) + ad / 2.0 + ad @ ad / 6.0)
+
+
+def apart(poses: Array, xi: Array) -> tuple[Array, Array]:
+    """Poses (k, 3) moved by errors (k, 3), each Exp(xi) T; d error about the moved ones / d xi, (3 k, 3 k)."""
+    C = plain.block_diagonal(np.array([left_jacobian(x) for x in xi]))
+    return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), C
+
+
+def chained(poses: Array, xi: Array, on: int) -> tuple[Array, Array]:
+    """The same for poses in the order of time, where xi are the sums of the errors of the motion from each to the next.
+
+    Pose j is E_j T_j with E_j = E_j-1 Exp(xi_j - xi_j-1): the motion between two poses depends on its own error alone,
+    whatever the errors before it are. With B = Ad(E_j-1) J_l(xi_j - xi_j-1), row j of the Jacobian is row j - 1 plus B
+    times the difference of xi_j and xi_j-1. In place of the one before it, the last pose hangs on pose ``on``.
+    """
+    E, rows, out = np.zeros((len(xi), 3)), np.zeros((len(xi), 3, xi.size)), np.zeros(poses.shape)
+    for j, pose in enumerate(poses):
+        before, last, step = np.zeros(3), -1, xi[j]
+        if j > 0:
+            last = on if j == len(xi) - 1 else j - 1
+            before, step, rows[j] = E[last], xi[j] - xi[last], rows[last]
+        M = shift_matrix(before) @ plain.heading_matrix(before[2])  # Ad
+        B = M @ left_jacobian(step)
+        rows[j, :, 3 * j : 3 * j + 3] += B
+        if j > 0:
+            rows[j, :, 3 * last : 3 * last + 3] -= B
+        E[j] = moved(before, M @ step)
+        out[j] = [*(E[j, :2] + plain.heading_matrix(E[j, 2])[:2, :2] @ pose[:2]), E[j, 2] + pose[2]]
+    return out, rows.reshape(xi.size, xi.size)
+
+
+# --- conversion --------------------------------------------------------------------------------------
+
+
+def converted(z: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
+    """(u, v, d) (m, 3) in px to azimuth, elevation and inverse range (m, 3), and the Jacobians (m, 3, 3)."""
+    f, B = sensor.f or 0.0, sensor.B or 0.0
+    u, v, d = z.T
+    a = np.arctan2(-u, f)
+    sa, ca = np.sin(a), np.cos(a)
+    e = np.arctan2(-v * ca, f)
+    se, ce = np.sin(e), np.cos(e)
+    J = np.zeros((len(z), 3, 3))
+    J[:, 0, 0] = a_u = -f / (f**2 + u**2)
+    J[:, 1, 0] = e_u = ce**2 * v * sa * a_u / f
+    J[:, 1, 1] = e_v = -(ce**2) * ca / f
+    J[:, 2, 0] = -d / (f * B) * (se * ca * e_u + ce * sa * a_u)
+    J[:, 2, 1] = -d / (f * B) * se * ca * e_v
+    J[:, 2, 2] = ce * ca / (f * B)
+    return np.stack([a, e, d * ce * ca / (f * B)], axis=1), J
+
+
+def imaged(y: Array, sensor: BelievedSensor) -> Array:
+    """Inverse of :func:`converted`; NaN for what is in no image."""
+    f, B = sensor.f or 0.0, sensor.B or 0.0
+    ca, ce = np.cos(y[:, 0]), np.cos(y[:, 1])
+    z = np.stack([-f * np.tan(y[:, 0]), -f * np.tan(y[:, 1]) / ca, y[:, 2] * f * B / (ce * ca)], axis=1)
+    return np.where(((ca > BESIDE) & (ce > BESIDE))[:, None], z, np.nan)
+
+
+def bias(z: Array, sensor: BelievedSensor) -> Array:
+    """Mean of the conversion less the conversion of the mean, (m, 3), by three points in u and in v."""
+    b = np.zeros(z.shape)
+    for axis in range(2):
+        step = np.zeros(3)
+        step[axis] = np.sqrt(3.0) * sensor.sigma[axis]
+        b += (converted(z + step, sensor)[0] + converted(z - step, sensor)[0] - 2.0 * converted(z, sensor)[0]) / 6.0
+    return b
+
+
+def untruncated(
+    d: Array, expected: Array, sigma: Array | float, searched: tuple[Array | float, Array | float]
+) -> tuple[Array, Array]:
+    """What d would be without the search range, and its variance: moments of the truncated normal about ``expected``.
+
+    d* = e + (d - e - sigma lambda) / kappa with variance sigma^2 / kappa, where sigma lambda and sigma^2 kappa are
+    mean and variance of d - e given that d is in the range.
+    """
+    low, high = searched
+    e = np.clip(expected, low - BEYOND * sigma, high + BEYOND * sigma)
+    alpha, beta = (low - e) / sigma, (high - e) / sigma
+    mass = np.exp(log_ndtr(beta)) - np.exp(log_ndtr(alpha))
+    at_low, at_high = norm.pdf(alpha), norm.pdf(beta)
+    shift = (at_low - at_high) / mass
+    kappa = 1.0 + (alpha * at_low - beta * at_high) / mass - shift**2
+    return e + (d - e - sigma * shift) / kappa, sigma**2 / kappa
+
+
+def searched(sensor: BelievedSensor, name: str) -> tuple[float, float]:
+    """Least and greatest disparity that the filter is told of, px.
+
+    Raises
+    ------
+    InputError
+        It is told of none.
+    """
+    if sensor.disparity is None:
+        raise InputError(
+            f"filter '{name}' needs key 'belief.sensor.disparity_px', the least and greatest disparity that are "
+            "reported; add it, as in truth.sensor"
+        )
+    return sensor.disparity
+
+
+def observed(
+    z: Array, shift: Array, expected: Array, sensor: BelievedSensor, which: Corrections
+) -> tuple[Array, Array]:
+    """Observations (m, 3) as inverse range where ``expected`` (m, 3) is predicted, and their noise (m, 3, 3).
+
+    ``shift`` (m,) are the biases in px that were subtracted from their disparities.
+    """
+    at = imaged(expected, sensor)
+    at = np.where(np.isnan(at), z, at)
+    sigma = disparity_sigma((at if which.prediction else z)[:, 2], sensor)
+    z, variance = z.copy(), np.tile(np.square(sensor.sigma), (len(z), 1))
+    variance[:, 2] = np.square(sigma)
+    if which.truncation:
+        low, high = searched(sensor, "robot-centred")
+        z[:, 2], variance[:, 2] = untruncated(z[:, 2], at[:, 2], sigma, (low - shift, high - shift))
+    y, J = converted(z, sensor)[0], converted(at if which.prediction else z, sensor)[1]
+    if which.debiasing:
+        y -= bias(z, sensor)
+    return y, (J * variance[:, None]) @ np.swapaxes(J, 1, 2)

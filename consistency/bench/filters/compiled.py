@@ -1,0 +1,241 @@
+"""A textbook filter joined with its compiled kernels: the same numbers, a whole trial at once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from consistency.bench.filters.covariance_update.local import LOCAL_FROM, Local
+from consistency.bench.filters.covariance_update.parking import Parking
+from consistency.bench.filters.guard.guarded import Guarded
+from consistency.bench.filters.guard.parts import guard_part
+from consistency.bench.filters.kernel.dispatch import fits, require_fitting
+from consistency.bench.filters.kernel.gain import HALTED, REASONS
+from consistency.bench.filters.kernel.jit import Outlook
+from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
+from consistency.bench.filters.kernel.slam import Data, Slam, landmark_width, robot_width
+from consistency.bench.filters.plain_sensors import bias_at, sensor_noise
+from consistency.bench.protocols import Problem, Truth
+from consistency.bench.scenario import Belief, GuardSettings
+from consistency.bench.types import Control, Estimates, Gaussian, Info, Map, Observation, Trial
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.conventions import ADDITIVE
+from consistency.referee.types import Array, Failure, Indices
+
+_lock = threading.Lock()
+_inside: list[Any] = []  # the limit in force, once for every trial that is running
+
+
+@cache
+def _libraries() -> Any:
+    return ThreadpoolController()  # looking for them takes longer than a short trial
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """The last bits depend on the number of BLAS threads, and matrices of this size are slower with two."""
+    with _lock:
+        _inside.append(_inside[-1] if _inside else _libraries().limit(limits=1))
+    try:
+        yield
+    finally:
+        with _lock:
+            limit = _inside.pop()
+            if not _inside:
+                limit.restore_original_limits()
+
+
+class Halted(Exception):
+    """A trial that was given up while it was done."""
+
+
+class Compiled:
+    """``init``, ``predict``, ``update``, ``pose`` of the twin, and ``run`` of the kernels.
+
+    Parameters
+    ----------
+    twin : the filter in plain NumPy, with ``name`` and the optional ``map``
+    parts : gives the parts of the filter for a problem and the controls (T, 3) of a trial
+    sensors : models of sensors whose data it takes
+    uvd : whether it works on (u, v, d); if not, such data are turned into points by eq. 21
+    innovations : "optimal" where they are white if the belief is right, see
+        :class:`consistency.protocols.Filter`
+    error : convention of the error in which its covariance is meant, see
+        :mod:`consistency.referee.geometry.conventions`
+    guard : kind of the guard that the twin has, if it has one
+
+    ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
+    allow it; the numbers are the same. ``realisable`` is that of the twin: False for a bound that is told the truth.
+    ``needs``, of the twin too, are the keys of ``belief.sensor`` that it cannot do without and others can.
+    """
+
+    local_from = LOCAL_FROM
+
+    def __init__(
+        self,
+        twin: Any,
+        parts: Callable[[Problem, Array], Slam],
+        *,
+        sensors: tuple[str, ...],
+        uvd: bool,
+        innovations: str | None = None,
+        error: str = ADDITIVE,
+        guard: str | None = None,
+    ) -> None:
+        self.twin, self.parts, self.sensors, self.uvd = twin, parts, sensors, uvd
+        self.innovations, self.error = innovations, error
+        self.name: str = twin.name
+        self.realisable: bool = is_realisable(twin)
+        self.needs: tuple[str, ...] = getattr(twin, "needs", ())
+        self.guard = guard
+
+    def guarded(self, kind: str) -> Compiled:
+        """This filter behind a guard, with the twin behind the same guard in plain Python."""
+        return Compiled(
+            Guarded(self.twin, kind), self.parts, sensors=self.sensors, uvd=self.uvd, error=self.error, guard=kind
+        )
+
+    def init(self, problem: Problem) -> Any:
+        return self.twin.init(problem)
+
+    def predict(self, state: Any, control: Control) -> Any:
+        return self.twin.predict(state, control)
+
+    def update(self, state: Any, observation: Observation) -> tuple[Any, Info | None]:
+        updated: tuple[Any, Info | None] = self.twin.update(state, observation)
+        return updated
+
+    def pose(self, state: Any) -> Gaussian:
+        pose: Gaussian = self.twin.pose(state)
+        return pose
+
+    def map(self, state: Any) -> dict[int, Gaussian]:
+        landmarks: dict[int, Gaussian] = self.twin.map(state)
+        return landmarks
+
+    def own_covariance(self, state: Any) -> Array:
+        """Covariance (3, 3) of the error that the filter declares."""
+        own: Array = self.pose(state).covariance if self.error == ADDITIVE else self.twin.own_covariance(state)
+        return own
+
+    def is_ready(self, trial: Trial, belief: Belief) -> bool:
+        """Whether ``run`` starts at once on this trial, or spends seconds on compiling first."""
+        return trial_kernel.is_ready(*self._arguments(trial, belief))
+
+    def outlook(self, trial: Trial, belief: Belief) -> Outlook:
+        """What ``run`` on this trial has to compile first, and how long that will take."""
+        return trial_kernel.outlook(*self._arguments(trial, belief))
+
+    def compile(self, trial: Trial, belief: Belief) -> None:
+        """Compile what ``run`` needs on this trial, or load it from disk."""
+        trial_kernel.compile(*self._arguments(trial, belief))
+
+    def run(self, trial: Trial, belief: Belief, halt: Indices | None = None) -> Estimates:
+        """Estimates of all steps of ``trial``.
+
+        Once ``halt`` (1,) is not 0, the trial is given up before its next step.
+
+        Raises
+        ------
+        InputError
+            The trial lacks what the filter needs.
+        Halted
+            The trial was given up.
+        """
+        halt = np.zeros(1, np.int64) if halt is None else halt
+        arguments = self._arguments(trial, belief, halt)
+        with one_blas_thread():
+            out: Outcome = trial_kernel(*arguments, stop=lambda: halt.fill(1))
+        if out.code == HALTED:
+            raise Halted(f"'{self.name}' was told to stop in step {out.step}")
+        failure = Failure(self.name, trial.run, out.step, REASONS[out.code]) if out.step else None
+        own = None if self.error == ADDITIVE else out.own
+        labels = np.flatnonzero(np.isfinite(out.points[:, 0]))
+        map_ = Map(labels, out.points[labels], out.spread[labels], out.joint) if out.code == 0 else None
+        return Estimates(
+            self.name, trial.run, out.pose, out.covariance, out.nis, out.nis_dof, failure, self.error, own, map_,
+            None if self.guard is None else out.rejected, out.log_det,
+        )  # fmt: skip
+
+    def _arguments(self, trial: Trial, belief: Belief, halt: Indices | None = None) -> tuple[Slam, Data, int]:
+        problem = problem_for(self, trial, belief)
+        slam = self.parts(problem, np.array(trial.controls, float))
+        z, R = sensor_noise(trial.z, belief.sensor, converted=belief.sensor.model == "uvd" and not self.uvd)
+        # copies: writable and C-contiguous, so that one compiled signature serves every caller
+        shift = bias_at(trial.z, belief.sensor)[:, -1]
+        controls, z, R, shift, start = (
+            np.array(a, float, order="C") for a in (trial.controls, z, R, shift, trial.start)
+        )
+        first, landmark = (np.array(a, np.int64, order="C") for a in (trial.first, trial.landmark))
+        halt = np.zeros(1, np.int64) if halt is None else halt
+        data = Data(controls, first, landmark, z, R, shift, start, trial.n_landmarks, halt)
+        r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+        slam = self._with_covariance_update(slam, r + w * trial.n_landmarks)
+        if self.guard is not None:
+            most = int(np.diff(first).max(initial=1))
+            slam = slam._replace(guard=guard_part(self.guard, belief.guard or GuardSettings(), z.shape[1], most))
+        return slam, data, r + w * len(np.unique(landmark))
+
+    def _with_covariance_update(self, slam: Slam, most: int) -> Slam:
+        """Local updating, which takes longer to compile, only in a world in which the state may grow so large."""
+        if isinstance(slam.covariance, Parking):
+            slam = slam._replace(covariance=slam.covariance._replace(start=self.local_from))
+        local = slam._replace(covariance=Local(self.local_from))
+        slam = local if most >= self.local_from and fits(local) else slam
+        require_fitting(slam)
+        return slam
+
+
+def planar(
+    twin: Callable[..., Any], method: str, parts: Callable[[Problem, Array], Slam], **options: str
+) -> tuple[Compiled, Compiled]:
+    """A method on landmarks in the plane, by relative positions (``METHOD-xy``) or range and bearing (``METHOD-rb``).
+
+    ``twin`` makes its plain twin of a name and ``uvd``, ``parts`` take sensor and landmark from the belief, and
+    ``options`` are those of :class:`Compiled`.
+    """
+    xy, rb = (twin(f"{method}-{suffix}", uvd=False) for suffix in ("xy", "rb"))
+    return (
+        Compiled(xy, parts, sensors=("relative-xy",), uvd=False, **options),
+        Compiled(rb, parts, sensors=("range-bearing",), uvd=False, **options),
+    )
+
+
+def problem_of(trial: Trial, belief: Belief) -> Problem:
+    """What a filter is told before step 1 of ``trial``."""
+    return Problem(belief, trial.start, trial.landmarks if belief.sensor.model == "linear" else None)
+
+
+def is_realisable(filter_: Any) -> bool:
+    """False for a filter that declares itself a bound, to be told the truth."""
+    return getattr(filter_, "realisable", True) is not False
+
+
+def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
+    """What this filter is told before step 1 of ``trial``: the truth too, if it is not realisable without.
+
+    Raises
+    ------
+    InputError
+        It needs the truth, and the trial has none, or has observations of what is no landmark.
+    """
+    problem = problem_of(trial, belief)
+    if is_realisable(filter_):
+        return problem
+    name = getattr(filter_, "name", type(filter_).__name__)
+    needs = f"filter '{name}' is a bound that takes its Jacobians at the truth"
+    if trial.truth is None or trial.landmarks is None:
+        missing = "truth.parquet" if trial.truth is None else "landmarks.parquet"
+        raise InputError(f"{needs}: run {trial.run} has none; a log needs {missing}, or leave the filter out")
+    if len(trial.landmark) and trial.landmark.max() >= len(trial.landmarks):
+        raise InputError(
+            f"{needs}: run {trial.run} has observations of things that are no landmark; leave the filter out"
+        )
+    return replace(problem, truth=Truth(trial.truth, trial.landmarks))

@@ -1,0 +1,250 @@
+"""Local updating: a step costs what the active part of the map costs, and nothing is approximated.
+
+Compressed EKF, Guivant & Nebot (2001). The state is split into the active part a (robot, landmarks in use) and
+the passive rest. While only a is moved and observed, all that a step does to the rest goes through the covariance
+of the rest with the base, the variables that were active when the split was made (index 0: at that time):
+
+    P_a,rest = Phi P0_base,rest        P_rest = P0_rest - P0_rest,base Psi P0_base,rest
+    x_rest = x0_rest + P0_rest,base theta
+
+Motion and observation act on rows of P_a, so they act on rows of [P_a | Phi] alike: the columns of Phi are
+carried behind those of P_a, and with W = S^-1/2 Cov(z, .) over both (W_a, W_b) and the whitened innovation y
+
+    Phi <- Phi - W_a' W_b,    Psi <- Psi + W_b' W_b,    theta <- theta + W_b' y.
+
+The landmarks of the base are taken relative to the robot of the base: l - r and less its turn with the heading.
+Otherwise what is observed is a small difference of large numbers wherever the pose is uncertain and its
+surroundings are not: on a long loop rounding is then ten times as large.
+
+A new landmark is a row of Phi. A passive landmark l that is seen again needs no pass over the map: it joins
+the base, with P0_l,base Phi' as its covariance with a and -P0_l,base Psi as its row of Phi. Only when the base has
+grown too large is everything written back; a rule for when keeps the sum of both costs low. It works for
+every linearisation rule, because Cov(z, .) = M P_involved,. in each of them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.bench.filters.covariance_update.splitting import (
+    add_label,
+    append_rows,
+    join,
+    start_rows,
+    take_out,
+    to_base,
+    wake,
+)
+from consistency.bench.filters.kernel.arrays import copy, fill
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.kernel.local_state import Factors, make_factors
+from consistency.bench.filters.kernel.slam import (
+    Data,
+    Slam,
+    State,
+    append,
+    held_at,
+    landmark_width,
+    make_local,
+    prepare,
+    robot_width,
+    settle,
+    spare_width,
+    withhold,
+)
+from consistency.bench.filters.kernel.work import Work
+from consistency.referee.types import Array, Indices
+
+LOCAL_FROM = 100  # variables in the state from which local updating is tried; measured, as the next three
+TRAFFIC = 60.0  # writing P back, in variables of the base: what going through memory costs beside the arithmetic
+OVERHEAD = 1e5  # multiplications (twice over) that the calls of a local step are worth
+PAUSE = 16  # steps of dense updating after a local stretch that did not pay; four times as many after the next
+
+
+@part(motion="Unicycle", landmark="WorldPoint", error="Additive")
+class Local(NamedTuple):
+    """Variables in the state from which updates are local.
+
+    Only where nothing but the robot moves, which an additive error of world points grants. What is taken relative
+    to the robot (``_raw``, ``_relative``) is the planar position of a point.
+    """
+
+    start: int
+
+
+@implement(spare_width, Local)
+def local_spares_nothing(covariance: Local, steps: int, n_landmarks: int) -> int:
+    return 0
+
+
+@implement(held_at, Local)
+def held_by_robot(covariance: Local, label: int, local: Factors) -> int:
+    return 0
+
+
+@implement(make_local, Local)
+def make_local_factors(covariance: Local, r: int, w: int, n: int, steps: int, n_landmarks: int) -> Factors:
+    if n < covariance.start:
+        return make_factors(r, r, 1)
+    c = max(n // (2 * w), 1) * w
+    return make_factors(c, n, c // w)
+
+
+@implement(prepare, Local)
+def prepare_active(
+    covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors
+) -> tuple[State, State]:
+    """The active part that a step works on, settled first where that is due, and split where it begins."""
+    r, w, home, offset = robot_width(slam.motion), landmark_width(slam.landmark), whole.offset, state.offset
+    x, P, n, b = state.x, state.P, state.n, state.base
+    if b > 0 and is_due(whole.n, n, b, w * len(labels), local):
+        join(slam, whole, n, b, local)
+        count_settling(whole.n, n, b, local)
+        x, P, n, b = whole.x, whole.P, whole.n, 0
+        copy(home, offset)
+    if b == 0 and n >= covariance.start and may_split(r, w, len(labels), local):
+        n = split(covariance, r, w, whole, labels, offset, local)
+        start_counting(n, local)
+        x, P, b = local.x, local.P, n
+    if b > 0:
+        more = activate(covariance, r, w, whole, labels, State(x, P, n, b, offset), local)
+        n, b = n + more, b + more
+        count(whole.n, n, b, more, w * len(labels), local)
+    return whole, State(x, P, n, b, offset)
+
+
+@implement(append, Local)
+def append_factors(
+    covariance: Local, slam: Slam, state: State, label: int, local: Factors, work: Work[NamedTuple]
+) -> None:
+    append_rows(slam, state, label, local, work.Jp)
+
+
+@implement(settle, Local)
+def settle_active(covariance: Local, slam: Slam, whole: State, state: State, local: Factors) -> None:
+    """``whole`` <- what the active part and the factors say, if there is an active part."""
+    if state.base > 0:
+        join(slam, whole, state.n, state.base, local)
+
+
+@implement(start_rows, Local)
+def start_raw_rows(covariance: Local, x: Array, width: int, p: int, i: int, j: int, Phi: Array) -> None:
+    for a in range(width):
+        Phi[i + a, j + a] += 1.0
+    if p > 0:
+        Phi[i, 0] += 1.0
+        Phi[i, 2] -= x[p + 1] - x[1]
+        Phi[i + 1, 1] += 1.0
+        Phi[i + 1, 2] += x[p] - x[0]
+
+
+@implement(to_base, Local)
+def to_relative_base(covariance: Local, x: Array, p: int, robot: Array, landmark: Array) -> None:
+    """x and y of a landmark relative to the robot."""
+    dx, dy = x[p] - x[0], x[p + 1] - x[1]
+    for i in range(len(landmark)):
+        landmark[i, 0] -= robot[i, 0] - dy * robot[i, 2]
+        landmark[i, 1] -= robot[i, 1] + dx * robot[i, 2]
+
+
+@inner
+def split(covariance: Local, r: int, w: int, whole: State, labels: Indices, offset: Indices, local: Factors) -> int:
+    """The robot and the known ones of ``labels`` (m,) become active and the base; returns their number of variables.
+
+    ``offset`` (n_landmarks,) <- that of each landmark in the active part, or -1.
+    """
+    fill(offset, -1)
+    n = r
+    for label in labels:
+        if whole.offset[label] >= 0:
+            add_label(label, whole.offset[label], n, n, r, w, local)
+            offset[label] = n
+            n += w
+    take_out(covariance, r, w, whole, n, local)
+    return n
+
+
+@inner
+def activate(covariance: Local, r: int, w: int, whole: State, labels: Indices, active: State, local: Factors) -> int:
+    """Passive ones of ``labels`` (m,) become active and join the base; returns by how many variables both grow."""
+    more, n, b, home = 0, active.n, active.base, whole.offset
+    for label in labels:
+        if home[label] >= 0 and active.offset[label] < 0:
+            add_label(label, home[label], n + more, b + more, r, w, local)
+            active.offset[label] = n + more
+            more += w
+    if more > 0:
+        wake(covariance, r, w, whole, n, b, more, local)
+    return more
+
+
+# --- when ----------------------------------------------------------------------------------------
+# Costs are multiplications, twice over; of the steps since the split: their number, their cost, what dense steps would
+# have cost, the size of the first base. After a stretch that did not pay: the pause, and what is left of it.
+STEPS, SPENT, DENSE, FIRST, LONG, LEFT = range(6)
+
+
+@inner
+def _work(n: int, b: int, seen: int) -> float:
+    """Cost of a local step in which landmarks of ``seen`` variables are seen."""
+    return OVERHEAD + float(seen) * (n + b) * (n + b)
+
+
+@inner
+def _settling(whole: int, n: int, b: int) -> float:
+    return whole * whole * (b + TRAFFIC) + 2.0 * whole * b * (n + b)
+
+
+@inner
+def may_split(r: int, w: int, seen: int, local: Factors) -> bool:
+    """Whether the next steps are to be local; counts the pause down."""
+    tally = local.tally
+    tally[LEFT] = max(tally[LEFT] - 1.0, 0.0)
+    return tally[LEFT] == 0.0 and 2 * (r + w * seen) <= len(local.x)
+
+
+@inner
+def start_counting(b: int, local: Factors) -> None:
+    """After a split with a base of ``b`` variables."""
+    tally = local.tally
+    tally[STEPS] = tally[SPENT] = tally[DENSE] = 0.0
+    tally[FIRST] = b
+
+
+@inner
+def count(whole: int, n: int, b: int, more: int, seen: int, local: Factors) -> None:
+    """A local step in which ``more`` variables became active."""
+    tally = local.tally
+    tally[STEPS] += 1.0
+    tally[SPENT] += _work(n, b, seen) + (OVERHEAD + 4.0 * more * b * (n + b) if more > 0 else 0.0)
+    tally[DENSE] += float(seen) * whole * whole
+
+
+@inner
+def is_due(whole: int, n: int, b: int, seen: int, local: Factors) -> bool:
+    """Whether settling now makes the average step cheapest, or the active part has no room for the next.
+
+    The average falls until a step costs more than it. What settling costs for each variable that joined since the
+    split is paid whenever it is done; waiting spreads what it costs for the first ones over more steps.
+    """
+    tally = local.tally
+    if n + seen > len(local.x) or n + b > whole:
+        return True
+    return _work(n, b, seen) * tally[STEPS] - tally[SPENT] > whole * whole * (tally[FIRST] + TRAFFIC)
+
+
+@inner
+def count_settling(whole: int, n: int, b: int, local: Factors) -> None:
+    """Whether the stretch paid; if not, a pause."""
+    tally = local.tally
+    paid = tally[SPENT] + _settling(whole, n, b) < tally[DENSE]
+    tally[LONG] = 0.0 if paid else max(4.0 * tally[LONG], PAUSE)
+    tally[LEFT] = tally[LONG]
+
+
+@implement(withhold, Local)
+def withhold_nothing_local(
+    covariance: Local, state: State, data: Data, k: int, rejected: Array, anew: Array, local: Factors
+) -> None:
+    """What is active is so whether it is used or not."""

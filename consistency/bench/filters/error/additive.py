@@ -1,0 +1,69 @@
+"""Truth minus estimate, variable by variable: the error of the textbook EKF, in world coordinates."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.bench.filters.kernel.arrays import copy_matrix
+from consistency.bench.filters.kernel.blas import add_transposed_times
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.slam import (
+    Slam,
+    State,
+    add_motion_noise,
+    expands,
+    insert_error,
+    motion_point,
+    move,
+    move_about,
+    pose_covariance,
+    propagate,
+    propagate_covariance_at,
+    retract,
+    robot_width,
+    to_error,
+)
+from consistency.bench.filters.kernel.work import Work
+from consistency.referee.types import Array
+
+
+@part()
+class Additive(NamedTuple):
+    """No parameters."""
+
+
+@implement(propagate, Additive)
+def propagate_additive(
+    error: Additive, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    """One step of motion, eq. 9 and 10: x <- f(x) and P <- F P F' + G Q G' in the robot's rows."""
+    pose = state.x[: robot_width(slam.motion)]
+    at = motion_point(slam.point, pose, k)
+    propagate_covariance_at(slam.point, slam, state, k, u, Phi, work)
+    add_motion_noise(slam.motion, at, u, state.P)
+    if expands(slam.point):
+        move_about(slam.motion, at, u, pose)
+    else:
+        move(slam.motion, pose, u, pose)
+
+
+@implement(to_error, Additive)
+def additive_as_it_is(error: Additive, pose: Array, values: Array, Hp: Array, Hl: Array) -> None:
+    """Nothing to do: the error is that of the variables."""
+
+
+@implement(insert_error, Additive)
+def additive_insert(error: Additive, pose: Array, values: Array, Jp: Array) -> None:
+    """Nothing to do: the error is that of the variables."""
+
+
+@implement(retract, Additive)
+def retract_additive(error: Additive, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
+    """x (n,) <- x + A' y, with A (k, n) and y (k,)."""
+    add_transposed_times(A, y, state.x[: state.n])
+
+
+@implement(pose_covariance, Additive)
+def additive_pose_covariance(error: Additive, x: Array, P: Array, out: Array) -> None:
+    """``out`` (r, r) <- P (r, r), which is already that of the additive error."""
+    copy_matrix(P, out)

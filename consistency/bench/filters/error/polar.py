@@ -1,0 +1,141 @@
+"""Right-invariant error of the pose, T_true = Exp(xi) T, beside polar errors of landmarks in the frame of the sensor.
+
+A landmark errs by a turn and by the logarithm of a scale: see ``methods/equivariant.py``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters.error.invariant_pose import move_pose
+from consistency.bench.filters.error.planar import shifted_covariance
+from consistency.bench.filters.kernel.arrays import fill
+from consistency.bench.filters.kernel.blas import add_gram, add_transposed_times
+from consistency.bench.filters.kernel.covariance import move_block
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.kernel.slam import (
+    Frame,
+    Sensor,
+    Slam,
+    State,
+    Triple,
+    insert_error,
+    move,
+    noise_columns,
+    pose_covariance,
+    propagate,
+    retract,
+    robot_frame,
+    to_error,
+)
+from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.landmark.inverse_range import inward, outward
+from consistency.bench.filters.landmark.sensor_point import SensorPoint, sight
+from consistency.bench.models import point
+from consistency.bench.models.point import Mounting
+from consistency.referee.types import Array
+
+
+@part(motion="Unicycle", landmark="SensorPoint", point="AtEstimate")
+class Polar(NamedTuple):
+    """No parameters. Right-invariant error of the pose; turn and logarithm of the scale of each landmark."""
+
+
+class PolarSlam(NamedTuple):
+    """The parts of such a filter, a :class:`consistency.filters.kernel.slam.Slam` of these types."""
+
+    motion: NamedTuple
+    sensor: Sensor
+    landmark: SensorPoint
+    error: Polar
+    point: NamedTuple
+    update: NamedTuple
+    covariance: NamedTuple
+
+
+@implement(propagate, Polar)
+def propagate_polar(
+    error: Polar, slam: PolarSlam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    """Pose and landmarks move; P <- F P F' + G Q G', F the identity but for a block for each landmark."""
+    x, P, n, G = state.x, state.P, state.n, work.small
+    columns, before = noise_columns(slam.motion, x[:3], u, G), robot_frame(slam.motion, x[:3])
+    move(slam.motion, x[:3], u, x[:3])
+    after, noise = robot_frame(slam.motion, x[:3]), work.rows[:columns, :n]
+    for o in range(3, n, 3):
+        body = _move_landmark(slam.landmark.mount, before, after, x[o : o + 3], work.Jz, work.Jb)
+        move_block(P, n, o, work.Jz)
+        for i in range(columns):
+            dx = -after.c * G[0, i] - after.s * G[1, i] + G[2, i] * body[1]
+            dy = after.s * G[0, i] - after.c * G[1, i] - G[2, i] * body[0]
+            for a in range(3):
+                noise[i, o + a] = work.Jb[a, 0] * dx + work.Jb[a, 1] * dy
+    for i in range(columns):
+        turn = G[2, i]
+        noise[i, 0], noise[i, 1], noise[i, 2] = G[0, i] + x[1] * turn, G[1, i] - x[0] * turn, turn
+    add_gram(1.0, noise, P[:n, :n])
+    for a in range(3):
+        for b in range(a):
+            P[a, b] = P[b, a]
+
+
+@inner
+def _move_landmark(mount: Mounting, before: Frame, after: Frame, q: Array, F: Array, B: Array) -> Triple:
+    """q (3,) <- as it is seen from ``after``, F (3, 3) <- derivative of its error by that before.
+
+    ``B`` (3, 3) <- derivative of the error by the position in the new frame of the robot, which is returned.
+    """
+    old, r_old = sight(q)
+    bx, by, bz = point.from_sensor(q[0], q[1], q[2], mount)
+    wx, wy, wz = point.turned_to_world(before.x, before.y, before.c, before.s, bx, by, bz)
+    body = point.turned_to_robot(after.x, after.y, after.c, after.s, wx, wy, wz)
+    q[0], q[1], q[2] = point.to_sensor(body[0], body[1], body[2], mount)
+    new, r = sight(q)
+    c, s = after.c * before.c + after.s * before.s, after.s * before.c - after.c * before.s
+    for a in range(3):
+        x, y, z = outward(mount, new[3 * a], new[3 * a + 1], new[3 * a + 2])
+        B[a, 0], B[a, 1], B[a, 2] = x / r, y / r, z / r
+        back = inward(mount, c * x - s * y, s * x + c * y, z)  # the row in the frame before
+        for b in range(3):
+            F[a, b] = (back[0] * old[3 * b] + back[1] * old[3 * b + 1] + back[2] * old[3 * b + 2]) * r_old / r
+    return body
+
+
+@implement(to_error, Polar)
+def to_polar(error: Polar, pose: Array, values: Array, Hp: Array, Hl: Array) -> None:
+    e, r = sight(values)
+    for a in range(len(Hp)):
+        Hp[a, 2] += pose[0] * Hp[a, 1] - pose[1] * Hp[a, 0]
+        x, y, z = Hl[a, 0], Hl[a, 1], Hl[a, 2]
+        for b in range(3):
+            Hl[a, b] = r * (x * e[3 * b] + y * e[3 * b + 1] + z * e[3 * b + 2])
+
+
+@implement(insert_error, Polar)
+def insert_polar(error: Polar, pose: Array, values: Array, Jp: Array) -> None:
+    """A new landmark does not depend on the pose."""
+
+
+@implement(retract, Polar)
+def retract_polar(error: Polar, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
+    """Pose (3,) <- Exp(xi) T, each landmark (3,) <- e^s exp(Omega) q, with the error A' y."""
+    x, delta = state.x, work.delta[: state.n]
+    fill(delta, 0.0)
+    add_transposed_times(A, y, delta)
+    move_pose(x[:3], delta[:3], x[:3])
+    for o in range(3, state.n, 3):
+        e, r = sight(x[o : o + 3])
+        left, up = delta[o], delta[o + 1]
+        angle = np.sqrt(left * left + up * up)
+        across, along = np.sin(angle) / angle if angle > 0.0 else 1.0, np.cos(angle)
+        r *= np.exp(delta[o + 2])
+        for a in range(3):
+            x[o + a] = r * (across * (left * e[a] + up * e[3 + a]) + along * e[6 + a])
+
+
+@implement(pose_covariance, Polar)
+def polar_pose_covariance(error: Polar, x: Array, P: Array, out: Array) -> None:
+    shifted_covariance(x, P, out)

@@ -1,0 +1,201 @@
+"""The correction that all updates share, eq. 11 and 12 with W = S^-1/2 Cov(z, x)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters.kernel.arrays import copy_matrix, sum_of
+from consistency.bench.filters.kernel.blas import (
+    add_gram,
+    add_product_of_transposed,
+    add_transposed_times,
+    solve_transposed,
+)
+from consistency.bench.filters.kernel.covariance import definite_root, gather_rows, subtract_gram
+from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.kernel.local_state import Factors
+from consistency.bench.filters.kernel.measuring import linearise
+from consistency.bench.filters.kernel.slam import (
+    Data,
+    Slam,
+    State,
+    combine,
+    landmark_width,
+    observed_width,
+    predict_innovation,
+    retract,
+    robot_width,
+    to_error,
+    wrap_residual,
+)
+from consistency.bench.filters.kernel.work import Work
+from consistency.referee.types import Array
+
+NOT_FINITE, INNOVATION, POSE, HALTED = 1, 2, 3, 4
+REASONS = {
+    NOT_FINITE: "the estimate is not finite",
+    INNOVATION: "the innovation covariance is not positive definite",
+    POSE: "the pose covariance is not positive definite",
+}
+
+
+@inner
+def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
+    """``work.rows`` (r + w m, n) <- rows of P of the robot and of the ``m`` seen landmarks.
+
+    The rows of Phi, which are treated alike, follow them in columns n..n + base - 1.
+    """
+    r, w, n, base = robot_width(slam.motion), landmark_width(slam.landmark), state.n, state.base
+    gather_rows(state.P, n, r, w, work.at, m, work.rows)
+    if base > 0:
+        copy_matrix(local.Phi[:r, :base], work.rows[:r, n : n + base])
+        for i in range(m):
+            first, o = r + w * i, work.at[i]
+            copy_matrix(local.Phi[o : o + w, :base], work.rows[first : first + w, n : n + base])
+
+
+@inner
+def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTuple]) -> None:
+    """``work``: zhat (s m,), Hp (m, s, r), Hl (m, s, w) <- h of the seen landmarks; Jacobians by the filter's error."""
+    pose, w, s = state.x[: robot_width(slam.motion)], landmark_width(slam.landmark), observed_width(slam.sensor)
+    for i in range(m):
+        o, expected = work.at[i], work.zhat[s * i : s * i + s]
+        values = state.x[o : o + w]
+        linearise(slam, pose, values, k, work.label[i], expected, work.Hp[i], work.Hl[i], work)
+        to_error(slam.error, pose, values, work.Hp[i], work.Hl[i])
+
+
+@inner
+def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> None:
+    """``work.A`` (s m, n + base) <- H P from the gathered rows; upper half of ``work.S`` (s m, s m) <- H P H'."""
+    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
+    A, S, Hp, Hl, width = work.A, work.S, work.Hp, work.Hl, state.n + state.base
+    for i in range(m):
+        combine(slam.landmark, Hp[i], Hl[i], work.rows[:, :width], i, A[s * i : s * i + s, :width])
+    for i in range(m):
+        o = work.at[i]
+        for row in range(s * i + s):
+            for a in range(s):
+                total = 0.0
+                for c in range(max(r, w)):
+                    term = 0.0
+                    if c < r:
+                        term += A[row, c] * Hp[i, a, c]
+                    if c < w:
+                        term += A[row, o + c] * Hl[i, a, c]
+                    total += term
+                S[row, s * i + a] = total
+
+
+@inner
+def innovate(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> Array:
+    """Innovation (s m,) of the ``m`` landmarks, which is the last column of ``work.A``."""
+    s = observed_width(slam.sensor)
+    y = work.A[: s * m, state.n + state.base]
+    for i in range(m):
+        measured, expected = data.z[work.known[i]], work.zhat[s * i : s * i + s]
+        wrap_residual(slam.sensor, expected, measured)
+        for a in range(s):
+            y[s * i + a] = measured[a] - expected[a]
+    return y
+
+
+@inner
+def correct_at_once(
+    update: NamedTuple,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    has_innovation: bool,
+    local: Factors,
+    work: Work[NamedTuple],
+) -> tuple[int, float, float]:
+    """The update of a filter that does not iterate: it is led by what :func:`predict_innovation` leaves in ``work``."""
+    code, total = 0, 0.0
+    if not has_innovation:
+        code, total = predict_innovation(update, slam, state, data, k, m, local, work)
+    if code > 0:
+        return code, np.nan, np.nan
+    code, nis, log_det = divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+    if code == 0:
+        apply(slam, state, m, local, work)
+    return code, nis, log_det
+
+
+@inner
+def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float, float]:
+    """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. As :func:`divide_by_root`."""
+    total = add_noise(slam, state, data, m, work)
+    return divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+
+
+@inner
+def add_noise(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> float:
+    """S (s m, s m) <- S + R; returns a sum that is finite if innovation and S are."""
+    s = observed_width(slam.sensor)
+    rows, width = s * m, state.n + state.base
+    S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
+    y, total = joined[:, width], 0.0
+    for i in range(m):
+        for a in range(s):
+            r = s * i + a
+            for c in range(s):
+                S[r, s * i + c] += data.R[work.known[i], a, c]
+            total += y[r] + sum_of(S[r, r:])
+    return total
+
+
+@inner
+def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float) -> tuple[int, float, float]:
+    """S <- its root, and A and the innovation <- divided by it; ``total`` is finite if all that is given is.
+
+    Returns a code of REASONS, 0 where all is well, the NIS, and log det S.
+    """
+    width = state.n + state.base
+    S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
+    y = joined[:, width]
+    if not definite_root(S, work.scale):
+        return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
+    solve_transposed(S, joined)
+    nis, log_det = 0.0, 0.0
+    for r in range(rows):
+        nis += y[r] * y[r]
+        log_det += 2.0 * np.log(S[r, r])
+    if np.isfinite(nis):
+        return 0, nis, log_det
+    return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
+
+
+@inner
+def shift(slam: Slam, state: State, m: int, j: int, work: Work[NamedTuple]) -> float:
+    """By how much the whitened gain moves variable j of an additive error."""
+    total, y = 0.0, state.n + state.base
+    for row in range(observed_width(slam.sensor) * m):
+        total += work.A[row, j] * work.A[row, y]
+    return total
+
+
+@inner
+def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
+    """x (n,) <- moved by W' S^-1/2 innovation, P (n, n) <- P - W' W; with the columns of Phi as ``local`` says."""
+    rows, n = observed_width(slam.sensor) * m, state.n
+    A, y = work.A[:rows, :n], work.A[:rows, n + state.base]
+    retract(slam.error, slam, state, A, y, work)
+    subtract_gram(state.P, n, robot_width(slam.motion), A)
+    apply_beyond(state, rows, local, work)
+
+
+@inner
+def apply_beyond(state: State, rows: int, local: Factors, work: Work[NamedTuple]) -> None:
+    """Phi, Psi and theta <- what a correction of the active part says of the rest."""
+    n, base = state.n, state.base
+    A, y = work.A[:rows, :n], work.A[:rows, n + base]
+    if base > 0:
+        beyond = work.A[:rows, n : n + base]
+        add_product_of_transposed(-1.0, A, beyond, local.Phi[:n, :base])
+        add_gram(1.0, beyond, local.Psi[:base, :base])
+        add_transposed_times(beyond, y, local.theta[:base])

@@ -1,0 +1,218 @@
+"""EKF-SLAM on landmarks of six numbers, anchored at where they were first seen: Civera, Davison & Montiel (2008).
+
+A landmark is the position of the sensor when it was first seen (x0, y0, z0 in m), azimuth and elevation of the ray
+in the world (rad), and the inverse of its length (1/m). In inverse depth the error of stereo is nearly Gaussian at
+any distance. The price is a state of twice the size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters import plain
+from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.kernel.covariance import combine_rows
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.kernel.slam import (
+    Frame,
+    Slam,
+    Triple,
+    combine,
+    insert,
+    landmark_width,
+    to_body,
+    to_body_jacobian,
+    world_point,
+)
+from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.plain import SlamState
+from consistency.bench.filters.plain_sensors import PointSensor, heading_matrix
+from consistency.bench.models.point import Mounting, turned_to_robot
+from consistency.bench.protocols import Problem
+from consistency.bench.types import Control, Gaussian, Info, Observation
+from consistency.referee.types import Array
+
+
+@part(motion="Unicycle", error="Additive", point="AtEstimate", covariance="Dense")
+class AnchoredInverseDepth(NamedTuple):
+    """No parameters."""
+
+
+@implement(landmark_width, AnchoredInverseDepth)
+def anchored_width(landmark: AnchoredInverseDepth) -> int:
+    return 6
+
+
+@inner
+def _ray(values: Array) -> Triple:
+    """Unit vector in the world of values (6,)."""
+    c = np.cos(values[4])
+    return c * np.cos(values[3]), c * np.sin(values[3]), np.sin(values[4])
+
+
+@implement(to_body, AnchoredInverseDepth)
+def to_body_of_anchored(landmark: AnchoredInverseDepth, frame: Frame, values: Array) -> Triple:
+    """The end of the ray in the frame of the robot, in m."""
+    mx, my, mz = _ray(values)
+    x, y, z = values[0] + mx / values[5], values[1] + my / values[5], values[2] + mz / values[5]
+    return turned_to_robot(frame.x, frame.y, frame.c, frame.s, x, y, z)
+
+
+@implement(to_body_jacobian, AnchoredInverseDepth)
+def to_body_jacobian_of_anchored(
+    landmark: AnchoredInverseDepth, frame: Frame, values: Array, body: Triple, row: Triple, Hp: Array, Hl: Array
+) -> None:
+    """Hp (3,) <- by x, y, heading, Hl (6,) <- by the six numbers, through the point in the world."""
+    c, s, d0, d1, d2 = frame.c, frame.s, row[0], row[1], row[2]
+    _by_values(values, c * d0 - s * d1, s * d0 + c * d1, d2, Hl)
+    Hp[0], Hp[1], Hp[2] = -Hl[0], -Hl[1], d0 * body[1] - d1 * body[0]
+
+
+@inner
+def _by_values(values: Array, g0: float, g1: float, g2: float, row: Array) -> None:
+    """``row`` (6,) <- derivatives by the six numbers of a function with gradient g by the point in the world."""
+    mx, my, mz = _ray(values)
+    cz, sz, cn, rho = np.cos(values[3]), np.sin(values[3]), np.cos(values[4]), values[5]
+    row[0], row[1], row[2] = g0, g1, g2
+    row[3] = (-g0 * my + g1 * mx) / rho
+    row[4] = (-g0 * mz * cz - g1 * mz * sz + g2 * cn) / rho
+    row[5] = -(g0 * mx + g1 * my + g2 * mz) / (rho * rho)
+
+
+@implement(insert, AnchoredInverseDepth)
+def insert_anchored(
+    landmark: AnchoredInverseDepth,
+    frame: Frame,
+    body: Triple,
+    Jb: Array,
+    mount: Mounting,
+    values: Array,
+    Jp: Array,
+    Jz: Array,
+) -> None:
+    """values (6,) <- anchor, direction and inverse length of the ray to ``body``; Jp (6, 3), Jz (6, 3) <- Jacobians."""
+    c, s = frame.c, frame.s
+    q0, q1, dz = body[0] - mount.x, body[1] - mount.y, body[2] - mount.z
+    dx, dy = c * q0 - s * q1, s * q0 + c * q1
+    flat2 = dx * dx + dy * dy
+    flat, length2 = np.sqrt(flat2), flat2 + dz * dz
+    values[0] = frame.x + c * mount.x - s * mount.y
+    values[1] = frame.y + s * mount.x + c * mount.y
+    values[2] = mount.z
+    values[3], values[4], values[5] = np.arctan2(dy, dx), np.arctan2(dz, flat), 1.0 / np.sqrt(length2)
+    for a in range(6):
+        for j in range(3):
+            Jp[a, j] = Jz[a, j] = 0.0
+    Jp[0, 0] = Jp[1, 1] = Jp[3, 2] = 1.0
+    Jp[0, 2], Jp[1, 2] = -s * mount.x - c * mount.y, c * mount.x - s * mount.y
+    third = values[5] / length2
+    for j in range(3):
+        ex, ey, ez = c * Jb[0, j] - s * Jb[1, j], s * Jb[0, j] + c * Jb[1, j], Jb[2, j]
+        Jz[3, j] = (dx * ey - dy * ex) / flat2
+        Jz[4, j] = (flat * ez - dz * (dx * ex + dy * ey) / flat) / length2
+        Jz[5, j] = -(dx * ex + dy * ey + dz * ez) * third
+
+
+@implement(world_point, AnchoredInverseDepth)
+def anchored_world_point(
+    landmark: AnchoredInverseDepth, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array
+) -> None:
+    """point (3,) <- anchor + ray / inverse depth, m; Dp (3, r) <- 0, Dl (3, 6) <- its Jacobian."""
+    m = _ray(values)
+    for a in range(3):
+        point[a] = values[a] + m[a] / values[5]
+        Dp[a, 0] = Dp[a, 1] = Dp[a, 2] = 0.0
+        _by_values(values, 1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0, Dl[a])
+
+
+@implement(combine, AnchoredInverseDepth)
+def combine_anchored(landmark: AnchoredInverseDepth, Hp: Array, Hl: Array, rows: Array, i: int, out: Array) -> None:
+    """out (3, width) <- H P, by the version for any width."""
+    combine_rows(Hp, Hl, rows, i, out)
+
+
+class AnchoredKalman(plain.SlamTwin):
+    """EKF-SLAM on anchored landmarks, their Jacobians through the point in the world."""
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def init(self, problem: Problem) -> SlamState:
+        return plain.start(problem, width=6)
+
+    def predict(self, state: SlamState, control: Control) -> SlamState:
+        return plain.predict_extended(state, control)
+
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        return plain.update_jointly(state, observation, self.uvd, self._correct, self._locate)
+
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        sensor = PointSensor(state.problem.belief.sensor, self.uvd)
+        zhat, H = np.zeros(3 * len(seen)), np.zeros((3 * len(seen), len(state.x)))
+        for i, label in enumerate(seen):
+            rows, at = slice(3 * i, 3 * i + 3), slice(state.at(label), state.at(label) + 6)
+            point, D = anchored_point(state.x[at])
+            zhat[rows] = sensor.measure(state.x[:3], point)
+            H[rows, :3], by_point = sensor.jacobians(state.x[:3], point)
+            H[rows, at] = by_point @ D
+        innovation = z.ravel() - zhat
+        S, W = plain.gain(state.P, H, plain.block_diagonal(R))
+        return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+
+    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        point, point_by_pose, point_by_z = plain.locate_point(state, z, self.uvd)
+        turn = heading_matrix(state.x[2])
+        mount = np.array(state.problem.belief.sensor.mount.position)
+        anchor = [*state.x[:2], 0.0] + turn @ mount
+        anchor_by_pose = np.column_stack([[1.0, 0, 0], [0, 1.0, 0], turn @ [-mount[1], mount[0], 0.0]])
+        ray = point - anchor
+        flat, length = np.hypot(ray[0], ray[1]), np.linalg.norm(ray)
+        values = np.array([*anchor, np.arctan2(ray[1], ray[0]), np.arctan2(ray[2], flat), 1.0 / length])
+        # azimuth, elevation and inverse length by the point: the inverse of the point by them
+        by_ray = np.linalg.inv(anchored_point(values)[1][:, 3:])
+        Jp = np.vstack([anchor_by_pose, by_ray @ (point_by_pose - anchor_by_pose)])
+        return values, Jp, np.vstack([np.zeros((3, 3)), by_ray @ point_by_z])
+
+    def pose(self, state: SlamState) -> Gaussian:
+        return plain.pose_of(state)
+
+    def map(self, state: SlamState) -> dict[int, Gaussian]:
+        blocks = {label: slice(state.at(label), state.at(label) + 6) for label in state.landmarks}
+        points = {label: anchored_point(state.x[at]) for label, at in blocks.items()}
+        return {label: Gaussian(p, D @ state.P[blocks[label], blocks[label]] @ D.T) for label, (p, D) in points.items()}
+
+    def joint(self, state: SlamState) -> Gaussian:
+        blocks = [slice(at, at + 6) for at in range(3, len(state.x), 6)]
+        mean, D = np.zeros(3 + 3 * len(blocks)), np.zeros((3 + 3 * len(blocks), len(state.x)))
+        mean[:3], D[:3, :3] = state.x[:3], np.eye(3)
+        for i, at in enumerate(blocks, 1):
+            mean[3 * i : 3 * i + 3], D[3 * i : 3 * i + 3, at] = anchored_point(state.x[at])
+        return Gaussian(mean, D @ state.P @ D.T)
+
+
+def anchored_point(values: Array) -> tuple[Array, Array]:
+    """Point (3,) in the world of a landmark's six numbers, with its Jacobian (3, 6)."""
+    azimuth, elevation, rho = values[3:]
+    ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    ray = np.array([ce * ca, ce * sa, se])
+    by_azimuth, by_elevation = np.array([-ce * sa, ce * ca, 0.0]), np.array([-se * ca, -se * sa, ce])
+    D = np.column_stack([np.eye(3), by_azimuth / rho, by_elevation / rho, -ray / rho**2])
+    return values[:3] + ray / rho, D
+
+
+def xyz_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``anchored-ekf-xyz``."""
+    return ekf.xyz_parts(problem, controls)._replace(landmark=AnchoredInverseDepth())
+
+
+def uvd_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``anchored-ekf-uvd``."""
+    return ekf.uvd_parts(problem, controls)._replace(landmark=AnchoredInverseDepth())
+
+
+XYZ = Compiled(AnchoredKalman("anchored-ekf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
+UVD = Compiled(AnchoredKalman("anchored-ekf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)

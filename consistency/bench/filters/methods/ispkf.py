@@ -1,0 +1,167 @@
+"""The unscented update linearised again where it led to: iterated sigma points, Sibley, Sukhatme & Matthies (2006).
+
+"The iterated sigma point Kalman filter with applications to long range stereo", Robotics: Science and Systems II, as
+Barfoot (2017), sec. 4.2.10, writes it. From the prior (x, P) a pass about x_i draws sigma points with mean x_i and the
+covariance P of the prior, gets from them the mean z_i, Cov(z, z) and Cov(x, z) of the observation, and gives
+
+    x_i+1 = x + Cov(x, z) S^-1 (z - z_i - A (x - x_i)),    S = Cov(z, z) + R,    A = Cov(z, x) P^-1.
+
+The first pass is that of the unscented filter. With points that lie close together it is the iterated EKF. The
+covariance is that of the last pass, P - Cov(x, z) S^-1 Cov(z, x): it is the prior that the points spread by in every
+pass, so that nothing is counted twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters import plain
+from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.kernel.covariance import state_index
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.gain import POSE, apply, gather, innovate, shift, whiten
+from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.kernel.local_state import Factors
+from consistency.bench.filters.kernel.slam import (
+    Data,
+    Slam,
+    State,
+    correct,
+    landmark_width,
+    make_room,
+    predict,
+    predict_innovation,
+    robot_width,
+)
+from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.methods import ukf
+from consistency.bench.filters.parts import sensor_of
+from consistency.bench.filters.plain import SlamState
+from consistency.bench.filters.plain_sensors import view
+from consistency.bench.filters.update.unscented import SigmaRoom, Unscented, innovate_by_points
+from consistency.bench.protocols import Problem
+from consistency.bench.types import Info
+from consistency.referee.types import Array
+
+PASSES = 5  # linearisations of an update; the first is the unscented filter's
+
+
+@part(error="Additive", point="AtEstimate")
+class IteratedPoints(NamedTuple):
+    """The sigma points, and the number of times that they are drawn in an update."""
+
+    points: Unscented
+    passes: int
+
+
+@implement(make_room, IteratedPoints)
+def iterated_points_room(update: IteratedPoints, r: int, w: int, s: int, m: int, n: int) -> NamedTuple:
+    """Arrays of sigma points, as for one pass."""
+    return make_room(update.points, r, w, s, m, n)
+
+
+@implement(predict, IteratedPoints)
+def predict_by_points(
+    update: IteratedPoints, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[SigmaRoom]
+) -> None:
+    """Motion as the unscented filter has it: there is no observation to iterate on."""
+    predict(update.points, slam, state, k, u, local, work)
+
+
+@implement(correct, IteratedPoints)
+def correct_by_iterated_points(
+    update: IteratedPoints,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    has_innovation: bool,
+    local: Factors,
+    work: Work[SigmaRoom],
+) -> tuple[int, float, float]:
+    r, w = robot_width(slam.motion), landmark_width(slam.landmark)
+    involved, first_nis, first_log_det = r + w * m, np.nan, np.nan
+    gather(slam, state, m, local, work)
+    for a in range(involved):
+        work.room.prior[a] = state.x[state_index(r, w, a, work.at)]
+    for i in range(update.passes):
+        if not innovate_by_points(update.points, slam, state, m, work):
+            return POSE, np.nan, np.nan
+        _relate_to_prior(r, w, state, m, innovate(slam, state, data, m, work), work)
+        code, nis, log_det = whiten(slam, state, data, m, work)
+        if code > 0:
+            return code, nis, log_det
+        if i == 0:
+            first_nis, first_log_det = nis, log_det
+        is_last = i == update.passes - 1
+        for a in range(involved):
+            j = state_index(r, w, a, work.at)
+            state.x[j] = work.room.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
+    apply(slam, state, m, local, work)
+    return 0, first_nis, first_log_det
+
+
+@implement(predict_innovation, IteratedPoints)
+def predict_innovation_by_first_points(
+    update: IteratedPoints, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
+) -> tuple[int, float]:
+    """Innovation and S of the first pass, which are those of the unscented filter."""
+    return predict_innovation(update.points, slam, state, data, k, m, local, work)
+
+
+@inner
+def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[SigmaRoom]) -> None:
+    """y (s m,) <- z - z_i - A (prior - x_i)."""
+    for a in range(r + w * m):
+        away = work.room.prior[a] - state.x[state_index(r, w, a, work.at)]
+        for row in range(len(y)):
+            y[row] -= work.room.Mt[a, row] * away
+
+
+class IteratedPointsKalman(ukf.UnscentedKalman):
+    """UKF-SLAM whose update is iterated; it predicts as the unscented filter does."""
+
+    def __init__(self, name: str, uvd: bool, passes: int = PASSES) -> None:
+        super().__init__(name, uvd)
+        self.passes = passes
+
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
+        involved = np.concatenate([np.arange(3), at.ravel()])
+        sensor = view(state.problem.belief.sensor, self.uvd)
+        set_ = state.problem.belief.sigma_points
+        x, infos = state.x, []
+        for _ in range(self.passes):
+            points, wm, wc = ukf.sigma_points(x, state.P, involved, set_)
+            Z = sensor.measure(points[:, None, :3], points[:, at]).reshape(len(points), -1)
+            zhat = wm @ Z
+            S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + plain.block_diagonal(R)
+            C = (points - x).T @ (wc[:, None] * (Z - zhat))
+            W = np.linalg.solve(S, C.T).T
+            # only the involved variables have moved; P of these may be singular in the first steps
+            slope = C[involved].T @ np.linalg.pinv(state.P[np.ix_(involved, involved)], hermitian=True)
+            innovation = z.ravel() - zhat - slope @ (state.x - x)[involved]
+            x = state.x.copy()
+            x[involved] += W[involved] @ innovation
+            infos.append(Info(innovation, S, W))
+        return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), infos[0]
+
+
+def xyz_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``ispkf-xyz``."""
+    points = problem.belief.sigma_points
+    update = IteratedPoints(Unscented(points.alpha, points.beta, points.kappa), PASSES)
+    return ukf.xyz_parts(problem, controls)._replace(update=update)
+
+
+def uvd_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``ispkf-uvd``."""
+    return xyz_parts(problem, controls)._replace(sensor=sensor_of(problem.belief, uvd=True))
+
+
+XYZ = Compiled(IteratedPointsKalman("ispkf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
+UVD = Compiled(IteratedPointsKalman("ispkf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)

@@ -1,0 +1,226 @@
+"""EKF-SLAM on points triangulated from pixels, with the moments of their noise at the prediction.
+
+The noise of a triangulated point p, eq. 21, depends on how far it is. With rho = sigma_d / d and d = f B / x, its
+covariance is R(p) = J diag(sigma_u^2, sigma_v^2, sigma_d^2) J', with J the Jacobian of eq. 21, and its mean is
+p (1 + rho^2): u and v enter linearly, and the second derivative of p by d is 2 p / d^2. Both are the first terms of
+series in rho.
+
+- ``ekf-xyz`` takes R at the measured point. A point that came out too near claims to be certain, one too far to be
+  uncertain, and the estimate is drawn towards the robot: see docs/static-limit.md.
+- ``predicted-ekf-xyz`` takes R at the point that is expected, in which the noise of this observation has no part.
+- ``debiased-ekf-xyz`` also subtracts the bias, p rho^2 at the point that is expected, after Sibley, Matthies & Sukhatme
+  (2005), "Bias reduction and filter convergence for long range stereo". Nothing is expected of a new landmark: its R is
+  that at the measured z, and p (1 + rho^2) = z is solved by z / (1 + rho^2) with rho at z. This is right to second
+  order and, unlike z (1 - rho^2), always before the camera. The bias is taken as known: p has the covariance of z.
+
+The noise of an ``xyz`` sensor does not depend on the point, so these two filters work on (u, v, d) alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters import plain
+from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.kernel.arrays import sum_of
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.gain import (
+    combine_seen,
+    correct_at_once,
+    gather,
+    innovate,
+    linearise_seen,
+)
+from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.kernel.local_state import Factors
+from consistency.bench.filters.kernel.slam import (
+    Data,
+    Slam,
+    State,
+    Triple,
+    correct,
+    locate,
+    locate_jacobian,
+    make_room,
+    measure,
+    measure_jacobian,
+    observed_width,
+    predict,
+    predict_innovation,
+    wrap_residual,
+)
+from consistency.bench.filters.kernel.work import Work
+from consistency.bench.filters.methods import ekf
+from consistency.bench.filters.plain import SlamState
+from consistency.bench.filters.plain_sensors import disparity_sigma, point_noise, variance_at
+from consistency.bench.filters.sensor.growth import Growth, growth_of, ratio_at
+from consistency.bench.filters.sensor.xyz import (
+    locate_xyz_jacobian,
+    measure_xyz,
+    measure_xyz_jacobian,
+    xyz_has_no_angle,
+    xyz_width,
+)
+from consistency.bench.filters.update.joint import NoRoom, joint_room, predict_by_error
+from consistency.bench.models import stereo
+from consistency.bench.models.point import Mounting
+from consistency.bench.protocols import Problem
+from consistency.bench.types import Control, Info
+from consistency.referee.types import Array
+
+
+@part()
+class DebiasedXyz(NamedTuple):
+    """Disparity noise over disparity at a depth of 1 m, which grows with the depth, and where the sensor is mounted.
+
+    ``growth`` is that of the noise with the disparity, and ``fB`` the disparity at 1 m, px.
+    """
+
+    rho: float
+    growth: Growth
+    fB: float
+    mount: Mounting
+
+
+implement(observed_width, DebiasedXyz)(xyz_width)
+implement(wrap_residual, DebiasedXyz)(xyz_has_no_angle)
+implement(measure, DebiasedXyz)(measure_xyz)
+implement(measure_jacobian, DebiasedXyz)(measure_xyz_jacobian)
+implement(locate_jacobian, DebiasedXyz)(locate_xyz_jacobian)  # the bias is taken as known
+
+
+@implement(locate, DebiasedXyz)
+def locate_debiased(sensor: DebiasedXyz, z: Array) -> Triple:
+    """The point without its bias."""
+    rho = sensor.rho * ratio_at(sensor.growth, sensor.fB / z[0]) * z[0]
+    share = 1.0 / (1.0 + rho * rho)
+    return share * z[0], share * z[1], share * z[2]
+
+
+@part(sensor="Xyz DebiasedXyz")
+class NoiseAtPrediction(NamedTuple):
+    """Focal length in px, baseline in m, standard deviations in px, and the rho at 1 m whose bias is subtracted.
+
+    ``growth`` is that of sd and rho with the disparity.
+    """
+
+    f: float
+    B: float
+    su: float
+    sv: float
+    sd: float
+    rho: float
+    growth: Growth
+
+
+implement(make_room, NoiseAtPrediction)(joint_room)
+implement(predict, NoiseAtPrediction)(predict_by_error)
+implement(correct, NoiseAtPrediction)(correct_at_once)
+
+
+@implement(predict_innovation, NoiseAtPrediction)
+def predict_innovation_with_noise_at_prediction(
+    update: NoiseAtPrediction,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    local: Factors,
+    work: Work[NoRoom],
+) -> tuple[int, float]:
+    gather(slam, state, m, local, work)
+    linearise_seen(slam, state, k, m, work)
+    combine_seen(slam, state, m, work)
+    return 0, _add_noise(update, data, m, innovate(slam, state, data, m, work), work)
+
+
+@inner
+def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Work[NoRoom]) -> float:
+    """y (3 m,) <- y - bias, S (3 m, 3 m) <- S + R; returns a sum that is finite if all that is given is."""
+    total, rows = 0.0, 3 * m
+    for i in range(m):
+        first = 3 * i
+        p = work.zhat[first : first + 3]
+        if p[0] > 0.0:
+            u, v, d = stereo.project(p[0], p[1], p[2], noise.f, noise.B)
+            J = stereo.triangulate_jacobian(u, v, d, noise.f, noise.B)
+            ratio = ratio_at(noise.growth, d)
+            variance = (noise.su**2, noise.sv**2, (noise.sd * ratio) ** 2)
+            share = (noise.rho * ratio * p[0]) ** 2
+            for a in range(3):
+                y[first + a] -= share * p[a]
+                for b in range(3):
+                    for c in range(3):
+                        work.S[first + a, first + b] += J[3 * a + c] * variance[c] * J[3 * b + c]
+        else:  # a point behind the camera has no pixel
+            for a in range(3):
+                for b in range(3):
+                    work.S[first + a, first + b] += data.R[work.known[i], a, b]
+    for r in range(rows):
+        total += y[r] + sum_of(work.S[r, r:rows])
+    return total
+
+
+class TriangulatedKalman(plain.WorldPointTwin):
+    """EKF-SLAM on triangulated points, with R at the prediction and, where asked, without the bias."""
+
+    def __init__(self, name: str, debiasing: bool) -> None:
+        super().__init__(name, uvd=False)
+        self.debiasing = debiasing
+
+    def predict(self, state: SlamState, control: Control) -> SlamState:
+        return plain.predict_extended(state, control)
+
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        sensor = state.problem.belief.sensor
+        zhat, H = plain.expect(state, seen, uvd=False)
+        expected, R = zhat.reshape(-1, 3), R.copy()
+        front = expected[:, 0] > 0.0
+        x, y, up = expected[front].T
+        pixels = np.column_stack(stereo.project(x, y, up, sensor.f or 0.0, sensor.B or 0.0))
+        R[front] = point_noise(pixels, variance_at(pixels, sensor), sensor)
+        bias = np.where(front, self._bias_ratio(state, expected[:, 0]), 0.0)[:, None] * expected
+        innovation = z.ravel() - zhat - bias.ravel()
+        S, W = plain.gain(state.P, H, plain.block_diagonal(R))
+        return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+
+    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        return plain.locate_point(state, z / (1.0 + self._bias_ratio(state, z[0])), uvd=False)
+
+    def _bias_ratio(self, state: SlamState, x: Array) -> Array:
+        """Square of the disparity's noise over the disparity of points at depths ``x``, m, or 0."""
+        sensor = state.problem.belief.sensor
+        fB = (sensor.f or 0.0) * (sensor.B or 0.0)
+        with np.errstate(divide="ignore"):
+            rho = disparity_sigma(fB / x, sensor) * x / fB
+        return np.square(rho) if self.debiasing else np.zeros_like(rho)
+
+
+def predicted_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``predicted-ekf-xyz``."""
+    sensor = problem.belief.sensor
+    su, sv, sd = sensor.sigma
+    noise = NoiseAtPrediction(sensor.f or 0.0, sensor.B or 0.0, su, sv, sd, 0.0, growth_of(sensor))
+    return ekf.xyz_parts(problem, controls)._replace(update=noise)
+
+
+def debiased_parts(problem: Problem, controls: Array) -> Slam:
+    """Parts of ``debiased-ekf-xyz``."""
+    sensor = problem.belief.sensor
+    f, B = sensor.f or 0.0, sensor.B or 0.0
+    su, sv, sd = sensor.sigma
+    rho = sd / (f * B)
+    growth = growth_of(sensor)
+    noise = NoiseAtPrediction(f, B, su, sv, sd, rho, growth)
+    part_ = DebiasedXyz(rho, growth, f * B, sensor.mount.packed())
+    return ekf.xyz_parts(problem, controls)._replace(sensor=part_, update=noise)
+
+
+PREDICTED = Compiled(
+    TriangulatedKalman("predicted-ekf-xyz", debiasing=False), predicted_parts, sensors=("uvd",), uvd=False
+)
+DEBIASED = Compiled(TriangulatedKalman("debiased-ekf-xyz", debiasing=True), debiased_parts, sensors=("uvd",), uvd=False)

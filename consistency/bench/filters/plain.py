@@ -1,0 +1,299 @@
+"""What the plain twins have in common: SLAM as a textbook writes it, dense and in NumPy, for reading and as oracle.
+
+Herath, Kodagoda & Dissanayake (2007) eq. 1-13. Nothing is shared with the kernels but the models. Each twin is a
+class of its own in ``methods``, made of the functions here; those on world points with an additive error share
+:class:`WorldPointTwin`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from consistency.bench.filters.plain_sensors import heading_matrix as heading_matrix
+from consistency.bench.filters.plain_sensors import sensor_noise, view
+from consistency.bench.models import motion
+from consistency.bench.protocols import Problem
+from consistency.bench.scenario import Belief
+from consistency.bench.types import Control, Gaussian, Info, Observation
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array, Indices
+
+
+@dataclass(frozen=True)
+class SlamState:
+    """Robot, then landmarks in the order in which they were first seen."""
+
+    x: Array  # (n,)
+    P: Array  # (n, n), covariance of the error in which the filter is written
+    landmarks: tuple[int, ...]
+    problem: Problem
+    width: int = 3  # variables of a landmark
+
+    def at(self, landmark: int) -> int:
+        """Offset of a landmark in x."""
+        return 3 + self.width * self.landmarks.index(landmark)
+
+    def beside(self, landmark: int) -> Indices:
+        """Places in x of all but a landmark."""
+        return np.delete(np.arange(len(self.x)), self.at(landmark) + np.arange(self.width))
+
+    @property
+    def positions(self) -> Indices:
+        """Places in x of x and y of the robot and of each landmark, (1 + m, 2)."""
+        first = np.array([0, *range(3, len(self.x), self.width)])
+        return np.column_stack([first, first + 1])
+
+
+def start(problem: Problem, width: int | None = None) -> SlamState:
+    """The state before step 1: the robot alone, known exactly; landmarks of ``width``, or as the sensor sees them."""
+    own = view(problem.belief.sensor, uvd=False).width
+    return SlamState(problem.start.copy(), np.zeros((3, 3)), (), problem, width or own)
+
+
+class Unicycle:
+    """Eq. 18."""
+
+    def move(self, pose: Array, control: Control) -> Array:
+        """Pose (3,) after a step."""
+        return np.array(motion.unicycle(pose[0], pose[1], pose[2], control.dt, control.v, control.omega))
+
+    def jacobians(self, pose: Array, control: Control) -> tuple[Array, Array]:
+        """F (3, 3) with respect to the pose and G (3, 2) with respect to (v, omega)."""
+        c, s, dt = np.cos(pose[2]), np.sin(pose[2]), control.dt
+        F = np.array([[1, 0, -dt * control.v * s], [0, 1, dt * control.v * c], [0, 0, 1]])
+        G = np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
+        return F, G
+
+
+def quarter_turn(v: Array) -> Array:
+    """J v of a vector (2,) in the plane: by how much a small turn moves its tip."""
+    return np.array([-v[1], v[0]])
+
+
+def process_noise(G: Array, belief: Belief) -> Array:
+    """G Q G' with Q = diag(sigma_v^2, sigma_omega^2), shape (3, 3)."""
+    Q = np.diag(np.square([belief.motion.sigma_v, belief.motion.sigma_omega]))
+    return np.asarray(G @ Q @ G.T)
+
+
+def predict_extended(state: SlamState, control: Control) -> SlamState:
+    """Eq. 9 and 10 with Jacobians at the estimate: the mean moves by f, P <- F P F' + G Q G'."""
+    robot, x, F = Unicycle(), state.x.copy(), np.eye(len(state.x))
+    F[:3, :3], G = robot.jacobians(x[:3], control)
+    x[:3] = robot.move(x[:3], control)
+    P = F @ state.P @ F.T
+    P[:3, :3] += process_noise(G, state.problem.belief)
+    return replace(state, x=x, P=P)
+
+
+def predict_by(state: SlamState, control: Control, displacement: Array, at: Array) -> SlamState:
+    """Eq. 9 and 10 with F of another ``displacement`` (2,) of the robot, in m, and G at the pose ``at`` (3,)."""
+    robot, x, F = Unicycle(), state.x.copy(), np.eye(len(state.x))
+    _, G = robot.jacobians(at, control)
+    x[:3] = robot.move(x[:3], control)
+    F[:2, 2] = quarter_turn(displacement)
+    P = F @ state.P @ F.T
+    P[:3, :3] += process_noise(G, state.problem.belief)
+    return replace(state, x=x, P=P)
+
+
+class Correct(Protocol):
+    """The update with landmarks already in the state: their labels, z (m, s), R (m, s, s)."""
+
+    def __call__(self, state: SlamState, seen: list[int], z: Array, R: Array, /) -> tuple[SlamState, Info]: ...
+
+
+Locate = Callable[[SlamState, int, Array], tuple[Array, Array, Array]]
+
+
+def update_jointly(
+    state: SlamState, observation: Observation, uvd: bool, correct: Correct, locate: Locate
+) -> tuple[SlamState, Info]:
+    """One update with all landmarks in the state, then the new ones; raw (u, v, d) where ``uvd``, else eq. 21.
+
+    ``locate`` gives a new landmark (w,) and its Jacobians with respect to the robot's error (w, 3) and z (w, s).
+    """
+    sensor = state.problem.belief.sensor
+    z, R = sensor_noise(observation.z, sensor, converted=sensor.model == "uvd" and not uvd)
+    is_known = np.array([int(label) in state.landmarks for label in observation.landmarks], dtype=bool)
+    seen = [int(label) for label in observation.landmarks[is_known]]
+    info = Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
+    if seen:
+        state, info = correct(state, seen, z[is_known], R[is_known])
+    for i in np.flatnonzero(~is_known):
+        label = int(observation.landmarks[i])
+        state = augment(state, label, locate(state, label, z[i]), R[i])
+    return state, info
+
+
+def augment(state: SlamState, label: int, placed: tuple[Array, Array, Array], R: Array) -> SlamState:
+    """The state with a new landmark (w,), its Jacobians by pose (w, 3) and z (w, s), and full cross-covariance."""
+    landmark, Jp, Jz = placed
+    n, w = len(state.x), len(landmark)
+    J = np.zeros((n + w, n))
+    J[:n] = np.eye(n)
+    J[n:, :3] = Jp
+    P = J @ state.P @ J.T
+    P[n:, n:] += Jz @ R @ Jz.T
+    return replace(state, x=np.append(state.x, landmark), P=P, landmarks=(*state.landmarks, label))
+
+
+def without(state: SlamState, landmark: int) -> SlamState:
+    """The state without a landmark: what it says of all else stays as it is."""
+    keep = state.beside(landmark)
+    rest = tuple(label for label in state.landmarks if label != landmark)
+    return replace(state, x=state.x[keep], P=state.P[np.ix_(keep, keep)], landmarks=rest)
+
+
+def expect(state: SlamState, seen: list[int], uvd: bool) -> tuple[Array, Array]:
+    """h (s m,) and its Jacobian H (s m, n) at the state, landmarks as points in the world."""
+    sensor = view(state.problem.belief.sensor, uvd)
+    s, w = sensor.size, sensor.width
+    zhat, H = np.zeros(s * len(seen)), np.zeros((s * len(seen), len(state.x)))
+    for i, label in enumerate(seen):
+        rows, at = slice(s * i, s * i + s), slice(state.at(label), state.at(label) + w)
+        zhat[rows] = sensor.measure(state.x[:3], state.x[at])
+        H[rows, :3], H[rows, at] = sensor.jacobians(state.x[:3], state.x[at])
+    return zhat, H
+
+
+def innovation_of(state: SlamState, z: Array, zhat: Array, uvd: bool) -> Array:
+    """z (m, s) less what is expected (s m,), as one vector (s m,)."""
+    return view(state.problem.belief.sensor, uvd).less(z, zhat.reshape(z.shape)).ravel()
+
+
+def gain(P: Array, H: Array, R: Array) -> tuple[Array, Array]:
+    """S = H P H' + R (k, k) and the gain P H' S^-1 (n, k), eq. 11 and 12; P (n, n), H (k, n)."""
+    S = H @ P @ H.T + R
+    return S, np.linalg.solve(S, H @ P).T
+
+
+def correct_about(
+    state: SlamState, at: Array, seen: list[int], z: Array, R: Array, uvd: bool
+) -> tuple[SlamState, Info]:
+    """The update of an EKF whose H is that of other values ``at`` (n,) than its estimate."""
+    zhat, _ = expect(state, seen, uvd)
+    _, H = expect(replace(state, x=at), seen, uvd)
+    innovation = innovation_of(state, z, zhat, uvd)
+    S, W = gain(state.P, H, block_diagonal(R))
+    return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+
+
+def locate_point(state: SlamState, z: Array, uvd: bool) -> tuple[Array, Array, Array]:
+    """A landmark (w,) as a point in the world, m, seen from the estimated pose; Jacobians by pose (w, 3), z (w, s)."""
+    return view(state.problem.belief.sensor, uvd).locate(state.x[:3], z)
+
+
+def pose_of(state: SlamState) -> Gaussian:
+    """Pose (3,) and covariance (3, 3) of a state whose error is additive."""
+    return Gaussian(state.x[:3], state.P[:3, :3])
+
+
+def map_of(state: SlamState) -> dict[int, Gaussian]:
+    """Landmarks (3,) by label, m, with covariance (3, 3), of a state of world points whose error is additive."""
+    w = state.width
+    blocks = {label: slice(state.at(label), state.at(label) + w) for label in state.landmarks}
+    return {label: in_space(state.x[at], state.P[at, at]) for label, at in blocks.items()}
+
+
+def in_space(mean: Array, P: Array) -> Gaussian:
+    """A landmark (w,) as a point (3,): one in the plane is known to be at height zero."""
+    missing = 3 - len(mean)
+    return Gaussian(np.pad(mean, (0, missing)), np.pad(P, (0, missing)))
+
+
+def joint_of(state: SlamState) -> Gaussian:
+    """Robot and landmarks together, (3 + 3 K,) and its covariance, of a state whose error is additive."""
+    count = (len(state.x) - 3) // state.width
+    spatial = np.eye(3)[:, : state.width]  # one in the plane is known to be at height zero
+    T = block_diag(np.eye(3), *[spatial] * count)
+    return Gaussian(T @ state.x, T @ state.P @ T.T)
+
+
+class Noting(Protocol):
+    """A state of world points with notes beside it."""
+
+    @property
+    def slam(self) -> SlamState: ...
+
+
+class SlamTwin:
+    """What every twin does with a state that is a ``SlamState``."""
+
+    def forget(self, state: SlamState, landmark: int) -> SlamState:
+        return without(state, landmark)
+
+
+class NotingTwin:
+    """What a twin says of a state that is a ``SlamState`` with notes beside it."""
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def pose(self, state: Noting) -> Gaussian:
+        return pose_of(state.slam)
+
+    def map(self, state: Noting) -> dict[int, Gaussian]:
+        return map_of(state.slam)
+
+    def joint(self, state: Noting) -> Gaussian:
+        return joint_of(state.slam)
+
+
+class WorldPointTwin(SlamTwin, ABC):
+    """SLAM on points in the world with an additive error; a twin adds how it predicts and how it corrects."""
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def init(self, problem: Problem) -> SlamState:
+        return start(problem)
+
+    @abstractmethod
+    def predict(self, state: SlamState, control: Control) -> SlamState: ...
+
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        return update_jointly(state, observation, self.uvd, self._correct, self._locate)
+
+    @abstractmethod
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]: ...
+
+    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        return locate_point(state, z, self.uvd)
+
+    def pose(self, state: SlamState) -> Gaussian:
+        return pose_of(state)
+
+    def map(self, state: SlamState) -> dict[int, Gaussian]:
+        return map_of(state)
+
+    def joint(self, state: SlamState) -> Gaussian:
+        return joint_of(state)
+
+
+def require_landmarks(problem: Problem, name: str) -> Array:
+    """Landmarks (N, 3) about which a linear world is expanded.
+
+    Raises
+    ------
+    InputError
+        There are none.
+    """
+    if problem.landmarks is None:
+        raise InputError(f"filter '{name}' needs the landmarks that its world is linearised about")
+    return problem.landmarks
+
+
+def block_diagonal(blocks: Array) -> Array:
+    """(m, s, s) -> (s m, s m)."""
+    m, s = blocks.shape[:2]
+    out = np.zeros((s * m, s * m))
+    for i, block in enumerate(blocks):
+        out[s * i : s * i + s, s * i : s * i + s] = block
+    return out

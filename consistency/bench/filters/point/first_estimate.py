@@ -1,0 +1,107 @@
+"""First-estimates Jacobians, Huang, Mourikis & Roumeliotis (2010), "Observability-based rules ...", IJRR 29(5).
+
+Each variable is linearised at its first estimate: a pose p_k at the prediction p_k|k-1, a landmark where it was put.
+f and h are those of the estimate. With J the quarter turn, F of step k + 1 has in its column of the heading
+J (p_k+1|k - p_k|k-1), and H of a landmark l turns with -J (l_first - p_k+1|k): a turn of robot and map about the
+world's origin, (J p_k|k-1, 1, J l_first), is carried by F to the same with p_k+1|k, and H does not see it. A new
+landmark is treated alike: its Jacobian by the heading is J (l_first - p_k|k-1).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from consistency.bench.filters.kernel.arrays import copy, matrix
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.measuring import place_observed
+from consistency.bench.filters.kernel.slam import (
+    Slam,
+    State,
+    expands,
+    landmark_point,
+    landmark_width,
+    make_notes,
+    motion_point,
+    move,
+    observation_point,
+    place,
+    propagate_covariance_at,
+    propagate_covariance_by,
+    stands_apart,
+)
+from consistency.bench.filters.kernel.work import Work
+from consistency.referee.types import Array
+
+
+@part(motion="Unicycle", landmark="WorldPoint PlanarPoint", error="Additive", update="Joint")
+class FirstEstimate(NamedTuple):
+    """No parameters."""
+
+
+class FirstEstimates(NamedTuple):
+    """The first estimate of every variable."""
+
+    path: Array  # (T + 1, 3), as predicted
+    landmarks: Array  # (labels, w)
+
+
+@implement(expands, FirstEstimate)
+def first_estimate_is_not_expanded(point: FirstEstimate) -> bool:
+    """False: f and h are evaluated at the estimate itself."""
+    return False
+
+
+@implement(stands_apart, FirstEstimate)
+def first_estimate_stands_apart(point: FirstEstimate) -> bool:
+    """True: the Jacobians are taken elsewhere."""
+    return True
+
+
+@implement(make_notes, FirstEstimate)
+def note_first_estimates(point: FirstEstimate, r: int, w: int, steps: int, labels: int) -> FirstEstimates:
+    """Room for the predictions of all steps and the first estimate of each landmark."""
+    return FirstEstimates(matrix(steps + 1, r), matrix(labels, w))
+
+
+@implement(motion_point, FirstEstimate)
+def motion_about_estimate(point: FirstEstimate, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), before the step."""
+    return pose
+
+
+@implement(propagate_covariance_at, FirstEstimate)
+def propagate_covariance_between_first_estimates(
+    point: FirstEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    """F by the displacement p_k+1|k - p_k|k-1 between first estimates; notes the prediction."""
+    before, after = work.notes.path[k], work.notes.path[k + 1]
+    if k == 0:
+        copy(state.x[:3], before)
+    move(slam.motion, state.x[:3], u, after)
+    propagate_covariance_by(slam.motion, after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
+
+
+@implement(observation_point, FirstEstimate)
+def observation_at_prediction(point: FirstEstimate, pose: Array, k: int) -> Array:
+    """The estimate ``pose`` (r,), after the prediction: its first."""
+    return pose
+
+
+@implement(landmark_point, FirstEstimate)
+def landmark_at_first_estimate(point: FirstEstimate, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    """The first estimate (w,) of landmark ``label``."""
+    first: Array = work.notes.landmarks[label]
+    return first
+
+
+@implement(place, FirstEstimate)
+def place_first_estimate(
+    point: FirstEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+) -> None:
+    """x[n:n + w] <- the inverse of h at the estimated pose, noted; its Jacobian by the heading at the prediction."""
+    w = landmark_width(slam.landmark)
+    pose, values, predicted = state.x[:3], state.x[state.n : state.n + w], work.notes.path[k + 1]
+    place_observed(slam, pose, z, values, work)
+    copy(values, work.notes.landmarks[label])
+    work.Jp[0, 2] -= pose[1] - predicted[1]
+    work.Jp[1, 2] += pose[0] - predicted[0]

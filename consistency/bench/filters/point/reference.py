@@ -1,0 +1,95 @@
+"""f and h to first order about a known reference: the Kalman filter of a linear world, Herath et al. (2007) eq. 1-8."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters.kernel.arrays import copy_matrix, matrix, vector
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.measuring import linearise_at
+from consistency.bench.filters.kernel.slam import (
+    Slam,
+    State,
+    expands,
+    landmark_point,
+    make_notes,
+    motion_point,
+    observation_point,
+    place,
+    propagate_covariance,
+    propagate_covariance_at,
+    robot_frame,
+    robot_width,
+    stands_apart,
+)
+from consistency.bench.filters.kernel.work import NoNotes, Work
+from consistency.referee.types import Array
+
+
+@part(sensor="Xyz", landmark="WorldPoint", error="Additive", update="Joint")
+class Reference(NamedTuple):
+    """Where the world is linearised."""
+
+    path: Array  # (T + 1, r)
+    landmarks: Array  # (n_landmarks, w)
+
+
+@implement(expands, Reference)
+def reference_is_expanded(point: Reference) -> bool:
+    """True: f and h are affine functions."""
+    return True
+
+
+@implement(stands_apart, Reference)
+def reference_stands_apart(point: Reference) -> bool:
+    return False
+
+
+@implement(make_notes, Reference)
+def no_notes_reference(point: Reference, r: int, w: int, steps: int, labels: int) -> NoNotes:
+    return NoNotes()
+
+
+@implement(motion_point, Reference)
+def motion_at_reference(point: Reference, pose: Array, k: int) -> Array:
+    """Reference pose (r,) of step k, before the step."""
+    return point.path[k]
+
+
+@implement(propagate_covariance_at, Reference)
+def propagate_covariance_at_reference(
+    point: Reference, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+) -> None:
+    """F at the reference pose before the step."""
+    propagate_covariance(slam.motion, point.path[k], u, state.P, state.n, Phi, state.base)
+
+
+@implement(observation_point, Reference)
+def observation_at_reference(point: Reference, pose: Array, k: int) -> Array:
+    """Reference pose (r,) of step k + 1."""
+    return point.path[k + 1]
+
+
+@implement(landmark_point, Reference)
+def landmark_at_reference(point: Reference, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+    """Reference (w,) of landmark ``label``."""
+    return point.landmarks[label]
+
+
+@implement(place, Reference)
+def place_about_reference(
+    point: Reference, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+) -> None:
+    """x[n:n + w] <- the landmark that solves the expanded h for z (3,), where w = 3; Jz = Hl^-1 and Jp = -Hl^-1 Hp."""
+    pose, landmark, n = point.path[k + 1], point.landmarks[label], state.n
+    r = robot_width(slam.motion)
+    z0, Hp, Hl = vector(3), matrix(3, r), matrix(3, len(landmark))
+    linearise_at(slam, robot_frame(slam.motion, pose), landmark, z0, Hp, Hl)
+    copy_matrix(np.linalg.inv(Hl), work.Jz)
+    copy_matrix(-np.dot(work.Jz, Hp), work.Jp)
+    for i in range(len(landmark)):
+        state.x[n + i] = landmark[i]
+        for j in range(3):
+            state.x[n + i] += work.Jz[i, j] * (z[j] - z0[j]) + work.Jp[i, j] * (state.x[j] - pose[j])

@@ -1,0 +1,258 @@
+"""Any filter through a trial, step by step: the path that filters of the user's own take."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from consistency.bench.filters.compiled import problem_for
+from consistency.bench.filters.kernel.linalg import definiteness
+from consistency.bench.filters.record import Record
+from consistency.bench.protocols import Filter, WholeTrial
+from consistency.bench.scenario import Belief
+from consistency.bench.types import Estimates, Gaussian, Info, Map, Trial
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+from consistency.referee.reading import one_line
+from consistency.referee.types import Array
+
+SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
+LONGEST = 1000  # characters of an exception's message that are kept
+
+
+def optimal_gain(filter_: Filter) -> bool:
+    """Does the filter declare that its gain is optimal, so that its innovations may be judged?"""
+    declared = getattr(filter_, "innovations", None)
+    return isinstance(declared, str) and declared == "optimal"
+
+
+def name_of(filter_: Filter) -> str:
+    """``name`` of a filter, or its class's."""
+    return str(getattr(filter_, "name", type(filter_).__name__))
+
+
+def error_of(filter_: Filter) -> str:
+    """Convention of the filter's own error, "so2" where it declares none.
+
+    Raises
+    ------
+    InputError
+        No such convention, or nothing that gives the covariance of that error.
+    """
+    error = getattr(filter_, "error", ADDITIVE)
+    if not isinstance(error, str) or error not in PLANAR:
+        raise InputError(f"filter '{name_of(filter_)}': its error must be one of {', '.join(PLANAR)}, got {error!r}")
+    if error != ADDITIVE and not isinstance(filter_, WholeTrial) and not hasattr(filter_, "own_covariance"):
+        raise InputError(f"filter '{name_of(filter_)}': with the error '{error}' it needs own_covariance(state)")
+    return error
+
+
+def rejects(filter_: Filter) -> bool:
+    """Does the filter say which observations it left out?"""
+    return callable(getattr(filter_, "rejected", None))
+
+
+def run_filter(filter_: Filter, trial: Trial, belief: Belief, record: Record | None = None) -> Estimates:
+    """A whole trial through a filter, compiled where it can be.
+
+    An exception, an estimate that is not finite or a pose covariance that is not positive definite ends the run as a
+    :class:`Failure` of that step.
+
+    Raises
+    ------
+    InputError
+        The filter's error is no convention, nothing gives its covariance, or estimates of a whole trial have another.
+    """
+    if isinstance(filter_, WholeTrial):
+        estimates, error = filter_.run(trial, belief), error_of(filter_)
+        if estimates.error != error or (estimates.own is None) != (error == ADDITIVE):
+            raise InputError(f"filter '{name_of(filter_)}': its estimates must be of the error '{error}' and carry it")
+        return estimates
+    return step_through(filter_, trial, belief, record)
+
+
+class _Unusable(Exception):
+    """What a filter gave cannot be used; the message is the whole reason."""
+
+
+def step_through(filter_: Filter, trial: Trial, belief: Belief, record: Record | None = None) -> Estimates:
+    """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``.
+
+    ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``rejected`` in each step
+    of one that has it, ``map`` and ``joint`` after the last step. The filter has arrays of its own, so that it changes
+    nothing for others. What it says is written into ``record`` step by step, where one is given.
+
+    Raises
+    ------
+    InputError
+        The filter's error is no convention, or nothing gives its covariance; it needs the truth and there is none.
+    """
+    T, name, error = trial.steps, name_of(filter_), error_of(filter_)
+    record = record or Record.empty(T, len(trial.landmark))
+    given, rank = own_arrays(trial), _Rank(error)
+    reason, map_ = "", None
+    problem = problem_for(filter_, given, belief)
+    state: Any = None
+    for step in range(1, T + 1):
+        record.at[0] = step
+        try:
+            if step == 1:
+                state = filter_.init(problem)
+            state = filter_.predict(state, given.control(step))
+            state, info = _state_and_info(filter_.update(state, given.observation(step)))
+            if rejects(filter_):
+                record.rejected[: trial.first[step]] = _value_of(filter_, "rejected", state)
+            mean, covariances = _pose_and_covariances(filter_, state, error)
+            if info is not None and len(info.innovation):
+                record.nis[step - 1], record.dof[step - 1] = _nis(info), len(info.innovation)
+                record.log_det[step - 1] = info.log_det
+            _require_finite(mean, *covariances)
+            rank.require(covariances)
+            map_ = _map(filter_, state, trial) if step == T else None
+        except (Exception, GeneratorExit, SystemExit) as exception:  # whatever a user's filter throws is a result
+            reason = reason_of(exception)
+            break
+        record.pose[step - 1], record.covariance[step - 1], record.own[step - 1] = mean, covariances[0], covariances[-1]
+    return record.estimates(name, trial.run, error, reason=reason, map_=map_, guarded=rejects(filter_))
+
+
+def own_arrays(trial: Trial) -> Trial:
+    """The trial with read-only arrays that no one else has."""
+    copies: dict[str, Any] = {name: a.copy() for name, a in vars(trial).items() if isinstance(a, np.ndarray)}
+    return replace(trial, **copies)
+
+
+def reason_of(exception: BaseException) -> str:
+    """Why a run failed, in one sentence, whatever the exception is."""
+    if isinstance(exception, _Unusable):
+        return str(exception)
+    if isinstance(exception, np.linalg.LinAlgError):
+        return "the innovation covariance is not positive definite"
+    try:
+        text = str(exception)
+    except BaseException as error:
+        text = f"its message cannot be read ({type(error).__name__})"
+    what = "out of memory" if isinstance(exception, MemoryError) else type(exception).__name__
+    text = text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
+    return f"{what}: {one_line(text.encode(errors='backslashreplace').decode(), 8 * LONGEST)}"
+
+
+def _nis(info: Info) -> float:
+    """NIS of an update whose innovation (k,) and S (k, k) are finite, and S positive definite."""
+    innovation = _array(info.innovation, (len(info.innovation),), "update")
+    S = _array(info.S, (len(innovation), len(innovation)), "update")
+    if not (np.isfinite(innovation).all() and np.isfinite(S).all()):
+        raise _Unusable("the innovation or its covariance is not finite")
+    np.linalg.cholesky(S)
+    nis = info.nis
+    if not np.isfinite(nis):
+        raise _Unusable("the NIS is not finite")
+    return nis
+
+
+def _pose_and_covariances(filter_: Filter, state: Any, error: str) -> tuple[Array, list[Array]]:
+    """Mean (3,) of the pose and its covariance (3, 3), with that of the filter's own error where it has one."""
+    estimate = filter_.pose(state)
+    mean, P = _array(estimate.mean, (3,)), _array(estimate.covariance, (3, 3))
+    if error == ADDITIVE:
+        return mean, [P]
+    return mean, [P, _array(_value_of(filter_, "own_covariance", state), (3, 3), "own_covariance")]
+
+
+def _value_of(filter_: Filter, method: str, state: Any) -> Any:
+    try:
+        return getattr(filter_, method)(state)
+    except np.linalg.LinAlgError as error:
+        raise _Unusable(f"LinAlgError: {error}") from error
+
+
+class _Rank:
+    """Demands covariances that are symmetric and, from the first own one of full rank on, positive definite."""
+
+    def __init__(self, error: str) -> None:
+        self.names, self.full = ("the pose covariance", f"the covariance of the error '{error}'"), False
+
+    def require(self, covariances: list[Array]) -> None:
+        """Raise for covariances (3, 3) that are not as they must be; the last one is of the filter's own error."""
+        for name, P in zip(self.names, covariances, strict=False):
+            if _asymmetric(P):
+                raise _Unusable(f"{name} is not symmetric")
+        rank = definiteness(covariances[-1])
+        if rank < 0 or (self.full and rank == 0):
+            raise _Unusable(f"{self.names[len(covariances) - 1]} is not positive definite")
+        self.full = self.full or rank == 1
+        if self.full and definiteness(covariances[0]) != 1:
+            raise _Unusable(f"{self.names[0]} is not positive definite")
+
+
+def _asymmetric(P: Array) -> bool:
+    return bool(np.abs(P - P.T).max() > SYMMETRY * np.abs(P).max())
+
+
+def _require_finite(*arrays: Array) -> None:
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise _Unusable("the estimate is not finite")
+
+
+def _state_and_info(value: Any) -> tuple[Any, Info | None]:
+    if not isinstance(value, tuple) or len(value) != 2:
+        raise TypeError("update must return (state, info)")
+    return value
+
+
+def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:
+    """What ``map`` of the filter gives, sorted by label; None without that method."""
+    if not callable(getattr(filter_, "map", None)):
+        return None
+    landmarks = _value_of(filter_, "map", state)
+    if not isinstance(landmarks, Mapping):
+        raise TypeError("map must return a dictionary of landmarks by label")
+    if unknown := [label for label in landmarks if label not in range(trial.n_landmarks)]:
+        raise ValueError(f"map() has a landmark {unknown[0]!r}; they are numbered 0 to {trial.n_landmarks - 1}")
+    labels = sorted(int(label) for label in landmarks)
+    mean, covariance = np.empty((len(labels), 3)), np.empty((len(labels), 3, 3))
+    for i, label in enumerate(labels):
+        mean[i], covariance[i] = _landmark(label, landmarks[label])
+    return Map(
+        np.array(labels, np.int64), mean, covariance, _joint(filter_, state, [int(label) for label in landmarks])
+    )
+
+
+def _joint(filter_: Filter, state: Any, labels: list[int]) -> Array | None:
+    """Covariance of pose and landmarks, these sorted by label; ``labels`` in the order of ``map``.
+
+    None without a method ``joint``.
+    """
+    if not callable(getattr(filter_, "joint", None)):
+        return None
+    n = 3 + 3 * len(labels)
+    P = _array(_value_of(filter_, "joint", state).covariance, (n, n), "joint")
+    if not np.isfinite(P).all():
+        raise _Unusable("the joint covariance of pose and map is not finite")
+    if _asymmetric(P):
+        raise _Unusable("the joint covariance of pose and map is not symmetric")
+    order = np.append(0, 1 + np.argsort(labels))
+    rows = (3 * order[:, None] + np.arange(3)).ravel()
+    return P[np.ix_(rows, rows)]
+
+
+def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:
+    mean, P = _array(estimate.mean, (3,), "map"), _array(estimate.covariance, (3, 3), "map")
+    if not (np.isfinite(mean).all() and np.isfinite(P).all()):
+        raise _Unusable(f"landmark {label} in the map is not finite")
+    if _asymmetric(P):
+        raise _Unusable(f"the covariance of landmark {label} in the map is not symmetric")
+    return mean, P
+
+
+def _array(value: Any, shape: tuple[int, ...], method: str = "pose") -> Array:
+    given = np.asarray(value)
+    if given.dtype.kind not in "biufO":
+        raise TypeError(f"{method}() gave numbers of type {given.dtype}, not real ones")
+    array = np.array(value, dtype=float)
+    if array.shape != shape:
+        raise ValueError(f"{method}() gave an array of shape {array.shape}, not {shape}")
+    return array

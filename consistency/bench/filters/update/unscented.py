@@ -1,0 +1,237 @@
+"""Sigma points, Julier & Uhlmann (2004), exact at the size of what is observed.
+
+With the variables ordered robot, seen landmarks (as observed), the rest, the Cholesky factor of P is
+[[C, 0], [G, D]]. A sigma point through a column of D moves only variables that neither f nor h reads, so
+it projects onto the mean: such points add nothing to S or to the cross-covariance, and their weight counts
+as weight of the centre. What is left is 2 L + 1 points over the L = r + w m variables involved; the rest of
+the state follows through G = P_rest,involved C'^-1, so that Cov(z, x) = Cov(z, C-coordinates) C^-1 P_involved,x
+and M = Cov(z, C-coordinates) C^-1, of size s m x L, is all that sees the whole state.
+
+C is lower triangular. The points of column j of the i-th seen landmark leave the robot and the landmarks
+before i where they are, bit by bit; only what comes from i on is projected again.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters.kernel.arrays import copy, fill, matrix, vector
+from consistency.bench.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
+from consistency.bench.filters.kernel.covariance import definite_root, state_index
+from consistency.bench.filters.kernel.dispatch import implement, part
+from consistency.bench.filters.kernel.gain import POSE, add_noise, correct_at_once, gather, innovate
+from consistency.bench.filters.kernel.jit import inner
+from consistency.bench.filters.kernel.linalg import semidefinite_cholesky
+from consistency.bench.filters.kernel.local_state import Factors
+from consistency.bench.filters.kernel.measuring import observe
+from consistency.bench.filters.kernel.slam import (
+    Data,
+    Slam,
+    State,
+    add_motion_noise,
+    correct,
+    landmark_width,
+    make_room,
+    move,
+    observed_width,
+    predict,
+    predict_innovation,
+    propagate_covariance_root,
+    robot_frame,
+    robot_width,
+    wrap_residual,
+)
+from consistency.bench.filters.kernel.work import Work
+from consistency.referee.types import Array
+
+
+@part(error="Additive", point="AtEstimate")
+class Unscented(NamedTuple):
+    """Scaled sigma points, Merwe (2004): spread alpha sqrt(L + kappa)."""
+
+    alpha: float
+    beta: float
+    kappa: float
+
+
+class SigmaRoom(NamedTuple):
+    """Arrays of sigma points; L = r + w m."""
+
+    F: Array  # (r, r) Cov(f, C-coordinates)
+    moved: Array  # (2 r + 1, r) sigma points of the robot
+    U: Array  # (L, L) upper root of the prior of the variables involved
+    block: Array  # (L, L) that prior, where it is singular
+    Z: Array  # (2 L + 1, s m) projected sigma points
+    Mt: Array  # (L, s m) transposed statistical linearisation
+    pose: Array  # (r,)
+    landmark: Array  # (w,)
+    prior: Array  # (L,) mean of that prior, for an update that iterates
+
+
+@implement(make_room, Unscented)
+def sigma_room(update: Unscented, r: int, w: int, s: int, m: int, n: int) -> SigmaRoom:
+    L = r + w * m
+    return SigmaRoom(
+        matrix(r, r),
+        matrix(2 * r + 1, r),
+        matrix(L, L),
+        matrix(L, L),
+        matrix(2 * L + 1, s * m),
+        matrix(L, s * m),
+        vector(r),
+        vector(w),
+        vector(L),
+    )
+
+
+@inner
+def _weights(L: int, points: Unscented) -> tuple[float, float, float, float]:
+    """Of scaled sigma points over L variables: spread, w0m, w0c, w."""
+    alpha, beta, kappa = points.alpha, points.beta, points.kappa
+    spread2 = alpha * alpha * (L + kappa)
+    w0 = 1.0 - L / spread2
+    return np.sqrt(spread2), w0, w0 + 1.0 - alpha * alpha + beta, 0.5 / spread2
+
+
+@implement(predict, Unscented)
+def predict_unscented(
+    update: Unscented, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[SigmaRoom]
+) -> None:
+    """x, P <- mean and covariance (r, r) of f over 2 r + 1 sigma points of the robot; its rows of P <- F C^-1 P."""
+    x, P, r = state.x, state.P, robot_width(slam.motion)
+    spread, w0m, w0c, w = _weights(r, update)
+    C, F, Y = work.small, work.room.F, work.room.moved
+    if not semidefinite_cholesky(P[:r, :r], C):
+        P[0, 0] = np.nan  # an indefinite prior is reported by the loop
+        return
+    copy(x[:r], work.pose)
+    move(slam.motion, work.pose, u, Y[2 * r])
+    for j in range(r):
+        for side in range(2):
+            step = spread if side == 0 else -spread
+            point = Y[2 * j + side]
+            for a in range(r):
+                point[a] = x[a] + step * C[a, j]
+            move(slam.motion, point, u, point)
+    for a in range(r):
+        x[a] = w0m * Y[2 * r, a]
+        for i in range(2 * r):
+            x[a] += w * Y[i, a]
+        for j in range(r):
+            F[a, j] = w * spread * (Y[2 * j, a] - Y[2 * j + 1, a])
+    propagate_covariance_root(slam.motion, P, r, state.n, C, F)
+    propagate_covariance_root(slam.motion, local.Phi, 0, state.base, C, F)
+    for a in range(r):
+        for b in range(r):
+            P[a, b] = w0c * (Y[2 * r, a] - x[a]) * (Y[2 * r, b] - x[b])
+            for i in range(2 * r):
+                P[a, b] += w * (Y[i, a] - x[a]) * (Y[i, b] - x[b])
+    add_motion_noise(slam.motion, work.pose, u, P)
+
+
+implement(correct, Unscented)(correct_at_once)
+
+
+@implement(predict_innovation, Unscented)
+def predict_innovation_by_points(
+    update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
+) -> tuple[int, float]:
+    gather(slam, state, m, local, work)
+    if not innovate_by_points(update, slam, state, m, work):
+        return POSE, np.nan
+    innovate(slam, state, data, m, work)
+    return 0, add_noise(slam, state, data, m, work)
+
+
+@inner
+def innovate_by_points(update: Unscented, slam: Slam, state: State, m: int, work: Work[SigmaRoom]) -> bool:
+    """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite.
+
+    The points lie about ``state.x`` (n,), which need not be the mean of P; the linearisation is ``work.room.Mt``.
+    """
+    r, w, width = robot_width(slam.motion), landmark_width(slam.landmark), state.n + state.base
+    L, rows = r + w * m, observed_width(slam.sensor) * m
+    spread, w0m, w0c, weight = _weights(L, update)
+    if not _root(r, w, L, work):
+        return False
+    _project(slam, state.x, m, spread, work)
+    Z, S, Mt, zhat = work.room.Z[: 2 * L + 1, :rows], work.S[:rows, :rows], work.room.Mt[:L, :rows], work.zhat
+    centre, U = Z[2 * L], work.room.U
+    for c in range(rows):
+        zhat[c] = w0m * centre[c]
+    for i in range(2 * L):
+        for c in range(rows):
+            zhat[c] += weight * Z[i, c]
+    for i in range(2 * L + 1):
+        for c in range(rows):
+            Z[i, c] -= zhat[c]
+    for a in range(rows):
+        for b in range(a, rows):
+            S[a, b] = w0c * centre[a] * centre[b]
+    add_gram(weight, Z[: 2 * L], S)
+    for j in range(L):
+        for c in range(rows):
+            Mt[j, c] = weight * spread * (Z[2 * j, c] - Z[2 * j + 1, c])
+        if U[j, j] == 0.0:  # row j of Mt and the rest of row j of U are zero, and stay so
+            U[j, j] = 1.0
+    solve_upper(U[:L, :L], Mt)
+    product_of_transposed(Mt, work.rows[:L, :width], work.A[:rows, :width])
+    return True
+
+
+@inner
+def _root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
+    """Upper root U = C' of the prior over the variables involved; False if it is indefinite."""
+    rows, at, U = work.rows, work.at, work.room.U[:L, :L]
+    for b in range(L):
+        j = state_index(r, w, b, at)
+        for a in range(b + 1):
+            U[a, b] = rows[a, j]
+    return definite_root(U, work.scale) or _singular_root(r, w, L, work)
+
+
+@inner
+def _singular_root(r: int, w: int, L: int, work: Work[SigmaRoom]) -> bool:
+    """The root of a semidefinite prior: a zero pivot has a zero row."""
+    rows, at, U, block = work.rows, work.at, work.room.U[:L, :L], work.room.block[:L, :L]
+    for b in range(L):
+        j = state_index(r, w, b, at)
+        for a in range(L):
+            block[a, b] = rows[a, j]
+    if not semidefinite_cholesky(block, U):
+        return False
+    for a in range(L):
+        for b in range(a):
+            U[b, a] = U[a, b]
+    return True
+
+
+@inner
+def _project(slam: Slam, x: Array, m: int, spread: float, work: Work[SigmaRoom]) -> None:
+    """Z <- h of the sigma points, in pairs along the rows of U; the last row is h of the mean."""
+    r, w, s = robot_width(slam.motion), landmark_width(slam.landmark), observed_width(slam.sensor)
+    L = r + w * m
+    at, U, Z, pose, landmark = work.at, work.room.U, work.room.Z, work.room.pose, work.room.landmark
+    for j in range(L):
+        first = 0 if j < r else r + w * ((j - r) // w)
+        fill(U[j, first:j], 0.0)  # the lower half holds anything, and the variables of a part are moved together
+    mean = robot_frame(slam.motion, x[:r])
+    for i in range(m):
+        observe(slam, mean, x[at[i] : at[i] + w], Z[2 * L, s * i : s * i + s])
+    for k in range(2 * L):
+        j, step = k // 2, spread if k % 2 == 0 else -spread
+        first = 0 if j < r else (j - r) // w
+        copy(Z[2 * L, : s * first], Z[k, : s * first])
+        frame = mean
+        if j < r:
+            for a in range(r):
+                pose[a] = x[a] + step * U[j, a]
+            frame = robot_frame(slam.motion, pose)
+        for i in range(first, m):
+            for a in range(w):
+                landmark[a] = x[at[i] + a] + step * U[j, r + w * i + a]
+            projected = Z[k, s * i : s * i + s]
+            observe(slam, frame, landmark, projected)
+            wrap_residual(slam.sensor, projected, Z[2 * L, s * i : s * i + s])

@@ -1,0 +1,183 @@
+"""What a section of a report is made of, beside figures: text, tables, lists of facts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from consistency.bench.pages.drawing import Figure, Key
+from consistency.bench.pages.looks import Look
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Title of what follows."""
+
+    text: str
+    level: int = 3
+    paper: str = ""  # text on paper; empty: no heading there
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+    lead: str = ""  # bold words before it
+    style: Literal["", "note"] = ""
+
+
+@dataclass(frozen=True)
+class Name:
+    """Cell with a filter's name and how it looks."""
+
+    text: str
+    look: Look
+
+
+@dataclass(frozen=True)
+class Status:
+    """Cell with the word of a verdict."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Cell with a mark and a number."""
+
+    mark: str
+    meaning: str
+    text: str
+    emphasis: Literal["", "found", "tolerated"] = ""
+
+
+@dataclass(frozen=True)
+class Small:
+    """A line in small print under the text of a cell."""
+
+    text: str
+    paper: str | None = None  # another text on paper
+    italic: bool = False
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Cell with small print under its text."""
+
+    text: str
+    below: tuple[Small, ...]
+    bold: bool = False
+
+
+Cell: TypeAlias = str | Name | Status | Answer | Stack
+
+
+@dataclass(frozen=True)
+class Column:
+    """Head of a column."""
+
+    head: str
+    paper: str = ""  # another head on paper, where a line break is one
+    width: str = "auto"  # on paper, as Typst writes it
+    number: bool = False  # set at the right
+
+    @property
+    def short(self) -> str:
+        return self.paper or self.head
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under heads; the first cell of a row is its name."""
+
+    columns: tuple[Column, ...]
+    groups: tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]  # title, or none, and rows
+    label: str  # what a screen reader says
+    caption: str = ""
+    paper: str = ""  # another caption on paper
+    style: Literal["", "narrow", "prose", "marks", "grouped", "plain"] = ""
+    apart: bool = False  # on a screen the caption stands above the table, not in it
+    whole: bool = False  # not broken between pages
+
+
+@dataclass(frozen=True)
+class Reason:
+    """The sentence of a verdict, and the figures behind it."""
+
+    name: str
+    look: Look
+    sentence: str
+    others: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Reasons:
+    """Why each filter has its verdict."""
+
+    entries: tuple[Reason, ...]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Names and values."""
+
+    rows: tuple[tuple[str, str], ...]
+    heads: tuple[str, str] | None = None  # of the table on paper
+    width: str = "3cm"  # of the names on paper
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A scenario as JSON text."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Details:
+    """Blocks that a reader of the page unfolds; on paper, blocks under a heading, or under none."""
+
+    summary: str
+    blocks: tuple[Facts | Settings, ...]
+    paper: str = ""  # heading on paper
+    whole: bool = False  # not broken between pages
+
+
+Block: TypeAlias = Figure | Heading | Text | Table | Reasons | Facts | Settings | Details
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """Blocks under one heading of the first level."""
+
+    anchor: str
+    title: str
+    link: str  # in the contents
+    blocks: tuple[Block, ...]
+    summary: str = ""
+    switches: tuple[Key, ...] = ()  # filters that a reader can hide
+
+
+@dataclass(frozen=True)
+class Document:
+    """A whole report, ready to be shown."""
+
+    title: str
+    answer: str
+    chapters: tuple[Chapter, ...]
+    opening: tuple[Block, ...] = ()  # below the answer, before the contents
+
+    @property
+    def parts(self) -> tuple[tuple[Block, ...], ...]:
+        """Blocks of the opening, then of each chapter."""
+        return (self.opening, *(chapter.blocks for chapter in self.chapters))
+
+    @property
+    def figures(self) -> tuple[Figure, ...]:
+        return tuple(block for part in self.parts for block in part if isinstance(block, Figure))
+
+
+def table(columns: tuple[Column, ...], rows: list[tuple[Cell, ...]], label: str, **options: str | bool) -> Table:
+    """Table of rows without groups."""
+    return Table(columns, (("", tuple(rows)),), label, **options)  # type: ignore[arg-type]

@@ -1,0 +1,162 @@
+"""Exhibits: findings of an experiment beside the figures and tables that its numbers make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from consistency.bench.pages.blocks import Block, Cell, Column, Heading, Small, Stack, Status, Table, table
+from consistency.bench.pages.drawing import Figure, Key, Panel, Sheet
+from consistency.bench.pages.model import Report
+from consistency.bench.pages.section import Part, Section
+from consistency.bench.pages.tables import extra_table
+from consistency.bench.pages.wording import number, p_cell
+from consistency.bench.types import outcome
+
+OF_FINDINGS = (
+    Column("Finding", width="2.5cm"),
+    Column("Claim and rule", "Claim, rule and source", "2.5fr"),
+    Column("Published", width="1.1fr"),
+    Column("Measured", width="1.9fr"),
+    Column("Verdict", width="1.75cm"),
+)
+STATUS, P_VALUE = "status", "p"  # in place of a format: the word of a verdict, a p value
+
+
+@dataclass(frozen=True)
+class Source:
+    """A table that an experiment leaves, and what a report shows of it."""
+
+    name: str  # of the file, without its suffix
+    numbers: tuple[str, ...]
+    texts: tuple[str, ...]
+    show: Callable[[pd.DataFrame], Block]
+    missing: tuple[str, ...] = ()  # numbers that may be NaN
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """One or more findings that the same tables are behind."""
+
+    findings: tuple[str, ...]  # ids
+    title: str
+    sources: tuple[Source, ...]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """An exhibit as a folder has it."""
+
+    exhibit: Exhibit
+    findings: tuple[dict[str, Any], ...]
+    tables: tuple[tuple[Source, pd.DataFrame], ...]
+
+
+def section(part: Part, exhibits: Sequence[Exhibit]) -> Section[Report, tuple[Shown, ...]]:
+    """The section of these exhibits; an exhibit without any of its tables is left out."""
+
+    def read(report: Report) -> tuple[Shown, ...] | None:
+        """The exhibits of the folder; None where there is none.
+
+        Raises
+        ------
+        InputError
+            A file is damaged or lacks a column.
+        """
+        shown = (_read(report, exhibit) for exhibit in exhibits)
+        return tuple(each for each in shown if each.tables) or None
+
+    return Section(part, read, show)
+
+
+def _read(report: Report, exhibit: Exhibit) -> Shown:
+    own = tuple(finding for finding in report.findings if finding["id"] in exhibit.findings)
+    tables = []
+    for source in exhibit.sources:
+        path = report.folder / f"{source.name}.parquet"
+        data = extra_table(path, source.numbers, source.texts, source.missing)
+        if data is not None:
+            tables.append((source, data))
+    return Shown(exhibit, own, tuple(tables))
+
+
+def show(shown: tuple[Shown, ...]) -> tuple[Block, ...]:
+    """Each exhibit: its heading, its findings with published value, measured value and rule, and its tables."""
+    blocks: list[Block] = []
+    for each in shown:
+        blocks.append(Heading(each.exhibit.title, paper=each.exhibit.title))
+        if each.findings:
+            blocks.append(findings_table(each.findings, f"Findings on: {each.exhibit.title}"))
+        blocks += [source.show(data) for source, data in each.tables]
+    return tuple(blocks)
+
+
+def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str = "") -> Table:
+    """Claim, rule, published and measured value and verdict of each finding."""
+    rows = [_row(finding) for finding in findings]
+    return table(OF_FINDINGS, rows, label, caption=caption, paper=f"{caption}." if caption else "", style="prose")
+
+
+def _row(finding: dict[str, Any]) -> tuple[Cell, ...]:
+    below = []
+    if finding["accept"]:
+        below.append(Small(f"Accepted if: {finding['accept']}", italic=True))
+    source, run = str(finding["source"] or ""), _run(finding)
+    if source or run:
+        below.append(Small(f"{f'{source}. ' if source else ''}{run}", paper=source))
+    return (
+        Stack(str(finding["id"]), (), bold=True),
+        Stack(str(finding["claim"]), tuple(below)),
+        str(finding["published"]),
+        str(finding["measured"]),
+        Status(outcome(source, str(finding["verdict"]))),
+    )
+
+
+def _run(finding: dict[str, Any]) -> str:
+    scenario = finding["scenario"]
+    if not scenario or scenario == "none":
+        return ""
+    return f"Scenario {scenario}, {finding['runs']} runs, seed {finding['seed']}."
+
+
+def listing(data: pd.DataFrame, heads: Mapping[str, tuple[str, str]], label: str, caption: str = "") -> Table:
+    """Rows of a data frame.
+
+    Parameters
+    ----------
+    heads : column: head, and the format of a number, :data:`P_VALUE`, :data:`STATUS`, or "" for text
+    """
+    columns = tuple(Column(head, number=form not in ("", STATUS)) for head, form in heads.values())
+    rows = [
+        tuple(_cell(value, form) for value, (_, form) in zip(row, heads.values(), strict=True))
+        for row in data[list(heads)].itertuples(index=False)
+    ]
+    return table(columns, rows, label, caption=caption)
+
+
+def _cell(value: Any, form: str) -> Cell:
+    if form == STATUS:
+        return Status(str(value))
+    if form == P_VALUE:
+        return "–" if pd.isna(value) else p_cell(value)
+    return number(value, form) if form else str(value)
+
+
+def single(title: str, caption: str, panel: Panel, keys: tuple[Key, ...] = ()) -> Figure:
+    """A figure of one panel."""
+    return Figure(title, caption, (panel,), (Sheet((panel,), 2.4, keys=keys),), keys, level=4)
+
+
+def several(title: str, caption: str, panels: Sequence[Panel], keys: tuple[Key, ...]) -> Figure:
+    """A figure of two or three panels side by side."""
+    layout, own = ("pair" if len(panels) == 2 else "three"), tuple(panels)
+    return Figure(title, caption, own, (Sheet(own, 2.1, keys=keys),), keys, layout, level=4)  # type: ignore[arg-type]
+
+
+def groups(data: pd.DataFrame, column: str) -> list[tuple[str, pd.DataFrame]]:
+    """Rows by the text in a column, in the order in which the texts come."""
+    return [(str(name), part) for name, part in data.groupby(column, sort=False)]

@@ -1,0 +1,26 @@
+"""Published claims beside what was measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from consistency.bench.pages.blocks import Table
+from consistency.bench.pages.exhibits import findings_table
+from consistency.bench.pages.model import Report
+from consistency.bench.pages.section import Part, Section
+
+FINDINGS = Part("findings", "Findings: published beside measured", "Findings")
+CAPTION = "Rules of acceptance are constants of the scripts, fixed before this run"
+
+
+def read(report: Report) -> tuple[dict[str, Any], ...] | None:
+    """Findings of the folder; None where there are none."""
+    return report.findings or None
+
+
+def show(findings: tuple[dict[str, Any], ...]) -> tuple[Table, ...]:
+    """One row a finding."""
+    return (findings_table(findings, "Findings", CAPTION),)
+
+
+SECTION = Section(FINDINGS, read, show)

@@ -1,0 +1,28 @@
+"""Why there are no pose errors where the truth is not known."""
+
+from __future__ import annotations
+
+from consistency.bench.pages.blocks import Text
+from consistency.bench.pages.model import Study
+from consistency.bench.pages.section import STUDY, Section
+
+
+def read(study: Study) -> Study | None:
+    """The study, where its truth is not known."""
+    return None if study.has_truth else study
+
+
+def show(study: Study) -> tuple[Text, ...]:
+    """One paragraph."""
+    return (Text(note(study), style="note"),)
+
+
+def note(study: Study) -> str:
+    """What is left to judge."""
+    return (
+        f"The truth of {study.name} is not known, so there are no pose errors and no NEES to show; the innovations "
+        f"below are {'all that can be judged' if study.judged else 'reported and not judged'}."
+    )
+
+
+SECTION = Section(STUDY, read, show)

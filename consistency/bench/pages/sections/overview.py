@@ -1,0 +1,118 @@
+"""Where several studies were made: all their verdicts as one picture and one table, before everything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.bench.pages.blocks import Block, Cell, Column, Name, Status, Table, table
+from consistency.bench.pages.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span, dodge
+from consistency.bench.pages.looks import EXPECTED, SHADE, solid
+from consistency.bench.pages.model import Report, Track
+from consistency.bench.pages.section import OPENING, Section
+from consistency.bench.pages.sections.verdicts import inflation
+from consistency.bench.pages.wording import brief
+from consistency.referee.diagnostics import Interval
+
+TITLE = "Which filter tells the truth about its uncertainty, and where?"
+LABEL = "covariance ratio (truth / stated)"
+ROOM = 1.5  # factor between the outermost values and the edges of the picture
+COLUMNS = (
+    Column("World", width="1.6fr"),
+    Column("Filter", width="1fr"),
+    Column("Verdict", width="0.9fr"),
+    Column("Mean ANEES", number=True),
+    Column("Covariance to multiply by", number=True),
+)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the interval of a filter in a world is drawn."""
+
+    track: Track
+    world: str
+    y: float
+    ratio: Interval
+
+
+def read(report: Report) -> Report | None:
+    """The report; None where it has one study, whose verdicts are at hand anyway."""
+    return report if len(report.studies) > 1 and any(study.has_truth for study in report.studies) else None
+
+
+def show(report: Report) -> tuple[Block, ...]:
+    """A row of the picture for each world, a row of the table for each filter in it."""
+    return _picture(report), _table(report)
+
+
+def _table(report: Report) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for study in report.studies:
+        for track in study.tracks:
+            scale = track.verdict.scale
+            anees = "–" if scale is None else brief(scale.mean_anees)
+            rows.append(
+                (study.name, Name(track.name, track.look), Status(track.verdict.status), anees, inflation(track))
+            )
+    caption = "Every verdict of this report; a right filter has a mean ANEES of 3 for a pose in the plane."
+    return table(COLUMNS, rows, "Verdicts of all studies", caption=caption, paper=caption, style="narrow", apart=True)
+
+
+def _picture(report: Report) -> Figure:
+    worlds = tuple(study.name for study in report.studies)
+    filters = {track.name: track for study in report.studies for track in study.tracks}
+    places = [
+        Place(track, study.name, row + dodge(slot, len(study.tracks)), ratio)
+        for row, study in enumerate(report.studies)
+        for slot, track in enumerate(study.tracks)
+        if (ratio := _ratio(track)) is not None
+    ]
+    factor = next(iter(filters.values())).verdict.settings.factor
+    values = [1.0 / factor, factor, *(place.ratio[0] for place in places)]
+    panel = Panel(
+        Axis(LABEL, log=True, window=(min(values) / ROOM, max(values) * ROOM)),
+        Axis("", rows=worlds),
+        (Span("x", 1.0 / factor, factor, SHADE), Rule("x", 1.0, EXPECTED), *_intervals(places)),
+        "Covariance ratio of every filter in every world, with its interval",
+        height=70 + 34 * len(worlds),
+    )
+    shade = Key(f"tolerated: 1 / {factor:g} to {factor:g}", SHADE, "band")
+    named = tuple(Key(name, solid(track.look), "points") for name, track in filters.items())
+    keys = (shade, Key("right", EXPECTED), *named)
+    caption = (
+        "By how much the covariance of the pose must grow to match the errors, with 95 % intervals; log axis. A filter "
+        "is shown to be honest where its whole interval lies in the shade and no other question found a fault; to the "
+        "right of it is overconfident. An arrow goes on beyond the drawn range."
+    )
+    sheet = Sheet((panel,), 0.6 + 0.2 * len(worlds), keys=keys)
+    return Figure(TITLE, caption, (panel,), (sheet,), keys, level=2, paper=f"{TITLE} {caption}")
+
+
+def _ratio(track: Track) -> Interval | None:
+    scale = track.verdict.scale
+    known = scale is not None and np.isfinite(scale.inflation.value) and scale.inflation.value > 0
+    return scale.inflation if known and scale is not None else None
+
+
+def _intervals(places: list[Place]) -> list[Intervals]:
+    """The intervals of each filter, in all worlds."""
+    marks = []
+    for name in dict.fromkeys(place.track.name for place in places):
+        own = [place for place in places if place.track.name == name]
+        value, low, high = np.array([place.ratio for place in own]).T
+        columns = {
+            "world": [place.world for place in own],
+            "filter": [name] * len(own),
+            "verdict": [place.track.verdict.status for place in own],
+            "text": [inflation(place.track) for place in own],
+        }
+        tips = (("world", "@world"), ("filter", "@filter"), ("verdict", "@verdict"), ("covariance", "@text"))
+        look = replace(own[0].track.look, size=5.0, width=1.3)
+        y = np.array([place.y for place in own])
+        marks.append(Intervals(y, value, low, high, look, None, tips, columns))
+    return marks
+
+
+SECTION = Section(OPENING, read, show)

@@ -1,0 +1,74 @@
+"""Where the numbers come from: seeds, versions, settings."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from consistency.bench.pages.blocks import Block, Details, Facts, Settings
+from consistency.bench.pages.model import Report, Study
+from consistency.bench.pages.section import Part, Section
+from consistency.bench.pages.wording import number
+
+PROVENANCE = Part("provenance", "Provenance", "Provenance")
+SHORT = 4000  # characters of settings that surely fit on one page
+
+
+def read(report: Report) -> Report:
+    """The whole report: every folder has a manifest."""
+    return report
+
+
+def show(report: Report) -> tuple[Block, ...]:
+    """Facts of the folder, then of each study with its settings."""
+    rows = facts(report.manifest)
+    return Facts(rows), *(_study(study, rows, len(report.studies) > 1) for study in report.studies)
+
+
+def _study(study: Study, stated: tuple[tuple[str, str], ...], several: bool) -> Details:
+    """Facts of one study that the report does not state already, and its settings."""
+    rows = tuple(row for row in facts(study.results.manifest) if row not in stated)
+    settings = resolved(study)
+    return Details(
+        f"{study.name}: {'provenance and ' if several else ''}resolved {'belief' if study.is_log else 'scenario'}",
+        (*((Facts(rows),) if rows else ()), Settings(settings)),
+        paper=f"{study.name}: {'provenance and ' if several else ''}resolved settings",
+        whole=len(settings) < SHORT,
+    )
+
+
+def resolved(study: Study) -> str:
+    """The scenario, or the log's belief, as JSON."""
+    manifest = study.results.manifest
+    return json.dumps(_rounded(manifest.get("scenario") or manifest.get("belief") or {}), indent=2, ensure_ascii=False)
+
+
+def _rounded(value: Any) -> Any:
+    """Six digits of every number, to read; the manifest has them all."""
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def facts(manifest: dict[str, Any]) -> tuple[tuple[str, str], ...]:
+    """What a manifest says of its run."""
+    versions = manifest.get("versions") or {}
+    wall, screening = manifest.get("wall_time_s"), manifest.get("screening")
+    rows = {
+        "Seed": manifest.get("seed"),
+        "Runs": manifest.get("runs"),
+        "Scenario hash": manifest.get("scenario_hash"),
+        "Screened": screening and "{broken} of {judged} observations leave the common motion".format_map(screening),
+        "Command": manifest.get("command"),
+        "Git commit": manifest.get("git_commit"),
+        "Wall time": None if wall is None else f"{number(float(wall), '.1f')} s",
+        "Versions": ", ".join(f"{name} {version}" for name, version in versions.items()) or None,
+    }
+    if manifest.get("complete") is False:
+        rows["Complete"] = "no: the run was interrupted; the numbers are of the finished runs"
+    return tuple((name, str(value)) for name, value in rows.items() if value is not None)
+
+
+SECTION = Section(PROVENANCE, read, show)

@@ -1,0 +1,136 @@
+"""The world from above with the paths of one run, as Herath et al. (2007) fig. 2a."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.bench.models.motion import dead_reckoning
+from consistency.bench.pages.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, xy
+from consistency.bench.pages.looks import ODOMETRY, TRUTH, Look
+from consistency.bench.pages.model import Study, Track
+from consistency.bench.pages.section import STUDY, Section
+from consistency.bench.simulation import simulate
+from consistency.referee.types import Array, Indices
+
+LANDMARK = Look("#8c8c8c", marker="*", size=4.0)
+ALONE = Look(ODOMETRY, (6.0, 3.0), width=1.1)
+TRUE = Look(TRUTH, width=1.6)
+START = Look("#ffffff", size=8.0, edge=TRUTH)
+
+
+@dataclass(frozen=True)
+class World:
+    """Paths of one run of T steps, in m."""
+
+    study: Study
+    paths: tuple[tuple[Track, Array], ...]  # (T, 2), NaN where there is no estimate
+    truth: Array | None  # (T + 1, 2)
+    odometry: Array | None  # (T + 1, 2)
+    landmarks: Array | None  # (N, 2)
+
+
+def read(study: Study) -> World:
+    """Paths of the shown run."""
+    landmarks = study.results.landmarks
+    return World(
+        study,
+        tuple((track, _path(study, track.name)) for track in study.tracks),
+        _truth(study),
+        _odometry(study),
+        None if landmarks is None else landmarks[["x", "y"]].to_numpy(float),
+    )
+
+
+def _path(study: Study, filter_name: str) -> Array:
+    path = np.full((len(study.steps), 2), np.nan)
+    step, values = _of_shown_run(study, "estimates", filter_name)
+    path[step - 1] = values
+    return path
+
+
+def _truth(study: Study) -> Array | None:
+    step, path = _of_shown_run(study, "truth")
+    return path[np.argsort(step, kind="stable")] if len(path) else None
+
+
+def _of_shown_run(study: Study, table: str, filter_name: str | None = None) -> tuple[Indices, Array]:
+    """Steps (N,) and positions (N, 2), m."""
+    rows = [np.zeros((0, 3))]
+    for batch in study.results.batches(table, ["run", "step", "x", "y"], filter_name):
+        rows.append(np.stack([batch["step"], batch["x"], batch["y"]], axis=-1)[batch["run"] == study.shown_run])
+    found = np.concatenate(rows)
+    return found[:, 0].astype(np.int64), found[:, 1:]
+
+
+def _odometry(study: Study) -> Array | None:
+    """The path by the controls alone; results keep no controls, but a simulated trial can be drawn again."""
+    scenario, seed = study.results.scenario, study.results.manifest.get("seed")
+    if scenario is None or seed is None:
+        return None
+    trial = simulate(scenario, study.shown_run, int(seed))
+    return dead_reckoning(trial.start, trial.controls)[:, :2]
+
+
+def figures(world: World) -> tuple[Figure, ...]:
+    """One map."""
+    study = world.study
+    panel = Panel(
+        Axis("x (m)"), Axis("y (m)"), (*_surroundings(world), *_estimates(world), *_start(world)),
+        f"Map of {study.name}", height=520, shape="map", equal=True,
+    )  # fmt: skip
+    keys = (*_keys(world), *study.keys())
+    title = f"Scenario and estimates, run {study.shown_run}"
+    return (Figure(title, caption(world), (panel,), (Sheet((panel,), 2.5, keys=keys, beside=True),), keys),)
+
+
+def _surroundings(world: World) -> list[Mark]:
+    marks: list[Mark] = []
+    if world.landmarks is not None:
+        marks.append(Points(*xy(world.landmarks), LANDMARK))
+    if world.odometry is not None:
+        marks.append(Line(*xy(world.odometry), ALONE, path=True))
+    if world.truth is not None:
+        marks.append(Line(*xy(world.truth), TRUE, path=True))
+    return marks
+
+
+def _start(world: World) -> list[Mark]:
+    return [] if world.truth is None else [Points(*xy(world.truth[:1]), START)]
+
+
+def _estimates(world: World) -> list[Mark]:
+    tips = (("step", "@step"), ("x", "@x{0.00} m"), ("y", "@y{0.00} m"))
+    return [
+        Line(*xy(path), track.look, track.owner, tips, {"step": world.study.steps}, path=True)
+        for track, path in world.paths
+    ]
+
+
+def _keys(world: World) -> list[Key]:
+    keys = []
+    if world.truth is not None:
+        keys += [Key("true path", TRUE), Key("start", START, "points")]
+    if world.odometry is not None:
+        keys.append(Key("odometry alone", ALONE))
+    if world.landmarks is not None:
+        keys.append(Key("landmark", LANDMARK, "points"))
+    return keys
+
+
+def caption(world: World) -> str:
+    """What the map shows."""
+    parts = []
+    if world.truth is not None:
+        parts.append("true path solid with its start as a circle")
+    if world.odometry is not None:
+        parts.append("path by odometry alone dashed grey")
+    if world.landmarks is not None:
+        parts.append(f"{len(world.landmarks)} landmarks as stars")
+    parts.append("estimates in the filters' colours")
+    note = "" if world.odometry is not None else " The odometry path is left out: results of a log hold no controls."
+    return f"{world.study.name} from above, run {world.study.shown_run}: {', '.join(parts)}.{note}"
+
+
+SECTION = Section(STUDY, read, figures)

@@ -1,0 +1,99 @@
+"""The workers of this machine."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from itertools import islice
+
+import joblib
+
+from consistency.bench.filters.compiled import one_blas_thread
+from consistency.bench.runs.work import Outcomes, Work
+from consistency.bench.store.results import Outcome
+from consistency.referee.errors import InputError
+
+AHEAD = 2  # runs that wait for each worker, so that none waits for them
+GLANCE = 0.1  # s between looks, for a signal that another thread was given
+
+
+@dataclass
+class Local:
+    """Threads: compiled filters release the GIL, and who waits for the process of another filter does.
+
+    Parameters
+    ----------
+    jobs : number of workers, -1 for one a core
+
+    Raises
+    ------
+    InputError
+        Another number.
+    """
+
+    jobs: int = -1
+
+    _room: int = field(default=sys.maxsize, init=False, repr=False, compare=False)  # workers that have memory
+
+    def __post_init__(self) -> None:
+        worker_count(self.jobs)
+
+    def prepare(self, work: Work, run: int, /) -> None:
+        """See :class:`consistency.runs.work.Backend`.
+
+        Raises
+        ------
+        InputError
+            A run takes more memory than there is.
+        """
+        workers = worker_count(self.jobs)
+        fitting = work.room_for(run, workers)
+        self._room = fitting if self.jobs == -1 else workers
+        work.compile(run, workers)
+
+    def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
+        """See :class:`consistency.runs.work.Backend`."""
+        workers = min(worker_count(self.jobs), len(runs), self._room)
+        with one_blas_thread():
+            if workers > 1:
+                yield from _in_threads(work, runs, workers)
+            else:
+                with work.isolation:
+                    yield from map(work, runs)
+
+
+def _in_threads(work: Work, runs: Sequence[int], workers: int) -> Outcomes:
+    pool, todo = ThreadPoolExecutor(workers), iter(runs)
+    try:
+        with work.isolation:  # left first, so that no thread waits for a process that hangs
+            waiting: set[Future[Outcome]] = set()
+            while True:
+                waiting |= {pool.submit(work, run) for run in islice(todo, AHEAD * workers - len(waiting))}
+                if not waiting:
+                    break
+                done, waiting = wait(waiting, GLANCE, FIRST_COMPLETED)
+                ready = sorted(done, key=_failed, reverse=True)  # what is finished counts, whatever ends the rest
+                del done  # an outcome that was handed on is kept by nobody here
+                while ready:
+                    yield ready.pop().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _failed(future: Future[Outcome]) -> bool:
+    return future.exception() is not None
+
+
+def worker_count(jobs: int) -> int:
+    """Number of workers that ``jobs`` stands for: itself, or one a core for -1.
+
+    Raises
+    ------
+    InputError
+        Any other number.
+    """
+    if jobs == 0 or jobs < -1:
+        raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
+    return jobs if jobs > 0 else int(joblib.cpu_count())

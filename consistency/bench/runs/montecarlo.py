@@ -1,0 +1,248 @@
+"""Monte Carlo studies: trials through filters, in parallel, with the same bits for any number of workers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any, overload
+
+import pandas as pd
+
+from consistency.bench.filters import filter_names, get_filter, usable_names
+from consistency.bench.filters.stepping import error_of, name_of
+from consistency.bench.protocols import Filter
+from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.campaign import Campaign, own_errors
+from consistency.bench.runs.campaign import Interrupted as Interrupted
+from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.resuming import PLAN, place_for, place_with
+from consistency.bench.runs.work import Backend, Recorded, Simulated, Work
+from consistency.bench.scenario import Belief, Scenario
+from consistency.bench.scenario.tables import UNITS
+from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
+from consistency.bench.store.journal import Journal
+from consistency.bench.store.log import Log, write_log
+from consistency.bench.store.results import Results, StoredResults, Tables
+from consistency.bench.store.storage import require_free
+from consistency.bench.store.tables import require_format
+from consistency.referee.errors import InputError
+from consistency.referee.reading import require_name
+from consistency.referee.system.provenance import manifest_of
+
+
+# fmt: off
+@overload
+def run_trials(
+    scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
+    timeout: float | None = ..., previous: Tables | None = ..., out: None = ..., overwrite: bool = ...,
+    resume: bool = ..., memory: float | None = ..., backend: Backend | None = ...,
+) -> Results: ...
+@overload
+def run_trials(
+    scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
+    timeout: float | None = ..., previous: Tables | None = ..., *, out: str | Path, overwrite: bool = ...,
+    resume: bool = ..., memory: float | None = ..., backend: Backend | None = ...,
+) -> StoredResults: ...
+# fmt: on
+def run_trials(
+    scenario: Scenario,
+    filters: Sequence[str | Filter],
+    runs: int = 50,
+    seed: int = 0,
+    jobs: int = -1,
+    timeout: float | None = None,
+    previous: Tables | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    memory: float | None = None,
+    backend: Backend | None = None,
+) -> Results | StoredResults:
+    """Simulate ``runs`` trials of ``scenario`` and put each through every filter.
+
+    Parameters
+    ----------
+    filters : names of built-in filters, or objects with ``init``, ``predict``, ``update`` and ``pose``
+    seed : the results are a function of (scenario, filter, seed, run) alone
+    jobs : workers; -1 for one per core. Compiled filters share threads, each other filter has processes of its own.
+    timeout : seconds per trial, after which the process of a filter that is not compiled is killed
+    previous : results of the same scenario, filters and seed to go on from; its runs are not done again
+    out : folder for the results, which appears as a whole at the end. Finished runs are kept in a journal beside it
+        as they come, so that memory does not grow with the runs, and none is lost, whatever ends the process
+    overwrite : replace ``out``, where it is an output folder of this bench, and drop unfinished work on it; that of
+        ``previous`` is replaced anyway
+    resume : continue from the runs in ``out`` and in its journal
+    memory : GiB that a filter that is not compiled may allocate in a trial; Linux only
+    backend : machines that do the runs, in place of ``jobs`` workers of this machine
+
+    Returns
+    -------
+    Results in memory; with ``out`` those in the folder, which are read on demand
+
+    Raises
+    ------
+    InputError
+        An unknown filter, one that does not fit the sensor, a number out of range, nothing in view, or a folder that
+        cannot be written, holds unfinished work, or is worked on by another process.
+    Interrupted
+        Ctrl-C, or a signal that is taken as such; carries the finished runs, and the folder, if any, is written.
+    """
+    _require_counts(runs, seed)
+    with studied(
+        scenario, filters, seed, backend or Local(jobs), timeout, memory, out=out, previous=previous, resume=resume,
+        overwrite=overwrite,
+    ) as campaign:  # fmt: skip
+        done = campaign.gathered.finished
+        if done and max(done) >= runs:
+            raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
+        return campaign.finish([range(runs)])
+
+
+# fmt: off
+@overload
+def run_log(
+    log: Log, filters: Sequence[str | Filter], jobs: int = ..., timeout: float | None = ...,
+    memory: float | None = ..., backend: Backend | None = ..., out: None = ..., resume: bool = ...,
+    overwrite: bool = ...,
+) -> Results: ...
+@overload
+def run_log(
+    log: Log, filters: Sequence[str | Filter], jobs: int = ..., timeout: float | None = ...,
+    memory: float | None = ..., backend: Backend | None = ..., *, out: str | Path, resume: bool = ...,
+    overwrite: bool = ...,
+) -> StoredResults: ...
+# fmt: on
+def run_log(
+    log: Log,
+    filters: Sequence[str | Filter],
+    jobs: int = -1,
+    timeout: float | None = None,
+    memory: float | None = None,
+    backend: Backend | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> Results | StoredResults:
+    """Put every run of a recorded log through every filter.
+
+    Parameters and exceptions are those of :func:`run_trials`. A resume is refused if a file of the log or its screening
+    has changed.
+    """
+    instances = resolve_filters(filters, log.belief, log.name)
+    trials = {trial.run: trial for trial in log.trials}
+    work = Work(Recorded(trials), Isolation(instances, log.belief, timeout, memory))
+    own = {"log_sha256": log.sha256} | ({"screening": log.screening} if log.screening else {})
+    fields = {"seed": None, "log": log.name, "belief": log.belief.model_dump(mode="json")} | own
+    with place_for(_known(instances) | own, None if out is None else Path(out), None, resume, overwrite) as place:
+        return Campaign(backend or Local(jobs), work, place, fields, log.landmarks).finish([sorted(trials)])
+
+
+@contextmanager
+def studied(
+    scenario: Scenario,
+    filters: Sequence[str | Filter],
+    seed: int,
+    backend: Backend,
+    timeout: float | None,
+    memory: float | None,
+    *,
+    out: str | Path | None,
+    previous: Tables | None,
+    resume: bool,
+    overwrite: bool,
+    plan: Mapping[str, Any] | None = None,
+    journal: Journal | None = None,
+) -> Iterator[Campaign]:
+    """Runs of a scenario, continued from earlier ones; see :func:`run_trials`, which raises the same exceptions.
+
+    Parameters
+    ----------
+    plan : by which the number of runs is found
+    journal : in place of ``out``: what keeps the finished runs, and may hold some; the caller knows that they are of
+        this study
+    """
+    instances = resolve_filters(filters, scenario.belief)
+    work = Work(Simulated(scenario, seed), Isolation(instances, scenario.belief, timeout, memory))
+    planned = {} if plan is None else {PLAN: dict(plan)}
+    known = _known(instances) | {"scenario_hash": scenario.hash, "seed": seed} | planned
+    fields = {"seed": seed} | _scenario_entry(scenario) | planned
+    with (
+        place_for(known, None if out is None else Path(out), previous, resume, overwrite)
+        if journal is None
+        else nullcontext(place_with(journal))
+    ) as place:
+        yield Campaign(backend, work, place, fields, _landmarks_table(scenario))
+
+
+def _known(filters: Sequence[Filter]) -> dict[str, Any]:
+    """What a resume must have in common, of the filters."""
+    return {"filters": [name_of(f) for f in filters], "error": own_errors(filters)}
+
+
+def resolve_filters(filters: Sequence[str | Filter], belief: Belief, log: str | None = None) -> list[Filter]:
+    """Filters by name or as they are, checked against the sensor, of the log in a folder or of a scenario."""
+    instances = [get_filter(f) if isinstance(f, str) else f for f in filters]
+    if not instances:
+        raise InputError(f"no filter given; known: {', '.join(filter_names())}")
+    for filter_ in instances:
+        if isinstance(filter_, type) or not isinstance(filter_, Filter):
+            hint = (
+                "give an object of it, with ()" if isinstance(filter_, type) else "it needs init, predict, update, pose"
+            )
+            raise InputError(f"{filter_!r} is no filter: {hint}")
+    names = [name_of(f) for f in instances]
+    if len(set(names)) < len(names):
+        raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+    model = belief.sensor.model
+    for filter_ in instances:
+        require_name(name_of(filter_), "filter")
+        error_of(filter_)
+        sensors = getattr(filter_, "sensors", None)
+        if sensors is not None and model not in sensors:
+            fitting = [name for name in usable_names() if model in getattr(get_filter(name), "sensors", (model,))]
+            raise InputError(
+                f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
+                f"filters that fit: {', '.join(fitting)}"
+            )
+        for key in getattr(filter_, "needs", ()):
+            if getattr(belief.sensor, key) is None:
+                unit = f"{key}{UNITS.get(key, '')}"
+                place = f"key 'belief.sensor.{unit}'" if log is None else f"{log}/sensor.toml: key '{unit}'"
+                raise InputError(f"{place}: missing; filter '{name_of(filter_)}' needs it, so add it or leave it out")
+    return instances
+
+
+def simulate_log(
+    scenario: Scenario, runs: int, seed: int, out: Path, overwrite: bool = False, form: str = "parquet"
+) -> None:
+    """Write ``runs`` simulated trials as a log folder, in Parquet or as CSV; raises as :func:`run_trials`."""
+    _require_counts(runs, seed)
+    require_format(form)
+    world = require_landmarks_in_view(scenario)
+    require_free(out, overwrite, "log")
+    started = time.monotonic()
+    trials = [world.trial(run, seed) for run in range(runs)]
+    manifest = manifest_of(kind="log", seed=seed, runs=runs, wall=time.monotonic() - started, complete=True)
+    manifest |= _scenario_entry(scenario) | {"failures": 0}
+    sensor = scenario.truth.sensor
+    view = None if sensor.image is None else (sensor.image, sensor.centre)
+    write_log(out, trials, scenario.belief, _landmarks_table(scenario), manifest, overwrite, view, form=form)
+
+
+def _require_counts(runs: int, seed: int) -> None:
+    if runs < 1:
+        raise InputError(f"runs must be at least 1, got {runs}")
+    if seed < 0:
+        raise InputError(f"seed must not be negative, got {seed}")
+
+
+def _scenario_entry(scenario: Scenario) -> dict[str, Any]:
+    return {"scenario": scenario.model_dump(mode="json"), "scenario_hash": scenario.hash}
+
+
+def _landmarks_table(scenario: Scenario) -> pd.DataFrame:
+    table = pd.DataFrame(draw_landmarks(scenario.truth), columns=["x", "y", "z"])
+    table.insert(0, "landmark", range(len(table)))
+    return table

@@ -1,0 +1,161 @@
+"""Run until the verdict is clear: a few trials, a look, more trials where it is still open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from consistency.bench.protocols import Filter
+from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.campaign import Campaign
+from consistency.bench.runs.montecarlo import studied
+from consistency.bench.runs.work import Backend
+from consistency.bench.scenario import Scenario
+from consistency.bench.store.curves import Curves, curves
+from consistency.bench.store.journal import Journal
+from consistency.bench.store.judge import beside, evidence_of
+from consistency.bench.store.results import Results, StoredResults, Tables
+from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
+from consistency.referee.diagnostics import Design, Verdict, look, sequential_design, speaks
+from consistency.referee.errors import InputError
+from consistency.referee.reading.columns import POSE
+from consistency.referee.terminal.progress import say
+from consistency.referee.verdicts.options import refused
+
+
+def run_until_decided(
+    scenario: Scenario,
+    filters: Sequence[str | Filter],
+    *,
+    detect: float = DETECT,
+    false_alarm: float = FALSE_ALARM,
+    power: float = POWER,
+    max_runs: int | None = None,
+    lost: float | None = None,
+    seed: int = 0,
+    jobs: int = -1,
+    timeout: float | None = None,
+    previous: Tables | None = None,
+    memory: float | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    backend: Backend | None = None,
+    journal: Journal | None = None,
+) -> tuple[Results | StoredResults, dict[str, Verdict]]:
+    """Simulate and judge at the inspections of a :class:`Design` until every filter is decided.
+
+    A filter is decided at the first inspection that finds a fault, or shows the ratio of true to stated covariance to
+    lie in [1 / detect, detect] and, where ``lost`` is given, the share of lost runs to be that at most. This verdict is
+    final, however many runs other filters take. With ``max_runs``, a filter still open after that many is undecided.
+    Which runs are drawn does not depend on the looks.
+
+    Parameters
+    ----------
+    seed, jobs, timeout, previous, memory, out, resume, overwrite, backend : as for :func:`run_trials`. A look then
+        holds the arrays of one filter in memory, and nothing else grows with the runs.
+    journal : in place of ``out``: what keeps the finished runs while the results stay in memory. It may hold runs of
+        the same scenario, filters and seed.
+
+    Returns
+    -------
+    Results of all runs, with the plan in their manifest, and the verdict of each filter at the look that decided it
+
+    Raises
+    ------
+    InputError, Interrupted
+        As :func:`run_trials`; a plan that cannot be, or is not that of the results to resume.
+    """
+    plan: dict[str, Any] = {
+        "dof": len(POSE), "detect": detect, "false_alarm": false_alarm, "power": power, "max_runs": max_runs,
+    }  # fmt: skip
+    plan |= {} if lost is None else {"lost": lost}
+    design, decided = plan_of(plan), dict[str, Verdict]()
+    with studied(
+        scenario, filters, seed, backend or Local(jobs), timeout, memory,
+        out=out, previous=previous, resume=resume, overwrite=overwrite, plan=plan, journal=journal,
+    ) as campaign:  # fmt: skip
+        _require_less(campaign, max_runs)
+        names = campaign.gathered.filters
+        read = partial(_curves, campaign, scenario.truth.steps)
+        results = campaign.finish(_rounds(campaign, looks(design, names, read, decided), decided, names))
+    return results, {name: decided[name] for name in names}
+
+
+def looks(
+    design: Design, filters: Sequence[str], read: Callable[[int, str], Curves], decided: dict[str, Verdict]
+) -> Iterator[int]:
+    """Yield the number of runs of each inspection, look when they are there, and end when all ``filters`` are decided.
+
+    Parameters
+    ----------
+    read : arrays of the first runs of a filter, by their number and its name
+    decided : where verdicts go, by filter
+    """
+    for runs, spent in design.inspections():
+        yield runs
+        for name in [name for name in filters if name not in decided]:
+            verdict = _look(design, read(runs, name), runs, spent)
+            if verdict is not None and (settled(verdict) or runs == design.max_runs):
+                decided[name] = verdict
+        if len(decided) == len(filters):
+            return
+
+
+def _look(design: Design, c: Curves, runs: int, spent: float | None) -> Verdict | None:
+    """What is said after so many runs; None where it is not the time to ask."""
+    evidence = evidence_of(c, runs)
+    if runs != design.max_runs and not speaks(design, evidence, spent):
+        return None
+    return beside(look(design, evidence, spent), c, design, runs)
+
+
+def _curves(campaign: Campaign, steps: int, runs: int, name: str) -> Curves:
+    return curves(campaign.so_far(runs), name, steps)
+
+
+def _rounds(
+    campaign: Campaign, counts: Iterator[int], decided: dict[str, Verdict], names: list[str]
+) -> Iterator[range]:
+    """Runs up to each look; says how it stands after those that were new."""
+    is_new, runs = False, 0
+    for ahead in counts:
+        if is_new:
+            say(f"{runs} runs: {progress_text(decided, names)}")
+        runs, is_new = ahead, not campaign.gathered.finished.issuperset(range(ahead))
+        yield range(runs)
+    if is_new:
+        say(f"{runs} runs: {progress_text(decided, names)}")
+    elif campaign.place.is_complete:
+        done = len(campaign.gathered.finished)
+        raise InputError(f"the {done} runs of the results to resume have decided every filter")
+
+
+def _require_less(campaign: Campaign, max_runs: int | None) -> None:
+    """Refuse results to which no run can be added."""
+    done = campaign.gathered.finished
+    before = next(run for run in count() if run not in done)
+    if max_runs is not None and (before > max_runs or (before == max_runs and campaign.place.is_complete)):
+        raise InputError(f"the results to resume have {before} runs; the plan looks for the last time at {max_runs}")
+
+
+def plan_of(plan: dict[str, Any]) -> Design:
+    """The design of a plan; raises InputError where it cannot be."""
+    try:
+        return sequential_design(**plan)
+    except ValueError as error:
+        raise refused(error) from None
+
+
+def settled(verdict: Verdict) -> bool:
+    """No further run changes what this look says."""
+    return verdict.status != "undecided"
+
+
+def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:
+    """One line of progress."""
+    parts = [f"{name} {verdict.status}" for name, verdict in decided.items()]
+    return ", ".join(parts + [f"{name} open" for name in filters if name not in decided])

@@ -1,0 +1,101 @@
+"""Scenarios: a TOML file becomes a frozen record of what is true and what the filter believes.
+
+``tables`` reads files, ``sensor`` has the one definition of a sensor, ``truth`` and ``belief`` the two halves of a
+scenario, ``record`` puts them together, ``writing`` makes a file of one. ``effects`` holds what a sensor does to an
+ideal observation, one effect a file: its keys and its ``apply``. Nothing here draws a trial; that is the simulation's.
+"""
+
+from consistency.bench.scenario.agreement import misbelief
+from consistency.bench.scenario.belief import Belief, BelievedMotion, GuardSettings, SigmaPoints
+from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
+from consistency.bench.scenario.record import Scenario, load_scenario, scenario_names
+from consistency.bench.scenario.sensor import (
+    PLANAR_SENSORS,
+    BelievedSensor,
+    LinearSensor,
+    Mount,
+    PicturedSensor,
+    RangeBearingSensor,
+    RelativeXySensor,
+    TrueSensor,
+    UvdSensor,
+    XyzSensor,
+)
+from consistency.bench.scenario.tables import (
+    Count,
+    Finite,
+    Interval,
+    NonNegative,
+    Positive,
+    Sigmas,
+    Table,
+    Triple,
+    explain,
+    read_table,
+)
+from consistency.bench.scenario.truth import (
+    AnnularLandmarks,
+    Circle,
+    CircularLandmarks,
+    Corridor,
+    FigureOfEight,
+    ListedLandmarks,
+    Path_,
+    RoundedRectangle,
+    TrueMotion,
+    Truth,
+    UniformLandmarks,
+    Waypoints,
+)
+from consistency.bench.scenario.writing import scenario_text, toml_text
+from consistency.referee.reading.shipped import data_folder
+
+__all__ = [
+    "PLANAR_SENSORS",
+    "AnnularLandmarks",
+    "Belief",
+    "BelievedMotion",
+    "BelievedSensor",
+    "BiasMap",
+    "Circle",
+    "CircularLandmarks",
+    "Corridor",
+    "Count",
+    "DisparityGrowth",
+    "FigureOfEight",
+    "Finite",
+    "GuardSettings",
+    "Interval",
+    "LinearSensor",
+    "ListedEffect",
+    "ListedLandmarks",
+    "LocalBias",
+    "Mount",
+    "NonNegative",
+    "Path_",
+    "PicturedSensor",
+    "Positive",
+    "RangeBearingSensor",
+    "RelativeXySensor",
+    "RoundedRectangle",
+    "Scenario",
+    "SigmaPoints",
+    "Sigmas",
+    "Table",
+    "Triple",
+    "TrueMotion",
+    "TrueSensor",
+    "Truth",
+    "UniformLandmarks",
+    "UvdSensor",
+    "Waypoints",
+    "XyzSensor",
+    "data_folder",
+    "explain",
+    "load_scenario",
+    "misbelief",
+    "read_table",
+    "scenario_names",
+    "scenario_text",
+    "toml_text",
+]

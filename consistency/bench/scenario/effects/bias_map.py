@@ -1,0 +1,70 @@
+"""Local biases over the image, Herath et al. (2007) sec. 4.1 and fig. 8."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from consistency.bench.scenario.effects.nodes import require_increasing
+from consistency.bench.scenario.tables import Finite, Table
+from consistency.referee.types import Array
+
+Nodes = Annotated[tuple[Finite, ...], Field(min_length=1)]
+Matrix = tuple[tuple[Finite, ...], ...]
+MATRICES = ("bias_u", "bias_v", "bias_d")
+
+
+class BiasMap(Table):
+    """Constant errors of u, v and d as tables over the image: bilinear between the nodes, constant beyond them.
+
+    A matrix has a row for each of ``v`` and a column for each of ``u``; one that is left out is zero.
+    """
+
+    units: ClassVar[dict[str, str]] = dict.fromkeys(("u", "v", *MATRICES), "_px")
+
+    u: Nodes  # (K,), px from the principal point, increasing
+    v: Nodes  # (L,), likewise
+    bias_u: Matrix = ()  # (L, K), px
+    bias_v: Matrix = ()
+    bias_d: Matrix = ()
+
+    @model_validator(mode="after")
+    def _is_a_grid(self) -> BiasMap:
+        for key in ("u", "v"):
+            require_increasing(key, getattr(self, key))
+        rows, columns = len(self.v), len(self.u)
+        for key in MATRICES:
+            matrix = getattr(self, key)
+            if matrix and [len(row) for row in matrix] != [columns] * rows:
+                widths = " and ".join(str(width) for width in sorted({len(row) for row in matrix}))
+                raise ValueError(
+                    f"{key} must have {rows} rows, one for each of v, of {columns} numbers, one for each of u; "
+                    f"got {len(matrix)} of {widths}"
+                )
+        if not any(getattr(self, key) for key in MATRICES):
+            raise ValueError(f"give at least one of {', '.join(MATRICES)}")
+        return self
+
+    def at(self, u: Array, v: Array) -> Array:
+        """Biases (..., 3) of u, v and d at pixels ``u``, ``v`` (...) from the principal point, all in px."""
+        left, right, across = _between(np.asarray(u, float), self.u)
+        low, high, down = _between(np.asarray(v, float), self.v)
+        table = self._table()
+        near = table[low, left] + across * (table[low, right] - table[low, left])
+        far = table[high, left] + across * (table[high, right] - table[high, left])
+        bias: Array = near + down * (far - near)
+        return bias
+
+    def _table(self) -> Array:
+        """All three matrices, (L, K, 3)."""
+        zero = np.zeros((len(self.v), len(self.u)))
+        return np.stack([np.array(getattr(self, key)) if getattr(self, key) else zero for key in MATRICES], axis=-1)
+
+
+def _between(x: Array, nodes: tuple[float, ...]) -> tuple[Array, Array, Array]:
+    """Indices of the nodes on both sides of x (...), and how far x is from the one to the other, (..., 1)."""
+    place = np.interp(x, nodes, np.arange(len(nodes)))
+    before = np.minimum(place.astype(np.int64), max(len(nodes) - 2, 0))
+    return before, np.minimum(before + 1, len(nodes) - 1), (place - before)[..., None]

@@ -1,0 +1,44 @@
+"""Mismatches of the stereo correspondence, Herath et al. (2007) sec. 4.3 and fig. 9c."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal, cast
+
+import numpy as np
+from pydantic import model_validator
+
+from consistency.bench.scenario.effects.effect import ListedEffect, register
+from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
+from consistency.bench.scenario.tables import Positive, Rate
+
+if TYPE_CHECKING:
+    from consistency.bench.scenario.sensor import UvdSensor
+
+
+@register
+class Mismatch(ListedEffect):
+    """With probability ``rate`` an observation has a disparity that says nothing of its landmark.
+
+    It is uniform over ``disparity``, or over the search range where that is left out; u and v stay. In the trial such
+    a row is of no landmark (source -1).
+    """
+
+    models: ClassVar[tuple[str, ...]] = ("uvd",)
+
+    kind: Literal["mismatch"] = "mismatch"
+    rate: Rate
+    disparity: tuple[Positive, Positive] | None = None  # px
+
+    @model_validator(mode="after")
+    def _is_a_range(self) -> Mismatch:
+        if self.disparity is not None and self.disparity[0] >= self.disparity[1]:
+            raise ValueError("disparity must be [low, high] with low < high")
+        return self
+
+    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+        """All rows, some of them mismatched."""
+        hit = np.flatnonzero(rng.random(len(observations)) < self.rate)
+        low, high = self.disparity or cast("UvdSensor", context.sensor).disparity
+        z, source = observations.z.copy(), observations.sources.copy()
+        z[hit, 2], source[hit] = rng.uniform(low, high, len(hit)), NO_LANDMARK
+        return observations.with_z(z, source)

@@ -1,0 +1,9 @@
+"""The simulated world: truth, controls and observations from a scenario and random generators.
+
+Nothing here imports a filter.
+"""
+
+from consistency.bench.simulation.path import planned_controls, planned_path
+from consistency.bench.simulation.world import World, draw_landmarks, require_landmarks_in_view, simulate
+
+__all__ = ["World", "draw_landmarks", "planned_controls", "planned_path", "require_landmarks_in_view", "simulate"]

@@ -1,0 +1,326 @@
+"""Recorded logs: a folder of controls, observations, what the filter believes, and the truth where known."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import tomli_w
+
+from consistency.bench.scenario import (
+    Belief,
+    BelievedMotion,
+    Finite,
+    GuardSettings,
+    PicturedSensor,
+    SigmaPoints,
+    Table,
+    read_table,
+    toml_text,
+)
+from consistency.bench.scenario.tables import SIGMA_UNITS
+from consistency.bench.store.results import controls_table, observations_table, truth_of
+from consistency.bench.store.storage import write_folder
+from consistency.bench.store.tables import read_table_file, require_format, table_file
+from consistency.bench.types import Trial
+from consistency.referee.errors import InputError
+from consistency.referee.reading import reading
+from consistency.referee.reading.columns import COLUMNS, POSE
+from consistency.referee.types import Array, Indices
+
+STRAY = 0.05  # share of pixels that gross errors may put outside the image; other units put more there
+View = tuple[tuple[int, int], tuple[float, float]]  # image (width, height) and principal point (column, row), px
+
+
+class Start(Table):
+    """Pose at step 0, known exactly."""
+
+    x: Finite
+    y: Finite
+    heading: Finite
+
+
+class SensorFile(PicturedSensor):
+    """``sensor.toml``: the sensor, its mount and noise, and the noise of the odometry, as believed."""
+
+    motion: BelievedMotion | None = None  # a log needs it; what is measured of a camera alone has none
+    start: Start | None = None
+    sigma_points: SigmaPoints = SigmaPoints()
+    guard: GuardSettings | None = None
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log folder in memory."""
+
+    name: str
+    trials: list[Trial]
+    belief: Belief
+    landmarks: pd.DataFrame | None
+    sha256: dict[str, str] = field(default_factory=dict)  # of the files, for the manifest of what is made of them
+    screening: dict[str, Any] | None = None  # gate and counts, where landmarks begin anew off the common motion
+
+
+def read_log(folder: str | Path) -> Log:
+    """Read a log folder.
+
+    ``controls``, ``observations`` (.parquet or .csv) and ``sensor.toml`` are needed, ``truth`` and ``landmarks``
+    (likewise) are optional. A folder of ``consistency simulate`` is a log.
+
+    Raises
+    ------
+    InputError
+        A file is missing, damaged, or holds what a filter cannot use; names file, column and row.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"--log {folder}: no such folder")
+    path = folder / "sensor.toml"
+    if not path.is_file():
+        raise InputError(
+            f"{path}: missing; 'consistency frontend' makes a log of images, 'consistency simulate' one of a scenario"
+        )
+    sensor = read_table(path, SensorFile)
+    if sensor.motion is None:
+        raise InputError(f"{path}: key 'motion': missing; give sigma_v and sigma_omega of the odometry")
+    belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points, guard=sensor.guard)
+    controls, observations = read_table_file(folder, "controls"), _observations(folder, sensor)
+    tables = {
+        name: read_table_file(folder, name) if table_file(folder, name).exists() else None
+        for name in ("truth", "landmarks")
+    }
+    _check(folder, controls, observations, belief)
+    _check_pixels(folder, observations, sensor)
+    start = np.array([sensor.start.x, sensor.start.y, sensor.start.heading]) if sensor.start else None
+    names = _names(folder, observations, tables["landmarks"])
+    _require_landmarks_only(folder, names, belief)
+    positions = _positions(folder, tables["landmarks"], names.landmarks, belief)
+    of_controls, of_observations, truth = _by_run(controls), _by_run(observations), tables["truth"]
+    of_truth = None if truth is None else _by_run(truth)
+    trials = [
+        _trial(folder, run, of_controls(run), of_observations(run), names, of_truth and of_truth(run), start, positions)
+        for run in sorted({int(run) for run in controls["run"]})
+    ]
+    texts = [file for file in folder.glob("*.csv") if file.stem in COLUMNS]
+    files = [path, *sorted([*folder.glob("*.parquet"), *texts])]
+    with reading(folder):
+        digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    return Log(str(folder), trials, belief, tables["landmarks"], digests)
+
+
+def write_log(
+    folder: Path,
+    trials: list[Trial],
+    belief: Belief,
+    landmarks: pd.DataFrame | None,
+    manifest: dict[str, object],
+    overwrite: bool = False,
+    view: View | None = None,
+    files: Mapping[str, str] = MappingProxyType({}),
+    form: str = "parquet",
+) -> None:
+    """Write trials as a log folder, whole or not at all.
+
+    ``view`` is image size and principal point in px, ``files`` are other texts by name, ``form`` is one of ``FORMATS``.
+
+    Raises
+    ------
+    InputError
+        Another ``form``; the folder is there already or cannot be written.
+    """
+    require_format(form)
+    tables = {"controls": controls_table(trials), "observations": observations_table(trials)}
+    if trials[0].truth is not None:
+        tables["truth"] = truth_of(trials)
+    if landmarks is not None:
+        tables["landmarks"] = landmarks
+    texts = {"sensor.toml": tomli_w.dumps(_sensor_file(belief, trials[0].start, view)), **files}
+
+    def contents(at: Path) -> None:
+        for name, text in texts.items():
+            _write_text(at / name, text)
+        if form == "csv":
+            for name, table in tables.items():
+                table.to_csv(at / f"{name}.csv", index=False)
+
+    write_folder(folder, tables if form == "parquet" else {}, manifest, contents, overwrite)
+
+
+def sensor_text(folder: Path, belief: Belief) -> str:
+    """``sensor.toml`` of a log folder as text, with the noises of ``belief`` in the place of its own.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged.
+    """
+    sensor = read_table(folder / "sensor.toml", SensorFile)
+    changed = sensor.model_copy(update={"motion": belief.motion, "sigma": belief.sensor.sigma})
+    return toml_text(changed.model_dump(mode="json", exclude_none=True))
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def _sensor_file(belief: Belief, start: Array, view: View | None) -> dict[str, object]:
+    sensor = belief.sensor.model_dump(exclude_none=True)
+    unit = f"sigma{SIGMA_UNITS[belief.sensor.model]}"
+    return {
+        "model": sensor["model"],
+        unit: list(sensor["sigma"]),
+        **{key: sensor[key] for key in ("f", "B") if key in sensor},
+        **({"disparity": list(sensor["disparity"])} if "disparity" in sensor else {}),
+        **{key: sensor[key] for key in ("disparity_growth", "bias") if key in sensor},
+        **({"image": list(view[0]), "principal_point": list(view[1])} if view else {}),
+        "mount": {key: list(value) for key, value in sensor["mount"].items()},
+        "motion": belief.motion.model_dump(),
+        "start": dict(zip(POSE, map(float, start), strict=True)),
+        "sigma_points": belief.sigma_points.model_dump(),
+        **({} if belief.guard is None else {"guard": belief.guard.model_dump(exclude_none=True)}),
+    }
+
+
+def _observations(folder: Path, sensor: SensorFile) -> pd.DataFrame:
+    """``observations.parquet`` with as many values in a row as the sensor measures."""
+    values = [f"z{i}" for i in range(sensor.size)]
+    table = read_table_file(folder, "observations", values[2:])
+    return table if sensor.size == 3 else table.drop(columns="z2", errors="ignore")
+
+
+def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, belief: Belief) -> None:
+    path = table_file(folder, "controls")
+    if controls.empty:
+        raise InputError(f"{path}: holds no control; at least one step is needed")
+    for run, part in controls.groupby("run"):
+        if not np.array_equal(np.sort(part["step"]), np.arange(1, len(part) + 1)):
+            raise InputError(f"{path}: column 'step' of run {run} must count 1, 2, … without gap or repetition")
+    if (controls["dt"] <= 0).any():
+        row = int(np.flatnonzero(controls["dt"] <= 0)[0])
+        raise InputError(f"{path}: column 'dt', row {row}: must be positive")
+    path = table_file(folder, "observations")
+    if observations.empty:
+        raise InputError(f"{path}: holds no observation; no landmark was ever in view")
+    twice = observations.duplicated(["run", "step", "landmark"])
+    if twice.any():
+        raise InputError(f"{path}: row {int(np.flatnonzero(twice)[0])}: this landmark is there twice in one step")
+    known = pd.MultiIndex.from_frame(controls[["run", "step"]])
+    stray = ~pd.MultiIndex.from_frame(observations[["run", "step"]]).isin(known)
+    if stray.any():
+        controls_file = table_file(folder, "controls").name
+        raise InputError(f"{path}: row {int(np.flatnonzero(stray)[0])}: {controls_file} has no such run and step")
+    if belief.sensor.model == "uvd" and (observations["z2"] <= 0).any():
+        row = int(np.flatnonzero(observations["z2"] <= 0)[0])
+        raise InputError(f"{path}: column 'z2', row {row}: a disparity must be positive")
+
+
+def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) -> None:
+    """Pixels must be relative to the principal point: with it they must fall into the image."""
+    if sensor.model != "uvd" or sensor.image is None:
+        return
+    for column, middle, size, sigma in zip(("z0", "z1"), sensor.centre, sensor.image, sensor.sigma, strict=False):
+        pixel = observations[column].to_numpy() + middle
+        outside = (pixel < -6 * sigma) | (pixel > size + 6 * sigma)
+        if outside.mean() > STRAY:
+            row = int(np.flatnonzero(outside)[0])
+            value = observations[column].iloc[row]
+            raise InputError(
+                f"{table_file(folder, 'observations')}: column '{column}', row {row}: {value:.1f} px "
+                "is outside the image of sensor.toml; u and v must be relative to the principal point"
+            )
+
+
+class _Names(NamedTuple):
+    """Numbers in the files: those of landmarks, sorted, and those of things that are no landmark, sorted."""
+
+    landmarks: Indices
+    things: Indices
+
+    def ids(self, numbers: pd.Series[int]) -> Indices:
+        """Place (N,) of each of N numbers in the one list and then the other; -1 where it is in neither."""
+        return pd.Index(np.concatenate(self)).get_indexer(pd.Index(numbers)).astype(np.int64)
+
+
+def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | None) -> _Names:
+    """Which of the numbers in ``observations.parquet`` are landmarks, by ``source`` and ``landmarks.parquet``."""
+    labels = np.unique(observations["landmark"])
+    if "source" not in observations:
+        return _Names(labels, labels[:0])
+    wrong = (observations["source"] < -1) | (observations["landmark"] < 0)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"{table_file(folder, 'observations')}: row {row}: beside a column 'source' landmarks are numbered from 0, "
+            "and a source is one of them or -1"
+        )
+    source = np.unique(observations["source"])
+    known = source[source >= 0] if landmarks is None else np.concatenate([source[source >= 0], landmarks["landmark"]])
+    real = np.union1d(source[source >= 0], np.intersect1d(labels, known))
+    return _Names(real, np.setdiff1d(labels, real))
+
+
+def _require_landmarks_only(folder: Path, names: _Names, belief: Belief) -> None:
+    if belief.sensor.model == "linear" and len(names.things):
+        raise InputError(
+            f"{table_file(folder, 'observations')}: column 'landmark': {names.things[0]} is no landmark, and a linear "
+            "world needs one that it is linearised about"
+        )
+
+
+def _positions(folder: Path, landmarks: pd.DataFrame | None, labels: Array, belief: Belief) -> Array | None:
+    path = table_file(folder, "landmarks")
+    if landmarks is None:
+        if belief.sensor.model == "linear":
+            raise InputError(f"{path}: missing; a linear world needs the landmarks it is linearised about")
+        return None
+    table = landmarks.set_index("landmark")[["x", "y", "z"]]
+    if table.index.has_duplicates:
+        raise InputError(f"{path}: column 'landmark': every landmark may stand there once")
+    if missing := sorted(set(labels) - set(table.index)):
+        raise InputError(f"{path}: landmark {missing[0]} of observations.parquet is not there")
+    return table.loc[list(labels)].to_numpy(float)
+
+
+def _by_run(table: pd.DataFrame) -> Callable[[int], pd.DataFrame]:
+    """The rows of each run, in order of the steps; those of a step as they stand."""
+    places = table.groupby("run").indices
+    return lambda run: table.iloc[places.get(run, [])].sort_values("step", kind="stable")
+
+
+def _trial(
+    folder: Path,
+    run: int,
+    controls: pd.DataFrame,
+    rows: pd.DataFrame,
+    names: _Names,
+    truth: pd.DataFrame | None,
+    start: Array | None,
+    positions: Array | None,
+) -> Trial:
+    """A trial of its rows of the tables, in order of the steps."""
+    steps, path = len(controls), None
+    if truth is not None:
+        if not np.array_equal(truth["step"], np.arange(steps + 1)):
+            raise InputError(f"{table_file(folder, 'truth')}: run {run} must have the steps 0 to {steps}, each once")
+        path = truth[POSE].to_numpy(float)
+    if start is None:
+        start = path[0] if path is not None else np.zeros(3)
+    return Trial(
+        run,
+        start,
+        controls[["dt", "v", "omega"]].to_numpy(float),
+        np.searchsorted(rows["step"], np.arange(1, steps + 2)),
+        names.ids(rows["landmark"]),
+        rows[[name for name in ("z0", "z1", "z2") if name in rows]].to_numpy(float),
+        len(names.landmarks) + len(names.things),
+        path,
+        positions,
+        names.ids(rows["source"]) if "source" in rows else None,
+        np.concatenate(names).astype(np.int64),
+    )

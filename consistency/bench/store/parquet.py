@@ -1,0 +1,306 @@
+"""Tables as Parquet: written piece by piece, in row groups that do not depend on the pieces; read back with checks."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from consistency.referee.errors import InputError
+from consistency.referee.reading import HUGE, LARGEST_NUMBER, MOST_DOF, WHOLE, is_file, one_line, reading, require_room
+from consistency.referee.reading.columns import COLUMNS, OWN_COVARIANCE
+from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+OPTIONAL = {  # columns of a table that may be missing
+    "observations": {"z2": "float64", "source": "int64"},  # z2 by sensors of three values
+    "estimates": dict.fromkeys([*OWN_COVARIANCE, "own_nees"], "float64"),
+    "map": {"joint_nees": "float64"},
+}
+NULLABLE = {"nees", "nis", *OPTIONAL["estimates"], *OPTIONAL["map"]}
+GIVEN = {"truth", "landmarks", "controls", "observations"}  # tables of the world, which no filter makes diverge
+UNBOUNDED = {"joint_nees"}  # infinite where the joint covariance of a run is not positive definite
+BY_FILTER = {"estimates", "map"}  # tables whose row groups hold one filter each
+REPEATED = {"t", "dt"}  # floating-point columns of few different values
+ROWS = 65_536  # of a row group, and of a batch that is read
+TYPES = {"str": pa.string(), "int64": pa.int64(), "float64": pa.float64()}
+NO_NUMBERS = (bool, np.bool_, datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
+
+Columns = dict[str, Array]  # columns of a table by name, equally long
+
+
+# --- writing -------------------------------------------------------------------------------------
+
+
+class Writer:
+    """A Parquet file of the table ``name``, in row groups of ``ROWS`` rows however many are added at a time.
+
+    ``columns`` are those of the rows to come, where an optional one may be among them.
+    """
+
+    def __init__(self, path: Path, name: str, columns: Iterable[str] = ()) -> None:
+        kinds = _kinds(name, columns)
+        self.optional = set(OPTIONAL.get(name, ()))
+        self.schema = pa.schema([(column, TYPES[kind]) for column, kind in kinds.items()])
+        # the bytes of similar numbers are alike: apart from each other they take less room, and nothing is lost
+        split = [column for column, kind in kinds.items() if kind == "float64" and column not in REPEATED]
+        repeated = [column for column in kinds if column not in split]
+        # numbers hardly compress, so that damage to them goes unseen without a checksum
+        self._file = pq.ParquetWriter(
+            path, self.schema, compression="zstd", use_dictionary=repeated, use_byte_stream_split=split,
+            write_page_checksum=True,
+        )  # fmt: skip
+        self._pieces: list[Any] = []
+        self._rows = 0
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def add(self, columns: Columns, **constant: str) -> None:
+        """Rows of arrays; ``constant`` is the text of a column that is the same in all of them.
+
+        An optional column that is not among them is null.
+        """
+        rows = len(next(iter(columns.values())))
+        arrays = [
+            pa.repeat(pa.scalar(constant[field.name], field.type), rows)
+            if field.name in constant
+            else pa.array(columns[field.name], field.type, from_pandas=True)
+            if field.name in columns or field.name not in self.optional
+            else pa.nulls(rows, field.type)
+            for field in self.schema
+        ]
+        self._pieces.append(pa.RecordBatch.from_arrays(arrays, schema=self.schema))
+        self._rows += rows
+        if self._rows >= ROWS:
+            self._write(self._rows - self._rows % ROWS)
+
+    def end_group(self) -> None:
+        """The rows that come next begin a row group of their own."""
+        if self._rows:
+            self._write(self._rows)
+
+    def _write(self, rows: int) -> None:
+        table = pa.Table.from_batches(self._pieces)
+        self._file.write_table(table.slice(0, rows), row_group_size=ROWS)
+        self._pieces = table.slice(rows).to_batches()
+        self._rows -= rows
+
+
+def _kinds(name: str, columns: Iterable[str]) -> dict[str, str]:
+    """Types of the columns of a table, with those of the optional ones that are among ``columns``."""
+    present = set(columns)
+    return COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in present}
+
+
+def write_table(path: Path, name: str, table: pd.DataFrame) -> None:
+    """A whole table; estimates and maps in row groups of one filter each."""
+    kinds = _kinds(name, map(str, table))
+    table = table[list(kinds)].astype(kinds)
+    with Writer(path, name, kinds) as writer:
+        if name not in BY_FILTER:
+            writer.add({str(column): table[column].to_numpy() for column in table})
+        else:
+            for filter_name in table["filter"].unique():
+                part = table[table["filter"] == filter_name].drop(columns="filter")
+                writer.add({str(column): part[column].to_numpy() for column in part}, filter=filter_name)
+                writer.end_group()
+        writer.end_group()
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+def read_parquet(folder: Path, name: str) -> pd.DataFrame:
+    """One table of a folder, checked: columns, types, no NaN where none is allowed.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged, lacks a column or holds what the column may not.
+    """
+    path = folder / f"{name}.parquet"
+    file = require_table(folder, name)
+    dtypes = _kinds(name, file.schema_arrow.names)
+    with reading(path):
+        read = _plain(file.read(list(dtypes)))
+        table = read.to_pandas()
+    for column, kind in dtypes.items():
+        if kind == "str":
+            _require_text(path, read.column(column))
+        else:
+            check_column(path, table[column], kind)
+    with reading(path):
+        checked: pd.DataFrame = table.astype(dtypes)
+    return checked
+
+
+def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
+    """Columns of numbers, some rows at a time and checked likewise; of one filter where it is named."""
+    path, dtypes = folder / f"{name}.parquet", COLUMNS[name] | OPTIONAL.get(name, {})
+    file = require_table(folder, name, columns)
+    needed = [*columns, "filter"] if filter_name is not None else list(columns)
+    held = None if filter_name is None else _filters_of(path)
+    first = 0
+    for group in range(file.num_row_groups):
+        if held is not None and filter_name not in held[group]:
+            first += file.metadata.row_group(group).num_rows
+            continue
+        with reading(path):
+            for batch in map(_plain, file.iter_batches(ROWS, [group], needed)):
+                table = {column: batch.column(column).to_pandas() for column in columns}
+                for column, values in table.items():
+                    values.name = column
+                    check_column(path, values, dtypes[column], first)
+                mask: Any = slice(None)
+                if filter_name is not None:
+                    _require_text(path, batch.column("filter"), first)
+                    mask = pc.equal(batch.column("filter"), filter_name).to_numpy(zero_copy_only=False)
+                first += batch.num_rows
+                yield {column: values.to_numpy(dtypes[column])[mask] for column, values in table.items()}
+    pa.default_memory_pool().release_unused()
+
+
+def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
+    """The opened file of a table, refused where it is missing, damaged or lacks a column, those in ``also`` too."""
+    path = folder / f"{name}.parquet"
+    if not is_file(path):
+        raise InputError(f"{path}: {'is no file' if path.exists() else 'missing'}; write the folder again")
+    file = open_parquet(path)
+    needed, names = dict.fromkeys((*COLUMNS[name], *also)), file.schema_arrow.names
+    if missing := [column for column in needed if column not in names]:
+        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
+    if twice := [column for column in needed if names.count(column) > 1]:
+        raise InputError(f"{path}: column '{twice[0]}' is there twice")
+    return file
+
+
+def open_parquet(path: Path, refusal: str = "cannot be read, damaged or cut short") -> Any:
+    """A Parquet file, opened and checked for the room that it takes; raises :class:`InputError`."""
+    with reading(path, refusal):
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        about = file.metadata
+        pages = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
+        require_room(path, max(pages, about.num_rows * about.num_columns * 8))
+        if about.num_rows != sum(about.row_group(k).num_rows for k in range(about.num_row_groups)):
+            raise ValueError("its numbers of rows do not agree")  # no checksum is over them
+    return file
+
+
+def read_frame(path: Path, refusal: str) -> pd.DataFrame:
+    """Read a whole Parquet file of unknown columns, by columns alone; raises :class:`InputError`."""
+    file = open_parquet(path, refusal)
+    with reading(path, refusal):
+        table: pd.DataFrame = _plain(file.read()).to_pandas()
+        return table
+
+
+def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
+    """Read a whole Parquet file: its columns as arrays, and the number of rows.
+
+    Arrays are floats with NaN where a cell is empty, or objects with None there.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or has a name of a column twice.
+    """
+    file = open_parquet(path, refusal)
+    with reading(path, refusal):
+        table = file.read()
+    names = table.column_names
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"{path}: column '{one_line(twice[0])}' is there twice")
+    with reading(path, refusal):
+        return {name: _cells(name, column) for name, column in zip(names, table.columns, strict=True)}, table.num_rows
+
+
+def _cells(name: str, column: Any) -> Array:
+    if pa.types.is_decimal(column.type):
+        column = column.cast(pa.float64())
+    if name != "filter" and (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+        values: Array = column.to_numpy().astype(float)
+        return values
+    return np.fromiter(column.to_pylist(), object, len(column))
+
+
+def _plain(table: Any) -> Any:
+    """A table or batch without the notes of other programs, which may turn columns into an index or other types."""
+    return table.replace_schema_metadata(None)
+
+
+def columns_of(folder: Path, name: str) -> list[str]:
+    """Names of the columns of a table; refused as :func:`require_table` does."""
+    return list(require_table(folder, name).schema_arrow.names)
+
+
+def _filters_of(path: Path) -> tuple[frozenset[str], ...]:
+    """Names of the filters in each row group of a table, which is passed over where a filter is not in it.
+
+    They are read and not taken from the statistics of the file: those that are damaged end the process, as pyarrow lets
+    no exception out of what it says of a column.
+    """
+    with reading(path):
+        about = path.stat()
+    return _filters_read(path, about.st_mtime_ns, about.st_size)
+
+
+@functools.lru_cache(maxsize=16)
+def _filters_read(path: Path, mtime_ns: int, size: int) -> tuple[frozenset[str], ...]:
+    file, first, found = open_parquet(path), 0, []
+    for group in range(file.num_row_groups):
+        with reading(path):
+            names = file.read_row_group(group, ["filter"]).column("filter")
+        _require_text(path, names, first)
+        found.append(frozenset(pc.unique(names).to_pylist()))
+        first += len(names)
+    return tuple(found)
+
+
+def _require_text(path: Path, names: Any, first: int = 0) -> None:
+    kind = names.type.value_type if pa.types.is_dictionary(names.type) else names.type
+    if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+        raise InputError(f"{path}: a column of text holds {one_line(kind, 40)}; write the folder again")
+    if names.null_count:
+        row = first + pc.index(names.is_null(), True).as_py()
+        raise InputError(f"{path}: a column of text, row {row}: nothing there")
+
+
+def are_no_numbers(cells: pd.Series[Any]) -> Array:
+    """Which cells (N,) are truth values, dates or durations, which pandas would turn into numbers."""
+    if cells.dtype.kind != "O":
+        return np.full(len(cells), cells.dtype.kind in "bmM")
+    return np.fromiter((isinstance(cell, NO_NUMBERS) for cell in cells), bool, len(cells))
+
+
+def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
+    """Refuse what is no number; ``first`` is the row of the file that the column begins with."""
+    import pandas as pd
+
+    with reading(path, f"column '{column.name}' cannot be read as numbers"):
+        if column.dtype.kind == "c" or are_no_numbers(column).any():
+            raise TypeError(column.dtype)
+        values = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
+    if column.name in NULLABLE:
+        values = np.where(column.isna() | (values == np.inf) & (column.name in UNBOUNDED), 0.0, values)
+    largest = MOST_DOF - 1 if column.name == "nis_dof" else HUGE if path.stem in GIVEN else LARGEST_NUMBER
+    right = np.abs(values) <= largest  # false of NaN
+    if not right.all():
+        row = int(np.argmin(right))
+        value, what = one_line(column.iloc[row], 60), "too large a" if np.isfinite(values[row]) else "not a finite"
+        raise InputError(f"{path}: column '{column.name}', row {first + row}: {what} number ({value})")
+    if kind == "int64" and ((values != np.round(values)) | (np.abs(values) > WHOLE)).any():
+        row = int(np.flatnonzero((values != np.round(values)) | (np.abs(values) > WHOLE))[0])
+        raise InputError(f"{path}: column '{column.name}', row {first + row}: not a whole number ({values[row]})")

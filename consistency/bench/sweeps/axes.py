@@ -1,0 +1,224 @@
+"""Axes of a grid: what a value of each changes in a scenario, and where another scenario lies on it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor
+from consistency.bench.scenario.tables import UNITS
+from consistency.bench.simulation import draw_landmarks
+from consistency.referee.errors import InputError
+
+Changes = dict[str, Any]  # dotted key of the scenario -> value
+BOTH = ("sensor", "motion")  # tables that truth and belief both have: a key of one is set in both
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A named axis, which changes several keys of a scenario together; its values are positive numbers."""
+
+    text: str
+    unit: str  # m, m/s; × for a multiple of what the base has
+    changes: Callable[[Scenario, float], Changes]
+    measure: Callable[[Scenario, Scenario], float]  # of a scenario beside the base; NaN where it has none
+
+
+def _baseline(base: Scenario, value: float) -> Changes:
+    """The largest disparity of the search grows with the baseline, so that the nearest depth stays."""
+    truth, belief = base.truth.sensor, base.belief.sensor
+    if truth.rig is None:
+        raise ValueError(f"a sensor '{truth.model}' has no baseline")
+    ratio = value / truth.rig[1]
+    changes: Changes = {"truth.sensor.B": value, "belief.sensor.B": value}
+    for half, sensor in (("truth", truth), ("belief", belief)):
+        if (disparity := getattr(sensor, "disparity", None)) is not None:
+            changes[f"{half}.sensor.disparity"] = (disparity[0], disparity[1] * ratio)
+    return changes
+
+
+def equivalent_baseline(scenario: Scenario, base: Scenario) -> float:
+    """Baseline (m) that makes depths with the base's camera as exact as the scenario's are.
+
+    sigma_depth = z^2 sigma_d / (f B), so that B counts with f over sigma_d; a sigma_d that grows with the disparity is
+    taken in the middle of the range.
+    """
+    (f, B), (f_base, _) = scenario.truth.sensor.rig or (np.nan, np.nan), base.truth.sensor.rig or (np.nan, np.nan)
+    return float(B * (f / _disparity_noise(scenario)) / (f_base / _disparity_noise(base)))
+
+
+def _disparity_noise(scenario: Scenario) -> float:
+    """Standard deviation of a disparity in px."""
+    sensor = scenario.truth.sensor
+    if not isinstance(sensor, UvdSensor) or sensor.disparity_growth is None:
+        return sensor.sigma[2]
+    middle = sensor.f * sensor.B / np.mean(sensor.range)
+    return float(sensor.sigma[2] * sensor.disparity_growth.ratio_at(np.array(middle)))
+
+
+def _range(base: Scenario, value: float) -> Changes:
+    return {"truth.sensor.range": (base.truth.sensor.range[0], value)}
+
+
+def _count(base: Scenario, value: float) -> Changes:
+    landmarks = base.truth.landmarks
+    if not isinstance(landmarks, UniformLandmarks):
+        raise ValueError("needs truth.landmarks.layout = 'uniform', whose count it multiplies")
+    return {"truth.landmarks.count": max(1, round(landmarks.count * value))}
+
+
+def density_of(scenario: Scenario) -> float:
+    """Landmarks on a square metre of the box in which they lie."""
+    landmarks = scenario.truth.landmarks
+    if isinstance(landmarks, UniformLandmarks):
+        area = float(np.prod([high - low for low, high in (landmarks.x, landmarks.y)]))
+        return landmarks.count / area if area > 0.0 else np.nan
+    points = draw_landmarks(scenario.truth)
+    area = float(np.prod(np.ptp(points[:, :2], axis=0)))
+    return len(points) / area if area > 0.0 else np.nan
+
+
+def _odometry(base: Scenario, value: float) -> Changes:
+    halves = (("truth", base.truth.motion), ("belief", base.belief.motion))
+    return {
+        f"{half}.motion.{key}": getattr(motion, key) * value
+        for half, motion in halves
+        for key in ("sigma_v", "sigma_omega")
+    }
+
+
+def _noise_ratio(scenario: Scenario, base: Scenario) -> float:
+    """Geometric mean of both ratios of the true noise of the odometry."""
+    pairs = [
+        (getattr(scenario.truth.motion, key), getattr(base.truth.motion, key)) for key in ("sigma_v", "sigma_omega")
+    ]
+    return float(np.sqrt(np.prod([a / b if b else np.nan for a, b in pairs])))
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "baseline": Quantity("baseline", "m", _baseline, equivalent_baseline),
+    "range": Quantity("range of landmarks", "m", _range, lambda scenario, _: float(scenario.truth.sensor.range[1])),
+    "density": Quantity(
+        "density of landmarks", "×", _count, lambda scenario, base: density_of(scenario) / density_of(base)
+    ),
+    "odometry": Quantity("noise of the odometry", "×", _odometry, _noise_ratio),
+    "speed": Quantity(
+        "speed", "m/s", lambda _, value: {"truth.path.speed": value}, lambda scenario, _: scenario.truth.path.speed
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of a grid: a named quantity or a key of the scenario, with its values in order."""
+
+    key: str
+    values: tuple[Any, ...]
+
+    @property
+    def text(self) -> str:
+        return QUANTITIES[self.key].text if self.key in QUANTITIES else self.key
+
+    @property
+    def unit(self) -> str:
+        return QUANTITIES[self.key].unit if self.key in QUANTITIES else ""
+
+    @property
+    def label(self) -> str:
+        """For the axis of a figure or the head of a column."""
+        return f"{self.text} ({self.unit})" if self.unit else self.text
+
+    @property
+    def numeric(self) -> bool:
+        return all(isinstance(value, int | float) and not isinstance(value, bool) for value in self.values)
+
+    @property
+    def log(self) -> bool:
+        """Whether distances are those of logarithms."""
+        return self.numeric and min(self.values) > 0
+
+    def say(self, index: int) -> str:
+        """One value with its unit, as "0.09 m" or "x0.5"."""
+        return say_value(self.unit, self.values[index])
+
+    def changes(self, base: Scenario, value: Any) -> Changes:
+        """Keys of the scenario that a value sets.
+
+        Raises
+        ------
+        ValueError
+            The base has no such thing.
+        """
+        if self.key in QUANTITIES:
+            return QUANTITIES[self.key].changes(base, value)
+        table, _, rest = self.key.partition(".")
+        return (
+            {f"{half}.{self.key}": value for half in ("truth", "belief")}
+            if table in BOTH and rest
+            else {self.key: value}
+        )
+
+    def of(self, scenario: Scenario, base: Scenario) -> Any:
+        """The value that another scenario has; NaN or None where it has none."""
+        if self.key in QUANTITIES:
+            return QUANTITIES[self.key].measure(scenario, base)
+        value: Any = scenario.model_dump(mode="json")
+        for part in next(iter(self.changes(base, None))).split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        return value
+
+
+def say_value(unit: str, value: Any) -> str:
+    """A value with its unit."""
+    text = f"{value:.3g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
+    return f"×{text}" if unit == "×" else f"{text} {unit}".rstrip()
+
+
+def require_key(axis: Axis, base: Scenario) -> None:
+    """Refuse a key that no scenario has.
+
+    Raises
+    ------
+    InputError
+        Says what is allowed in its place.
+    """
+    if axis.key in QUANTITIES:
+        return
+    for key in axis.changes(base, None):
+        table: Any = base.model_dump()
+        for part in key.split("."):
+            stem = part.rpartition("_")[0]  # a key may end in its unit
+            if not isinstance(table, Mapping) or (part not in table and stem not in table):
+                known = sorted(table) if isinstance(table, Mapping) else []
+                allowed = f"{', '.join(QUANTITIES)}, or a key of the scenario"
+                beside = f", where '{part}' could be {', '.join(known)}" if known and part != key.split(".")[0] else ""
+                raise InputError(f"key 'grid.{axis.key}': unknown; allowed: {allowed}{beside}")
+            table = table.get(part, table.get(stem))
+
+
+def leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of all that nested tables hold."""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{path}{key}.")
+        else:
+            yield path + key, value
+
+
+def with_changes(base: Scenario, name: str, summary: str, changes: Changes) -> Scenario:
+    """A copy of the scenario with keys set; raises pydantic's ValidationError."""
+    data = base.model_dump() | {"name": name, "summary": summary}
+    for path, value in changes.items():
+        *parents, key = path.split(".")
+        table = data
+        for parent in parents:
+            table = table[parent]
+        stem, _, unit = key.rpartition("_")
+        if key not in table and f"_{unit}" in UNITS.values():
+            table.pop(stem, None)  # the value comes with its unit
+        table[key] = value
+    return Scenario.model_validate(data)

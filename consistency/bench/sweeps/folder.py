@@ -1,0 +1,256 @@
+"""The folder of a sweep: an atomic folder for each filter in each cell, so that it goes on where it was stopped."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from consistency.bench.scenario import Scenario
+from consistency.bench.store.journal import Journal, Unfinished
+from consistency.bench.store.storage import read_manifest, write_folder
+from consistency.bench.sweeps.axes import Axis
+from consistency.bench.sweeps.cell import CellResult, Outcome, plain_numbers, result_from
+from consistency.bench.sweeps.plan import MOST_CELLS, Cell, Rule, Sweep
+from consistency.referee.errors import InputError
+from consistency.referee.reading import reading
+from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.provenance import manifest_of
+
+KIND, CELL_KIND = "sweep", "cell"
+CELLS = "cells"  # folder of the cells in that of the sweep
+# rooms whose code the numbers of a cell depend on
+CODE = ("diagnostics", "filters", "geometry", "models", "scenario", "simulation", "verdicts", "runs/sequential.py")
+
+
+@functools.cache
+def code_digest() -> str:
+    """Hash of the sources that the numbers of a cell depend on."""
+    root = Path(__file__).parents[1]
+    paths = (
+        path for name in CODE for path in ((root / name).rglob("*.py") if (root / name).is_dir() else (root / name,))
+    )
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Work:
+    """One filter in one cell."""
+
+    cell: Cell
+    filter: str
+
+    @property
+    def text(self) -> str:
+        return f"{self.filter}, {self.cell.text}"
+
+
+class SweepFolder:
+    """A sweep with the folder of its cells.
+
+    Parameters
+    ----------
+    sweep : what is to be done
+    path : folder; it need not be there
+    """
+
+    def __init__(self, sweep: Sweep, path: Path) -> None:
+        self.sweep, self.path = sweep, path
+
+    def place(self, work: Work) -> Path:
+        """Folder of one filter in one cell."""
+        return self.path / CELLS / work.cell.name / work.filter
+
+    def inputs(self, work: Work) -> dict[str, Any]:
+        """What the numbers of a cell depend on."""
+        sweep = self.sweep
+        return {
+            "scenario": work.cell.scenario.hash, "filter": work.filter, "seed": sweep.seed_of(work.cell),
+            **sweep.rule.model_dump(), "code": code_digest(),
+        }  # fmt: skip
+
+    def done(self, work: Work) -> CellResult | None:
+        """The result that is there; None where there is none.
+
+        Raises
+        ------
+        InputError
+            It was made with other inputs, or is damaged.
+        """
+        path = self.place(work)
+        if not path.exists():
+            return None
+        manifest = read_manifest(path)
+        before, now = manifest.get("inputs"), self.inputs(work)
+        if not isinstance(before, dict):
+            raise InputError(f"{path}/manifest.json: key 'inputs' is missing; remove that folder")
+        for key, value in now.items():
+            if before.get(key) != value:
+                what = "source code of the bench" if key == "code" else key
+                raise StaleCell(f"{path}: made with another {what} ({before.get(key)}, now {value})")
+        with reading(path / "manifest.json", "key 'result' is damaged; remove that folder"):
+            return result_from(manifest["result"])
+
+    def is_missing(self, work: Work) -> bool:
+        """Whether there is no result, or one with other inputs."""
+        try:
+            return self.done(work) is None
+        except StaleCell:
+            return True
+
+    def require_usable(self, overwrite: bool) -> None:
+        """Refuse, before any work, a folder of something else, and cells that were made with other inputs.
+
+        Raises
+        ------
+        InputError
+            See above; with ``overwrite`` such cells are run again.
+        """
+        if not (self.path.exists() or self.path.is_symlink()):
+            return
+        try:
+            kind = read_manifest(self.path).get("kind")
+        except InputError as error:
+            raise InputError(f"--out {self.path}: is not a folder of 'consistency sweep' ({error})") from None
+        if kind != KIND:
+            raise InputError(f"--out {self.path}: holds {kind}, not a sweep; choose another folder")
+        stale = list(self._stale()) if not overwrite else []
+        if stale:
+            more = f" (and {len(stale) - 1} more)" if len(stale) > 1 else ""
+            raise InputError(
+                f"{stale[0]}{more}; add --overwrite to run such cells again, or give another --out to keep them"
+            )
+
+    def _stale(self) -> Iterator[StaleCell]:
+        for work in self.all_work():
+            try:
+                self.done(work)
+            except StaleCell as stale:
+                yield stale
+
+    def all_work(self, part: int = 1, parts: int = 1) -> list[Work]:
+        """Every filter in every cell of a share."""
+        return [Work(cell, name) for cell in self.sweep.share(part, parts) for name in self.sweep.filters]
+
+    def begin(self) -> None:
+        """Make the folder, or take over the one that is there; other shares may do so at the same time."""
+        manifest = manifest_of(kind=KIND, sweep=describe(self.sweep))
+        if not self.path.exists():
+            try:
+                write_folder(self.path, {}, manifest)
+                return
+            except InputError:
+                if not self.path.exists():
+                    raise
+        before = read_manifest(self.path)
+        try:
+            former = sweep_from(before, self.path)
+        except InputError:
+            former = self.sweep
+        if replace(former, filters=()) == replace(self.sweep, filters=()):
+            self.sweep = replace(self.sweep, filters=tuple(dict.fromkeys((*former.filters, *self.sweep.filters))))
+        text = json.dumps(manifest | {"sweep": describe(self.sweep), "tables": []}, indent=2)
+        write_whole(self.path / "manifest.json", f"{text}\n".encode(), 0o644)
+
+    @contextmanager
+    def at_work(self, work: Work) -> Iterator[Journal]:
+        """The journal of what is finished of a cell; nobody else has it meanwhile, and it is gone with the cell's end.
+
+        Raises
+        ------
+        Busy
+            Another process is at work on the cell.
+        """
+        inputs = self.inputs(work)
+        with Unfinished(self.place(work), resume=True, kind=CELL_KIND) as unfinished:
+            journal = unfinished.journal
+            if journal.study.get("inputs") != inputs:
+                journal.clear()
+                journal.begin({"inputs": inputs})
+            yield journal
+            unfinished.is_over = True
+
+    def write(self, work: Work, outcome: Outcome, wall: float) -> None:
+        """Put a result in its place as a whole; one that another process has put there meanwhile is replaced."""
+        manifest = manifest_of(
+            kind=CELL_KIND, wall=wall, inputs=self.inputs(work), cell=work.cell.text,
+            seed=self.sweep.seed_of(work.cell), result=plain_numbers(outcome.result),
+            scenario=work.cell.scenario.model_dump(mode="json"),
+        )  # fmt: skip
+        write_folder(
+            self.place(work), {}, manifest,
+            lambda at: outcome.runs.to_csv(at / "runs.csv", index=False, float_format="%.6g"), overwrite=True,
+        )  # fmt: skip
+
+    def results(self) -> dict[tuple[int, str], CellResult]:
+        """What is there, by number of the cell and filter; results with other inputs are left out."""
+        found = {}
+        for cell, name in itertools.product(self.sweep.cells, self.sweep.filters):
+            try:
+                result = self.done(Work(cell, name))
+            except StaleCell:
+                continue
+            if result is not None:
+                found[cell.number, name] = result
+        return found
+
+
+class StaleCell(InputError):
+    """A cell that was made with other inputs."""
+
+
+def describe(sweep: Sweep) -> dict[str, Any]:
+    """A sweep as JSON, from which it can be made again."""
+    return {
+        "name": sweep.name,
+        "summary": sweep.summary,
+        "base": sweep.base.model_dump(mode="json"),
+        "grid": {axis.key: list(axis.values) for axis in sweep.axes},
+        "filters": list(sweep.filters),
+        "seed": sweep.seed,
+        "rule": sweep.rule.model_dump(),
+    }
+
+
+def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
+    """The sweep that :func:`describe` described, under the key ``sweep`` of what ``path`` holds.
+
+    Raises
+    ------
+    InputError
+        It is damaged.
+    """
+    with reading(path, "key 'sweep' is damaged; write it again"):
+        data = manifest["sweep"]
+        lists = [data["filters"], *data["grid"].values()]
+        if not all(isinstance(values, list) and values for values in lists):
+            raise TypeError("filters and values must be lists")
+        if not all(isinstance(name, str) for name in data["filters"]):
+            raise TypeError("filters must be names")
+        if math.prod(map(len, lists[1:])) > MOST_CELLS:
+            raise ValueError(f"more than {MOST_CELLS} cells")
+        sweep = Sweep(
+            str(data["name"]), str(data["summary"]), Scenario.model_validate(data["base"]),
+            tuple(Axis(key, tuple(values)) for key, values in data["grid"].items()),
+            tuple(data["filters"]), int(data["seed"]), Rule.model_validate(data["rule"]),
+        )  # fmt: skip
+        _ = sweep.cells  # each is checked when it is made
+        return sweep
+
+
+def open_sweep(path: Path) -> SweepFolder:
+    """A folder of ``consistency sweep``; raises InputError where it is none."""
+    manifest = read_manifest(path)
+    if manifest.get("kind") != KIND:
+        raise InputError(f"{path}: holds {manifest.get('kind')}, not a sweep; give a folder of 'consistency sweep'")
+    return SweepFolder(sweep_from(manifest, path / "manifest.json"), path)

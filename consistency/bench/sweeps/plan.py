@@ -1,0 +1,236 @@
+"""A sweep's file: the world it starts from, the grid, the filters and the rule; expanded to cells."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import itertools
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError, field_validator
+
+from consistency.bench.filters import get_filter
+from consistency.bench.runs.montecarlo import resolve_filters
+from consistency.bench.runs.sequential import plan_of
+from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key, with_changes
+from consistency.referee.defaults import DETECT, POWER
+from consistency.referee.diagnostics import Settings
+from consistency.referee.errors import InputError
+from consistency.referee.reading import HUGE
+from consistency.referee.reading.columns import POSE
+
+MOST_CELLS = 20_000  # each is a scenario in memory, and a folder
+LONGEST = 150  # characters of a folder's name
+REFERENCE = {"uvd": "ekf-uvd", "xyz": "ekf-xyz", "linear": "kf"}  # filter whose step costs 1, by the sensor's model
+
+
+class Rule(Table):
+    """When a cell is decided; the keys are those of ``consistency run --until-decided``."""
+
+    false_alarm: Positive = 0.01
+    detect: Positive = DETECT
+    power: Positive = POWER
+    max_runs: Count = 192
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        return self.model_dump() | {"dof": len(POSE)}
+
+    @property
+    def settings(self) -> Settings:
+        """Settings of the verdict for a fixed number of runs."""
+        return Settings(self.false_alarm, self.detect, self.power)
+
+
+class SweepFile(Table):
+    """Keys of a sweep's file."""
+
+    summary: str
+    base: str  # name or path of a scenario
+    filters: Annotated[list[str], Field(min_length=1)]
+    seed: Annotated[int, Field(ge=0, strict=True)] = 0
+    rule: Rule = Rule()
+    grid: Annotated[dict[str, Any], Field(min_length=1)]
+
+    @field_validator("grid")
+    @classmethod
+    def _flat(cls, grid: dict[str, Any]) -> dict[str, Any]:
+        """``truth.path.speed = [...]`` may stand with or without quotes."""
+        return dict(leaves(grid))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One point of the grid."""
+
+    number: int  # 0, 1, ... in the order of the grid, the last axis fastest
+    indices: tuple[int, ...]  # place on each axis
+    name: str  # of its folder
+    text: str  # "baseline 0.09 m, range 4 m"
+    scenario: Scenario
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A grid of scenarios, filters, and the rule by which each filter is judged in each of them."""
+
+    name: str
+    summary: str
+    base: Scenario
+    axes: tuple[Axis, ...]
+    filters: tuple[str, ...]
+    seed: int
+    rule: Rule
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """Every cell, in the order of the grid."""
+        places = itertools.product(*(range(len(axis.values)) for axis in self.axes))
+        return tuple(self.cell(number, at) for number, at in enumerate(places))
+
+    def cell(self, number: int, at: tuple[int, ...]) -> Cell:
+        """The cell at a place on each axis; raises ValueError or pydantic's ValidationError."""
+        changes: dict[str, Any] = {}
+        for axis, i in zip(self.axes, at, strict=True):
+            changes |= axis.changes(self.base, axis.values[i])
+        name, text = _folder_name(self.axes, at), text_of(self.axes, at)
+        return Cell(number, at, name, text, with_changes(self.base, name, f"{self.base.name}, {text}", changes))
+
+    @property
+    def reference(self) -> str:
+        """The filter whose step costs 1."""
+        return REFERENCE[self.base.belief.sensor.model]
+
+    def seed_of(self, cell: Cell) -> int:
+        """The cell's own seed: its trials depend on its scenario, not on its place or on other cells."""
+        digest = hashlib.sha256(f"{self.seed} {cell.scenario.hash}".encode()).digest()
+        return int.from_bytes(digest[:4], "big")
+
+    def share(self, part: int, parts: int) -> list[Cell]:
+        """Cells of one share of ``parts``, in an order that mixes the grid.
+
+        Slow cells lie together in the grid; mixed, shares take equally long, and the time left is foreseen.
+        """
+        mixed = sorted(self.cells, key=lambda cell: hashlib.sha256(cell.name.encode()).digest())
+        return mixed[part - 1 :: parts]
+
+
+def text_of(axes: Sequence[Axis], at: Sequence[int]) -> str:
+    """A place in the grid in words."""
+    return ", ".join(f"{axis.text} {axis.say(i)}" for axis, i in zip(axes, at, strict=True))
+
+
+def _folder_name(axes: Sequence[Axis], at: Sequence[int]) -> str:
+    parts = []
+    for axis, i in zip(axes, at, strict=True):
+        value = axis.values[i]
+        text = f"{value:.12g}" if isinstance(value, float) else str(value)
+        parts.append(f"{axis.key}-{re.sub(r'[^A-Za-z0-9.+-]+', '_', text).strip('_')}")
+    name = "_".join(parts)
+    return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+# --- reading ----------------------------------------------------------------------------------------
+
+
+def _shipped() -> Path:
+    return data_folder("experiments") / "sweeps"
+
+
+def sweep_names() -> list[str]:
+    """Names of the built-in sweeps."""
+    return sorted(path.stem for path in _shipped().glob("*.toml"))
+
+
+def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
+    """A sweep by built-in name or by path to a ``.toml`` file, every cell checked.
+
+    Parameters
+    ----------
+    filters : in place of those of the file
+
+    Raises
+    ------
+    InputError
+        Unknown name, unreadable file, unknown key, a value that a cell may not have, a filter that does not fit.
+    """
+    path = Path(name)
+    if str(name) in sweep_names():
+        path = _shipped() / f"{name}.toml"
+    elif path.suffix != ".toml":
+        near = difflib.get_close_matches(str(name), sweep_names(), n=1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        known = ", ".join(sweep_names())
+        raise InputError(f"unknown sweep '{name}'{hint}; known: {known}; or give a .toml file or a folder of 'sweep'")
+    file = read_table(path, SweepFile)
+    try:
+        sweep = _sweep(path, file, tuple(filters or file.filters))
+        plan_of(sweep.rule.plan)
+        for filter_ in sweep.filters:
+            get_filter(filter_)
+        resolve_filters(sweep.filters, sweep.base.belief)
+        _require_cells(sweep)
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+    return sweep
+
+
+def _sweep(path: Path, file: SweepFile, filters: tuple[str, ...]) -> Sweep:
+    beside = path.parent / file.base
+    base = load_scenario(beside if file.base.endswith(".toml") else file.base)
+    axes = tuple(_axis(key, values) for key, values in file.grid.items())
+    for axis in axes:
+        require_key(axis, base)
+    return Sweep(path.stem, file.summary, base, axes, filters, file.seed, file.rule)
+
+
+def _axis(key: str, values: Any) -> Axis:
+    if not isinstance(values, list) or not values:
+        raise InputError(f"key 'grid.{key}': must be a list of one value or more, got {values!r}")
+    if any(values.count(value) > 1 for value in values):
+        raise InputError(f"key 'grid.{key}': a value is given twice; each may stand once")
+    if key in QUANTITIES:
+        for value in values:
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+                raise InputError(f"key 'grid.{key}': values must be positive numbers, got {value!r}")
+    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+    if numbers and not all(-HUGE <= value <= HUGE for value in values):
+        raise InputError(f"key 'grid.{key}': numbers must be finite, and {HUGE:g} at most")
+    values = sorted(map(float, values)) if numbers and any(isinstance(value, float) for value in values) else values
+    return Axis(key, tuple(sorted(values) if numbers else values))
+
+
+def _require_cells(sweep: Sweep) -> None:
+    """Every value alone, so that the message names its key; then every cell, and a folder's name for each."""
+    taken: dict[str, str] = {}
+    for axis in sweep.axes:
+        for value in axis.values:
+            try:
+                changes = axis.changes(sweep.base, value)
+                with_changes(sweep.base, sweep.base.name, "", changes)
+            except (ValidationError, ValueError) as error:
+                text = explain(error, Scenario) if isinstance(error, ValidationError) else str(error)
+                raise InputError(f"key 'grid.{axis.key}', value {value!r}: {text}") from None
+        for key in changes:
+            if taken.setdefault(key, axis.key) != axis.key:
+                raise InputError(
+                    f"keys 'grid.{taken[key]}' and 'grid.{axis.key}' both set {key}; leave one of them out"
+                )
+    count = math.prod(len(axis.values) for axis in sweep.axes)
+    if count > MOST_CELLS:
+        raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
+    try:
+        names = [cell.name for cell in sweep.cells]
+    except (ValidationError, ValueError) as error:
+        text = explain(error, Scenario) if isinstance(error, ValidationError) else str(error)
+        raise InputError(f"key 'grid': some values do not go together: {text}") from None
+    if twice := sorted(name for name, times in Counter(names).items() if times > 1):
+        raise InputError(f"key 'grid': two values are too much alike to be told apart ({twice[0]})")

@@ -1,0 +1,204 @@
+"""A map, and advice from it, on a terminal and as JSON."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from consistency.bench.sweeps.cell import CellResult, plain_numbers
+from consistency.bench.sweeps.recommend import OPEN, Advice, Candidate
+from consistency.bench.sweeps.regime import Regime
+from consistency.referee.diagnostics.records import STATUSES
+from consistency.referee.diagnostics.wording import plural, short
+from consistency.referee.system.provenance import plain
+from consistency.referee.terminal.table import COLOURS, open_console
+
+MOST_CELLS = 48  # for a table of all cells on a terminal; map.csv has any number
+
+
+def print_regime(regime: Regime) -> None:
+    """Print a row for each filter: number of cells by verdict, and the cost of a step."""
+    counts = {
+        name: Counter(r.status for (_, n), r in regime.results.items() if n == name) for name in regime.sweep.filters
+    }
+    statuses = [status for status in STATUSES if any(count[status] for count in counts.values())]
+    table = RichTable(box=None, pad_edge=False)
+    for column in ("filter", *statuses, "cost"):
+        table.add_column(column, justify="left" if column == "filter" else "right")
+    for name, count in counts.items():
+        costs = [r.cost for (_, n), r in regime.results.items() if n == name and np.isfinite(r.cost)]
+        cost = f"×{np.median(costs):.2g}" if costs else "-"
+        table.add_row(escape(name), *(str(count[status]) for status in statuses), cost)
+    out = open_console()
+    out.print(table)
+    cells = regime.sweep.cells
+    if len(cells) <= MOST_CELLS:
+        out.print()
+        out.print(_cells_table(regime))
+        out.print("verdict, and ratio of true to stated covariance", markup=False, soft_wrap=not out.is_terminal)
+    lines = [f"{len(cells)} cells; cost: CPU time of a step against {regime.sweep.reference}, median over the cells"]
+    if alone := sum(bool(regime.trusted(cell)) for cell in cells):
+        lines.append(f"in {alone} of {len(cells)} cells some filter is consistent")
+    if regime.missing:
+        lines.append(f"{regime.missing} of {len(cells) * len(regime.sweep.filters)} are not there yet")
+    for line in lines:
+        out.print(line, markup=False, soft_wrap=not out.is_terminal)
+
+
+def _cells_table(regime: Regime) -> RichTable:
+    """Print a row for each cell: its values, and the verdict and covariance ratio of each filter."""
+    table = RichTable(box=None, pad_edge=False)
+    axes = [axis for axis in regime.sweep.axes if len(axis.values) > 1] or list(regime.sweep.axes)
+    for axis in axes:
+        table.add_column(escape(axis.key.rpartition(".")[2]), justify="right" if axis.numeric else "left", max_width=36)
+    for name in regime.sweep.filters:
+        table.add_column(escape(name))
+    for cell in regime.sweep.cells:
+        values = [escape(axis.say(cell.indices[regime.sweep.axes.index(axis)])) for axis in axes]
+        found = regime.at(cell)
+        table.add_row(*values, *(_verdict_text(found.get(name)) for name in regime.sweep.filters))
+    return table
+
+
+def _verdict_text(result: CellResult | None) -> str:
+    if result is None:
+        return "-"
+    colour = COLOURS[result.status]
+    ratio = "" if np.isnan(result.ratio) else f" {'∞' if np.isinf(result.ratio) else short(result.ratio)}"
+    return f"[{colour}]{result.status}[/{colour}]{ratio}"
+
+
+# --- advice -----------------------------------------------------------------------------------------
+
+
+def print_advice(advice: Advice) -> None:
+    """Where the rig lies, a row a filter, and the answer in sentences."""
+    out = open_console()
+
+    def line(text: str) -> None:
+        out.print(text, markup=False, soft_wrap=not out.is_terminal)
+
+    line(f"{advice.rig.name}: {'; '.join(place.text for place in advice.places)}")
+    for note in notes_of(advice):
+        line(f"  {note}")
+    line(f"nearest cell of the map: {advice.nearest.text}")
+    table = RichTable(box=None, pad_edge=False)
+    for column in ("filter", "there", "cells around", "RMSE m", "RMSE deg", "cost", "runs here"):
+        table.add_column(column, justify="left" if column in ("filter", "there", "runs here") else "right")
+    for candidate in advice.candidates:
+        table.add_row(*_row(candidate))
+    out.print(table)
+    line("")
+    for sentence in sentences_of(advice):
+        line(sentence)
+
+
+def _row(c: Candidate) -> list[str]:
+    near, colour = c.nearest, COLOURS[c.nearest.status]
+    said = "-" if c.verdict is None else f"{'no fault found' if c.verdict.status in OPEN else c.verdict.status}"
+    heading = f"{np.rad2deg(near.rmse_heading):.2f}" if np.isfinite(near.rmse_heading) else "-"
+    return [
+        escape(c.filter), f"[{colour}]{near.status}[/{colour}]", f"{c.agreeing} of {c.around}",
+        f"{near.rmse_position:.3f}" if np.isfinite(near.rmse_position) else "-", heading,
+        f"×{near.cost:.2g}" if np.isfinite(near.cost) else "-", said,
+    ]  # fmt: skip
+
+
+def notes_of(advice: Advice) -> list[str]:
+    """What was assumed, counted otherwise, or is not on the map."""
+    notes = []
+    if advice.equivalent is not None:
+        own, counted = advice.equivalent
+        notes.append(
+            f"its baseline of {own:.3g} m counts as {counted:.3g} m, which makes depths as exact with the map's camera"
+        )
+    if advice.rig.assumed:
+        notes.append(f"taken from the map: {', '.join(advice.rig.assumed)}")
+    if advice.unlike:
+        notes.append(f"no cell of the map is like the rig in: {', '.join(advice.unlike)}")
+    if advice.lacking and advice.best is not None:
+        notes.append(f"its sweep is not finished: the nearest cell lacks {', '.join(advice.lacking)}")
+    return notes
+
+
+def sentences_of(advice: Advice) -> list[str]:
+    """The answer, how sure it is, and why."""
+    best = advice.best
+    if best is None:
+        contradicted = [c for c in advice.candidates if c.sure == "no"]
+        if contradicted:
+            names = ", ".join(f"{c.filter} ({c.verdict.status})" for c in contradicted if c.verdict is not None)
+            return [f"No filter to trust: the map has one, but {plural(advice.runs, 'run')} of this rig find: {names}."]
+        if advice.lacking:
+            return [
+                f"No answer yet: of {advice.nearest.text} the map lacks {', '.join(advice.lacking)}. {_none_of(advice)}"
+            ]
+        where = f" Nearest cell where one is consistent: {advice.elsewhere}." if advice.elsewhere else ""
+        return [f"No filter of the map is consistent near this rig.{where}"]
+    return [
+        f"Take {best.filter}: {best.sure}. {_why(advice, best)}",
+        *([_confirmed(advice, best)] if best.verdict is not None else []),
+        *(_contradiction(advice, c) for c in advice.candidates if c.sure == "no"),
+    ]
+
+
+def _none_of(advice: Advice) -> str:
+    """What the map has, and how to have the rest."""
+    there, sweep = ", ".join(c.filter for c in advice.candidates), advice.regime.sweep
+    total = len(sweep.cells) * len(sweep.filters)
+    return (
+        f"Of those there ({there}) none is consistent. {advice.regime.missing} of its {total} results are missing; "
+        "finish the sweep: the same 'consistency sweep' goes on."
+    )
+
+
+def _why(advice: Advice, best: Candidate) -> str:
+    inside = "The rig lies inside the map" if advice.inside else "The rig lies outside the map, which only hints"
+    cells = f"all {best.around}" if best.agreeing == best.around else f"{best.agreeing} of the {best.around}"
+    where = f"{cells} cells around it" if best.around > 1 else "the cell where it lies"
+    return f"{inside}; the filter is consistent in {where}."
+
+
+def _confirmed(advice: Advice, best: Candidate) -> str:
+    """What the confirming runs said, and what they could have missed."""
+    assert best.verdict is not None
+    rate = 100.0 * advice.regime.sweep.rule.false_alarm
+    ratio, (low, high) = best.verdict.inflation, best.verdict.inflation_interval
+    found = f"{plural(advice.runs, 'run')} of this rig find no fault (a right filter would fail in {rate:g} %)"
+    scale = f"the ratio of true to stated covariance is {short(ratio)} [{short(low)}, {short(high)}]"
+    power = f"a covariance too small by ×{short(best.detectable)} would have been found with probability 0.95"
+    return f"{found}; {scale}; {power}."
+
+
+def _contradiction(advice: Advice, c: Candidate) -> str:
+    assert c.verdict is not None
+    runs = plural(advice.runs, "run")
+    return f"Not {c.filter}: consistent on the map, but {runs} of this rig say {c.verdict.reasons[0]}."
+
+
+def advice_json(advice: Advice) -> dict[str, Any]:
+    """The advice for programs; NaN becomes null."""
+    best = advice.best
+    return {
+        "rig": advice.rig.name, "map": advice.regime.sweep.name, "inside": advice.inside,
+        "take": None if best is None else best.filter, "sure": None if best is None else best.sure,
+        "answer": sentences_of(advice), "notes": notes_of(advice), "nearest_cell": advice.nearest.text,
+        "axes": {p.axis.key: {"value": plain(p.value), "inside": p.inside} for p in advice.places},
+        "runs": advice.runs,
+        "filters": [
+            {"filter": c.filter, "sure": c.sure or None, "cells_around": c.around, "agreeing": c.agreeing}
+            | {"nearest": plain_numbers(c.nearest)}
+            | {"confirmed": None if c.verdict is None else _verdict_json(c)}
+            for c in advice.candidates
+        ],
+    }  # fmt: skip
+
+
+def _verdict_json(c: Candidate) -> dict[str, Any]:
+    assert c.verdict is not None
+    numbers = {"inflation": c.verdict.inflation, "interval": c.verdict.inflation_interval, "detectable": c.detectable}
+    return {"status": c.verdict.status, "reason": c.verdict.reasons[0]} | {k: plain(v) for k, v in numbers.items()}

@@ -1,0 +1,145 @@
+"""The map of a sweep: where each filter is consistent, how accurate it is there, and what it costs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from consistency.bench.scenario import data_folder
+from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
+from consistency.bench.sweeps.folder import SweepFolder, describe, open_sweep, sweep_from
+from consistency.bench.sweeps.plan import Cell, Sweep
+from consistency.referee.errors import InputError
+from consistency.referee.reading import read_json, reading
+from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
+
+MAP_KIND = "map"
+SHIPPED = "regime.json"
+FIELDS = tuple(CellResult.__dataclass_fields__)
+EQUAL = 0.02  # relative difference of two RMSE below which the cheaper filter comes first
+
+
+@dataclass(frozen=True)
+class Regime:
+    """Results of a sweep by cell and filter; cells or filters may be missing."""
+
+    sweep: Sweep
+    results: Mapping[tuple[int, str], CellResult]  # by number of the cell and filter
+    manifest: Mapping[str, Any]  # where it comes from
+
+    @property
+    def missing(self) -> int:
+        """Filters in cells that are not there."""
+        return len(self.sweep.cells) * len(self.sweep.filters) - len(self.results)
+
+    def at(self, cell: Cell) -> dict[str, CellResult]:
+        """What is there of a cell, in the order of the filters."""
+        found = ((name, self.results.get((cell.number, name))) for name in self.sweep.filters)
+        return {name: result for name, result in found if result is not None}
+
+    def trusted(self, cell: Cell) -> list[tuple[str, CellResult]]:
+        """Filters that are consistent in a cell, the most accurate first."""
+        return ranked({name: result for name, result in self.at(cell).items() if result.status == "consistent"})
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """Rows by cell and filter: the value on each axis, the filter, and the fields of :class:`CellResult`."""
+        rows = [
+            [*(_text(axis.values[i]) for axis, i in zip(self.sweep.axes, cell.indices, strict=True)), name,
+             *(getattr(result, field) for field in FIELDS)]
+            for cell in self.sweep.cells for name, result in self.at(cell).items()
+        ]  # fmt: skip
+        return pd.DataFrame(rows, columns=[*(axis.key for axis in self.sweep.axes), "filter", *FIELDS])
+
+
+def _text(value: Any) -> Any:
+    return value if isinstance(value, int | float | str) else json.dumps(value)
+
+
+def ranked(results: Mapping[str, CellResult]) -> list[tuple[str, CellResult]]:
+    """By RMSE of position; of those that differ by 2 % or less the cheaper one first."""
+
+    def key(pair: tuple[str, CellResult]) -> tuple[float, float]:
+        rmse, cost = pair[1].rmse_position, pair[1].cost
+        step = round(float(np.log(rmse)) / EQUAL) if np.isfinite(rmse) and rmse > 0 else np.inf
+        return step, cost if np.isfinite(cost) else np.inf
+
+    return sorted(results.items(), key=key)
+
+
+# --- files ------------------------------------------------------------------------------------------
+
+
+def regime_of(folder: SweepFolder) -> Regime:
+    """The map of what a folder holds."""
+    return Regime(folder.sweep, folder.results(), manifest_of(kind=MAP_KIND))
+
+
+def write_regime(regime: Regime, out: Path) -> list[Path]:
+    """``map.json``, the summary that ``recommend`` reads, and the same as ``map.csv`` and ``map.parquet``."""
+    table = regime.table
+    paths = [out / f"map.{kind}" for kind in ("json", "csv", "parquet")]
+    contents = (
+        dumped(regime).encode(), table.to_csv(index=False, float_format="%.6g").encode(),
+        table.to_parquet(compression="zstd", index=False),
+    )  # fmt: skip
+    for path, content in zip(paths, contents, strict=True):
+        try:
+            write_whole(path, content, 0o644)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return paths
+
+
+def dumped(regime: Regime) -> str:
+    """The map as JSON, a row a line."""
+    manifest = dict(regime.manifest) | {"sweep": describe(regime.sweep), "columns": ["cell", "filter", *FIELDS]}
+    rows = [
+        json.dumps([number, name, *plain_numbers(result).values()], ensure_ascii=False)
+        for (number, name), result in sorted(regime.results.items(), key=lambda item: item[0])
+    ]
+    head = json.dumps(manifest, indent=1, ensure_ascii=False).removesuffix("\n}")
+    return f'{head},\n "rows": [\n  ' + ",\n  ".join(rows) + "\n ]\n}\n"
+
+
+def read_regime(path: Path | None = None) -> Regime:
+    """A map from ``map.json``, from a folder of ``consistency sweep``, or the shipped one.
+
+    Raises
+    ------
+    InputError
+        There is none, or it is damaged.
+    """
+    if path is None:
+        path = data_folder("reference") / SHIPPED
+        if not path.is_file():
+            path = data_folder("reports") / "reference" / SHIPPED
+        if not path.is_file():
+            raise InputError(
+                "no map is shipped with this version; make one with 'consistency sweep regime --out regime' (about 20 "
+                "minutes), then add --map regime"
+            )
+    if path.is_dir():
+        return regime_of(open_sweep(path))
+    data = read_json(path)
+    if not isinstance(data, dict) or data.get("kind") != MAP_KIND or data.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(f"--map {path}: is no map; give a folder of 'consistency sweep', or its map.json")
+    sweep = sweep_from(data, path)
+    with reading(f"--map {path}", "key 'rows' is damaged; write the map again"):
+        results = dict(_rows(data))
+    return Regime(sweep, results, {k: v for k, v in data.items() if k not in ("rows", "columns", "sweep")})
+
+
+def _rows(data: Mapping[str, Any]) -> Iterator[tuple[tuple[int, str], CellResult]]:
+    for row in data["rows"]:
+        fields = dict(zip(data["columns"], row, strict=True))
+        number, name = int(fields.pop("cell")), str(fields.pop("filter"))
+        yield (number, name), result_from(fields)

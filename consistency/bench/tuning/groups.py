@@ -1,0 +1,92 @@
+"""What a factor scales: process noise Q, measurement noise R, or single channels of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.scenario import Belief
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+
+MOTION = ("v", "omega")  # channels of Q
+CHANNELS = {  # of R, by model of the sensor
+    "uvd": ("u", "v", "d"),
+    "xyz": ("x", "y", "z"),
+    "linear": ("x", "y", "z"),
+    "relative-xy": ("dx", "dy"),
+    "range-bearing": ("range", "bearing"),
+}
+DIGITS = 6  # of a tuned standard deviation, so that what is judged is what is written
+
+
+class Group(NamedTuple):
+    """Channels whose variances have one factor, such as ``Q.v``; ``name`` is what the user calls them."""
+
+    name: str
+    channels: tuple[str, ...]
+
+
+def groups_of(text: str, belief: Belief) -> tuple[Group, ...]:
+    """Groups as the option ``--groups`` has them: "Q,R", "Q.v,Q.omega,R" or "Q,R.u+R.v,R.d".
+
+    ``Q`` and ``R`` stand for all their channels with a noise. Channels that no group names stay as they are.
+
+    Raises
+    ------
+    InputError
+        An unknown channel, one that is named twice, or one whose noise is zero and stays so whatever its factor.
+    """
+    known = {"Q": [f"Q.{name}" for name in MOTION], "R": [f"R.{name}" for name in CHANNELS[belief.sensor.model]]}
+    sigma, groups, seen = sigma_by_channel(belief), [], set[str]()
+    for name in (part.strip() for part in text.split(",")):
+        channels: list[str] = []
+        for member in (part.strip() for part in name.split("+")):
+            if member not in known and member not in sigma:
+                allowed = ", ".join(channel for part in known for channel in (part, *known[part]))
+                raise InputError(f"--groups {text}: unknown noise '{member}'; there are {allowed}")
+            wanted = [channel for channel in known.get(member, [member]) if member not in known or sigma[channel] > 0.0]
+            if not wanted or sigma[wanted[0]] == 0.0:
+                raise InputError(
+                    f"--groups {text}: '{member}' is believed to be zero, which no factor changes; believe in a noise, "
+                    "or leave it out"
+                )
+            channels += wanted
+        if twice := sorted(seen & set(channels)) or [c for c in channels if channels.count(c) > 1]:
+            raise InputError(f"--groups {text}: '{twice[0]}' is named twice; it has one factor")
+        seen |= set(channels)
+        groups.append(Group(name, tuple(channels)))
+    return tuple(groups)
+
+
+def scaled(belief: Belief, groups: Sequence[Group], log_factors: Array) -> Belief:
+    """The belief with the variances of each group times its factor; ``log_factors`` (groups,)."""
+    sigma = sigma_by_channel(belief)
+    for group, log_factor in zip(groups, log_factors, strict=True):
+        for channel in group.channels:
+            sigma[channel] *= float(np.exp(log_factor / 2.0))
+    return _with_sigma(belief, sigma)
+
+
+def rounded(belief: Belief) -> Belief:
+    """The belief with the digits that are written of its standard deviations."""
+    return _with_sigma(
+        belief, {channel: float(f"{value:.{DIGITS}g}") for channel, value in sigma_by_channel(belief).items()}
+    )
+
+
+def sigma_by_channel(belief: Belief) -> dict[str, float]:
+    """Standard deviation of each channel, SI units and px."""
+    values = (belief.motion.sigma_v, belief.motion.sigma_omega, *belief.sensor.sigma)
+    names = (*(f"Q.{name}" for name in MOTION), *(f"R.{name}" for name in CHANNELS[belief.sensor.model]))
+    return dict(zip(names, values, strict=True))
+
+
+def _with_sigma(belief: Belief, sigma: dict[str, float]) -> Belief:
+    v, omega, *rest = sigma.values()
+    motion = belief.motion.model_copy(update={"sigma_v": v, "sigma_omega": omega})
+    return belief.model_copy(
+        update={"motion": motion, "sensor": belief.sensor.model_copy(update={"sigma": tuple(rest)})}
+    )

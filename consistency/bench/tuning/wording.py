@@ -1,0 +1,188 @@
+"""What came of a fit: in words, for programs, and as files to go on with."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.bench.scenario import Belief, scenario_text, toml_text
+from consistency.bench.scenario.tables import SIGMA_UNITS
+from consistency.bench.store.log import Log, sensor_text
+from consistency.bench.store.storage import write_folder
+from consistency.bench.tuning.fit import LIMIT
+from consistency.bench.tuning.groups import sigma_by_channel
+from consistency.bench.tuning.parts import with_belief
+from consistency.bench.tuning.tune import Factor, Setting, Tuning
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics.wording import short
+from consistency.referee.system.provenance import manifest_of, plain
+
+TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}
+KIND = "tuning"
+
+
+def lines(tuning: Tuning, out: Path | None = None) -> list[str]:
+    """What to print beside the table of verdicts; ``out`` is the folder that was written."""
+    parts, chosen = tuning.parts, tuning.chosen
+    text = [
+        f"{tuning.filter} on {parts.world.name}: fitted by {TITLE[chosen.by]} on {parts.about[0]}, judged on "
+        f"{parts.about[1]} ({chosen.settings} settings, {tuning.seconds:.0f} s)",
+        *_factors(chosen, parts.belief),
+        f"before: {tuning.before.reasons[0]}{_power(tuning.before)}",
+        f"after: {chosen.verdict.reasons[0]}{_power(chosen.verdict)}",
+    ]
+    if (other := tuning.other) is not None:
+        text += [
+            f"of {tuning.tried} other settings, at which errors are as large as stated, the nearest to consistent is:",
+            *_factors(other, parts.belief), f"on {parts.about[1]}: {other.verdict.reasons[0]}{_power(other.verdict)}",
+        ]  # fmt: skip
+        if not tuning.no_setting:
+            text += [
+                "it leaves no fault, but is not the setting of the greatest score: its noises make up for something "
+                "else, and hold in worlds like this one alone"
+            ]
+    if tuning.no_setting:
+        names = ", ".join(factor.group.name for factor in tuning.factors)
+        text += [f"no setting of {names} is consistent, of {tuning.tried + 1} tried:"]
+    text += [f"  - {reason}" for reason in tuning.why]
+    text += ["", noise_table(tuning).rstrip()]
+    if out is not None:
+        text += ["", f"{out} has {', '.join(files(tuning))}{_next(tuning, out)}"]
+    return text
+
+
+def verdicts(tuning: Tuning) -> dict[str, Verdict]:
+    """Rows of the table of verdicts, by name."""
+    rows = {f"{tuning.filter}, as believed": tuning.before, f"{tuning.filter}, tuned": tuning.verdict}
+    return rows | ({} if tuning.other is None else {f"{tuning.filter}, scaled to its errors": tuning.other.verdict})
+
+
+def _factors(setting: Setting, before: Belief) -> list[str]:
+    old, new = sigma_by_channel(before), sigma_by_channel(setting.belief)
+    rows = []
+    for factor in setting.factors:
+        changed = ", ".join(f"{name} {old[name]:.4g} -> {new[name]:.4g}" for name in factor.group.channels)
+        rows.append(f"  {factor.group.name} {factor_text(factor)} (sigma: {changed})")
+    return rows
+
+
+def factor_text(factor: Factor) -> str:
+    """x1.02 [0.97, 1.07], of variances; "at most" or "at least" where the data bound it on one side alone."""
+    low, high = factor.interval.low, factor.interval.high
+    bound = f"at most x{short(high)}" if np.isfinite(high) else f"at least x{short(low)}" if low > 0.0 else ""
+    if factor.edge:
+        limit = np.exp(factor.edge * LIMIT)
+        return f"is at the limit of what is tried, x{limit:g}; {bound or 'not known'} with {100.0 * CONFIDENCE:g} %"
+    if np.isnan(low):
+        return f"x{short(factor.value)}"
+    if not bound:
+        return f"x{short(factor.value)}, which these data do not bound"
+    if low > 0.0 and np.isfinite(high):
+        return f"x{short(factor.value)} [{short(low)}, {short(high)}]"
+    return f"x{short(factor.value)}, {bound} with {100.0 * CONFIDENCE:g} %"
+
+
+def _power(verdict: Verdict) -> str:
+    if verdict.scale is None or not np.isfinite(verdict.scale.detectable):
+        return ""
+    ratio = short(verdict.scale.detectable)
+    return f" (a covariance too small by x{ratio} would be found with power {verdict.settings.power:g})"
+
+
+def noise_table(tuning: Tuning) -> str:
+    """The believed noises as TOML to paste: into a scenario, or into ``sensor.toml`` of a log."""
+    belief = tuning.belief
+    motion = {"sigma_v": belief.motion.sigma_v, "sigma_omega": belief.motion.sigma_omega}
+    sigma = {f"sigma{SIGMA_UNITS[belief.sensor.model]}": list(belief.sensor.sigma)}
+    is_log = isinstance(tuning.parts.world, Log)
+    return toml_text(sigma | {"motion": motion} if is_log else {"belief": {"motion": motion, "sensor": sigma}})
+
+
+def files(tuning: Tuning) -> dict[str, str]:
+    """Texts by name of the file: the tuned world, or sensor, and what came of the fit."""
+    world, belief = tuning.parts.world, tuning.belief
+    comment = f"{tuning.filter} tuned by {TITLE[tuning.chosen.by]} on {tuning.parts.about[0]}: {tuning.verdict.status}"
+    if isinstance(world, Log):
+        named = {"sensor.toml": f"# {comment}\n{sensor_text(Path(world.name), belief)}"}
+    else:
+        name = f"{world.name}-tuned"
+        named = {f"{name}.toml": scenario_text(with_belief(world, belief, name), comment)}
+    return named
+
+
+def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
+    """Write the files of a fit, with its outcome, as a folder that appears whole.
+
+    Raises
+    ------
+    InputError
+        The folder is there already, or cannot be written.
+    """
+    outcome = json.dumps(as_data(tuning, out), indent=2, allow_nan=False) + "\n"
+    texts = files(tuning) | {"tuning.json": outcome}
+
+    def contents(at: Path) -> None:
+        for name, text in texts.items():
+            (at / name).write_text(text, encoding="utf-8")
+
+    world = tuning.parts.world
+    origin = {"log": world.name, "log_sha256": world.sha256} if isinstance(world, Log) else {"scenario": world.name}
+    manifest = manifest_of(KIND, wall=tuning.seconds, filters=[tuning.filter], **origin)
+    write_folder(out, {}, manifest, contents, overwrite)
+
+
+def _next(tuning: Tuning, out: Path) -> str:
+    """What to do with the files."""
+    world, run = tuning.parts.world, "consistency run"
+    if isinstance(world, Log):
+        use = f"{run} --log {world.name} --filter {tuning.filter} --out results"
+        return f"; put it in the place of {Path(world.name) / 'sensor.toml'}, and run: {use}"
+    [name] = files(tuning)
+    return f"; judged again by: {run} {out / name} --filter {tuning.filter} {tuning.parts.again} --out results"
+
+
+def as_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
+    """The outcome for programs; numbers that are not finite become null. An open interval has low 0 or high null."""
+    data = {
+        "filter": tuning.filter,
+        "world": tuning.parts.world.name,
+        "fitted_on": tuning.parts.about[0],
+        "judged_on": tuning.parts.about[1],
+        "before": _verdict(tuning.before),
+        "chosen": _setting(tuning.chosen),
+        "nearest": None if tuning.other is None else _setting(tuning.other),
+        "tried": tuning.tried,
+        "consistent": tuning.consistent,
+        "no_setting": tuning.no_setting,
+        "why": list(tuning.why),
+        "seconds": tuning.seconds,
+        "out": None if out is None else str(out),
+    }
+    return dict(plain(data))
+
+
+def _setting(setting: Setting) -> Mapping[str, Any]:
+    factors = [
+        {
+            "group": factor.group.name, "channels": list(factor.group.channels), "factor": factor.value,
+            "low": factor.interval.low, "high": factor.interval.high, "edge": factor.edge,
+        }
+        for factor in setting.factors
+    ]  # fmt: skip
+    return {
+        "by": setting.by, "factors": factors, "sigma": sigma_by_channel(setting.belief), "settings": setting.settings,
+        "verdict": _verdict(setting.verdict),
+    }  # fmt: skip
+
+
+def _verdict(verdict: Verdict) -> Mapping[str, Any]:
+    return {
+        "status": verdict.status, "reasons": list(verdict.reasons), "runs": verdict.runs,
+        "statistics": plain(verdict.statistics),
+        "detectable": None if verdict.scale is None else verdict.scale.detectable,
+    }  # fmt: skip

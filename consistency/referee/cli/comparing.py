@@ -1,0 +1,92 @@
+"""Comparisons: ``compare`` and ``baseline``; they parse, call and print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from consistency.referee.cli.files import are_files, read_files, reads_files, tell_notes
+from consistency.referee.cli.options import FalseAlarm, Judged, Skip
+from consistency.referee.defaults import FALSE_ALARM
+from consistency.referee.errors import InputError
+from consistency.referee.reading.options import Reading, flag_of
+
+
+@reads_files
+def compare(
+    path: Judged,
+    files: Reading,
+    other: Annotated[
+        Path | None, typer.Argument(metavar="[OTHER]", help="Earlier ones in the same form, or a file of 'baseline'.")
+    ] = None,
+    filters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--filter", metavar="NAME", help="Without OTHER: the first against the rest. With it: this filter in both."
+        ),
+    ] = None,
+    false_alarm: FalseAlarm = FALSE_ALARM,
+    skip: Skip = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,
+) -> None:
+    """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
+    from consistency.referee.terminal.table import comparisons_json, print_comparisons
+    from consistency.referee.verdicts.baselines import baseline_of_files, is_baseline, read_baseline
+    from consistency.referee.verdicts.comparison import compare_filters, compare_with
+    from consistency.referee.verdicts.options import skip_asked
+
+    if fail_on not in (None, "worse"):
+        raise InputError(f"--fail-on must be 'worse', got '{fail_on}'")
+    if not 0.0 < false_alarm < 1.0:
+        raise InputError(f"--false-alarm must lie between 0 and 1, got {false_alarm}")
+    first = skip_asked(skip)
+    sides = [each for each in (path, other) if each is not None]
+    estimates = [each for each in sides if not is_baseline(each) and are_files(each, files)]
+    if not estimates and (unread := files.given()):
+        raise InputError(f"{flag_of(unread[0])}: is for files of another estimator, and none is named")
+    if len(estimates) == 2 and files.covariance is not None:
+        raise InputError(
+            f"--covariance: would be read with {path} and with {other}; keep one of them with 'consistency baseline'"
+        )
+    read = {each: read_files(each, files) for each in estimates}
+    new, *old = (
+        baseline_of_files(read[each], str(each), files.truth, first) if each in read else read_baseline(each, first)
+        for each in sides
+    )
+    if old:
+        compared = compare_with(new, old[0], filters or [], false_alarm)
+    else:
+        compared = compare_filters(new, filters or [], false_alarm)
+    tell_notes(*read.values())
+    if as_json:
+        print(comparisons_json(compared))
+    else:
+        print_comparisons(compared)
+    if fail_on and any(each.worse for each in compared):
+        raise typer.Exit(1)
+
+
+@reads_files
+def baseline(
+    path: Judged,
+    out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],
+    files: Reading,
+    skip: Skip = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
+) -> None:
+    """Keep what a later 'compare' needs of results, one row a run."""
+    from consistency.referee.verdicts.baselines import baseline_of_files, write_baseline
+
+    if are_files(path, files):
+        recordings = read_files(path, files)
+        write_baseline(baseline_of_files(recordings, str(path), files.truth, skip), out, overwrite)
+        tell_notes(recordings)
+    else:
+        from consistency.bench.store.results import open_results
+        from consistency.referee.verdicts.baselines import baseline_of
+
+        write_baseline(baseline_of(open_results(path), str(path), skip), out, overwrite)
+    print(f"baseline in {out}; next: consistency compare NEW {out}")

@@ -1,0 +1,79 @@
+"""``consistency monitor``: parses, calls, prints."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from consistency.referee.cli.options import given
+from consistency.referee.defaults import GATE_FALSE_ALARM
+from consistency.referee.errors import InputError
+
+
+def monitor(
+    path: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="Innovations of one run: .csv, .parquet, .npz, .ulg of PX4, a folder of 'run', or - for CSV lines.",
+        ),
+    ],
+    innovations: Annotated[
+        str | None,
+        typer.Option("--innovations", help="'optimal': declares the optimal gain, without which nothing is judged."),
+    ] = None,
+    false_alarm: Annotated[
+        float, typer.Option("--false-alarm", help="Chance that a right filter ever raises an alarm.")
+    ] = GATE_FALSE_ALARM,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Scales of the NIS up to this ratio are no fault; 1 is the exact test.")
+    ] = 1.2,
+    gate: Annotated[
+        float | None, typer.Option("--gate", help="Probability of the filter's chi-square gate, such as 0.99.")
+    ] = None,
+    mission: Annotated[
+        int | None, typer.Option("--mission", help="Innovations of the whole mission, if known.")
+    ] = None,
+    filter_name: Annotated[
+        str | None, typer.Option("--filter", help="Which, if FILE holds several; of a .ulg the sensor.")
+    ] = None,
+    run: Annotated[
+        int | None, typer.Option("--run", help="Which, if FILE holds several; of a .ulg the EKF2's instance.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
+) -> None:
+    """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
+    from consistency.bench.pages import require_plot, write_monitor_plot
+    from consistency.referee.reading import one_line
+    from consistency.referee.terminal.table import print_watched, watched_json
+    from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
+
+    if fail_on not in (None, "alarm"):
+        raise InputError(f"--fail-on must be 'alarm', got '{fail_on}'")
+    watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
+    if path == "-":
+        options = given(filter=filter_name, run=run, plot=plot)
+        if options:
+            raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
+        watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
+    else:
+        log = read_innovations(Path(path), filter_name, run)
+        for note in log.notes:
+            print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
+        if plot is not None:
+            require_plot(plot, overwrite)
+        watched = watch(log, watcher)
+    if plot is not None:
+        write_monitor_plot(plot, watched)
+    if as_json:
+        print(watched_json(watched))
+    else:
+        print_watched(watched)
+    if fail_on and watched.alarm is not None:
+        raise typer.Exit(1)

@@ -1,0 +1,90 @@
+"""Arrays of symmetric matrices, stored by entry: a covariance of three components in six numbers, not nine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.types import Array
+
+
+class Symmetric:
+    """Matrices (..., n, n) as one array (...) for each entry, where (i, j) and (j, i) may be the same array.
+
+    Each entry of all matrices is contiguous in memory, so that code that needs only the variances reads no more.
+    Indices of the leading axes select matrices; ``np.asarray`` gives all of them as (..., n, n).
+    """
+
+    def __init__(self, entries: Sequence[Sequence[Array]]) -> None:
+        self._entries = entries  # n rows of n arrays (...)
+
+    @classmethod
+    def of(cls, matrices: Array | Symmetric) -> Symmetric:
+        """Matrices of an array (..., n, n), which is not copied."""
+        if isinstance(matrices, Symmetric):
+            return matrices
+        n = matrices.shape[-1]
+        return cls([[matrices[..., i, j] for j in range(n)] for i in range(n)])
+
+    @classmethod
+    def filled(cls, shape: tuple[int, ...], n: int, value: float = np.nan) -> Symmetric:
+        """Matrices (``shape``, n, n) of one value, to be written by :meth:`entry`."""
+        half = {(i, j): np.full(shape, value) for i in range(n) for j in range(i, n)}
+        return cls([[half[min(i, j), max(i, j)] for j in range(n)] for i in range(n)])
+
+    def entry(self, i: int, j: int) -> Array:
+        """Entry (i, j) of all matrices, (...); writing to it changes them."""
+        return self._entries[i][j]
+
+    @property
+    def n(self) -> int:
+        return len(self._entries)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (*self._entries[0][0].shape, self.n, self.n)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, here: Any) -> Any:
+        if isinstance(here, tuple) and len(here) == len(self.shape):
+            return self.entry(here[-2], here[-1])[here[:-2]]
+        return self._each(lambda entry: entry[here])
+
+    def without(self, some: Array) -> Symmetric:
+        """NaN where ``some`` (...) is true."""
+        return self._each(lambda entry: np.where(some, np.nan, entry))
+
+    def part(self, index: Sequence[int]) -> Symmetric:
+        """Rows and columns ``index`` of all matrices."""
+        return Symmetric([[self.entry(i, j) for j in index] for i in index])
+
+    def broadcast(self, shape: tuple[int, ...]) -> Symmetric:
+        """Matrices broadcast to leading axes ``shape``."""
+        return self._each(lambda entry: np.broadcast_to(entry, shape))
+
+    @property
+    def variances(self) -> Array:
+        """Diagonals, (..., n), in an array of their own."""
+        return np.stack([self.entry(i, i) for i in range(self.n)], axis=-1)
+
+    def where_all(self, holds: Callable[[Array], Array]) -> Array:
+        """Where ``holds``, asked of arrays (...), is true of every entry; (...) of bool."""
+        out = np.ones(self.shape[:-2], bool)
+        for entry in self._different().values():
+            out &= holds(entry)
+        return out
+
+    def _different(self) -> dict[int, Array]:
+        return {id(entry): entry for row in self._entries for entry in row}
+
+    def _each(self, function: Callable[[Array], Array]) -> Symmetric:
+        """``function`` of each entry; those that were the same array still are."""
+        new = {key: function(entry) for key, entry in self._different().items()}
+        return Symmetric([[new[id(entry)] for entry in row] for row in self._entries])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        return np.stack([np.stack(row, axis=-1) for row in self._entries], axis=-2).astype(dtype or float, copy=False)

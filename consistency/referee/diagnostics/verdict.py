@@ -1,0 +1,210 @@
+"""The verdict on one filter, from its errors over independent runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import wording
+from consistency.referee.diagnostics.band import simultaneous_band
+from consistency.referee.diagnostics.ends import early_ends
+from consistency.referee.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
+from consistency.referee.diagnostics.headline import at_share, status_of
+from consistency.referee.diagnostics.hypothesis_tests import Tests, ask
+from consistency.referee.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
+from consistency.referee.diagnostics.intervals import chi2_mean_interval
+from consistency.referee.diagnostics.joint import joint_test, near
+from consistency.referee.diagnostics.location import accuracy_of, axes_of, bias_of, location_of, shape_of, tails_of
+from consistency.referee.diagnostics.lost import lost_of
+from consistency.referee.diagnostics.nees import anees
+from consistency.referee.diagnostics.questions import (
+    AXIS,
+    DIRECTION,
+    JOINT,
+    MAIN,
+    STEP,
+    answers,
+)
+from consistency.referee.diagnostics.records import Answer, Equivalence, Evidence, Innovations, Settings, Verdict
+from consistency.referee.diagnostics.sample import Sample, impossible, innovations_of, sample_of
+from consistency.referee.diagnostics.sample import shape_of as shape_of_arrays
+from consistency.referee.diagnostics.scaling import scale_of
+from consistency.referee.diagnostics.whitening import entries
+
+DEFAULT = Settings()
+
+
+@dataclass(frozen=True)
+class Look:
+    """One of several looks at growing evidence; see :mod:`consistency.diagnostics.sequential`."""
+
+    spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
+    # None where nothing but the scale is asked
+    scale: float  # p value of the scale, valid at any time
+
+
+def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = None) -> Verdict:
+    """Judge one filter: a status of ``records.STATUSES``, with reasons.
+
+    Runs are independent, steps are not: every test takes a run as one observation, or holds under any
+    dependence between steps. A filter whose errors are Gaussian with the stated covariance is found at fault in
+    any of the questions (``consistency.referee.diagnostics.questions``) with probability ``false_alarm`` at most;
+    half of that belongs to the mean NEES, for which :func:`gate_runs` plans. A filter is *consistent* if no question
+    found a fault, and two one-sided tests put the ratio of true to stated covariance inside [1 / detect, detect]; with
+    ``lost``, the share of lost runs is shown to be at most that, too. Without a fault and without this evidence, the
+    filter is undecided. A filter with failed runs is never consistent.
+
+    Innovations are judged where an optimal gain is declared, otherwise they are reported: only those of an optimal gain
+    are white. Without truth they are judged alone.
+
+    If a fit to the truth absorbed an unknown part of the errors (``Evidence.reduced``), a covariance that is too large
+    is no fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the largest
+    share of the NEES that the fit may have absorbed (``Evidence.unseen``). Questions that cannot be answered after the
+    fit (``Evidence.unavailable``) are not asked.
+
+    A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
+    pose and map together, where it is given.
+
+    Raises
+    ------
+    ValueError
+        Nothing to judge is given, or shapes or options do not fit.
+    """
+    runs, steps = shape_of_arrays(evidence)
+    both_sides = settings
+    settings = replace(settings, allow="conservative") if evidence.reduced else settings
+    innovations, p_values = _innovations(evidence, settings)
+    sample = sample_of(evidence, settings)
+    joint = None
+    if evidence.joint is not None:
+        joint = joint_test(evidence.joint, settings, evidence.run_numbers, evidence.landmarks)
+    p_values |= {} if joint is None else joint.p_values
+    tests = None
+    if sample is not None:
+        tests = ask(sample, settings, p_values, look.scale if look else None)
+        p_values |= {q: p for q, p in tests.p_values.items() if q not in evidence.unavailable}
+    if look is not None:
+        p_values = _at(look, p_values)
+    by_question = answers(p_values, settings.false_alarm)
+    excused = {"innovation scale"} if innovations is not None and _near(innovations, settings) else set()
+    excused |= {JOINT} if joint is not None and near(joint, settings) else set()
+    verdict = Verdict(
+        evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,
+        innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
+        unit=evidence.unit, skipped=evidence.skipped,
+    )  # fmt: skip
+    if sample is not None and evidence.landmarks is None:
+        ends = early_ends(sample.nees)
+        verdict = replace(verdict, ends=ends if ends.runs else None)
+    if sample is not None and tests is not None:
+        shown = _equivalence(sample, both_sides, look, evidence)
+        lost = lost_of(evidence, sample.nees, sample.dof, settings, any_time=look is not None)
+        verdict = _with_records(replace(verdict, lost=lost), evidence, sample, tests, shown)
+    verdict = replace(verdict, status=status_of(verdict, sample, tests, joint))
+    return replace(verdict, reasons=tuple(wording.reasons(verdict)))
+
+
+def _at(look: Look, p_values: dict[str, float]) -> dict[str, float]:
+    """p values corrected for the number of looks; the share of the scale stays what it is if it is asked alone."""
+    if look.spent is None:
+        return {q: p if q == MAIN else 1.0 for q, p in p_values.items() if np.isfinite(p)}
+    return {q: p if q == MAIN or not np.isfinite(p) else min(1.0, p / look.spent) for q, p in p_values.items()}
+
+
+# --- innovations -------------------------------------------------------------------------------------
+
+
+def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | None, dict[str, float]]:
+    nis_and_dof = innovations_of(evidence)
+    if nis_and_dof is None:
+        return None, {}
+    test = nis_test(*nis_and_dof)
+    low_high = chi2_mean_interval(test.dof, CONFIDENCE) if test.dof else (float("nan"), float("nan"))
+    if evidence.innovations is not None and evidence.innovation_covariances is not None:
+        white = whiteness(evidence.innovations, evidence.innovation_covariances)
+    else:
+        white = nis_whiteness(*nis_and_dof)
+    judged = evidence.optimal_gain
+    shown = equivalence_of_innovations(test, settings, max(settings.factor, settings.tolerated)) if judged else None
+    record = Innovations(test.ratio, low_high, test.dof, judged, white.correlation, white.bound, shown)
+    if not judged:
+        return record, {}
+    if settings.one_sided:
+        return record, {"innovation scale": test.above}
+    return record, {"innovation scale": test.p_value, "innovation whiteness": white.p_value}
+
+
+# --- results beside the p values -----------------------------------------------------------------
+
+
+def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: Tests, shown: Equivalence) -> Verdict:
+    settings = verdict.settings
+    if settings.tolerance is not None:
+        verdict = replace(verdict, answers=_excused(verdict.answers, _tolerated(sample, tests, settings)))
+    by_question = {a.question: a for a in verdict.answers if not a.tolerated}
+    band = tests.band
+    step = by_question.get(STEP)
+    if step is not None and step.found and not band.outside.any():  # found by what Holm's correction left over
+        rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
+        band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
+    location = location_of(sample, band, by_question, ordered=evidence.landmarks is None, detect=settings.factor)
+    scale = scale_of(sample, tests, at_share(verdict), location, shown)
+    if sample.errors is None or evidence.error is None or evidence.covariance is None:
+        return replace(verdict, scale=scale, location=location, tails=tails_of(tests, evidence.run_numbers))
+    odd = impossible(evidence, sample.counted)
+    there = entries(evidence.covariance).where_all(np.isfinite)
+    return replace(
+        verdict,
+        scale=scale,
+        location=location,
+        impossible=tuple((int(run), int(k) + 1) for run, k in np.argwhere(odd)),
+        left_out_steps=tuple(int(k) + 1 for k in np.flatnonzero((there & ~sample.counted).any(axis=0))),
+        axes=axes_of(sample, tests, location),
+        bias=bias_of(sample, tests, location, by_question),
+        shape=shape_of(sample, tests, by_question, at_share(verdict).false_alarm),
+        tails=tails_of(tests, evidence.run_numbers),
+        accuracy=accuracy_of(sample),
+    )
+
+
+def _equivalence(sample: Sample, settings: Settings, look: Look | None, evidence: Evidence) -> Equivalence:
+    if look is not None:
+        return equivalence_by_betting(sample.means(), sample.dof, settings)
+    factor = max(settings.factor, settings.tolerated)
+    return equivalence(
+        sample.means(), sample.dof, sample.longest, settings, factor, not evidence.reduced, evidence.unseen
+    )
+
+
+def _excused(all_answers: Iterable[Answer], questions: set[str]) -> tuple[Answer, ...]:
+    """Answers with the faults in these questions marked as tolerated."""
+    return tuple(replace(a, tolerated=True) if a.found and a.question in questions else a for a in all_answers)
+
+
+def _near(innovations: Innovations, settings: Settings) -> bool:
+    """Whether the scale of the innovations is shown to lie within the tolerance."""
+    if settings.tolerance is None or not innovations.judged:
+        return False
+    test = NisTest(innovations.ratio, innovations.dof, float("nan"), float("nan"))
+    return equivalence_of_innovations(test, settings, settings.tolerated).shown
+
+
+def _tolerated(sample: Sample, tests: Tests, settings: Settings) -> set[str]:
+    """Questions about the scale whose ratio is shown to lie within the tolerance, whatever they found."""
+    R, steps = settings.tolerated, sample.longest
+    if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
+        return set()
+    tolerated = {MAIN}
+    if sample.errors is not None:
+        groups = sample.errors.groups.values()
+        if all(equivalence(sample.group_means(g), len(g), steps, settings, R).shown for g in groups):
+            tolerated |= {AXIS}
+    if tests.largest is not None and tests.largest.ratio.high <= R:
+        tolerated |= {DIRECTION}
+    band = tests.band
+    curve = anees(sample.nees)
+    outside = (curve > band.high * R) | (curve < band.low / R)
+    return tolerated if outside.any() else tolerated | {STEP}

@@ -1,0 +1,133 @@
+"""A candidate and its reference, from arrays or from the bench's own results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from consistency.referee.diagnostics import Comparison, RunSummary, compare, summary, whiten
+from consistency.referee.diagnostics.comparison import FailedRuns
+from consistency.referee.diagnostics.skipping import Skip
+from consistency.referee.gating.checks import Arrays, Candidate, evidence, of_results
+from consistency.referee.reading.columns import POSE
+
+if TYPE_CHECKING:
+    from consistency.bench.store.results import Results
+    from consistency.referee.verdicts.baselines import Baseline
+
+
+NONE_FAILED = FailedRuns(0, 0)
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Two filters to compare."""
+
+    candidate: Candidate
+    a: RunSummary
+    b: RunSummary
+    name_b: str
+    axes: tuple[str, ...] | None
+    paired: bool
+    failures: FailedRuns = NONE_FAILED
+
+    @property
+    def failed_more(self) -> bool:
+        """a has more failed runs than b on the same trials."""
+        return self.paired and self.failures.a > self.failures.b
+
+    @property
+    def usable_runs(self) -> int:
+        """Runs that both have, or the fewer of the two where they are not paired."""
+        a, b = (x.runs[np.isfinite(x.nees)] for x in (self.a, self.b))
+        return len(np.intersect1d(a, b)) if self.paired else min(len(a), len(b))
+
+    def compare(self, false_alarm: float) -> Comparison:
+        """See :func:`consistency.diagnostics.compare`."""
+        return compare(self.a, self.b, false_alarm, self.axes, self.paired)
+
+    def reasons(self, c: Comparison) -> list[str]:
+        """A sentence, then each quantity of both."""
+        anees = c.differences[0]
+        outcome = "worse" if c.worse or self.failed_more else "not worse"
+        lines = [
+            f"{outcome} than {self.name_b}: mean NEES {anees.a:.3g} against {anees.b:.3g}, {self.a.dof} expected; "
+            f"its ratio to {self.a.dof} is {'farther from' if c.distance > 0 else 'nearer to'} 1 "
+            f"by x{np.exp(abs(c.distance)):.3g} (p {c.p_value:.2g}, {c.runs} {'paired runs' if c.paired else 'runs'})"
+        ]
+        if self.failed_more:
+            lines.append(f"{self.failures.a} runs failed, of {self.name_b} {self.failures.b}")
+        lines += [
+            f"{d.name} {d.a:.4g} against {d.b:.4g}: {'difference' if 'coverage' in d.name else 'ratio'} "
+            f"{d.difference:.3g} [{d.low:.3g}, {d.high:.3g}]"
+            for d in c.differences
+        ]
+        return lines
+
+
+def of_arrays(name: str, candidate: Arrays, reference: Arrays, skip: str | float | Skip | None = None) -> Sides:
+    """Both sides from arrays, row i of both the same trial; errors as :func:`consistency.testing.assert_not_worse`."""
+    a, row_a = _side("candidate a", name, candidate, skip)
+    b, row_b = _side("reference b", name, reference, skip)
+    if a.runs != b.runs:
+        raise ValueError(f"the candidate has {a.runs} runs and the reference {b.runs}; row i of both must be one trial")
+    if a.planned_dof != b.planned_dof:
+        raise ValueError(f"the errors have {a.planned_dof} and {b.planned_dof} components")
+    return Sides(
+        a, row_a, row_b, "the reference", None if candidate.axes is None else tuple(candidate.axes), paired=True
+    )
+
+
+def _side(side: str, name: str, arrays: Arrays, skip: str | float | Skip | None) -> tuple[Candidate, RunSummary]:
+    try:
+        case = evidence(name, arrays, skip=skip)
+    except ValueError as error:
+        raise ValueError(f"{side}: {error}") from None
+    e, P = case.evidence.error, case.evidence.covariance
+    values = case.evidence.nees if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
+    assert values is not None
+    return case, summary(values, case.planned_dof, e, P)
+
+
+def of_filters(
+    results: Results,
+    filter_name: str | None,
+    than: str | None,
+    reference: Results | Baseline | str | Path | None,
+    name: str | None,
+    skip: str | float | Skip | None = None,
+) -> Sides:
+    """Both sides from results, or from results and a baseline of an earlier state.
+
+    Raises
+    ------
+    ValueError
+        No such filter, nothing to compare with, or a baseline that cannot be read.
+    """
+    from consistency.referee.verdicts.baselines import Baseline, baseline_of, read_baseline, require_skip
+
+    if reference is None and than is None:
+        raise ValueError("than: name the filter to compare with, or give other results as reference")
+    candidate = of_results(results, filter_name, name, skip=skip)
+    new = baseline_of(results, skip=skip)
+    if reference is None:
+        old = new
+    elif isinstance(reference, Baseline):
+        old = require_skip(reference, skip)
+    else:
+        old = (
+            read_baseline(Path(reference), skip)
+            if isinstance(reference, str | Path)
+            else baseline_of(reference, skip=skip)
+        )
+    of_a = filter_name or results.filters[0]
+    of_b = than or of_a
+    if of_b not in old.filters:
+        raise ValueError(f"filter '{of_b}' is not in the reference; there are: {', '.join(old.filters)}")
+    paired = new.of_the_trials_of(old)
+    label = of_b if old is new else f"{of_b} in {old.name}"
+    failures = FailedRuns(new.failures[of_a], old.failures[of_b])
+    return Sides(candidate, new.filters[of_a], old.filters[of_b], label, tuple(POSE), paired, failures)

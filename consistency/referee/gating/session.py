@@ -1,0 +1,170 @@
+"""The gates of a whole test session: collected from reports, judged together, failed late where the budget says so."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from consistency.referee.gating.budget import final_rate
+from consistency.referee.gating.watch import Entry, Terms
+from consistency.referee.gating.wording import fault_text, few_to_compare
+
+PROPERTY = "consistency"  # of a test, one a gate: JSON without the statistics
+STATISTICS = "consistency_statistics"  # attribute of its reports: of every gate, as JSON
+
+
+def to_property(entry: Entry) -> tuple[str, str]:
+    """A pair for ``user_properties``: text, so that every reporter can carry it."""
+    data = {key: value for key, value in vars(entry).items() if key not in ("statistics", "test", "test_outcome")}
+    return PROPERTY, json.dumps(data, allow_nan=False)
+
+
+@dataclass
+class Tested:
+    """What the reports of one test said."""
+
+    nodeid: str
+    location: tuple[str, int | None, str]
+    outcome: str = ""
+    expected_to_fail: bool = False
+    entries: list[Entry] = field(default_factory=list)
+
+
+@dataclass
+class Ledger:
+    """Tests with gates, in the order in which they came; under xdist one test may run in several workers."""
+
+    budget: float | None = None
+    tests: dict[tuple[str, str], Tested] = field(default_factory=dict)
+    rate: float | None = None  # of each gate on the budget, once :meth:`settle` has run
+
+    def take(self, report: Any) -> None:
+        """Remember what a pytest ``TestReport`` carries; the last report of a test carries all its gates."""
+        properties = [json.loads(text) for key, text in report.user_properties if key == PROPERTY]
+        key = (getattr(report, "worker_id", ""), report.nodeid)
+        if not properties and key not in self.tests:
+            return
+        tested = self.tests.setdefault(key, Tested(report.nodeid, report.location))
+        statistics = getattr(report, STATISTICS, None)
+        details = json.loads(statistics) if statistics else [{}] * len(properties)
+        tested.entries = [
+            Entry(**data, statistics=more, test=report.nodeid) for data, more in zip(properties, details, strict=True)
+        ]
+        tested.expected_to_fail |= hasattr(report, "wasxfail")
+        if report.when == "setup":  # also of a second try
+            tested.outcome = ""
+        if report.when == "call" or report.outcome == "failed":
+            tested.outcome = report.outcome
+
+    def entries(self) -> list[Entry]:
+        """All gates, each with the outcome of its test."""
+        return [
+            replace(entry, test_outcome=tested.outcome) for tested in self.tests.values() for entry in tested.entries
+        ]
+
+    def settle(self) -> list[tuple[Tested, list[str]]]:
+        """Judge the gates on the budget at their final rate: tests that fail only now, and what to say."""
+        spent = [entry.in_place for entry in self.entries() if entry.in_budget]
+        if self.budget is None or not spent:
+            return []
+        self.rate = final_rate(self.budget, spent)
+        late = []
+        for tested in self.tests.values():
+            texts = []
+            for i, entry in enumerate(tested.entries):
+                if entry.in_budget:
+                    tested.entries[i], text = settled(entry, self.rate, self.budget, len(spent))
+                    texts += [text] if text else []
+            if texts and not tested.expected_to_fail:
+                late.append((tested, texts))
+                tested.outcome = "failed"
+        return late
+
+    def bound(self) -> float:
+        """Chance that any gate fails its test by a false alarm, at most; those that a test wants to fail cannot."""
+        own = [e.false_alarm for e in self.entries() if not e.in_budget and not wanted(e)]
+        return min(1.0, sum(own) + (self.budget or 0.0) * (self.rate is not None))
+
+
+def settled(entry: Entry, rate: float, budget: float, gates: int) -> tuple[Entry, str]:
+    """The gate at its final rate, and what to say if it fails only now ('' otherwise)."""
+    needed = needed_at(entry, rate)
+    entry = replace(entry, false_alarm=rate, needed=needed)
+    if entry.outcome != "passed":
+        return entry, ""
+    share = f"Judged at the end of the session: its budget of {budget:g} over {gates} gates is {rate:.3g} for each."
+    if entry.p_value is not None and entry.p_value <= rate:
+        entry = replace(entry, outcome="fault found", **entry.late)
+        return entry, f"{fault_text(entry.gate, entry.name, entry.reasons)}\n{share}"
+    if entry.standard_error is not None and entry.runs < needed:
+        text = few_to_compare(
+            entry.gate, entry.name, entry.runs, needed, Terms(rate, entry.detect, entry.power, entry.allow)
+        )
+        return replace(entry, outcome="too few runs"), f"{text}\n{share}"
+    return entry, ""
+
+
+def needed_at(entry: Entry, rate: float) -> int:
+    """Runs that a gate asks for at a false-alarm rate."""
+    from consistency.referee.diagnostics import Comparison, gate_runs
+
+    if entry.standard_error is None:
+        return gate_runs(entry.dof, entry.detect, rate, entry.power, entry.allow, entry.lost)
+    comparison = Comparison(entry.runs, True, (), 0.0, entry.standard_error, 1.0, rate, **entry.spread)
+    return comparison.needed_runs(entry.detect, entry.power)
+
+
+def lines(ledger: Ledger) -> Iterator[str]:
+    """The summary for a terminal: a row a gate, and under it why it did not pass."""
+    entries = ledger.entries()
+    rows = [("test", "gate", "outcome", "p", "runs", "planned", "inflation")]
+    for e in entries:
+        rows.append((e.test, e.gate, outcome(e), number(e.p_value), str(e.runs), str(e.needed), interval(e)))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for i, row in enumerate(rows):
+        yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        if i and entries[i - 1].outcome == "fault found":
+            yield f"    {entries[i - 1].name} is {entries[i - 1].reasons[0]}"
+    yield ending(ledger)
+
+
+def ending(ledger: Ledger) -> str:
+    """How many gates, and the chance that any of them fails a test without a fault."""
+    entries = ledger.entries()
+    bad, good = (sum(e.outcome != "passed" and wanted(e) == w for e in entries) for w in (False, True))
+    text = f"{len(entries)} gate{'s' * (len(entries) != 1)}, {bad} failed"
+    text += f", {good} failed as expected" if good else ""
+    text += f"; chance that any fails without a fault at most {ledger.bound():.3g}"
+    if ledger.rate is not None:
+        text += f" (budget {ledger.budget:g}: {ledger.rate:.3g} for a gate)"
+    return text
+
+
+def outcome(e: Entry) -> str:
+    """Also whether the test wanted the gate to fail."""
+    return e.outcome + (" (expected)" if wanted(e) else "")
+
+
+def wanted(e: Entry) -> bool:
+    """The gate did not pass, and its test did."""
+    return e.outcome != "passed" and e.test_outcome == "passed"
+
+
+def number(value: float | None) -> str:
+    """A p value, or a dash."""
+    return "-" if value is None else f"{min(value, 1.0):.2g}" if value >= 1e-6 else "<1e-6"
+
+
+def interval(e: Entry) -> str:
+    """Covariance inflation and its 95 % interval."""
+    if e.inflation is None:
+        return "-"
+    low, high = (f"{x:.3g}" if x is not None else "inf" for x in e.inflation_interval)
+    return f"x{e.inflation:.3g} [{low}, {high}]"
+
+
+def named(entries: Iterable[Entry]) -> list[dict[str, Any]]:
+    """Entries as dictionaries, in the order of their fields."""
+    return [dict(vars(entry)) for entry in entries]

@@ -1,0 +1,149 @@
+"""What a gate and the test session around it tell each other; standard library only, so that a plugin loads fast."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from consistency.referee.defaults import DETECT, GATE_FALSE_ALARM, POWER
+from consistency.referee.gating.budget import in_place_rate
+
+# of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose
+DEFAULTS: dict[str, Any] = {
+    "dof": 3, "detect": DETECT, "false_alarm": GATE_FALSE_ALARM, "power": POWER, "tolerance": None,
+    "allow": None, "lost": None,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What one gate found, in words and numbers that JSON holds; not finite numbers are None."""
+
+    gate: str  # assert_consistent | assert_not_worse
+    name: str  # of the filter
+    outcome: str  # passed | fault found | too few runs
+    status: str  # of the verdict; better or worse of a comparison
+    p_value: float | None  # false-alarm rate at which a fault is just found
+    false_alarm: float  # rate that the gate was judged at
+    in_budget: bool  # the rate is provisional: the session decides at its end
+    in_place: float  # rate at which a gate of a budget may fail at once; 0 if it must wait
+    runs: int
+    needed: int
+    dof: int
+    detect: float
+    power: float
+    allow: str | None
+    reasons: list[str]  # the first is a sentence
+    statistic: float | None = None
+    threshold: list[float | None] = field(default_factory=list)
+    inflation: float | None = None
+    inflation_interval: list[float | None] = field(default_factory=list)
+    first_step: int | None = None
+    subset: str | None = None
+    faults: list[str] = field(default_factory=list)
+    distance: float | None = None  # of a comparison
+    standard_error: float | None = None
+    spread: dict[str, float] = field(default_factory=dict)  # what else plans the runs of a comparison
+    lost: float | None = None  # share of lost runs that must not pass
+    late: dict[str, Any] = field(default_factory=dict)  # what changes here if the end of the session finds the fault
+    statistics: dict[str, Any] = field(default_factory=dict)  # all of the verdict
+    test: str = ""
+    test_outcome: str = ""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Settings of a gate, from arguments, marker, budget and defaults."""
+
+    false_alarm: float
+    detect: float
+    power: float
+    allow: str | None
+    tolerance: float | None = None
+    budget: float | None = None  # of the whole session; ``false_alarm`` is then provisional
+    may_fail: bool = True  # in place
+    lost: float | None = None  # share of lost runs that must be excluded
+
+    @property
+    def planned(self) -> float:
+        """Largest false-alarm rate that this gate can end with."""
+        return self.false_alarm if self.budget is None else self.budget
+
+
+@dataclass
+class Watch:
+    """One running test: what its gates are told, and where their entries go."""
+
+    marked: Mapping[str, Any] = field(default_factory=dict)  # of the marker, only what was said
+    budget: float | None = None
+    tests: int = 1  # collected
+    plan: Callable[[int], int] | None = None  # runs that the fixture would give by dimension of the error; None unasked
+    budgeted: int = 0  # gates of this test that ran on the budget
+    keep: Callable[[Entry], None] = lambda entry: None
+
+
+_watches: list[Watch] = []  # the running test is last; tests of a process run one after the other
+
+
+def current() -> Watch:
+    """The watch of the running test; outside a session one that tells nothing."""
+    return _watches[-1] if _watches else Watch()
+
+
+@contextlib.contextmanager
+def watching(watch: Watch) -> Iterator[None]:
+    """Make ``watch`` the current one."""
+    _watches.append(watch)
+    try:
+        yield
+    finally:
+        _watches.remove(watch)
+
+
+def terms(
+    false_alarm: float | None,
+    detect: float | None,
+    power: float | None,
+    allow: str | None,
+    tolerance: float | None = None,
+    lost: float | None = None,
+) -> Terms:
+    """Arguments first, then the marker of the running test, then the session's budget, then the defaults.
+
+    Raises
+    ------
+    ValueError
+        An argument out of its range.
+    """
+    watch = current()
+    given: dict[str, Any] = {
+        "false_alarm": false_alarm, "detect": detect, "power": power, "allow": allow, "tolerance": tolerance,
+        "lost": lost,
+    }  # fmt: skip
+    choices: dict[str, Any] = dict(watch.marked) | {key: value for key, value in given.items() if value is not None}
+    options = DEFAULTS | choices
+    for key in ("false_alarm", "power"):
+        if not 0.0 < options[key] < 1.0:
+            raise ValueError(f"{key} must lie between 0 and 1, got {options[key]}")
+    if not 0.0 < options["detect"] < float("inf") or options["detect"] == 1.0:
+        raise ValueError(
+            f"detect must be a positive ratio of true to stated covariance, not 1; got {options['detect']}"
+        )
+    if options["allow"] not in (None, "conservative"):
+        raise ValueError(f"allow must be 'conservative' or None, got '{options['allow']}'")
+    if options["allow"] == "conservative" and options["detect"] < 1.0:
+        raise ValueError(f"detect {options['detect']} is a covariance too large, which allow='conservative' accepts")
+    wide = options["tolerance"]
+    if wide is not None and (not 0.0 < wide < float("inf") or wide == 1.0):
+        raise ValueError(f"tolerance must be a positive ratio of true to stated covariance, not 1; got {wide}")
+    if options["lost"] is not None and not 0.0 < options["lost"] < 1.0:
+        raise ValueError(f"lost must lie between 0 and 1, got {options['lost']}")
+    rest = float(options["detect"]), float(options["power"]), options["allow"], wide
+    if watch.budget is None or "false_alarm" in choices:
+        return Terms(float(options["false_alarm"]), *rest, lost=options["lost"])
+    rate = in_place_rate(watch.budget, watch.tests, watch.budgeted)
+    watch.budgeted += 1
+    provisional = rate or in_place_rate(watch.budget, watch.tests)
+    return Terms(provisional, *rest, budget=watch.budget, may_fail=rate > 0, lost=options["lost"])

@@ -1,0 +1,66 @@
+"""The figure of a monitor: the NIS of a run and the evidence against it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from consistency.bench.pages import paper
+from consistency.bench.pages.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
+from consistency.bench.pages.looks import EXPECTED, LIMIT, style
+from consistency.referee.types import Array
+from consistency.referee.verdicts.monitoring import Watched
+
+HEIGHT = 3.6  # inches
+POINTS = 600  # at most, of the NIS: few enough to see a change among them
+FAULT = replace(style(1), dash=(), width=1.1)
+
+
+def monitor_plot(watched: Watched, kind: str, resolution: int = 200) -> bytes:
+    """NIS / dof above, the e-value below, over the steps of the file; ``kind`` is png, pdf or svg."""
+    return paper.render(sheet(watched), kind, resolution)
+
+
+def sheet(watched: Watched) -> Sheet:
+    """One panel above the other, over the same steps."""
+    return Sheet((_sizes(watched), _evidence(watched)), HEIGHT, columns=1)
+
+
+def _sizes(watched: Watched) -> Panel:
+    step, ratio, together = averaged(watched.step, watched.nis_over_dof)
+    label = "NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})"
+    points = Points(step, ratio, replace(style(0), size=2.0, alpha=0.7))
+    return Panel(
+        Axis("step", share="step"), Axis(label, log=bool((ratio > 0).any())), (points, Rule("y", 1.0, EXPECTED)),
+        f"NIS over degrees of freedom of {watched.name} over steps", title=watched.name,
+    )  # fmt: skip
+
+
+def _evidence(watched: Watched) -> Panel:
+    """E-value after each step with the value at which an alarm is raised; since the fault it is shaded.
+
+    What goes on beyond the square of that value is cut off.
+    """
+    threshold, alarm = watched.monitor.threshold, watched.alarm
+    marks: list[Mark] = []
+    if alarm is not None:
+        marks.append(Span("x", float(alarm.since), float(alarm.step), replace(FAULT, alpha=0.15)))
+        marks.append(Rule("x", float(alarm.step), FAULT))
+    marks += [Rule("y", threshold, LIMIT), Line(watched.step, watched.evidence, style(0))]
+    return Panel(
+        Axis("step", share="step"), Axis("e-value", log=True, most=threshold**2), tuple(marks),
+        f"E-value of {watched.name} over steps",
+    )  # fmt: skip
+
+
+def averaged(step: Array, ratio: Array) -> tuple[Array, Array, int]:
+    """Steps and ratios (N,) averaged over as many neighbours as leave few enough points; how many those are."""
+    known = np.isfinite(ratio)
+    step, ratio = step[known], ratio[known]
+    together = max(1, -(-len(ratio) // POINTS))
+    starts = np.arange(0, len(ratio), together)
+    if together == 1:
+        return step, ratio, 1
+    counts = np.diff(np.append(starts, len(ratio)))
+    return np.add.reduceat(step, starts) / counts, np.add.reduceat(ratio, starts) / counts, together

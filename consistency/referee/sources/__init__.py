@@ -1,0 +1,142 @@
+"""Files of other estimators, read as errors and covariances; docs/files.md describes the formats.
+
+Filters, scenarios and results folders of this package do not belong here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
+from consistency.referee.reading import require_name
+from consistency.referee.reading.options import Reading, flag_of
+from consistency.referee.sources.alignment import ALIGNMENTS, require_alignment
+from consistency.referee.sources.archive import read_archive
+from consistency.referee.sources.bags import is_bag, read_bags
+from consistency.referee.sources.kitti import BODIES, is_drive
+from consistency.referee.sources.relative import MARGINAL
+from consistency.referee.sources.table import read_tables
+from consistency.referee.sources.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
+from consistency.referee.sources.windows import Relative, relative_of
+
+__all__ = [
+    "ALIGNMENTS",
+    "BODIES",
+    "CONVENTIONS",
+    "ORDERS",
+    "is_recording",
+    "planar_error",
+    "read_recordings",
+    "se2_log",
+    "se3_log",
+    "spatial_error",
+]
+
+CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *SPATIAL)))
+TABLES = (".csv", ".parquet", ".pq")
+
+
+def is_recording(path: Path, reading: Reading) -> bool:
+    """Whether a path is something :func:`read_recordings` reads, and not a folder of ``consistency run``.
+
+    Raises
+    ------
+    InputError
+        The path is a results folder, with an option for other files; or a folder of neither kind.
+    """
+    given = reading.given()
+    if path.is_dir() and not (path / "manifest.json").exists():
+        recording = bool(trajectory_files(path)) or is_bag(path) or bool(given)
+        if not recording:
+            known = f"trajectories ({', '.join(SUFFIXES)}) or ROS bags"
+            raise InputError(f"{path}: holds no results of 'consistency run', and no {known}")
+    else:
+        recording = not path.is_dir() and (path.exists() or path.suffix != "")
+    if not recording and path.exists() and given:
+        raise InputError(f"{flag_of(given[0])}: does not go with {path}, a folder of 'consistency run'")
+    return recording
+
+
+def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
+    """Read CSV, Parquet, TUM or NumPy files, or ROS bags: one recording for each estimator.
+
+    Parameters
+    ----------
+    estimates : .csv, .parquet, .npz, .bag, or a TUM trajectory, or a folder of these with one for each run
+
+    Raises
+    ------
+    InputError
+        Something cannot be used: names file, line, column or option, and what is allowed.
+    """
+    r = reading or Reading()
+    over = relative_of(r.relative, bool(r.motions), r.windows)
+    r = _checked(r, over)
+    if not estimates.exists():
+        raise InputError(f"{estimates}: no such file")
+    require_name(estimates.name, "file")
+    suffix = estimates.suffix.lower()
+    if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
+        raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
+    if is_bag(estimates):
+        _refuse(estimates, r, "state", "covariance", "covariance_order", "truth")
+        if over is not None:
+            raise InputError(f"{estimates}: --relative: {MARGINAL}")
+        return read_bags(estimates, r)
+    _refuse(estimates, r, "topic", "truth_topic")
+    if suffix == ".npz":
+        _refuse(
+            estimates, r, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align"
+        )
+        return read_archive(estimates, r.error, over)
+    if suffix in TABLES:
+        _refuse(estimates, r, "covariance", "covariance_order", "axes")
+        if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
+            raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
+        return _with_frame(read_tables(estimates, r, over), r)
+    if suffix not in SUFFIXES and not estimates.is_dir():
+        known = ", ".join((*TABLES, ".npz", ".bag", *SUFFIXES))
+        raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
+    _refuse(estimates, r, "state")
+    return _with_frame(read_tum(estimates, r, over), r)
+
+
+def _checked(r: Reading, over: Relative | None) -> Reading:
+    """Options that go together, whatever the file; numbers are floats, and no alignment is None."""
+    if r.error is not None and r.error not in CONVENTIONS:
+        raise InputError(f"--error {r.error}: must be one of {', '.join(CONVENTIONS)}")
+    if r.max_dt is not None and not (math.isfinite(r.max_dt) and r.max_dt >= 0):
+        raise InputError(f"--max-dt {r.max_dt:g}: must be 0 or more, in s")
+    offset = float(r.time_offset) if isinstance(r.time_offset, int) else r.time_offset
+    if offset not in (None, "estimate") and not (isinstance(offset, float) and math.isfinite(offset)):
+        raise InputError(f"--time-offset {offset}: must be a number of seconds, or 'estimate'")
+    if offset is not None and r.truth is None and r.truth_topic is None:
+        raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
+    if over is not None and offset == "estimate":
+        raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
+    align = require_alignment(r.align, r.truth or r.truth_topic)
+    if over is not None and align is not None:
+        raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
+    return replace(r, time_offset=offset, align=align)
+
+
+def _with_frame(recordings: list[Evidence], r: Reading) -> list[Evidence]:
+    """Add a note on the body and the world frame of the poses of a drive."""
+    if r.truth is None or not is_drive(r.truth):
+        return recordings
+    note = (
+        f"{r.truth}: the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first "
+        "packet"
+    )
+    return [replace(recordings[0], notes=(note, *recordings[0].notes)), *recordings[1:]]
+
+
+def _refuse(path: Path, r: Reading, *names: str) -> None:
+    if given := r.given(names):
+        kept = path.suffix.lower() == ".npz" and given[0] in ("truth", "axes")
+        instead = f", an archive; it has a key '{given[0]}' in its place" if kept else ""
+        raise InputError(f"{flag_of(given[0])}: does not go with {path}{instead}")

@@ -1,0 +1,263 @@
+"""NumPy archives (.npz): arrays over (runs, steps)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.conventions import PLANAR, planar_error
+from consistency.referee.reading import is_file, reading, require_name, require_room
+from consistency.referee.sources.hints import hints, turns
+from consistency.referee.sources.interpolation import Manifold
+from consistency.referee.sources.poses import Poses
+from consistency.referee.sources.record import Track, assemble, symmetric
+from consistency.referee.sources.relative import Stretch, relative_recording
+from consistency.referee.sources.sheet import Places, are_dof, bounded
+from consistency.referee.sources.windows import Relative
+from consistency.referee.types import Array, Failure
+
+KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
+NEEDED = (("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof"))
+OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "cross_covariances"}
+
+
+def read_archive(path: Path, convention: str | None, relative: Relative | None = None) -> list[Evidence]:
+    """The recording of an archive.
+
+    ``errors`` (runs, steps, n) with ``covariances`` (runs, steps, n, n); or ``estimates`` and ``truth``, both
+    (runs, steps, n), with ``covariances``; or ``nees`` (runs, steps) with ``dof``. One run may lack the first
+    dimension. Optional: ``nis`` and ``nis_dof`` (runs, steps), ``axes`` (n,), ``t`` (steps,), and ``lengths``
+    (runs,), the number of steps of each run, where they differ. With ``relative`` estimates and truth are planar
+    poses, or estimates are motions; ``cross_covariances`` (runs, steps, 3, 3) are those with the step before.
+    """
+    arrays = load_arrays(path)
+    kind = next((keys for keys in NEEDED if set(keys) <= set(arrays)), None)
+    if kind is None:
+        raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(arrays)) or 'nothing'}")
+    unknown = sorted(set(arrays) - set(kind) - OPTIONAL)
+    if unknown:
+        raise InputError(f"{path}: key '{unknown[0]}' does not go with {', '.join(kind)}; needs {KINDS}")
+    if convention is not None and kind != NEEDED[1]:
+        raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")
+    if relative is not None and kind != NEEDED[1]:
+        raise InputError(f"{path}: --relative needs the keys {', '.join(NEEDED[1])}, of poses or motions")
+    if kind == NEEDED[2]:
+        return [_of_nees(path, arrays)]
+    covariances = _array(path, arrays, "covariances", 4)
+    if kind == NEEDED[0]:
+        error, error_kind = _array(path, arrays, "errors", 3), ""
+        estimates, truth = np.zeros_like(error), error
+    else:
+        estimates, truth = (_array(path, arrays, key, 3) for key in ("estimates", "truth"))
+        if estimates.shape != truth.shape:
+            raise InputError(f"{path}: key 'truth' has shape {truth.shape}, 'estimates' {estimates.shape}")
+        error_kind = convention or "vector"
+        n = estimates.shape[-1]
+        if error_kind not in PLANAR or (error_kind != "vector" and n != 3):
+            raise InputError(f"--error {error_kind}: here it is 'vector', or so2, left or right for x, y, heading")
+        _require_truth(path, truth, estimates)
+        if relative is not None:
+            return [_relative(path, arrays, estimates, truth, covariances, convention or "so2", relative)]
+        error = planar_error(truth, estimates, error_kind) if n == 3 else truth - estimates
+    runs, steps, n = error.shape
+    if covariances.shape != (runs, steps, n, n):
+        raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {(runs, steps, n, n)}")
+    lengths = run_lengths(path, arrays, runs, steps)
+    nis, dof = _nis(path, arrays, (runs, steps))
+    given = error_kind or "vector"
+    tracks, poses = [], []
+    for run, length in enumerate(lengths):
+        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
+        P = symmetric(covariances[run, :length], place.__getitem__)
+        poses.append(_poses(place, estimates[run, :length], P, truth[run, :length], given))
+        cut = (None if values is None else values[run, :length] for values in (nis, dof))
+        tracks.append(Track(run, np.arange(length), place, error[run, :length], P, *cut))
+    axes = _axes(path, arrays, n)
+    notes = [f"error convention {error_kind}: {PLANAR[error_kind]}"] if error_kind else []
+    notes += hints(path.stem, axes, poses)
+    if given == "vector":
+        remedy = "add --error so2, if these are x, y, heading" if error_kind and n == 3 else "wrap it to [-pi, pi]"
+        notes += turns(path.stem, axes, error, covariances, remedy)
+    return [assemble(path.stem, tracks, step_times(path, arrays, steps), axes, str(path), error_kind, notes)]
+
+
+def _poses(place: Places, estimate: Array, covariance: Array, truth: Array, convention: str) -> Poses:
+    """Estimates (T, n) of one run beside their truth, NaN where it is not known."""
+    t, known = np.arange(len(estimate), dtype=float), np.isfinite(truth).all(axis=-1)
+    manifold: Manifold = "vector" if convention == "vector" else "planar"
+    stated = np.ones(len(t), bool)
+    return Poses(place, t, estimate, covariance, stated, t[known], truth[known], manifold, convention, 0.0)
+
+
+def _relative(
+    path: Path, arrays: dict[str, Array], estimates: Array, truth: Array, covariances: Array, convention: str,
+    relative: Relative,
+) -> Evidence:  # fmt: skip
+    """Motions over windows of planar poses, or of motions."""
+    runs, steps, n = estimates.shape
+    if n != 3 or convention == "vector":
+        raise InputError(f"{path}: --relative needs poses x, y, heading, with --error so2, left or right")
+    shape = (runs, steps, n, n)
+    cross = None
+    if "cross_covariances" in arrays and not relative.motions:
+        cross = _array(path, arrays, "cross_covariances", 4)
+    for key, matrices in (("covariances", covariances), ("cross_covariances", cross)):
+        if matrices is not None and matrices.shape != shape:
+            raise InputError(f"{path}: key '{key}' has shape {matrices.shape}, needs {shape}")
+    t, stretches = step_times(path, arrays, steps), []
+    for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
+        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
+        P = symmetric(covariances[run, :length], place.__getitem__)
+        known = np.flatnonzero(np.isfinite(truth[run, :length]).all(axis=-1))
+        own = None if cross is None else cross[run, :length]
+        stretches.append(
+            Stretch(
+                run, str(path), place, t[:length], estimates[run, :length], P, own, known, truth[run, known], convention
+            )
+        )
+    return relative_recording(path.stem, str(path), stretches, ("x", "y", "heading"), range(3), relative)
+
+
+def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
+    """All arrays of an archive by key, of any shape; ``keys`` says in messages which it should hold.
+
+    Raises
+    ------
+    InputError
+        The file is missing, or not an archive of arrays.
+    """
+    if not is_file(path):
+        raise InputError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+    with path.open("rb") as file:
+        what = "damaged or cut short" if file.read(2) == b"PK" else "or holds Python objects"
+    refusal = f"is not a NumPy archive, {what}; write it with numpy.savez"
+    with reading(path, refusal), np.load(path, allow_pickle=False) as archive:
+        if not hasattr(archive, "files"):
+            raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
+        if len(set(archive.files)) < len(archive.files):
+            raise ValueError("a key is there twice")
+        require_room(path, sum(member.file_size for member in archive.zip.infolist()))
+        return {key: _numbers(path, archive, key) for key in archive.files}
+
+
+def _numbers(path: Path, archive: Any, key: str) -> Array:
+    """One array of an archive; what only Python could read is refused."""
+    try:
+        array: Array = archive[key]
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            what = "holds Python objects, as of runs of different lengths; pad them with NaN and add 'lengths'"
+            raise InputError(f"{path}: key '{key}' {what}") from None
+        raise
+    return array
+
+
+def _array(path: Path, arrays: dict[str, Array], key: str, dimensions: int) -> Array:
+    """An array of floats; one run without its dimension gets it."""
+    array = arrays[key]
+    names = ("runs", "steps", "n", "n")[:dimensions]
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{path}: key '{key}' holds {array.dtype}, not numbers")
+    if array.ndim == dimensions - 1:
+        array = array[None]
+    if array.ndim != dimensions or not array.size:
+        raise InputError(f"{path}: key '{key}' has shape {array.shape}, needs ({', '.join(names)})")
+    return bounded(np.asarray(array, float))
+
+
+def whole_numbers(path: Path, arrays: dict[str, Array], key: str, shape: tuple[int, ...]) -> Array:
+    """Numbers of one key, as many as ``shape``, or one for all; raises InputError."""
+    array = arrays[key]
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{path}: key '{key}' holds {array.dtype}, not numbers")
+    try:
+        return np.broadcast_to(bounded(np.asarray(array, float)), shape)
+    except ValueError:
+        raise InputError(f"{path}: key '{key}' must be one number or of shape {shape}") from None
+
+
+def _require_truth(path: Path, truth: Array, estimates: Array) -> None:
+    bad = np.isfinite(estimates).all(axis=-1) & ~np.isfinite(truth).all(axis=-1)
+    if bad.any():
+        run, step = np.argwhere(bad)[0]
+        raise InputError(f"{path}: key 'truth', run {run}, step {step + 1}: not finite")
+
+
+def run_lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> list[int]:
+    """Steps of each run; those of the array ``lengths`` (runs,) where they differ."""
+    if "lengths" not in arrays:
+        return [steps] * runs
+    lengths = np.atleast_1d(arrays["lengths"])
+    if lengths.shape != (runs,) or lengths.dtype.kind not in "iu" or ((lengths < 1) | (lengths > steps)).any():
+        raise InputError(f"{path}: key 'lengths' must be {runs} whole numbers from 1 to {steps}")
+    return [int(length) for length in lengths]
+
+
+def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[Array | None, Array | None]:
+    if "nis" not in arrays:
+        return None, None
+    if "nis_dof" not in arrays:
+        raise InputError(f"{path}: key 'nis_dof' is missing; it is the number of measurements in each nis")
+    nis = _array(path, arrays, "nis", 2)
+    if nis.shape != shape:
+        raise InputError(f"{path}: key 'nis' has shape {nis.shape}, needs {shape}")
+    dof = whole_numbers(path, arrays, "nis_dof", shape)
+    known = np.isfinite(nis)
+    if (nis < 0).any() or np.isinf(nis).any() or not are_dof(dof[known]).all():
+        raise InputError(
+            f"{path}: keys 'nis', 'nis_dof': nis must be 0 or more, nis_dof whole numbers from 0 to below 2^31"
+        )
+    return nis, np.where(known, dof, 0.0)
+
+
+def step_times(path: Path, arrays: dict[str, Array], steps: int) -> Array:
+    """Key ``t``, (steps,) in s; NaN without it."""
+    if "t" not in arrays:
+        return np.full(steps, np.nan)
+    t = arrays["t"]
+    if t.shape != (steps,) or t.dtype.kind not in "fiu" or not (np.diff(t) > 0).all():
+        raise InputError(f"{path}: key 't' must be {steps} increasing numbers, in s")
+    return np.asarray(t, float)
+
+
+def _axes(path: Path, arrays: dict[str, Array], n: int) -> tuple[str, ...]:
+    if "axes" not in arrays:
+        return tuple(f"e{i + 1}" for i in range(n))
+    axes = tuple(require_name(str(axis), f"{path}: key 'axes'") for axis in np.atleast_1d(arrays["axes"]))
+    if len(axes) != n:
+        raise InputError(f"{path}: key 'axes' names {len(axes)} components, the error has {n}")
+    return axes
+
+
+def _of_nees(path: Path, arrays: dict[str, Array]) -> Evidence:
+    """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
+    nees = _array(path, arrays, "nees", 2).copy()
+    dof = arrays["dof"]
+    if dof.ndim or dof.dtype.kind not in "fiu" or not 1 <= float(dof) < 2**31 or dof % 1:
+        raise InputError(f"{path}: key 'dof' must be one whole number of 1 or more, the dimension of the error")
+    if (nees < 0).any():
+        run, step = np.argwhere(nees < 0)[0]
+        raise InputError(f"{path}: key 'nees', run {run}, step {step + 1}: {nees[run, step]:g} is negative")
+    runs, steps = nees.shape
+    n = int(dof)
+    nis, nis_dof = _nis(path, arrays, (runs, steps))
+    failures = []
+    for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
+        nees[run, length:] = np.nan
+        finite = np.isfinite(nees[run, :length])
+        first = int(np.argmax(finite)) if finite.any() else 0
+        broken = np.flatnonzero(~finite[first:])
+        if len(broken):
+            step = first + int(broken[0])
+            nees[run, step:] = np.nan
+            failures.append(Failure(path.stem, run, step + 1, "NEES is not finite"))
+    axes = _axes(path, arrays, n)
+    t = step_times(path, arrays, steps)
+    return Evidence(
+        path.stem, nees=nees, dof=n, nis=nis, nis_dof=nis_dof, failures=tuple(failures), axes=axes,
+        runs=np.arange(runs), t=t,
+    )  # fmt: skip

@@ -1,0 +1,126 @@
+"""World frames that differ by a turn and a shift: estimates and errors carried from one to the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.geometry import wrap
+from consistency.referee.sources.interpolation import Manifold
+from consistency.referee.sources.poses import Poses
+from consistency.referee.types import Array
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Maps a point x of the world of the estimates to turn x + shift in that of the truth."""
+
+    turn: Rotation
+    shift: Array  # (3,), m; 0 along z in the plane
+
+    @staticmethod
+    def about_z(angle: float, shift: Array) -> Frame:
+        """Turn by ``angle``, rad, and shift (2,) or (3,), m."""
+        return Frame(Rotation.from_euler("z", angle), np.append(shift, np.zeros(3 - len(shift))))
+
+    @property
+    def heading(self) -> float:
+        """Turn about z, rad, of a frame that turns about nothing else."""
+        return float(self.turn.as_rotvec()[2])
+
+    def after(self, other: Frame) -> Frame:
+        """Composition of frames: first ``other``, then this one."""
+        return Frame(self.turn * other.turn, self.turn.apply(other.shift) + self.shift)
+
+    def placed(self, values: Array, manifold: Manifold) -> Array:
+        """Poses (k, m) of one world in the other; those that are not finite stay."""
+        out: Array = values.copy()
+        finite = np.isfinite(values).all(axis=1)
+        if manifold == "planar":
+            out[:, :2] = values[:, :2] @ self.turn.as_matrix()[:2, :2].T + self.shift[:2]
+            out[:, 2] = wrap(values[:, 2] + self.heading)
+        elif finite.any():
+            out[finite, :3] = self.turn.apply(values[finite, :3]) + self.shift
+            out[finite, 3:] = (self.turn * Rotation.from_quat(values[finite, 3:])).as_quat()
+        return out
+
+
+IDENTITY = Frame(Rotation.identity(), np.zeros(3))
+
+
+def moved(p: Poses, frame: Frame) -> Poses:
+    """The estimates in another world, with their covariance."""
+    T = carried(p.convention, frame, p.covariance.shape[-1])
+    return replace(p, estimate=frame.placed(p.estimate, p.manifold), covariance=T @ p.covariance @ T.T)
+
+
+def carried(convention: str, frame: Frame, n: int) -> Array:
+    """Matrix (n, n) that carries an error of a pose over to another world.
+
+    An error in the body frame is unchanged; that of ``right`` maps by the adjoint (Sola et al. 2018, eq. 159 and 175).
+    """
+    T, d = np.eye(n), n // 2 if n == 6 else 2
+    if convention == "left":
+        return T
+    turn = frame.turn.as_matrix()
+    T[:d, :d] = turn[:d, :d]
+    if n == 6 and convention in ("so3", "right"):
+        T[3:, 3:] = turn
+    if convention == "right":
+        x, y, z = frame.shift
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        T[:d, d:] = cross @ turn if n == 6 else cross[:2, 2:]
+    return T
+
+
+def fitted_frame(runs: Sequence[Poses]) -> Frame | None:
+    """The turn about z and the shift with which the positions of all runs are nearest to the truth.
+
+    Umeyama (1991), in the plane. None with fewer than three estimates.
+    """
+    own, true = _positions(runs)
+    if len(own) < 3:
+        return None
+    a, b = own - own.mean(axis=0), true - true.mean(axis=0)
+    angle = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
+    turn = Rotation.from_euler("z", angle)
+    return Frame(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)))
+
+
+def turned_frame(runs: Sequence[Poses]) -> Frame:
+    """The frame that makes the orientations of poses in space, and then positions, right in the mean."""
+    turns = []
+    for p in runs:
+        own, true = _pairs(p)
+        if len(own):
+            turns.append((Rotation.from_quat(true[:, 3:]) * Rotation.from_quat(own[:, 3:]).inv()).mean())
+    turn = Rotation.concatenate(turns).mean() if turns else IDENTITY.turn
+    own, true = _positions(runs)
+    return Frame(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)) if len(own) else np.zeros(3))
+
+
+def spread(runs: Sequence[Poses]) -> float:
+    """Root mean square distance of the true positions from their mean, m; 0 where there are none."""
+    true = _positions(runs)[1]
+    return float(np.sqrt(np.square(true - true.mean(axis=0)).sum(axis=1).mean())) if len(true) else 0.0
+
+
+def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
+    """Estimated and true positions (N, 3) of all runs, z = 0 in the plane."""
+    own, true = [np.empty((0, 3))], [np.empty((0, 3))]
+    for p in runs:
+        d = 3 if p.manifold == "spatial" else 2
+        for side, values in zip((own, true), _pairs(p), strict=True):
+            side.append(np.pad(values[:, :d], ((0, 0), (0, 3 - d))))
+    return np.concatenate(own), np.concatenate(true)
+
+
+def _pairs(p: Poses) -> tuple[Array, Array]:
+    """Estimates that are finite and have a truth, and that truth, (k, m) both."""
+    known = p.known()
+    estimate = p.estimate[known.rows]
+    finite = np.isfinite(estimate).all(axis=1)
+    return estimate[finite], known.truth[finite]

@@ -1,0 +1,391 @@
+"""Hints on mix-ups in files with impossible errors: a unit, order, side or frame that makes the covariance fit."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.diagnostics.whitening import whiten
+from consistency.referee.geometry import wrap
+from consistency.referee.geometry.conventions import PLANAR, SPATIAL
+from consistency.referee.sources.fits import Fit, fit_of
+from consistency.referee.sources.frames import Frame, fitted_frame, moved, spread
+from consistency.referee.sources.poses import Poses
+from consistency.referee.types import Array
+
+MOST = 4000  # estimates that are looked at, of all runs together
+MOST_FITTED = 1000  # of which so many are, where less than a decade is wrong
+WRONG = 1.0  # decades that the NEES is off, from which a mix-up is looked for
+APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
+RIGHT = 0.4  # decades that it may be off with the mix-up undone
+LEAST_GAIN = float(np.log(1e4))  # log likelihood that a reading gains over simple faults, and as much as it has rivals
+ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
+ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
+ALIKE = 0.01  # decades between guesses of which the likelier is named
+DEGREE = np.pi / 180.0
+MILLI = 1e-3
+TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
+
+NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
+
+Change = Callable[[Poses], Poses]
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A possible mix-up in words, and the files read without it."""
+
+    text: str
+    change: Change
+    last: bool = False  # named only where nothing else fits: it has a fit of its own for each run
+    fine: bool = True  # named where less than a decade is wrong too: no bias and no drift looks like it
+
+
+def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 0.0) -> list[str]:
+    """Hints on a probable mix-up, where the covariance does not fit and one other reading of the files does; or none.
+
+    Where the NEES of a median estimate is off by a decade or more, the guess that brings it nearest to a right one is
+    named. Where it is off by less, a guess is named if all errors then agree with the covariance, and no simple fault
+    of a filter explains as much (:mod:`consistency.referee.sources.fits`).
+    """
+    if not runs:
+        return []
+    some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
+    if _same(some):
+        return [
+            f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies of "
+            "one; give the true poses as the truth"
+        ]
+    off = decades(some)
+    limit = np.append(WRONG, np.full(len(off) - 1, APART))
+    worst = int(np.argmax(np.abs(off) / limit))
+    gross = bool(abs(off[worst]) > limit[worst])
+    if gross and (best := _gross(_guesses(some, axes), some)) is not None:
+        return [f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, but about right if {best.text}"]
+    some = [poses.some(max(MOST_FITTED // len(runs), 20)) for poses in some]
+    declared = fit_of(some)
+    if declared is None:
+        return []
+    if not gross and declared.size * declared.fault() < LEAST_GAIN:
+        return []
+    guesses = _guesses(some, axes)
+    best = _fine(guesses, some, declared)
+    if best is None:
+        return []
+    worst = int(np.argmax(np.abs(off)))
+    return [
+        f"{name}: the NEES{_of(axes, worst)} is {_times(off[worst])}, and no single factor explains the errors, but "
+        f"all would be consistent if {best.text}"
+    ]
+
+
+def _of(axes: Sequence[str], worst: int) -> str:
+    return "" if worst == 0 else f" of {axes[worst - 1]} by itself"
+
+
+def _times(off: float) -> str:
+    return f"{10.0 ** abs(off):.2g} times too {'large' if off > 0 else 'small'}"
+
+
+def _same(runs: Sequence[Poses]) -> bool:
+    """Whether the errors are rounding in nearly all estimates, in values and beside their standard deviations."""
+    same = total = 0
+    for p in runs:
+        error, known = np.abs(p.errors()), p.known().rows
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))[known]
+            rounding = ROUNDING * max(1.0, float(np.abs(p.truth).max(initial=0.0)))
+            same += int(((error[known] <= rounding) & (error[known] <= NEGLIGIBLE * sigma)).all(axis=1).sum())
+        total += len(known)
+    return total >= LEAST and same >= NEARLY_ALL * total
+
+
+def _gross(guesses: Sequence[Guess], some: Sequence[Poses]) -> Guess | None:
+    """The guess with which the NEES of a median estimate is nearest to a right one, if it is near."""
+    left = np.array([np.abs(decades([guess.change(poses) for poses in some])).max() for guess in guesses])
+    first = np.where([guess.last for guess in guesses], np.nan, left)
+    left = first if np.nanmin(first) < RIGHT else left
+    if not np.nanmin(left) < RIGHT:
+        return None
+    return guesses[int(np.flatnonzero(left <= np.nanmin(left) + ALIKE)[0])]
+
+
+def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: Fit) -> Guess | None:
+    """The likeliest guess with which everything is right, where no simple fault is nearly as likely."""
+    guesses = [guess for guess in guesses if guess.fine]
+    bar, simple, found = LEAST_GAIN + np.log(max(len(guesses), 1)), declared.simple(), []
+    errors = np.concatenate([poses.errors() for poses in some])
+    for guess in guesses:
+        read = [guess.change(poses) for poses in some]
+        if any(new.truth is not old.truth for new, old in zip(read, some, strict=True)):
+            continue  # a density of the truth in another unit is no likelier
+        same = all(
+            new.estimate is old.estimate and new.convention == old.convention
+            for new, old in zip(read, some, strict=True)
+        )
+        fit = fit_of(read, errors if same else None)
+        if fit is None or len(fit.w) < len(declared.w) or declared.size * (fit.likelihood - simple) < bar:
+            continue
+        gain = min(fit.size, declared.size) * (fit.likelihood - simple)
+        if gain >= bar and fit.right():
+            found.append((gain, guess))
+    most = max((gain for gain, _ in found), default=0.0)
+    return next((guess for gain, guess in found if gain >= most - 1.0), None)  # nearly as likely: the first
+
+
+def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remedy: str) -> list[str]:
+    """Components of errors (runs, steps, n) that look like angles: their large errors are whole turns."""
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        far = (np.abs(error) > np.pi) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < SHARP)
+        home = np.abs(wrap(error)) <= NEAR * sigma
+    found = []
+    for k, axis in enumerate(axes):
+        jumps = int(far[..., k].sum())
+        if jumps >= LEAST and home[..., k][far[..., k]].all():
+            steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
+            found.append(f"{name}: the error of {axis} is off by 2 pi in {steps}, as that of an angle; {remedy}")
+    return found
+
+
+def decades(runs: Sequence[Poses]) -> Array:
+    """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,).
+
+    NaN without any.
+    """
+    n = runs[0].covariance.shape[-1]
+    found = []
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for poses in runs:
+            error, P = poses.errors(), poses.covariance
+            own = np.square(error) / np.diagonal(P, axis1=1, axis2=2)
+            found.append(np.column_stack([np.square(whiten(error, P)).sum(axis=1), own]))
+    nees = np.concatenate(found)
+    nees = nees[np.isfinite(nees).all(axis=1)]
+    if not len(nees):
+        return np.full(1 + n, np.nan)
+    right = stats.chi2.median(np.append(n, np.ones(n)))
+    return np.asarray(np.log10(np.maximum(np.median(nees, axis=0), 1e-300) / right))
+
+
+# --- guesses ----------------------------------------------------------------------------------------
+
+
+def _guesses(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
+    """Possible mix-ups, the likelier first."""
+    kind, convention = runs[0].manifold, runs[0].convention
+    guesses = [*_covariances()]
+    if kind == "spatial":
+        own = [*_orders(convention), *_quaternions(), *guesses, *_permuted(axes, 3)]
+        return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_frames(runs)]
+    if kind == "planar":
+        own = [*_sides(convention), *_headings(), *guesses, *_permuted(axes, 3)]
+        return [*own, *_units(2, slice(2, 3)), _mirrored(convention), *_frames(runs)]
+    return [*guesses, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
+
+
+def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:
+    """Components of the covariance, or of estimates and covariance, in another order; of six in both blocks alike."""
+    n = width if len(axes) != 2 * width else 2 * width
+    if width > SWAPS:
+        return
+    orders: Iterable[tuple[int, ...]] = itertools.permutations(range(width))
+    if width > ALL_ORDERS:
+        orders = (_swap(width, *pair) for pair in itertools.combinations(range(width), 2))
+    for order in orders:
+        if order == tuple(range(width)):
+            continue
+        there = [axes[order.index(slot)] for slot in range(width)]
+        words = f"in the order {', '.join(there)}{' (rotations alike)' * (n > width)}"
+        whole = [*order, *(width + i for i in order)][:n]
+        if states:
+            what = f"the components of the estimates and of their covariance are {words}, beside those of the truth"
+        else:
+            what = f"the components of the covariance are {words}"
+        change = _reordered_states(whole) if states else _reordered(whole)
+        yield Guess(f"{what}; write them as {', '.join(axes[:width])}", change)
+
+
+def _swap(width: int, i: int, j: int) -> tuple[int, ...]:
+    order = list(range(width))
+    order[i], order[j] = j, i
+    return tuple(order)
+
+
+def _reordered(order: list[int]) -> Change:
+    return lambda p: replace(p, covariance=p.covariance[:, order][:, :, order])
+
+
+def _reordered_states(order: list[int]) -> Change:
+    return lambda p: replace(_reordered(order)(p), estimate=p.estimate[:, order])
+
+
+def _ned(convention: str) -> Iterator[Guess]:
+    """A world whose z points down, with a body whose z does so too or not."""
+    north = Frame(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
+    down = np.diag([1.0, -1.0, -1.0])
+    turned = {"so3-body": slice(3, 6), "left": slice(0, 6)}.get(convention, slice(0, 0))
+    T = np.eye(6)
+    T[turned, turned] = np.kron(np.eye(2), down)[turned, turned]
+
+    def with_body(p: Poses) -> Poses:
+        p = moved(p, north)
+        finite = np.isfinite(p.estimate).all(axis=1)
+        if finite.any():
+            p.estimate[finite, 3:] = (Rotation.from_quat(p.estimate[finite, 3:]) * Rotation.from_matrix(down)).as_quat()
+        return replace(p, covariance=T @ p.covariance @ T)
+
+    worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
+    remedy = "write both in one (swap x and y, turn z over)"
+    yield Guess(f"{worlds}; {remedy}", lambda p: moved(p, north), fine=False)
+    yield Guess(f"{worlds}, and their bodies have z down and z up; {remedy}", with_body, fine=False)
+
+
+def _mirrored(convention: str) -> Guess:
+    """A plane of x north and y east."""
+    A = np.diag([1.0, -1.0, -1.0])
+    if convention != "left":
+        A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]
+
+    def change(p: Poses) -> Poses:
+        x, y, heading = p.estimate.T
+        own = np.column_stack([y, x, wrap(0.5 * np.pi - heading)])
+        return replace(p, estimate=own, covariance=A @ p.covariance @ A.T)
+
+    words = "one file is in a plane of x north, y east, the other in one of x east, y north"
+    return Guess(f"{words}; write both in one (swap x and y, heading = pi/2 - heading)", change, fine=False)
+
+
+def _orders(convention: str) -> Iterator[Guess]:
+    swap = [3, 4, 5, 0, 1, 2]
+    for other in SPATIAL:
+        for turned in (False, True):
+            if (other, turned) != (convention, False):
+                words = [] if other == convention else [f"the error is '{other}' (--error {other})"]
+                words += ["the covariance has its two blocks in the other order (--covariance-order)"] if turned else []
+                yield Guess(" and ".join(words), _read_as(other, swap if turned else [0, 1, 2, 3, 4, 5]))
+
+
+def _read_as(convention: str, order: list[int]) -> Change:
+    return lambda p: replace(p, convention=convention, covariance=p.covariance[:, order][:, :, order])
+
+
+def _sides(convention: str) -> Iterator[Guess]:
+    for other in PLANAR:
+        if other not in (convention, "vector"):
+            yield Guess(f"the error is '{other}' (--error {other})", _read_as(other, [0, 1, 2]))
+
+
+def _quaternions() -> Iterator[Guess]:
+    first = [0, 1, 2, 4, 5, 6, 3]
+    yield Guess(
+        "the quaternions of both files are w x y z; write them x y z w",
+        lambda p: replace(p, estimate=p.estimate[:, first], truth=p.truth[:, first]),
+    )
+    yield Guess(
+        "the quaternions of the estimates are w x y z; write them x y z w",
+        lambda p: replace(p, estimate=p.estimate[:, first]),
+    )
+    yield Guess(
+        "the quaternions of the truth are w x y z; write them x y z w", lambda p: replace(p, truth=p.truth[:, first])
+    )
+    back = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
+    yield Guess(
+        "the quaternions of the estimates turn world into body; invert them",
+        lambda p: replace(p, estimate=p.estimate * back),
+    )
+
+
+def _headings() -> Iterator[Guess]:
+    degrees = np.array([1.0, 1.0, DEGREE])
+    remedy = "; multiply them by pi / 180"
+    yield Guess(f"the headings of both files are in degrees{remedy}", lambda p: _scaled(p, degrees, degrees))
+    yield Guess(f"the headings of the estimates are in degrees{remedy}", lambda p: _scaled(p, degrees, None))
+    yield Guess(f"the headings of the truth are in degrees{remedy}", lambda p: _scaled(p, None, degrees))
+    both = "the headings of both files and their variances are in degrees"
+    yield Guess(f"{both}{remedy}", lambda p: _weighed(_scaled(p, degrees, degrees), slice(2, 3), DEGREE))
+
+
+def _scaled(p: Poses, estimate: Array | None, truth: Array | None) -> Poses:
+    ones = np.ones(p.estimate.shape[1])
+    p = replace(p, estimate=p.estimate * (ones if estimate is None else estimate))
+    p = replace(p, truth=p.truth * (ones if truth is None else truth))
+    for values in (p.estimate, p.truth):
+        values[:, 2] = wrap(values[:, 2])
+    return p
+
+
+def _units(width: int, angles: slice) -> Iterator[Guess]:
+    """Millimetres and degrees; the first ``width`` components are metres."""
+    part = slice(0, width)
+
+    def shrunk(values: Array) -> Array:
+        out: Array = values.copy()
+        out[:, part] *= MILLI
+        return out
+
+    yield Guess(
+        "its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180", lambda p: _weighed(p, angles, DEGREE)
+    )
+    yield Guess(
+        "its positions are in millimetres (mm^2 for m^2); divide them by 1000", lambda p: _weighed(p, part, MILLI)
+    )
+    yield Guess(
+        "the positions of the estimates and their covariance are in millimetres; divide them by 1000",
+        lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI),
+    )
+    for of, change in (
+        ("truth", lambda p: replace(p, truth=shrunk(p.truth))),
+        ("estimates", lambda p: replace(p, estimate=shrunk(p.estimate))),
+    ):
+        yield Guess(f"the positions of the {of} are in millimetres; divide them by 1000", change)
+
+
+def _weighed(p: Poses, part: slice, factor: float) -> Poses:
+    scale = np.ones(p.covariance.shape[-1])
+    scale[part] = factor
+    return replace(p, covariance=p.covariance * scale[:, None] * scale)
+
+
+def _covariances() -> Iterator[Guess]:
+    yield Guess("its diagonal holds standard deviations; square them", _squared)
+    yield Guess("it is an information matrix; invert it", _inverted)
+
+
+def _squared(p: Poses) -> Poses:
+    n = p.covariance.shape[-1]
+    return replace(p, covariance=np.square(np.diagonal(p.covariance, axis1=1, axis2=2))[:, :, None] * np.eye(n))
+
+
+def _inverted(p: Poses) -> Poses:
+    P = np.full_like(p.covariance, np.nan)
+    regular = np.abs(np.linalg.det(p.covariance)) > 0
+    P[regular] = np.linalg.inv(p.covariance[regular])
+    return replace(p, covariance=P)
+
+
+# --- frames -----------------------------------------------------------------------------------------
+
+
+def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
+    """The worlds of the files differ by a turn about z and a shift, the same in all runs, or another in each."""
+    frame = fitted_frame(runs)
+    if frame is None or not (size := spread(runs)) > 0:
+        return
+    angle = np.rad2deg(frame.heading)
+    if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
+        turn = f"turned by {angle:.1f} degrees about z and " if abs(angle) > TURN else ""
+        where = ", ".join(f"{value:.3g}" for value in frame.shift[: 3 if runs[0].manifold == "spatial" else 2])
+        words = (
+            f"the world of the estimates is {turn}shifted by ({where}) m to meet that of the truth; "
+            f"write both in one world, or add --align posyaw{'-all' * (len(runs) > 1)}"
+        )
+        yield Guess(words, lambda p: moved(p, frame), fine=False)
+    if len(runs) > 1:
+        words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
+        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True, fine=False)

@@ -1,0 +1,74 @@
+"""Estimates of one run beside samples of the truth, before any error is taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.referee.geometry.conventions import planar_error, spatial_error
+from consistency.referee.sources.interpolation import Known, Manifold, truth_at
+from consistency.referee.sources.sheet import Places
+from consistency.referee.types import Array, Indices
+
+
+@dataclass(frozen=True)
+class Poses:
+    """One run; N estimates and M samples of the truth.
+
+    ``convention`` is that of the error which the covariance describes. Broken values are NaN.
+    """
+
+    place: Places  # (N,), "est.csv, line 7"
+    t: Array  # (N,), s, increasing
+    estimate: Array  # (N, m)
+    covariance: Array  # (N, n, n)
+    stated: Array  # (N,) of bool: there is a covariance
+    true_t: Array  # (M,), s, increasing
+    truth: Array  # (M, m)
+    manifold: Manifold
+    convention: str
+    max_dt: float  # s
+    cross: Array | None = None  # (N, n, n), E e_before e' with the row before; dropped where rows are chosen
+
+    def known(self, shift: float = 0.0) -> Known:
+        """The truth at the timestamps, ``shift`` s later."""
+        return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
+
+    def errors(self, shift: float = 0.0) -> Array:
+        """Truth less estimate, (N, n), with the truth ``shift`` s later; NaN where one of both is not known."""
+        known = self.known(shift)
+        out = np.full(self.covariance.shape[:2], np.nan)
+        out[known.rows] = self.error_of(known.rows, known.truth)
+        return out
+
+    def error_of(self, rows: Indices, truth: Array) -> Array:
+        """Error (k, n) of some rows; NaN where the estimate is not finite."""
+        estimate = self.estimate[rows]
+        finite = np.isfinite(estimate).all(axis=1)
+        out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
+        error = spatial_error if self.manifold == "spatial" else planar_error
+        out[finite] = error(truth[finite], estimate[finite], self.convention)
+        return out
+
+    def later(self, shift: float) -> Poses:
+        """The estimates ``shift`` s later."""
+        return replace(self, t=self.t + shift) if shift else self
+
+    def sound(self) -> Poses:
+        """The estimates that are finite, with a finite covariance."""
+        return self._of(
+            np.flatnonzero(np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2)))
+        )
+
+    def some(self, most: int) -> Poses:
+        """At most ``most`` estimates, evenly chosen."""
+        if len(self.t) <= most:
+            return self
+        return self._of(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
+
+    def _of(self, rows: Indices) -> Poses:
+        return replace(
+            self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
+            covariance=self.covariance[rows], stated=self.stated[rows], cross=None,
+        )  # fmt: skip

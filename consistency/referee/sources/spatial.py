@@ -1,0 +1,199 @@
+"""Trajectories in space from any kind of file: errors of poses with their 6 x 6 covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.reading.options import Reading
+from consistency.referee.sources.alignment import clocks_and_frames
+from consistency.referee.sources.hints import hints
+from consistency.referee.sources.interpolation import truth_at
+from consistency.referee.sources.matching import common_times
+from consistency.referee.sources.poses import Poses
+from consistency.referee.sources.record import Track, assemble
+from consistency.referee.sources.relative import Stretch, relative_recording
+from consistency.referee.sources.sheet import Places
+from consistency.referee.sources.windows import Relative
+from consistency.referee.types import Array
+
+AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
+WHOLE = {"": range(6)}  # what is one recording, by what its name ends in
+BLOCKS = {" position": range(3), " rotation": range(3, 6)}  # their cross-covariance is not known
+SINGLE = {f" {axis}": range(i, i + 1) for i, axis in enumerate(AXES)}  # no covariance is
+BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
+FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
+
+
+@dataclass(frozen=True)
+class Source:
+    """Origin of trajectories, for names and messages."""
+
+    path: Path
+    files: Sequence[tuple[Path | str, Path | str]]  # of each run: its estimates, its truth
+    covariance: Path
+    why: str = ""  # the convention is what it is
+
+
+@dataclass(frozen=True)
+class Match:
+    """The estimates of one run that have truth and covariance."""
+
+    place: Places  # (k,)
+    t: Array  # (k,)
+    error: Array  # (k, 6)
+    P: Array  # (k, 6, 6)
+    left_out: int
+    angle: float  # rad, median of the rotation error
+    bent: float  # sigma, median of what the interpolated truth may be off by
+
+
+def require_axes(axes: Sequence[str] | None) -> None:
+    """Refuse components that a pose in space does not have."""
+    if unknown := [axis for axis in axes or () if axis not in AXES]:
+        raise InputError(f"--axes {','.join(axes or ())}: '{unknown[0]}' is not one of {', '.join(AXES)}")
+
+
+def recordings_of(
+    source: Source,
+    poses: Sequence[Poses],
+    parts: Mapping[str, range],
+    r: Reading,
+    relative: Relative | None = None,
+) -> list[Evidence]:
+    """The recording of one estimator, each of whose runs is one of ``poses``; clocks and mix-ups are looked for.
+
+    Parameters
+    ----------
+    parts : ``WHOLE``, ``BLOCKS`` or ``SINGLE``: components whose covariance is known, each of which is a recording
+    relative : judge motions over windows in place of poses
+
+    Raises
+    ------
+    InputError
+        A run has no estimate with truth and covariance, or the covariance is singular throughout.
+    """
+    judged = [i for i, axis in enumerate(AXES) if r.axes is None or axis in r.axes]
+    if relative is not None:
+        if parts is not WHOLE:
+            raise InputError(f"{source.path}: --relative needs covariances of whole poses; here parts are stated apart")
+        stretches = [
+            _stretch(run, one, *files, r.shift, relative)
+            for run, (one, files) in enumerate(zip(poses, source.files, strict=True))
+        ]
+        return [relative_recording(source.path.stem, str(source.covariance), stretches, AXES, judged, relative)]
+    shift, clocks, moved = clocks_and_frames(source.path.name, poses, r.time_offset, r.align, judged)
+    poses = moved.runs
+    matches = [_match(one, *files, shift) for one, files in zip(poses, source.files, strict=True)]
+    columns, t = common_times([run.t for run in matches])
+    tracks = [
+        Track(i, c, run.place, run.error, run.P, t=run.t)
+        for i, (c, run) in enumerate(zip(columns, matches, strict=True))
+    ]
+    kind = poses[0].convention
+    notes = [
+        *_notes(source.path, matches, poses[0].max_dt),
+        *clocks,
+        *moved.notes,
+        *hints(source.path.name, AXES, poses, shift),
+    ]
+    notes.append(f"error convention {kind}: {SPATIAL[kind]}{source.why}")
+    recordings = []
+    for title, whole in parts.items():
+        if part := [i for i in judged if i in whole]:
+            some = [_part(track, part) for track in tracks]
+            names, name = tuple(AXES[i] for i in part), f"{source.path.stem}{title}"
+            recordings.append(moved.on(assemble(name, some, t, names, str(source.covariance), kind, notes)))
+            notes = []
+    return recordings
+
+
+def _part(track: Track, part: list[int]) -> Track:
+    if len(part) == len(AXES):
+        return track
+    assert track.error is not None
+    assert track.covariance is not None
+    return replace(track, error=track.error[:, part], covariance=track.covariance[:, part][:, :, part])
+
+
+def _match(poses: Poses, path: Path | str, truth: Path | str, shift: float) -> Match:
+    """The estimates of a run that have truth and covariance."""
+    known = poses.known(shift)
+    if not len(known.rows):
+        raise apart(path, poses.t + shift, truth, poses.true_t, poses.max_dt, "truth")
+    kept = poses.stated[known.rows]
+    if not kept.any():
+        raise InputError(f"{path}: no estimate has both a truth and a covariance within {poses.max_dt:g} s")
+    rows = known.rows[kept]
+    error = poses.error_of(rows, known.truth[kept])
+    P = poses.covariance if len(rows) == len(poses.t) else poses.covariance[rows]
+    doubts = _doubts(error, P, known.bend[kept])
+    return Match(poses.place.at(rows), poses.t[rows], error, P, len(poses.t) - len(rows), *doubts)
+
+
+def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: float, relative: Relative) -> Stretch:
+    """A run before its windows are taken: all its motions, or the poses that have a covariance."""
+    rows = np.arange(len(poses.t))
+    if relative.motions:
+        bare = np.flatnonzero(~poses.stated[1:])
+        if bare.size:
+            raise InputError(
+                f"{poses.place[int(bare[0]) + 1]}: this motion has no covariance within {poses.max_dt:g} s"
+            )
+    elif poses.cross is not None:
+        rows = rows[poses.stated]
+    t = poses.t[rows] + shift
+    known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
+    if not len(known.rows):
+        raise apart(path, t, truth, poses.true_t, poses.max_dt, "truth")
+    cross = None if poses.cross is None else poses.cross[rows]
+    return Stretch(
+        run, str(path), poses.place.at(rows), t, poses.estimate[rows], poses.covariance[rows], cross,
+        known.rows, known.truth, poses.convention,
+    )  # fmt: skip
+
+
+def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, tolerance: float, what: str) -> InputError:
+    """Message that no timestamp of one is near one of the other."""
+    own_span, span = (f"{each[0]:.10g} to {each[-1]:.10g}" for each in (t, other_t))
+    return InputError(
+        f"{path}: no estimate has a {what} within {tolerance:g} s (--max-dt): t is {own_span}, but {span} in {other}"
+    )
+
+
+def _doubts(error: Array, P: Array, bend: Array) -> tuple[float, float]:
+    """Medians over a run: angle of the rotation error, rad; what the interpolated truth may be off by, sigma."""
+    angles = np.linalg.norm(error[:, 3:], axis=1)
+    angle = float(np.nanmedian(angles)) if np.isfinite(angles).any() else 0.0
+    sigma = np.sqrt(np.abs(np.diagonal(P[:, :3, :3], axis1=1, axis2=2)).mean(axis=1))
+    ratio = np.where((sigma > 0) & (bend > 1e-9), bend / np.where(sigma > 0, sigma, 1.0), 0.0)
+    return angle, float(np.median(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else 0.0
+
+
+def _notes(estimates: Path, matches: Sequence[Match], max_dt: float) -> list[str]:
+    """Notes on left-out rows, and on probable mix-ups of clocks or conventions."""
+    notes = []
+    total = sum(run.left_out + len(run.t) for run in matches)
+    if left_out := sum(run.left_out for run in matches):
+        notes.append(
+            f"{estimates}: {left_out} of {total} estimates have no truth or no covariance "
+            f"within {max_dt:g} s (--max-dt) and are left out"
+        )
+    angle, bent = max(run.angle for run in matches), max(run.bent for run in matches)
+    if angle > FAR:
+        notes.append(
+            f"{estimates}: the rotation error is {np.rad2deg(angle):.0f} degrees in the median of a run: "
+            "are the quaternions of both files x y z w, body to world, of the same body frame?"
+        )
+    if bent > BENT:
+        notes.append(
+            f"{estimates}: the truth turns so fast that between its samples it may be off by {bent:.1f} sigma in the "
+            "median of a run, which counts as error; give a truth of a higher rate"
+        )
+    return notes

@@ -1,0 +1,238 @@
+"""TUM trajectories: lines ``t tx ty tz qx qy qz qw``, the covariances in the same line or in a file of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.errors import InputError
+from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.reading.options import Reading
+from consistency.referee.sources.kitti import is_drive, read_drive
+from consistency.referee.sources.matching import associate
+from consistency.referee.sources.openvins import FULL as STATES
+from consistency.referee.sources.openvins import LAYOUT, States, as_states, read_deviations
+from consistency.referee.sources.poses import Poses
+from consistency.referee.sources.record import symmetric
+from consistency.referee.sources.sheet import Lines, Places, read_numbers
+from consistency.referee.sources.spatial import BLOCKS, SINGLE, WHOLE, Source, apart, recordings_of, require_axes
+from consistency.referee.sources.windows import Relative
+from consistency.referee.types import Array, Indices
+
+ORDERS = ("translation-rotation", "rotation-translation")
+POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
+FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
+BOTH = 2 * FULL  # and a cross-covariance with the line before
+UNIT = 1e-3  # quaternions of four decimals pass
+SUFFIXES = (".txt", ".tum")
+
+
+def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
+    """Evidence of one estimator: a file, or a folder with a file for each run.
+
+    With axes named only these components of the error are judged, by their part of the covariance.
+
+    With the 20 columns that the tools of OpenVINS write, position and rotation are two recordings: their
+    cross-covariance is not in the file, so a joint NEES would be wrong. With the states and standard deviations of a
+    simulation each component is one. The truth may be a drive of KITTI.
+    """
+    order = r.covariance_order
+    if r.error not in (None, *SPATIAL):
+        raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
+    if order not in (None, *ORDERS):
+        raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}")
+    require_axes(r.axes)
+    if r.truth is None:
+        raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
+    runs = _runs(estimates, r.truth, r.covariance)
+    parts: Mapping[str, range] = WHOLE
+    poses: list[Poses] = []
+    for path, true_path, P_path in runs:
+        own = read_trajectory(path)
+        if not poses:
+            parts = _parts(own)
+            error_kind = r.error or ("so3" if parts is WHOLE else "so3-body")
+        if parts is not WHOLE and order == ORDERS[0]:
+            raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
+        if _parts(own) is not parts:
+            raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
+        poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], r.tolerance, r.body))
+    why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
+    source = Source(estimates, [(path, true) for path, true, _ in runs], r.covariance or estimates, why)
+    return recordings_of(source, poses, parts, r, relative)
+
+
+def _parts(own: Lines) -> Mapping[str, range]:
+    """Components whose covariance is known, by the layout of a file."""
+    if isinstance(own, States):
+        return SINGLE
+    return BLOCKS if own.values.shape[1] == SPLIT else WHOLE
+
+
+def _origin(parts: Mapping[str, range]) -> str:
+    if parts is WHOLE:
+        return "as in ROS messages with a covariance; declare yours with --error"
+    return "written by OpenVINS" + "; --error so3 where it comes from another ROS topic" * (parts is BLOCKS)
+
+
+def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
+    """Files of every run: estimates, truth, covariance."""
+    if not estimates.is_dir():
+        for option, path in (("--truth", truth), ("--covariance", covariance)):
+            if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
+                raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
+        return [(estimates, truth, covariance)]
+    files = trajectory_files(estimates)
+    if not files:
+        raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json")
+    stems = [path.stem for path in files]
+    if twice := next((path for path in files if stems.count(path.stem) > 1), None):
+        raise InputError(f"{estimates}: holds the run '{twice.stem}' twice, as .txt and .tum; keep one of them")
+    if covariance is not None and not covariance.is_dir():
+        raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
+    out = []
+    for path in files:
+        own_truth = _same_stem(truth, path, "--truth") if truth.is_dir() and not is_drive(truth) else truth
+        own_covariance = None if covariance is None else _same_stem(covariance, path, "--covariance")
+        out.append((path, own_truth, own_covariance))
+    return out
+
+
+def trajectory_files(folder: Path) -> list[Path]:
+    """Files of a folder that may be trajectories, by name."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+
+
+def _same_stem(folder: Path, path: Path, option: str) -> Path:
+    if is_drive(folder / path.stem):
+        return folder / path.stem
+    matches = [other for other in trajectory_files(folder) if other.stem == path.stem]
+    if not matches:
+        raise InputError(f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum for {path}")
+    return matches[0]
+
+
+def _poses(
+    own: Lines,
+    truth_path: Path,
+    covariance_path: Path | None,
+    convention: str,
+    order: str,
+    tolerance: float,
+    body: str | None,
+) -> Poses:
+    """A run with its truth; the covariance is NaN where none is near."""
+    truth = read_drive(truth_path, body) if is_drive(truth_path) else read_trajectory(truth_path, true=True)
+    covariance, source, cross = _inline(own, order), own, None
+    rows = picked = np.arange(len(own.t))
+    if covariance_path is not None:
+        if covariance is not None:
+            raise InputError(f"--covariance {covariance_path}: {own.path} holds covariances already; give one of them")
+        if isinstance(own, States):
+            source, covariance = read_deviations(covariance_path)
+        else:
+            source = read_covariances(covariance_path)
+            covariance = _matrices(source.values[:, 1 : 1 + FULL], order)
+        rows, picked = _pairs(own, source, tolerance, "covariance")
+        if source.values.shape[1] == 1 + BOTH:
+            cross = _cross(own, source, rows, picked, order)
+    if covariance is None:
+        of = f"the standard deviations of {LAYOUT}" if isinstance(own, States) else f"lines of t and {FULL} numbers"
+        raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
+    P = np.full((len(own.t), 6, 6), np.nan)
+    P[rows] = symmetric(covariance if source is own else covariance[picked], lambda row: source.place(int(picked[row])))
+    with_P = np.zeros(len(own.t), bool)
+    with_P[rows] = True
+    own = own.of(slice(0, POSE))
+    place, estimate = Places(own.place, np.arange(len(own.t))), own.values[:, 1:]
+    return Poses(
+        place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance, cross
+    )
+
+
+def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:
+    """Cross-covariances with the line before, on the rows of ``own``, (N, 6, 6)."""
+    if len(gap := np.flatnonzero(np.diff(picked) != 1)):
+        raise InputError(
+            f"{source.place(int(picked[gap[0]]) + 1)}: no pose of {own.path} has this time, but the "
+            "cross-covariance of the next line is with this one; give each line its pose"
+        )
+    out = np.full((len(own.t), 6, 6), np.nan)
+    out[rows] = _matrices(source.values[picked, 1 + FULL :], order)
+    return out
+
+
+def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indices, Indices]:
+    rows, match = associate(own.t, other.t, tolerance)
+    if not len(rows):
+        raise apart(own.path, own.t, other.path, other.t, tolerance, what)
+    return rows, match
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+def read_trajectory(path: Path, true: bool = False) -> Lines:
+    """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
+    widths = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
+    layout = f"t tx ty tz qx qy qz qw ({', '.join(map(str, widths))} columns)"
+    lines = read_numbers(path, (*widths, *STATES), layout)
+    columns = "5 to 8"
+    if lines.values.shape[1] not in widths:
+        states = as_states(lines)
+        if states is None:
+            raise InputError(f"{lines.place(0)}: has {lines.values.shape[1]} columns; should be {layout}")
+        lines, columns = states, "2 to 5"
+    pose = lines.values[:, 1:8]
+    if true and not np.isfinite(pose).all():
+        row = int(np.flatnonzero(~np.isfinite(pose).all(axis=1))[0])
+        raise InputError(f"{lines.place(row)}: the truth is not finite; leave such lines out")
+    length = np.linalg.norm(pose[:, 3:], axis=1)
+    bad = np.flatnonzero(np.isfinite(pose).all(axis=1) & (np.abs(length - 1.0) > UNIT))
+    if len(bad):
+        row = int(bad[0])
+        raise InputError(
+            f"{lines.place(row)}: the quaternion has length {length[row]:.4g}, not 1; columns {columns} must "
+            "be qx qy qz qw"
+        )
+    return lines
+
+
+def read_covariances(path: Path) -> Lines:
+    """A file of covariances: t, then 36 numbers row by row, or the 21 of the upper triangle.
+
+    72 numbers are the 36 and the cross-covariance E e_before e' with the line before, row by row.
+    """
+    widths, layout = (1 + TRIANGLE, 1 + FULL, 1 + BOTH), f"t and {FULL} numbers, or t and {TRIANGLE}, or t and {BOTH}"
+    return read_numbers(path, widths, layout)
+
+
+def _inline(own: Lines, order: str) -> Array | None:
+    numbers = own.values[:, POSE:]
+    if not numbers.shape[1]:
+        return None
+    if own.values.shape[1] == SPLIT:  # rotation, then position
+        rotation, position = _triangle(numbers[:, :6], 3), _triangle(numbers[:, 6:], 3)
+        out = np.zeros((len(numbers), 6, 6))
+        out[:, :3, :3], out[:, 3:, 3:] = position, rotation
+        return out
+    return _matrices(numbers, order)
+
+
+def _matrices(numbers: Array, order: str) -> Array:
+    """(N, 36) or (N, 21) -> (N, 6, 6), translation first."""
+    P = numbers.reshape(-1, 6, 6) if numbers.shape[1] == FULL else _triangle(numbers, 6)
+    if order == ORDERS[1]:
+        turned = [3, 4, 5, 0, 1, 2]
+        P = P[:, turned][:, :, turned]
+    return np.asarray(P)
+
+
+def _triangle(numbers: Array, n: int) -> Array:
+    out = np.empty((len(numbers), n, n))
+    i, j = np.triu_indices(n)
+    out[:, i, j] = out[:, j, i] = numbers
+    return out

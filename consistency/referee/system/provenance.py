@@ -1,0 +1,82 @@
+"""Where a file came from, and what JSON can hold."""
+
+from __future__ import annotations
+
+import functools
+import platform
+import shlex
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.system.machine import this_machine
+
+SCHEMA_VERSION = 1
+PACKAGES = (
+    "filter-consistency", "numpy", "scipy", "numba", "filterpy", "pandas", "pyarrow", "joblib", "bokeh", "matplotlib",
+    "typst",
+)  # fmt: skip
+
+
+def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
+    """Provenance that every output folder of a ``kind`` (results, log, findings) carries."""
+    wall = fields.pop("wall", None)
+    program = Path(sys.argv[0]).name
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "kind": kind,
+        "versions": dict(_versions()),
+        "machines": [this_machine()],
+        "command": shlex.join(["consistency" if program == "__main__.py" else program, *sys.argv[1:]]),
+        "git_commit": _git_commit(),
+        "wall_time_s": None if wall is None else round(wall, 3),
+        **fields,
+    }
+
+
+@functools.cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    """Python and the packages that results depend on; reading them takes milliseconds, so once a process."""
+    versions = [("python", platform.python_version())]
+    for package in PACKAGES:
+        try:
+            versions.append((package, metadata.version(package)))
+        except metadata.PackageNotFoundError:
+            versions.append((package, "not installed"))
+    return tuple(versions)
+
+
+@functools.cache
+def _git_commit() -> str | None:
+    """Commit of the checkout that the package runs from, with ``-dirty`` where it was changed; None elsewhere.
+
+    Asked once a process, as its modules are read once.
+    """
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():  # installed, perhaps inside somebody else's repository
+        return None
+    command = ["git", "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]
+    try:
+        lines = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.splitlines()
+    except (OSError, subprocess.SubprocessError):
+        return None
+    commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid ")), "(initial)")
+    dirty = any(not line.startswith("#") for line in lines)
+    return None if commit == "(initial)" else commit + ("-dirty" if dirty else "")
+
+
+def plain(value: Any) -> Any:
+    """Arrays as lists, not finite numbers as None: what JSON can hold."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,264 @@
+"""Baselines: a row for each run of every filter, kept as a small file for later comparisons."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from consistency.referee.diagnostics import Evidence, RunSummary, summary
+from consistency.referee.diagnostics.skipping import Skip
+from consistency.referee.errors import InputError
+from consistency.referee.reading import HUGE, read_json, reading
+from consistency.referee.reading.columns import POSE
+from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of, plain
+from consistency.referee.verdicts.files import evidence_of_windows
+from consistency.referee.verdicts.options import skip_asked
+
+if TYPE_CHECKING:
+    from consistency.bench.store.curves import Curves
+    from consistency.bench.store.results import Tables
+
+HIGHEST_DOF = 1000  # of an error in a baseline
+FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A row for each run of every filter: the data for a later comparison, and their origin."""
+
+    name: str
+    scenario: str | None
+    origin: tuple[Any, Any]  # scenario hash and seed, or what a log or truth holds: the same trials have the same
+    filters: dict[str, RunSummary]
+    failures: dict[str, int]
+    manifest: dict[str, Any]
+    axes: dict[str, tuple[str, ...]]  # names of the components of each filter's error
+    skip: str | None = None  # first steps that were left out: 20, 2s
+
+    def of_the_trials_of(self, other: Baseline) -> bool:
+        """Whether both are of the same trials, so that runs of one number belong together."""
+        return self is other or (self.origin[0] is not None and self.origin == other.origin)
+
+
+def baseline_of(results: Tables, name: str = "results", skip: str | float | Skip | None = None) -> Baseline:
+    """Summaries of all filters, with the first steps of each run left out where ``skip`` says so.
+
+    Raises
+    ------
+    InputError
+        The results have no truth, or nothing is left.
+    """
+    first = skip_asked(skip)
+    if not results.has_truth:
+        raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
+    from consistency.bench.store.curves import curves, steps_of
+
+    steps = steps_of(results)
+    filters = {
+        each: _summary_of(curves(results, each, steps, maps=False).without_first(first)) for each in results.filters
+    }
+    failures = {each: int((results.failures["filter"] == each).sum()) for each in results.filters}
+    scenario = results.scenario
+    m = results.manifest
+    origin = (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed"))
+    axes = dict.fromkeys(filters, tuple(POSE))
+    return Baseline(name, scenario.name if scenario else None, origin, filters, failures, m, axes, _option(first))
+
+
+def _option(skip: Skip | None) -> str | None:
+    return None if skip is None else skip.option
+
+
+def baseline_of_files(
+    recordings: Sequence[Evidence], name: str, truth: Path | None = None, skip: str | float | Skip | None = None
+) -> Baseline:
+    """Summaries of estimators whose files were read, with the first steps left out where ``skip`` says so.
+
+    Parameters
+    ----------
+    truth : file, or folder of them, beside which the estimates were read; the same trials have the same
+
+    Raises
+    ------
+    InputError
+        An estimator has no NEES, or nothing of it is left.
+    """
+    filters, first = {}, skip_asked(skip)
+    for r in recordings:
+        r = r.without_first(first)
+        if r.nees is None:
+            raise InputError(f"{name}: has no truth of {r.name}; give it with --truth, as only a NEES can be compared")
+        of = evidence_of_windows(r) if r.independent and not r.unshown else r
+        assert of.nees is not None
+        filters[r.name] = summary(of.nees, r.dof, of.error, of.covariance, of.run_numbers)
+    failures = {r.name: len(r.failures) for r in recordings}
+    origin = (None if truth is None else _digest(truth), None)
+    return Baseline(
+        name, None, origin, filters, failures, {}, {r.name: tuple(r.axes) for r in recordings}, _option(first)
+    )
+
+
+def _digest(truth: Path) -> str:
+    digest = hashlib.sha256()
+    for path in [truth] if truth.is_file() else sorted(path for path in truth.rglob("*") if path.is_file()):
+        with path.open("rb") as file:
+            own = hashlib.sha256()
+            for piece in iter(lambda: file.read(2**20), b""):
+                own.update(piece)
+            digest.update(own.digest())
+    return digest.hexdigest()
+
+
+def _summary_of(c: Curves) -> RunSummary:
+    nees = c.judged.nees
+    assert nees is not None
+    return summary(nees, len(POSE), c.error, c.covariance, c.runs)
+
+
+def write_baseline(of: Tables | Baseline, path: Path, overwrite: bool = False) -> None:
+    """Keep the summaries of results as a small JSON file, for version control.
+
+    Raises
+    ------
+    InputError
+        The file exists or cannot be written, or the results have no truth.
+    """
+    if path.exists() and not overwrite:
+        raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
+    base = of if isinstance(of, Baseline) else baseline_of(of, str(path))
+    data = manifest_of(
+        kind="baseline",
+        scenario=base.scenario,
+        origin=list(base.origin),
+        skip=base.skip,
+        filters={
+            name: {key: plain(value) for key, value in vars(s).items()}
+            | {"failures": base.failures[name], "axes": list(base.axes[name])}
+            for name, s in base.filters.items()
+        },
+    )
+    try:
+        write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"))
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
+
+
+def is_baseline(path: Path) -> bool:
+    """Whether a file looks like one of :func:`write_baseline`, whatever its name."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(64).lstrip().startswith(b"{")
+
+
+def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baseline:
+    """A results folder, or a file of :func:`write_baseline`.
+
+    Parameters
+    ----------
+    skip : first steps to leave out; of a file those that it was written without
+
+    Raises
+    ------
+    InputError
+        Neither, or damaged.
+    """
+    if path.is_dir():
+        from consistency.bench.store.results import open_results
+
+        return baseline_of(open_results(path), str(path), skip)
+    data = read_json(path)
+    if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")
+    with reading(path, "damaged; write it again"):
+        for key in ("scenario", "origin", "filters"):
+            if key not in data:
+                raise ValueError(f"key '{key}': missing")
+        scenario, origin, left_out = data["scenario"], data["origin"], data.get("skip")  # files written before lack it
+        if not isinstance(scenario, str | None) or not isinstance(left_out, str | None):
+            raise ValueError(f"key '{'skip' if isinstance(scenario, str | None) else 'scenario'}': not a text")
+        if not isinstance(origin, list) or len(origin) != 2:
+            raise ValueError("key 'origin': not a list of two")
+        if not isinstance(data["filters"], dict):
+            raise ValueError("key 'filters': not a table")
+        rows = {name: _filter_of(row, f"filters.{name}") for name, row in data["filters"].items()}
+    filters = {name: row[0] for name, row in rows.items()}
+    failures = {name: row[1] for name, row in rows.items()}
+    axes = {name: row[2] for name, row in rows.items()}
+    base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, data, axes, left_out)
+    return require_skip(base, skip)
+
+
+def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
+    """The baseline, if the same first steps were left out of it.
+
+    Raises
+    ------
+    InputError
+        They were not.
+    """
+    asked = _option(skip_asked(skip))
+    if base.skip != asked:
+        own = "of all steps" if base.skip is None else f"with --skip {base.skip}"
+        wanted = "without --skip" if asked is None else f"with --skip {asked}"
+        raise InputError(f"{base.name}: was written {own}; write it again {wanted}, or compare by the same steps")
+    return base
+
+
+def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]]:
+    """One filter in the file, values of R runs: a summary as the referee takes it, failed runs, names of components."""
+    _known(table, place, FILTER_KEYS, optional=("axes",))  # files written before lack it
+    runs = [_whole(run, f"{place}.runs.{k}", 0, 2**63) for k, run in enumerate(_list(table["runs"], f"{place}.runs"))]
+    if len(set(runs)) < len(runs):
+        raise ValueError(f"key '{place}.runs': a run is there twice")
+    nees = _numbers(table["nees"], f"{place}.nees")
+    squared, covered = (
+        [_numbers(row, f"{place}.{key}.{k}", HIGHEST_DOF) for k, row in enumerate(_list(table[key], f"{place}.{key}"))]
+        for key in ("squared", "covered")
+    )
+    parts = [np.array(values, float) for values in (nees, squared, covered)]
+    if {len(part) for part in parts} != {len(runs)} or parts[1].shape != parts[2].shape:
+        raise ValueError(f"key '{place}': its lists are not equally long")
+    dof = _whole(table["dof"], f"{place}.dof", 1, HIGHEST_DOF + 1)
+    axes = _list(table.get("axes", POSE), f"{place}.axes", HIGHEST_DOF)
+    if not all(isinstance(axis, str) for axis in axes):
+        raise ValueError(f"key '{place}.axes': not all are names")
+    failures = _whole(table["failures"], f"{place}.failures", 0)
+    return RunSummary(np.array(runs, np.int64), dof, *parts), failures, tuple(axes)
+
+
+def _known(table: Any, place: str, keys: Sequence[str], optional: Sequence[str] = ()) -> None:
+    """Refuse what is no table of these keys and no others."""
+    if not isinstance(table, dict):
+        raise ValueError(f"key '{place}': not a table")
+    if missing := [key for key in keys if key not in table]:
+        raise ValueError(f"key '{place}.{missing[0]}': missing")
+    if unknown := [key for key in table if key not in (*keys, *optional)]:
+        raise ValueError(f"key '{place}.{unknown[0]}': unknown")
+
+
+def _list(values: Any, place: str, longest: int | None = None) -> list[Any]:
+    if not isinstance(values, list) or (longest is not None and len(values) > longest):
+        raise ValueError(f"key '{place}': not a list" + ("" if longest is None else f" of at most {longest}"))
+    return values
+
+
+def _numbers(values: Any, place: str, longest: int | None = None) -> list[float | None]:
+    """Numbers of 0 or more; None where a run has no value."""
+    for k, value in enumerate(_list(values, place, longest)):
+        if value is not None and not (type(value) in (int, float) and 0.0 <= value <= HUGE**4):
+            raise ValueError(f"key '{place}.{k}': not a number from 0 to {HUGE**4:g}")
+    return list(values)
+
+
+def _whole(value: Any, place: str, least: int, end: int | None = None) -> int:
+    if type(value) is not int or value < least or (end is not None and value >= end):
+        raise ValueError(f"key '{place}': not a whole number from {least}" + (f" to below {end}" if end else ""))
+    return value

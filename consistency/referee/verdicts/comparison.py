@@ -1,0 +1,109 @@
+"""Filters against each other on the same trials, and against a baseline kept from an earlier release."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
+from consistency.referee.diagnostics import Comparison, compare
+from consistency.referee.diagnostics.comparison import FailedRuns
+from consistency.referee.errors import InputError
+from consistency.referee.verdicts.baselines import Baseline
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Filter ``a`` against ``b``."""
+
+    a: str
+    b: str
+    comparison: Comparison
+    failures: FailedRuns
+    note: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Result of the comparison in a sentence."""
+        c = self.comparison
+        way = "run by run on the same trials" if c.paired else "as independent samples"
+        text = f"{self.a} is {'less consistent' if c.worse else 'not found less consistent'} than {self._reference}"
+        text += f": {c.runs} runs, {way}, p {c.p_value:.2g}"
+        if c.distance == c.standard_error == 0.0:
+            text += "; every run is the same in both"
+        elif c.worse and c.conservative:
+            text += (
+                f"; its covariance is farther too large, unless rare runs with a large NEES are missing here: up to "
+                f"{100.0 * c.unseen:.2g} % of all runs may be of a kind that {c.runs} do not show"
+            )
+        elif not c.worse:
+            text += f"; {self._limit}"
+            if not c.at_most < np.log(DETECT):
+                text += (
+                    f"; {c.needed_runs(DETECT)} runs find a covariance farther off by x{DETECT:g} with power {POWER:g}"
+                )
+        if any(self.failures):
+            text += f"; failed runs {self.failures.a}, {self.failures.b} in the reference"
+        return f"{text}. {self.note}".rstrip(". ") if self.note else text
+
+    @property
+    def _limit(self) -> str:
+        """How much farther off filter ``a`` may be that is not found worse."""
+        most = self.comparison.at_most
+        if most < 0.0:
+            return f"nearer to consistent, by x{np.exp(-most):.3g} at least"
+        return "no difference shown" + (f"; at most x{np.exp(most):.3g} farther off" if np.isfinite(most) else "")
+
+    @property
+    def _reference(self) -> str:
+        return self.b if self.a != self.b else "the reference"
+
+    @property
+    def worse(self) -> bool:
+        """Less consistent, or, on the same trials, with more failed runs."""
+        return self.comparison.worse or (self.comparison.paired and self.failures.a > self.failures.b)
+
+
+def compare_filters(base: Baseline, filters: Sequence[str], false_alarm: float = FALSE_ALARM) -> list[Compared]:
+    """The first filter against each of the others, on the same trials."""
+    names = list(filters) or list(base.filters)
+    if len(names) < 2:
+        raise InputError(
+            f"{base.name}: give two filters with --filter, or another folder or a baseline to compare with"
+        )
+    return [_compared(base, names[0], base, other, true_pairs=True, false_alarm=false_alarm) for other in names[1:]]
+
+
+def compare_with(
+    new: Baseline, old: Baseline, filters: Sequence[str], false_alarm: float = FALSE_ALARM
+) -> list[Compared]:
+    """Each filter of ``new`` against the same in ``old``; run by run only where the trials are the same."""
+    pairs = [(name, name) for name in filters or new.filters if filters or name in old.filters]
+    if not pairs and len(new.filters) == len(old.filters) == 1:  # estimators that are named after their files
+        pairs = [(next(iter(new.filters)), next(iter(old.filters)))]
+    if not pairs:
+        raise InputError(f"{new.name} and {old.name} have no filter in common; name one with --filter")
+    same = new.of_the_trials_of(old)
+    which = "Log or truth" if new.scenario is None and old.scenario is None else "Scenario or seed"
+    note = "" if same else f"{which} differ: the trials are not the same"
+    return [replace(_compared(new, a, old, b, same, false_alarm), note=note) for a, b in pairs]
+
+
+def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, false_alarm: float) -> Compared:
+    for base, name in ((a, of_a), (b, of_b)):
+        if name not in base.filters:
+            raise InputError(f"--filter {name}: is not in {base.name}; there are: {', '.join(base.filters)}")
+    axes = a.axes[of_a]
+    if axes != b.axes[of_b]:
+        raise InputError(
+            f"{of_a} against {of_b}: their errors have different components, {', '.join(axes)} and "
+            f"{', '.join(b.axes[of_b])}"
+        )
+    paired = None if true_pairs else False
+    try:
+        comparison = compare(a.filters[of_a], b.filters[of_b], false_alarm, axes, paired)
+    except ValueError as error:
+        raise InputError(f"{of_a} against {of_b}: {error}") from None
+    return Compared(of_a, of_b, comparison, FailedRuns(a.failures[of_a], b.failures[of_b]))

@@ -1,0 +1,104 @@
+"""What the options of a command ask of the referee, and how many runs that takes."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+from consistency.referee.diagnostics import Design, Settings, gate_runs, lost_runs, pilot_plan, required_runs
+from consistency.referee.diagnostics.skipping import Skip, skip_of
+from consistency.referee.errors import InputError
+from consistency.referee.reading.columns import POSE
+from consistency.referee.types import Array
+
+OPTION = {
+    "ratio": "detect",
+    "false_alarm": "false-alarm",
+    "max_runs": "max-runs",
+}  # of the plan, as the command calls it
+
+
+def settings_of(confidence: float | None = None, **given: Any) -> Settings:
+    """Settings of a verdict from the options of a command; those that are None keep their defaults.
+
+    Raises
+    ------
+    InputError
+        A value out of its range, or both a confidence and a false-alarm rate.
+    """
+    given = {name: value for name, value in given.items() if value is not None}
+    if confidence is not None:
+        if "false_alarm" in given:
+            raise InputError("--confidence is 1 less --false-alarm; give one of them")
+        if not 0.0 < confidence < 1.0:
+            raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
+        given["false_alarm"] = 1.0 - confidence
+    try:
+        return Settings(**given)
+    except ValueError as error:
+        raise refused(error) from None
+
+
+def skip_asked(given: str | float | Skip | None) -> Skip | None:
+    """The first steps or seconds that an option asks to leave out.
+
+    Raises
+    ------
+    InputError
+        It is neither a number of steps nor of seconds.
+    """
+    try:
+        return skip_of(given)
+    except ValueError as error:
+        raise refused(error) from None
+
+
+def plan(
+    dof: int,
+    detect: float,
+    false_alarm: float,
+    power: float,
+    allow: str | None = None,
+    pilots: Mapping[str, tuple[Array, int]] | None = None,
+    lost: float | None = None,
+) -> dict[str, Any]:
+    """Runs that a verdict takes (``runs``), those of one chi-square test (``one_step``), and the first looks.
+
+    Parameters
+    ----------
+    pilots : of each filter, mean NEES over ``dof`` of a few runs (N,), and their steps; ``like`` then has the runs that
+        filters take whose steps depend on each other as theirs do
+    lost : share of lost runs that is to be excluded
+
+    Raises
+    ------
+    InputError
+        A number out of its range, or pilots without truth.
+    """
+    if allow not in (None, "conservative"):
+        raise InputError(f"--allow must be 'conservative', got '{allow}'")
+    if pilots is not None and dof != len(POSE):
+        raise InputError(f"--dof {dof}: results of the bench have {len(POSE)} dimensions; leave it out")
+    try:
+        runs = gate_runs(dof, detect, false_alarm, power, allow, lost)
+        looks = list(itertools.takewhile(lambda n: n < runs, (n for n, spent in Design(dof).inspections() if spent)))
+        planned: dict[str, Any] = {
+            "dof": dof, "detect": detect, "false_alarm": false_alarm, "power": power, "allow": allow, "runs": runs,
+            "one_step": required_runs(dof, detect, false_alarm, power, two_sided=allow is None), "looks": looks,
+        }  # fmt: skip
+        planned |= {} if lost is None else {"lost": lost, "lost_runs": lost_runs(lost, power)}
+        if pilots is not None:
+            planned["like"] = {
+                name: vars(pilot_plan(means, dof, steps, detect, false_alarm, power, allow, lost))
+                for name, (means, steps) in pilots.items()
+            }
+        return planned
+    except ValueError as error:
+        raise error if isinstance(error, InputError) else refused(error) from None
+
+
+def refused(error: ValueError) -> InputError:
+    """What a plan refuses, with the option of the command in place of the argument."""
+    name, rest = str(error).split(" ", 1)
+    return InputError(f"--{OPTION.get(name, name)} {rest}")

@@ -1,9 +1,0 @@
-"""The simulated world: truth, controls and observations from a scenario and random generators.
-
-Nothing here imports a filter.
-"""
-
-from consistency.simulation.path import planned_controls, planned_path
-from consistency.simulation.world import World, draw_landmarks, require_landmarks_in_view, simulate
-
-__all__ = ["World", "draw_landmarks", "planned_controls", "planned_path", "require_landmarks_in_view", "simulate"]

@@ -1,0 +1,186 @@
+"""Estimation of a sensor model from residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.bench.filters.compiled import one_blas_thread
+from consistency.bench.scenario import PicturedSensor
+from consistency.bench.scenario.effects.nodes import hats
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+from consistency.stereo.characterising import coordinate
+from consistency.stereo.characterising.basis import octaves
+from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
+from consistency.stereo.characterising.coordinate import Levels
+from consistency.stereo.characterising.likelihood import Fit, Rows, fit
+from consistency.stereo.characterising.residuals import Residuals, Selection, select
+from consistency.stereo.characterising.tails import Estimate, Tails, rate, ratios, tails
+
+NAMES = ("u", "v", "d")
+RATE = 0.01  # chance that any interval misses
+LEAST = 100  # rows from which a noise can be told
+LEAST_TRACKS = 5
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """Estimates for one coordinate, u, v or d."""
+
+    name: str
+    sigma: Estimate  # px, of what is drawn anew
+    pooled: float  # px, about the mean of all rows: noise, offsets and bias together; NaN where that is not known
+    about_tracks: float  # px, about the means of tracks; NaN likewise
+    correlation: Estimate | None  # with the step before
+    offset: Estimate | None  # share of the variance about the bias map
+    tails: Tails
+    lags: Array  # (lags,), autocorrelation along tracks
+    bounds: Array  # (lags,), 95 % bound if white
+    residuals: Array  # (N,), whitened and standardised
+    note: str = ""
+
+    @property
+    def white(self) -> bool | None:
+        """Whether no correlation is shown; None where it cannot be told."""
+        return None if self.correlation is None else self.correlation.holds(0.0)
+
+    @property
+    def offset_px(self) -> float:
+        """Standard deviation of the offsets of tracks, px."""
+        if self.offset is None:
+            return float("nan")
+        return float(self.sigma.value * np.sqrt(self.offset.value / max(1.0 - self.offset.value, 1e-12)))
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Standard deviation of disparity by disparity."""
+
+    nodes: Array  # (m,), px
+    sigma: tuple[Estimate, ...]  # px, at each node
+    p_value: float  # that it is the same at all
+    shown: bool
+
+
+@dataclass(frozen=True)
+class Characterisation:
+    """Estimated model of a sensor, with its data."""
+
+    sensor: PicturedSensor  # as believed so far: model, calibration, image, mount
+    source: str
+    coordinates: tuple[Coordinate, Coordinate, Coordinate]
+    growth: Growth | None
+    bias: BiasEstimate | None  # None where it cannot be told from where the landmarks are
+    gross: Estimate  # share of rows that are grossly wrong
+    tracks: int
+    rows: int
+    left_out: Mapping[str, int]  # reason: rows
+    level: Levels
+    kept: Residuals
+    notes: tuple[str, ...] = ()  # what could not be estimated, and limits
+    ratio: tuple[Estimate, ...] = ()  # sd while moving over sd at rest, of u, v, d
+
+
+@one_blas_thread()  # its matrices are small: a second one takes twice the time of the processors, and gains nothing
+def characterise(
+    data: Residuals,
+    sensor: PicturedSensor,
+    source: str,
+    strange: int = 0,
+    grid: tuple[int, int] = GRID,
+    alone: bool = False,
+    miss: float = RATE,
+) -> Characterisation:
+    """Noise, growth, bias map, offsets, correlation and tails from residuals about the truth.
+
+    Parameters
+    ----------
+    data : residuals of (u, v, d), px
+    sensor : calibration, image and search range
+    strange : rows that were of no landmark
+    grid : nodes of the bias map across and down
+    alone : whether the rows of a track are not in order of time and have no offset in common
+    miss : chance that any interval misses
+
+    Raises
+    ------
+    InputError
+        Too few rows or tracks are left.
+    """
+    u, v = _nodes(data, sensor, grid)
+    chosen = select(data, sensor, grid_of(data, u, v).regressors(data))
+    kept = chosen.kept
+    tracks = len(kept.first) if len(kept) else 0
+    if len(kept) < LEAST or tracks < LEAST_TRACKS:
+        raise InputError(
+            f"{source}: {len(kept)} observations of {tracks} tracks are left of {len(data)}; a noise takes at least "
+            f"{LEAST} of {LEAST_TRACKS}: record more"
+        )
+    cells = grid_of(kept, u, v)
+    nodes = octaves(kept.ideal[:, 2])
+    levels = Levels(miss, growth=len(nodes), bias=3 * int(cells.known.sum()))
+    X = cells.regressors(kept)
+    fits = [_fitted(kept, k, X, cells.ridge, np.ones((len(kept), 1)), chosen, source, alone) for k in range(3)]
+    growth = None
+    if len(nodes) > 1:
+        by_disparity = _fitted(kept, 2, X, cells.ridge, hats(kept.ideal[:, 2], nodes), chosen, source, alone)
+        p_value = coordinate.growth_p_value(by_disparity)
+        shown = p_value < levels.rate / 6
+        growth = Growth(nodes, tuple(coordinate.at_nodes(by_disparity, levels.of("growth"))), p_value, shown)
+        fits[2] = by_disparity if shown else fits[2]
+    return Characterisation(
+        sensor, source, _coordinates(fits, kept, levels, alone), growth,
+        estimate_bias(fits, cells, levels.of("bias"), levels.rate / 18),
+        rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")), tracks, len(kept),
+        {"near a limit of the sensor": chosen.at_limits, "grossly wrong": chosen.gross, "of no landmark": strange},
+        levels, kept,
+        ratio=ratios(np.column_stack([f.regression.residual for f in fits]), np.ones((len(kept), 3)), kept.moving,
+                     kept.track, levels.of("sigma")),
+    )  # fmt: skip
+
+
+def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tuple[Array, Array]:
+    """Nodes of the bias map, evenly from edge to edge of the image, or of the data where no image is known."""
+    if sensor.image is None:
+        edges = [np.quantile(data.ideal[:, k], [0.01, 0.99]) for k in range(2)]
+    else:
+        edges = [np.array([-middle, size - middle]) for size, middle in zip(sensor.image, sensor.centre, strict=True)]
+    u, v = (np.linspace(low, high, count) for (low, high), count in zip(edges, grid, strict=True))
+    return u, v
+
+
+def _fitted(
+    data: Residuals, k: int, X: Array, ridge: Array, G: Array, chosen: Selection, source: str, alone: bool
+) -> Fit:
+    """The fit of coordinate ``k``; nodes without any data are no parameters."""
+    rows = Rows(data.r[:, k], X, G, data.first, data.gap, ridge)
+    try:
+        return fit(rows, float(chosen.rough[k]), memory=rows.length >= 1.5 and not alone)
+    except ValueError as error:
+        raise InputError(f"{source}: {error} of {NAMES[k]}; record more or longer tracks") from None
+
+
+def _coordinates(
+    fits: list[Fit], kept: Residuals, levels: Levels, alone: bool
+) -> tuple[Coordinate, Coordinate, Coordinate]:
+    u, v, d = (_coordinate(k, fit, kept, levels, alone) for k, fit in enumerate(fits))
+    return u, v, d
+
+
+def _coordinate(k: int, of: Fit, kept: Residuals, levels: Levels, alone: bool) -> Coordinate:
+    r, rows = kept.r[:, k], of.rows
+    n = np.diff(np.append(rows.first, len(r)))
+    centred = r - (np.add.reduceat(r, rows.first) / n)[rows.track]
+    lags, bounds = coordinate.autocorrelation(of)
+    memory = rows.length >= 1.5 and not alone
+    w = of.regression.residual
+    return Coordinate(
+        NAMES[k], coordinate.noise(of, levels.of("sigma")), float(r.std(ddof=1)),
+        float(np.sqrt((centred**2).sum() / max(len(r) - len(n), 1))),
+        coordinate.correlation(of, levels.of("correlation")) if memory else None,
+        coordinate.offset_share(of, levels.of("offset")) if memory else None,
+        tails(w, levels.of("tails")), lags, bounds, w / w.std(),
+    )  # fmt: skip

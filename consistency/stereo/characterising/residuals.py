@@ -1,0 +1,148 @@
+"""Residuals of (u, v, d) where the truth is known, and which of them tell of the noise without being chosen by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from consistency.bench.models import point, stereo
+from consistency.bench.scenario import PicturedSensor
+from consistency.bench.scenario.effects.nodes import hats
+from consistency.bench.types import Trial
+from consistency.referee.types import Array, Indices
+from consistency.stereo.characterising.basis import FEW, octaves
+
+MARGIN = 4.0  # standard deviations from a limit within which the noise decides whether a row is there at all
+GROSS = 6.0  # robust standard deviations: a Gaussian error is beyond in 2 of 10^9
+MAD = 1.482602218505602  # standard deviation of a Gaussian over its median absolute deviation
+HUBER = 1.345  # standard deviations beyond which a row counts less, Huber (1964)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """N observations beside what they would be without error, sorted by track and step."""
+
+    r: Array  # (N, 3), measured less ideal, px
+    ideal: Array  # (N, 3), u, v, d in px
+    track: Indices  # (N,), a landmark in a run
+    step: Indices  # (N,)
+    moving: Array  # (N,) of bool, whether the sensor moved before this observation
+
+    def __len__(self) -> int:
+        return len(self.r)
+
+    def keep(self, chosen: Array) -> Residuals:
+        """The rows for which ``chosen`` (N,) is true."""
+        return Residuals(*(value[chosen] for value in vars(self).values()))
+
+    @property
+    def first(self) -> Indices:
+        """First row of each track, (K,)."""
+        return np.flatnonzero(np.append(True, np.diff(self.track) != 0)).astype(np.int64)
+
+    @property
+    def gap(self) -> Array:
+        """Steps since the row before in the track, (N,); 0 in its first."""
+        gap = np.diff(self.step, prepend=self.step[:1]).astype(float)
+        gap[self.first] = 0.0
+        return gap
+
+
+def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Residuals, int]:
+    """Residuals of trials with true poses and landmarks, and how many rows are of things that are no landmark.
+
+    What is ideal is Herath et al. (2007) eq. 22 at the true poses.
+    """
+    parts, strange = list[Residuals](), 0
+    for number, trial in enumerate(trials):
+        assert trial.truth is not None
+        assert trial.landmarks is not None
+        real = trial.landmark < len(trial.landmarks)
+        strange += int((~real).sum())
+        step = np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))[real]
+        landmark, z = trial.landmark[real], trial.z[real]
+        body = point.to_robot(*trial.truth[step].T, *trial.landmarks[landmark].T)
+        assert sensor.f is not None
+        assert sensor.B is not None
+        ideal = np.stack(stereo.project(*point.to_sensor(*body, sensor.mount.packed()), sensor.f, sensor.B), axis=-1)
+        order = np.lexsort((step, landmark))
+        moved = np.append(False, np.abs(np.diff(trial.truth, axis=0)).max(axis=1) > 0.0)
+        track = landmark + number * trial.n_landmarks
+        parts.append(Residuals(*(a[order] for a in (z - ideal, ideal, track, step, moved[step]))))
+    joined = [np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)]
+    return Residuals(*joined), strange
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The rows that the noise is estimated from, and the others."""
+
+    kept: Residuals
+    gross: int  # rows too far off to be of the noise
+    at_limits: int  # rows left out because of the search range or the edge of the image
+    rough: Array  # (3,), px, robust standard deviations
+
+
+def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> Selection:
+    """Leave out rows near the limits of the sensor, by their ideal values, and those that are grossly wrong.
+
+    Near the ends of the search range only some noise is measured; ``MARGIN`` standard deviations away, the variance
+    lacks less than one part in 1000. The ideal value decides, which knows nothing of the noise of its row.
+
+    Parameters
+    ----------
+    regressors : (N, p), of the bias map
+    """
+    fits = [_robust(data.r[:, k], regressors) for k in range(3)]
+    centred = data.r - np.column_stack(fits)
+    scale = np.column_stack([_spread(centred[:, 0]), _spread(centred[:, 1]), _local_spread(centred[:, 2], data)])
+    rough = np.array([_spread(centred[:, k])[0] for k in range(3)])
+    inside = np.ones(len(data), bool)
+    expected = data.ideal + np.column_stack(fits)
+    if sensor.disparity is not None:
+        low, high = sensor.disparity
+        margin = MARGIN * scale[:, 2]
+        inside &= (expected[:, 2] >= low + margin) & (expected[:, 2] <= high - margin)
+    if sensor.image is not None:
+        for k, (size, middle) in enumerate(zip(sensor.image, sensor.centre, strict=True)):
+            margin = MARGIN * scale[:, k]
+            inside &= (expected[:, k] >= margin - middle) & (expected[:, k] <= size - middle - margin)
+    gross = inside & (np.abs(centred) > GROSS * scale).any(axis=1)
+    return Selection(data.keep(inside & ~gross), int(gross.sum()), int((~inside).sum()), rough)
+
+
+def _robust(r: Array, X: Array) -> Array:
+    """Values (N,) of the regression of ``r`` on ``X`` with Huber's weights; coefficients without data are 0."""
+    beta = np.full(X.shape[1], np.median(r))
+    for _ in range(10):
+        e = r - X @ beta
+        weight = np.minimum(1.0, HUBER * _spread(e) / np.maximum(np.abs(e), 1e-12))
+        normal = (X * weight[:, None]).T @ X + 1e-3 * np.eye(X.shape[1])
+        beta = np.linalg.solve(normal, X.T @ (weight * r))
+    return np.asarray(X @ beta)
+
+
+def _spread(e: Array) -> Array:
+    """Robust standard deviation of a sample, at each of its members (N,)."""
+    return np.full(len(e), max(MAD * float(np.median(np.abs(e - np.median(e)))), 1e-9))
+
+
+def _local_spread(e: Array, data: Residuals) -> Array:
+    """Robust standard deviation (N,) of rows of about the same disparity."""
+    d = np.maximum(data.ideal[:, 2], 1e-3)
+    nodes = octaves(d)
+    nearest = hats(d, nodes).argmax(axis=1)
+    out = _spread(e)
+    for node in range(len(nodes)):
+        own = nearest == node
+        if own.sum() >= FEW:
+            out[own] = _spread(e[own])[0]
+    return out
+
+
+def of_part(data: Residuals, moving: bool) -> Residuals:
+    """Rows while the sensor moved, or while it stood; a track is one of each."""
+    part = data.keep(data.moving == moving)
+    return replace(part, track=part.track)

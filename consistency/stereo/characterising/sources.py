@@ -1,0 +1,99 @@
+"""What is characterised: a log, stereo pairs in the order of time, or stereo pairs of a chessboard."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from consistency.referee.errors import InputError
+from consistency.stereo.characterising.bias import GRID
+from consistency.stereo.characterising.recorded import Measured, characterise_log, is_log
+
+WIDEST = 10.0  # m, of a square of a board; more are millimetres
+NODES, CORNERS = 2, 3  # least numbers across and down, of nodes of a bias map and of corners
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is known of a source beside its files."""
+
+    grid: tuple[int, int] | None = None
+    at_rest: bool = False
+    free_poses: bool = False
+    calibration: Path | None = None
+    truth: Path | None = None
+    format: str | None = None
+    left: str | None = None
+    right: str | None = None
+    board: tuple[int, int] | None = None  # inner corners across and down
+    square: float | None = None  # m
+    distortion: str | None = None
+    seed: int | None = None
+
+    def of_images(self) -> list[str]:
+        """Options that are given and mean nothing for a log."""
+        names = ("calibration", "truth", "format", "left", "right", "board", "square", "distortion", "seed")
+        return [f"--{name}" for name in names if getattr(self, name) is not None]
+
+
+def characterise_source(source: Path, options: Options) -> Measured:
+    """The sensor of a log folder or of a folder of images.
+
+    Raises
+    ------
+    InputError
+        Options that do not go together or with the source, and whatever the source lacks.
+    """
+    if not source.is_dir():
+        raise InputError(f"{source}: no such folder; give a log, or a folder of stereo pairs")
+    if is_log(source):
+        if given := options.of_images():
+            raise InputError(f"{given[0]}: goes with images, but {source} is a log")
+        return characterise_log(source, options.grid or GRID, options.at_rest, options.free_poses)
+    if (options.board is None) != (options.square is None):
+        raise InputError(
+            "--board and --square go together: without the size of its squares, the depth of a plane is not known, and "
+            "so not what its disparities should be"
+        )
+    if options.board is None or options.square is None:
+        return _of_sequence(source, options)
+    if not 0.0 < options.square < WIDEST:
+        raise InputError(f"--square {options.square:g}: must be a positive number of metres, below {WIDEST:g}")
+    if options.seed is not None:
+        raise InputError("--seed: goes with images without a board; nothing is drawn at random from one")
+    if options.at_rest or options.truth is not None:
+        raise InputError("--board: goes neither with --at-rest nor with --truth; the poses of the board are fitted")
+    from consistency.stereo.characterising.plane import characterise_board
+
+    model = options.distortion or "full"
+    return Measured(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
+
+
+def _of_sequence(source: Path, options: Options) -> Measured:
+    from consistency.stereo.characterising.pictures import Sources, characterise_images
+
+    if options.distortion is not None:
+        raise InputError("--distortion: goes with --board; other images bring their calibration")
+    if options.grid is not None:
+        raise InputError("--grid: goes with a log or with --board; images of an unknown scene give no bias map")
+    o = options
+    return Measured(
+        characterise_images(
+            source, Sources(o.calibration, o.truth, o.format, o.left, o.right, o.at_rest, o.free_poses, o.seed or 0)
+        ),
+        {},
+    )
+
+
+def counts(text: str, option: str, least: int) -> tuple[int, int]:
+    """Two counts of ``KxL``.
+
+    Raises
+    ------
+    InputError
+        ``text`` is something else, or one of them is below ``least``.
+    """
+    one, cross, two = text.lower().partition("x")
+    if not (cross and one.isdecimal() and two.isdecimal() and min(int(one), int(two)) >= least):
+        raise InputError(f"{option} {text}: must be two numbers of at least {least}, as 9x6")
+    return int(one), int(two)

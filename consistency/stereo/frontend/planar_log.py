@@ -1,0 +1,222 @@
+"""Relative motions and matches as a planar log: controls, few landmarks, and the noise that a filter believes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+from consistency.bench.models import point, stereo
+from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
+from consistency.bench.types import Trial
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+from consistency.stereo.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes
+from consistency.stereo.vision.motion import RelativeMotion
+from consistency.stereo.vision.pose import RelativePose, angular
+from consistency.stereo.vision.rig import StereoRig
+from consistency.stereo.vision.sequence import Sequence
+from consistency.stereo.vision.tracks import PIXELS, Selection, linked, thinned
+
+MAX_AGE, MIN_LIFE, BANDS = 12, 2, 3  # observations of a landmark at most and at least, columns: as docs/kitti07.md
+NEAR = 10.0  # standard deviations of its disparity that a landmark has at least: its range is nearly Gaussian
+MOST_SLOTS = 64  # landmarks at once
+# rad: as many such tilts, at random, come to 1 / NEAR within a landmark's life
+LEAVES = 1.0 / (NEAR * np.sqrt(MAX_AGE))
+CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, forward <- forward, left, up
+
+
+@dataclass(frozen=True)
+class Plane:
+    """How well motions in space are those of a robot on a plane.
+
+    The log's sigma says how far landmarks are off when they are seen along the planar path. A landmark that is off by
+    more than a tenth of its distance, in any direction, is of no use to a filter that is of first order: that is the
+    same limit as on the range of a landmark, 1 / NEAR.
+    """
+
+    sigma: tuple[float, float, float]  # u, v, d, px
+    limit: tuple[float, float, float]  # px, a tenth of a landmark's distance: f / NEAR twice, the median d / NEAR
+    tilts: Array  # (T,), by which each motion rolls and pitches, rad
+
+    @property
+    def holds(self) -> bool:
+        return bool((np.array(self.sigma) <= self.limit).all())
+
+    @property
+    def leaving(self) -> int:
+        """Motions that tilt by more than LEAVES."""
+        return int((self.tilts > LEAVES).sum())
+
+    @property
+    def line(self) -> str:
+        """What leaves the plane, and by how much."""
+        (u, v, d), limits = self.sigma, ", ".join(f"{value:.0f}" for value in self.limit)
+        tilts = np.rad2deg(self.tilts)
+        return (
+            f"seen along a plane, landmarks are off by {u:.0f}, {v:.0f}, {d:.0f} px in u, v, d, and a tenth of their "
+            f"distance is {limits} px; {self.leaving} of {len(tilts)} motions tilt the camera by more than "
+            f"{np.rad2deg(LEAVES):.1f} deg ({np.median(tilts):.2g} in the median, {tilts.max():.2g} at most)"
+        )
+
+    @property
+    def fields(self) -> dict[str, object]:
+        """Entries of a manifest."""
+        tilts = np.rad2deg(self.tilts)
+        return {
+            "holds": self.holds, "sigma_px": self.sigma, "limit_px": self.limit, "motions": len(tilts),
+            "leaving": self.leaving, "tilt_deg": {"median": float(np.median(tilts)), "most": float(tilts.max())},
+        }  # fmt: skip
+
+
+def plane_of(motions: list[RelativeMotion], trial: Trial, belief: Belief) -> Plane:
+    """What of ``motions`` the planar log that :func:`log_of` makes of them leaves out."""
+    R, t = np.array([m.pose.R for m in motions]), np.array([m.pose.t for m in motions])
+    turn, _ = in_robot_axes(R, t, robot_axes(t), 0.0)
+    tilts = np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()[:, :2], axis=1)
+    sensor = belief.sensor
+    assert sensor.f is not None
+    u, v, d = sensor.sigma
+    wide = sensor.f / NEAR
+    return Plane((u, v, d), (wide, wide, float(np.median(trial.z[:, 2])) / NEAR), tilts)
+
+
+def log_of(
+    sequence: Sequence,
+    motions: list[RelativeMotion],
+    truth: tuple[Array, Array] | None,
+    max_landmarks: int,
+    lever: float = 0.0,
+) -> tuple[Trial, Belief]:
+    """One trial of the sequence and what a filter is to believe about it.
+
+    Controls are the visual odometry's own motions on the plane: a filter that takes them uses the same images twice.
+
+    Parameters
+    ----------
+    truth : poses (n, 3, 3), (n, 3) of the left camera in the world, m, or None
+    max_landmarks : in the log, at most
+    lever : m from the robot's point forward to the camera
+
+    Raises
+    ------
+    InputError
+        No track can be used, or too few landmarks are allowed.
+    """
+    rig, dt = sequence.rectification.rig, np.diff(sequence.t)
+    R, t = np.array([m.pose.R for m in motions]), np.array([m.pose.t for m in motions])
+    axes = robot_axes(t)
+    moves = planar_motions(*in_robot_axes(R, t, axes, lever))
+    mount = Mount(position=(lever, 0.0, 0.0), rotation=tuple(map(float, RelativePose(axes @ CAMERA, np.zeros(3)).rpy)))
+    seen = selected(observations(rig, motions), max_landmarks, rig.image_size[0])
+    sigma = misfit(seen, planar_path(moves), mount, rig)
+    true_path = None
+    if truth is not None:
+        steps = in_robot_axes(*relative(*truth), axes, lever)
+        true_path = planar_path(planar_motions(*steps))
+    trial = Trial(
+        run=0,
+        start=np.zeros(3),
+        controls=np.column_stack([dt, moves[:, 0] / dt, moves[:, 2] / dt]),
+        first=np.searchsorted(seen["step"], np.arange(1, len(sequence) + 1)),
+        landmark=seen["landmark"].to_numpy(np.int64),
+        z=seen[PIXELS].to_numpy(float),
+        n_landmarks=int(seen["landmark"].max()) + 1,
+        truth=true_path,
+    )
+    sensor = BelievedSensor(model="uvd", sigma=sigma, f=float(rig.K_left[0, 0]), B=rig.baseline, mount=mount)
+    return trial, Belief(motion=odometry_noise(motions, axes, dt), sensor=sensor)
+
+
+def observations(rig: StereoRig, motions: list[RelativeMotion]) -> pd.DataFrame:
+    """Rows (step, z0, z1, z2, sigma, piece): u, v, d in px of every track, ``sigma`` that of d.
+
+    A track is a chain of inliers of the motions: where one is an outlier it ends, and another landmark begins.
+    """
+    pieces = linked([m.rows[m.inliers] for m in motions])
+    parts, known = [], set[int]()
+    for step, (m, piece) in enumerate(zip(motions, pieces, strict=True), start=1):
+        new = np.array([p not in known for p in piece.tolist()], bool)
+        known.update(piece.tolist())
+        for at, uv, sigma, keep in ((step - 1, m.uv0, m.sigma0, new), (step, m.uv1, m.sigma1, np.full(len(new), True))):
+            uv, sigma = uv[m.inliers][keep], sigma[m.inliers][keep]
+            u, v = uv[:, 0] - rig.K_left[0, 2], uv[:, 1] - rig.K_left[1, 2]
+            d = u - (uv[:, 2] - rig.K_right[0, 2])
+            columns = {"piece": piece[keep], "z0": u, "z1": v, "z2": d, "sigma": np.hypot(sigma[:, 0], sigma[:, 2])}
+            parts.append(pd.DataFrame(columns).assign(step=at))
+    return pd.concat(parts, ignore_index=True).sort_values(["piece", "step"], ignore_index=True)
+
+
+def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
+    """Rows (step, landmark, z0, z1, z2) of at most ``most`` landmarks, as many at once as that allows.
+
+    Raises
+    ------
+    InputError
+        No track can be used, or even one landmark at once makes more than ``most`` in all.
+    """
+    rows = rows[rows["z2"] >= NEAR * rows["sigma"]]
+    if rows.empty:
+        raise InputError(f"no match has a disparity of at least {NEAR:g} of its sigmas; the scene is too far for a log")
+    rows = rows.assign(piece=np.cumsum((rows["piece"].diff() != 0) | (rows["step"].diff() != 1)))
+
+    def selection_of(slots: int) -> pd.DataFrame:
+        return thinned(rows, Selection(slots, MAX_AGE, MIN_LIFE, BANDS, float(width)))
+
+    low, high, best = 1, MOST_SLOTS, selection_of(1)
+    if (fewest := best["landmark"].nunique()) > most:
+        raise InputError(f"--max-landmarks {most}: one landmark at once makes {fewest} over the sequence; allow more")
+    while low < high:  # the largest number at once
+        middle = (low + high + 1) // 2
+        table = selection_of(middle)
+        if table["landmark"].nunique() <= most:
+            low, best = middle, table
+        else:
+            high = middle - 1
+    return best
+
+
+def misfit(seen: pd.DataFrame, path: Array, mount: Mount, rig: StereoRig) -> tuple[float, float, float]:
+    """Root mean square of u, v, d (px) about landmarks placed by their nearest sight along the planar path.
+
+    ``path`` is (T + 1, 3). The misfit holds the noise of the pixels and what the plane leaves out, roll and pitch above
+    all. No truth is used.
+    """
+    f, B, packed = float(rig.K_left[0, 0]), rig.baseline, mount.packed()
+    nearest = seen.loc[seen.groupby("landmark")["z2"].idxmax()].set_index("landmark")
+    x, y, heading = path[nearest["step"]].T
+    u, v, d = nearest[PIXELS].to_numpy(float).T
+    place = np.column_stack(
+        point.to_world(x, y, heading, *point.from_sensor(*stereo.triangulate(u, v, d, f, B), packed))
+    )
+    others = seen[seen["step"].to_numpy() != nearest["step"].loc[seen["landmark"]].to_numpy()]
+    x, y, heading = path[others["step"]].T
+    target = place[nearest.index.get_indexer(others["landmark"])].T
+    back = point.to_sensor(*point.to_robot(x, y, heading, *target), packed)
+    error = others[PIXELS].to_numpy(float) - np.column_stack(stereo.project(*back, f, B))
+    rms = np.sqrt(np.mean(error**2, axis=0))
+    return float(rms[0]), float(rms[1]), float(rms[2])
+
+
+def odometry_noise(motions: list[RelativeMotion], axes: Array, dt: Array) -> BelievedMotion:
+    """Noise of v and omega from the covariances of the motions, root mean square over the steps.
+
+    Parameters
+    ----------
+    axes : (3, 3), rows are forward, left and up of the robot in the camera's frame
+    dt : (T,), duration of each motion, s
+    """
+    forward, _, up = axes
+    along = [forward @ m.covariance[:3, :3] @ forward for m in motions]
+    turn = [up @ angular(m.pose) for m in motions]
+    about = [row @ m.covariance[3:, 3:] @ row for row, m in zip(turn, motions, strict=True)]
+    sigma_v, sigma_omega = (float(np.sqrt(np.mean(np.array(variance) / dt**2))) for variance in (along, about))
+    return BelievedMotion(sigma_v=sigma_v, sigma_omega=sigma_omega)
+
+
+def relative(R: Array, t: Array) -> tuple[Array, Array]:
+    """Motions from frame to frame of poses (n, 3, 3), (n, 3)."""
+    back = np.swapaxes(R[:-1], 1, 2)
+    return back @ R[1:], np.einsum("nij,nj->ni", back, np.diff(t, axis=0))

@@ -1,0 +1,146 @@
+"""Disparities in rendered images, as Herath et al. (2007) fig. 4, 5 and 8 have those of a real camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from consistency.bench.pages.blocks import Table
+from consistency.bench.pages.drawing import Axis, Bars, Figure, Key, Line, Panel, Points, Rule, Span, Stems
+from consistency.bench.pages.exhibits import Exhibit, Source, groups, listing, section, single
+from consistency.bench.pages.looks import EXPECTED, LIMIT, SHADE, Look, style
+from consistency.bench.pages.section import Part
+
+IMAGES = Part("images", "The stereo sensor in rendered images", "Rendered images")
+SAMPLES, GAUSS = Look("#c4c4c4"), replace(style(0), width=1.4)
+KEYS = (Key("samples", SAMPLES, "band"), Key("Gaussian", GAUSS))
+
+
+def protocol(stops: pd.DataFrame) -> Figure:
+    """Features kept at each stop, experiment 2."""
+    marks: list[Line | Points | Rule] = [Rule("y", float(stops["needed"].iloc[0]), LIMIT)]
+    keys = [Key("needed", LIMIT)]
+    for k, (residual, part) in enumerate(stops.sort_values("disparity").groupby("residual")):
+        x, y = part["disparity"].to_numpy(), part["features"].to_numpy()
+        look = replace(style(k), size=3.0)
+        marks.append(Points(x, y, look, tips=(("disparity", "@x{0.0} px"), ("features", "@y"))))
+        keys.append(Key(f"k1 left over {residual:g}", look, "points"))
+    panel = Panel(
+        Axis("disparity (px)"), Axis("features kept", start=0.0), tuple(marks), "Features kept over disparity"
+    )
+    caption = (
+        f"Of {stops['selected'].median():.0f} features at a stop, those that are kept through all images; experiment 2 "
+        f"of Herath et al. (2007) sec. 3.3, which kept at least {stops['needed'].iloc[0]:g}."
+    )
+    return single("Features kept at each stop", caption, panel, tuple(keys))
+
+
+def growth(stops: pd.DataFrame) -> Figure:
+    """Noise of disparity over disparity, fig. 5c."""
+    marks: list[Line | Rule] = [Rule("y", float(stops["sigma"].iloc[0]), LIMIT)]
+    keys = [Key("sec. 4.5", LIMIT)]
+    for k, (residual, part) in enumerate(stops.sort_values("disparity").groupby("residual")):
+        for name, text, dash in (("within", "about track means", ()), ("pooled", "pooled", (4.0, 2.0))):
+            look = replace(style(k), dash=dash)
+            marks.append(Line(part["disparity"].to_numpy(), part[name].to_numpy(), look))
+            keys.append(Key(f"{text}, k1 left over {residual:g}", look))
+    panel = Panel(
+        Axis("disparity (px)"),
+        Axis("sd of disparity (px)", "sd (px)", log=True, digits=(1, 2, 5)),
+        tuple(marks),
+        "Standard deviation of disparity over disparity",
+    )
+    caption = (
+        f"Standard deviation of disparity at {len(stops) // stops['residual'].nunique()} stops before a wall, with the "
+        "means of the tracks subtracted and pooled at each stop, where the rectification is right and where it leaves "
+        "a radial distortion k1, opposite in both images; as Herath et al. (2007) fig. 5c. Their sec. 4.5 uses "
+        f"{stops['sigma'].iloc[0]:g} px throughout."
+    )
+    return single("Noise of disparity", caption, panel, tuple(keys))
+
+
+def pooled(bins: pd.DataFrame) -> Figure:
+    """Errors of disparity about the means of their tracks, fig. 5a."""
+    sd, edges = float(bins["sd"].iloc[0]), np.append(bins["low"].to_numpy(), bins["high"].iloc[-1])
+    x = np.linspace(edges[0], edges[-1], 201)
+    gauss = np.exp(-0.5 * (x / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
+    panel = Panel(
+        Axis("error of d about the mean of its track (px)"),
+        Axis("density (1/px)", start=0.0),
+        (Bars(edges, bins["density"].to_numpy(), SAMPLES), Line(x, gauss, GAUSS)),
+        "Distribution of errors of disparity about the means of tracks",
+    )
+    caption = (
+        f"Errors of disparity about the means of their tracks, pooled over all stops, {int(bins['samples'].iloc[0])} "
+        f"of them, with the Gaussian of the same standard deviation, {sd:.3f} px; as Herath et al. (2007) fig. 5a."
+    )
+    return single("Errors of disparity about track means", caption, panel, KEYS)
+
+
+def biases(features: pd.DataFrame) -> Figure:
+    """Mean error of each feature, fig. 8."""
+    marks, keys = [], []
+    for k, (left, part) in enumerate(features.groupby("left", sort=False)):
+        look = replace(style(k), size=3.0)
+        marks.append(Points(part["u"].to_numpy(), part["bias_d"].to_numpy(), look, tips=(("bias", "@y{0.00} px"),)))
+        keys.append(Key(str(left), look, "points"))
+    panel = Panel(Axis("u (px)"), Axis("mean error of d (px)"), tuple(marks), "Local biases of disparity over u")
+    caption = (
+        "Mean error of the disparity of each feature on a wall at a disparity of 14.7 px, by what the rectification "
+        "leaves; as Herath et al. (2007) fig. 8, where biases are up to 2 px."
+    )
+    return single("Local biases of disparity", caption, panel, tuple(keys))
+
+
+def whiteness(lags: pd.DataFrame) -> Figure:
+    """Autocorrelation along tracks, freed of what subtracting a mean does."""
+    lag, value, limit = lags["lag"].to_numpy(), lags["autocorrelation"].to_numpy(), float(lags["limit"].iloc[0])
+    reach = 1.5 * max(limit, float(np.abs(value).max()))
+    marks = (
+        Span("y", -limit, limit, SHADE),
+        Rule("y", 0.0, EXPECTED),
+        Stems(lag, value, style(0), tips=(("lag", "@x"), ("autocorrelation", "@y{0.000}"))),
+    )
+    panel = Panel(
+        Axis("lag (images)", window=(0.4, float(lag.max()) + 0.6), whole=True),
+        Axis("autocorrelation", "correlation", window=(-reach, reach)), marks, "Autocorrelation along tracks",
+    )  # fmt: skip
+    caption = (
+        "Autocorrelation of the errors of disparity about the means of their tracks, with what subtracting the mean "
+        f"does given back; shaded: the rule, {limit:g} at most."
+    )
+    return single("Whiteness", caption, panel)
+
+
+def largest(features: pd.DataFrame) -> Table:
+    """Largest mean error of a feature, and how far it is from what the cameras give."""
+    rows = []
+    for left, part in groups(features, "left"):
+        walls = part.groupby("wall")["bias_d"].agg(lambda bias: bias.abs().max())
+        away = (part["bias_d"] - part["expected"]).std()
+        rows.append((left, walls.median(), walls.max(), part["sd"].median(), away))
+    data = pd.DataFrame(rows, columns=["left", "median", "most", "sd", "away"])
+    heads = {
+        "left": ("Rectification leaves", ""), "median": ("Largest bias (px), median of walls", ".2f"),
+        "most": ("of all walls", ".2f"), "sd": ("Noise about track means (px)", ".3f"),
+        "away": ("Bias less that of the cameras, sd (px)", ".3f"),
+    }  # fmt: skip
+    return listing(data, heads, "Largest biases of disparity", "Largest mean error of a feature before each wall")
+
+
+STOPS = ("disparity", "selected", "features", "within", "pooled", "residual", "sigma", "needed")
+EXHIBITS = (
+    Exhibit(("fig4-protocol",), "fig4-protocol: features at each stop",
+            (Source("images_stops", STOPS, (), protocol),)),
+    Exhibit(("fig5a",), "fig5a: distribution and whiteness of the noise of disparity",
+            (Source("images_fig5a", ("low", "high", "density", "sd", "samples"), (), pooled),
+             Source("images_fig5a_lags", ("lag", "autocorrelation", "limit"), (), whiteness))),
+    Exhibit(("fig5b", "fig5c"), "fig5b, fig5c: noise of disparity over disparity",
+            (Source("images_stops", STOPS, (), growth),)),
+    Exhibit(("fig7-8",), "fig7-8: local biases of disparity",
+            (Source("images_bias", ("u", "bias_d"), ("left",), biases),
+             Source("images_bias", ("wall", "bias_d", "expected", "sd"), ("left",), largest))),
+)  # fmt: skip
+SECTION = section(IMAGES, EXHIBITS)

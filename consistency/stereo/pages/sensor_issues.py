@@ -1,0 +1,140 @@
+"""The practical issues of Herath et al. (2007) sec. 4, issue by issue."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from consistency.bench.pages.blocks import Table
+from consistency.bench.pages.drawing import Axis, Figure, Key, Line, Panel, Points, Rule
+from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, section, several
+from consistency.bench.pages.looks import COLOURS, EXPECTED, Look, style
+from consistency.referee.types import Array
+from consistency.stereo.pages.biases import SENSOR
+
+POSE = (("x", "m"), ("y", "m"), ("heading", "deg"))
+SIGMAS = 2.0
+ERROR, BOUND = Look(COLOURS[0], width=1.0), Look(COLOURS[0], (3.0, 2.0), width=0.8)
+OUTCOME = {
+    "case": ("Case", ""), "status": ("Verdict", STATUS), "anees": ("Mean NEES", ".2f"),
+    "rmse_position_m": ("RMSE (m)", ".3f"), "rmse_heading_deg": ("RMSE (deg)", ".2f"),
+}  # fmt: skip
+GUARD = {"precision": ("Precision", ".3f"), "recall": ("Recall", ".3f")}
+
+
+def outcomes(rows: pd.DataFrame) -> Table:
+    """Verdict, NEES and errors of each case, with the scores of a guard where there is one."""
+    heads = OUTCOME | (GUARD if rows["precision"].notna().any() else {})
+    return listing(rows, heads, "Outcomes", "Mean NEES is 3 if the covariance is right")
+
+
+def first_run(steps: pd.DataFrame) -> Figure:
+    """Errors with 2-sigma bounds, as fig. 10."""
+    x = steps["step"].to_numpy()
+    panels = []
+    for name, unit in POSE:
+        tips = (("step", "@x"), ("error", f"@y{{0.000}} {unit}"), ("2 sigma", f"@bound{{0.000}} {unit}"))
+        bound = SIGMAS * steps[f"sigma_{name}"].to_numpy()
+        line = Line(x, steps[name].to_numpy(), ERROR, tips=tips, bound=bound)
+        y = Axis(f"{name} error ({unit})", f"{name} error\n({unit})")
+        panels.append(Panel(Axis("step", share="step"), y, (line, Rule("y", 0.0, EXPECTED)), f"Error of {name}"))
+    caption = (
+        "Errors of the pose in the first run, with the filter's own 2-sigma bounds; as Herath et al. (2007) fig. 10."
+    )
+    return several("Errors and bounds", caption, panels, (Key("error", ERROR), Key("2-sigma bounds", BOUND)))
+
+
+def guards(rows: pd.DataFrame) -> Table:
+    """Each guard against what the same filter does on clean data."""
+    heads = {
+        "filter": ("Filter", ""), "guard": ("Guard", ""), "rmse_ratio": ("RMSE over clean", ".2f"),
+        "clean": ("Clean", STATUS), "clean_anees": ("Mean NEES", ".2f"), "guarded": ("Guarded", STATUS),
+        "guarded_anees": ("Mean NEES", ".2f"),
+    }  # fmt: skip
+    caption = "Behind each guard among 5 % mismatches, beside the same filter without mismatches"
+    return listing(rows, heads, "Guards", caption)
+
+
+def lenses(rows: pd.DataFrame) -> Figure:
+    """Heading and consistency over the field of view."""
+    keys, heading, nees = [], list[Line | Points](), list[Line | Points]()
+    cases = rows.groupby(["filter", "k1"], sort=False)
+    for k, (case, part) in enumerate(cases):
+        name, k1 = case
+        x, look = part["degrees"].to_numpy(), style(k)
+        heading += _marked(x, part["rmse_heading_deg"], look, "@y{0.00} deg")
+        nees += _marked(x, part["anees"], look, "@y{0.0}")
+        keys.append(Key(f"{name}, k1 left over {k1:g}", look, marked=True))
+    x_axis = Axis("field of view (degrees)", share="view")
+    y_axes = [Axis(label, log=True, digits=(1, 2, 5)) for label in ("RMSE of heading (deg)", "mean NEES")]
+    panels = (
+        Panel(x_axis, y_axes[0], tuple(heading), "Heading over the view"),
+        Panel(x_axis, y_axes[1], (Rule("y", 3.0, EXPECTED), *nees), "Mean NEES over the view"),
+    )
+    caption = (
+        "Accuracy of the heading and consistency over the field of view across the image, with a perfect rectification "
+        "and with one that leaves a radial distortion, opposite in both cameras; sec. 4.1. The line is at 3."
+    )
+    return several("Field of view", caption, panels, tuple(keys))
+
+
+def _marked(x: Array, y: pd.Series, look: Look, tip: str) -> list[Line | Points]:
+    """A line with a marker at each of its points."""
+    return [Line(x, y.to_numpy(), look), Points(x, y.to_numpy(), look, tips=(("value", tip),))]
+
+
+def of_lenses(rows: pd.DataFrame) -> Table:
+    """The numbers of the figure, with verdicts."""
+    heads = {
+        "degrees": ("Degrees", ".0f"), "k1": ("k1 left over", "g"), "filter": ("Filter", ""),
+        "status": ("Verdict", STATUS), "anees": ("Mean NEES", ".2f"), "rmse_position_m": ("RMSE (m)", ".3f"),
+        "rmse_heading_deg": ("RMSE (deg)", ".2f"),
+    }  # fmt: skip
+    return listing(rows, heads, "Lenses")
+
+
+def counts(rows: pd.DataFrame) -> Figure:
+    """Errors over the number of features."""
+    x, panels = rows["count"].to_numpy(), []
+    for column, label, tip in (("rmse_position_m", "RMSE of position (m)", "@y{0.000} m"),
+                               ("rmse_heading_deg", "RMSE of heading (deg)", "@y{0.00} deg")):  # fmt: skip
+        axis = Axis("features at a time", log=True, digits=(1, 2, 4, 8), share="count")
+        marks = tuple(_marked(x, rows[column], style(0), tip))
+        panels.append(Panel(axis, Axis(label, log=True, digits=(1, 2, 5)), marks, f"{label} over features"))
+    caption = "Errors of parked-ekf-uvd over the number of features that are tracked at a time; sec. 4.2."
+    return several("Errors over the number of features", caption, panels, ())
+
+
+def of_counts(rows: pd.DataFrame) -> Table:
+    """The numbers of the figure, with the test from one count to the next."""
+    heads = OUTCOME | {"p": ("p, fewer no worse", P_VALUE)}
+    return listing(rows, heads, "Counts of features", "p of the test against the row above")
+
+
+NUMBERS = ("anees", "rmse_position_m", "rmse_heading_deg", "precision", "recall")
+TEXTS, NO_GUARD = ("case", "status"), ("precision", "recall")
+STEPS = ("step", *(f"{of}{name}" for of in ("", "sigma_") for name, _ in POSE))
+LENSES = ("degrees", "k1", "anees", "rmse_position_m", "rmse_heading_deg")
+
+
+def _spurious(name: str, title: str) -> Exhibit:
+    sources = (Source(name, NUMBERS, TEXTS, outcomes, NO_GUARD),
+               Source(f"{name}_errors", STEPS, (), first_run, STEPS[1:]))  # fmt: skip
+    return Exhibit((name,), f"{name}: {title}", sources)
+
+
+EXHIBITS = (
+    _spurious("fig10a", "spurious features without a guard"),
+    _spurious("fig10b", "spurious features behind one-point RANSAC"),
+    Exhibit(("guarded",), "guarded: every guard beside clean data",
+            (Source("guarded", ("rmse_ratio", "clean_anees", "guarded_anees"),
+                    ("filter", "guard", "clean", "guarded"), guards),)),
+    Exhibit(("fov",), "fov: field of view, with and without distortion",
+            (Source("field_of_view", LENSES, ("filter", "status"), lenses),
+             Source("field_of_view", LENSES, ("filter", "status"), of_lenses))),
+    Exhibit(("feature-count",), "feature-count: how many features",
+            (Source("feature_count", (*NUMBERS, "count", "p"), TEXTS, counts, (*NO_GUARD, "p")),
+             Source("feature_count", (*NUMBERS, "count", "p"), TEXTS, of_counts, (*NO_GUARD, "p")))),
+    Exhibit(("near-far-mix",), "near-far-mix: near and far features",
+            (Source("near_far_mix", NUMBERS, TEXTS, outcomes, NO_GUARD),)),
+)  # fmt: skip
+SECTION = section(SENSOR, EXHIBITS)

@@ -1,0 +1,204 @@
+"""Observations that leave the motion that most others of a step share: moving things, tracks that slip.
+
+A screening of the log itself, before any filter: two observations of a landmark in consecutive steps give a point and
+where it went, and one motion of the robot in space is fitted to all points of a step, with Cauchy weights. No truth and
+no estimate of a filter is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from consistency.bench.models import planar, point, stereo
+from consistency.bench.scenario import Belief, BelievedSensor
+from consistency.bench.types import Trial
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import wrap
+from consistency.referee.types import Array, Indices
+
+GATE = 4.0  # standard deviations that a gate is taken for, as that of an inlier of the front-end
+SOFT = 2.0  # standard deviations, at which the Cauchy weight of a misfit is one half
+LOOSE = np.array([0.0, 0.1, 0.1, 0.02, 0.02, 0.0])  # m, rad a step, of what odometry does not tell: slip, bumps
+STEPS = 10  # of reweighted least squares
+NEAREST = 0.5  # m, depth of a point that a fit may move behind the camera
+MAD = 1.4826  # standard deviation over median deviation, of a Gaussian
+
+
+@dataclass(frozen=True)
+class Screened:
+    """Trials in which landmarks begin anew where they leave the common motion, and how often they do."""
+
+    trials: list[Trial]
+    gate: Array  # (s,), in units of z
+    scale: Array  # (s,), standard deviation of the misfits by their median: what a gate should be some times of
+    offered: int  # observations
+    judged: int  # of these, whose landmark was seen in the step before
+    broken: int  # of these, that leave the common motion
+
+
+def screened(trials: Sequence[Trial], belief: Belief, gate: Array) -> Screened:
+    """Recorded trials in which a landmark begins anew, under another number, where it leaves the common motion.
+
+    Parameters
+    ----------
+    gate : (s,), greatest misfit of each value of an observation, in units of z: px, m or rad. What is left in a step of
+        one or two landmarks, which any motion fits, passes.
+
+    Raises
+    ------
+    InputError
+        The sensor is ``linear``, whose observations are of no point that moves.
+    """
+    if belief.sensor.model == "linear":
+        raise InputError("a log of a sensor 'linear' cannot be screened: it observes no points that move")
+    pairs = [_pairs(trial) for trial in trials]
+    misfits = [np.abs(_misfits(trial, *rows, belief, gate)) for trial, rows in zip(trials, pairs, strict=True)]
+    every = np.concatenate(misfits)
+    scale = MAD * np.median(every, axis=0) if len(every) else np.zeros(len(gate))
+    broken = [rows[1][(e > gate).any(axis=1)] for rows, e in zip(pairs, misfits, strict=True)]
+    offered = sum(len(trial.z) for trial in trials)
+    return Screened(_begun_anew(trials, broken), gate, scale, offered, len(every), sum(map(len, broken)))
+
+
+def _pairs(trial: Trial) -> tuple[Indices, Indices]:
+    """Rows (n,) of observations, and of those of the same landmark in the step after; sorted by step."""
+    step = np.repeat(np.arange(trial.steps), np.diff(trial.first))
+    order = np.lexsort((step, trial.landmark))
+    follows = (np.diff(trial.landmark[order]) == 0) & (np.diff(step[order]) == 1)
+    before, after = order[:-1][follows], order[1:][follows]
+    by_step = np.argsort(step[after], kind="stable")
+    return before[by_step], after[by_step]
+
+
+def _misfits(trial: Trial, before: Indices, after: Indices, belief: Belief, gate: Array) -> Array:
+    """Seen less expected (n, s) at the common motion of each step, over its standard deviation by leverage."""
+    step = np.repeat(np.arange(trial.steps), np.diff(trial.first))[after]
+    out = np.empty((len(after), trial.z.shape[1]))
+    for k in np.unique(step):
+        rows = np.flatnonzero(step == k)
+        dt, v, omega = trial.controls[k]
+        mean = np.array([dt * v, 0.0, 0.0, 0.0, 0.0, dt * omega])
+        noise = dt * np.repeat([belief.motion.sigma_v, belief.motion.sigma_omega], 3)
+        points, seen = _points(trial.z[before[rows]], belief.sensor), trial.z[after[rows]]
+        out[rows] = _misfit(points, seen, mean, np.hypot(noise, LOOSE), gate / GATE, belief.sensor)
+    return out
+
+
+def _misfit(points: Array, seen: Array, mean: Array, sigma: Array, scale: Array, sensor: BelievedSensor) -> Array:
+    """Misfits (n, s) of points (n, 3) in the robot frame a step before, by reweighted least squares from the odometry.
+
+    A fit takes after the observations that it rests on: a misfit is divided by sqrt(1 - leverage) (Cook & Weisberg
+    1982, sec. 2.1).
+    """
+    move = mean.copy()
+    for _ in range(STEPS):
+        error, slope = _error_and_slope(points, seen, move, sensor)
+        weight = 1.0 / (1.0 + ((error / (SOFT * scale)) ** 2).sum(axis=1))
+        J = slope / scale[:, None]
+        normal = np.einsum("n,nij,nik->jk", weight, J, J) + np.diag(sigma**-2)
+        right = np.einsum("n,nij,ni->j", weight, J, error / scale) + (mean - move) / sigma**2
+        move = move + np.linalg.solve(normal, right)
+    error, slope = _error_and_slope(points, seen, move, sensor)
+    J = slope / scale[:, None]
+    leverage = weight[:, None] * np.einsum("nij,jk,nik->ni", J, np.linalg.inv(normal), J)
+    return np.asarray(error / np.sqrt(np.maximum(1.0 - leverage, 1e-3)))
+
+
+def _error_and_slope(points: Array, seen: Array, move: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
+    """Seen less expected z (n, s), and the derivative (n, s, 6) of the expected by shift and rotation vector."""
+    turn = Rotation.from_rotvec(move[3:]).as_matrix()
+    moved = (points - move[:3]) @ turn
+    expected, by_point = _expected(moved, sensor)
+    by_turn = np.cross(moved[:, None, :], np.eye(3)[None]).transpose(0, 2, 1)
+    by_move = np.concatenate([np.broadcast_to(-turn.T, by_turn.shape), by_turn], axis=2)
+    error = seen - expected
+    if sensor.model == "range-bearing":
+        error[:, 1] = wrap(error[:, 1])
+    return error, by_point @ by_move
+
+
+def _points(z: Array, sensor: BelievedSensor) -> Array:
+    """Observations (n, s) as points in the robot frame (n, 3), m; those of a sensor in the plane have height 0."""
+    if sensor.model == "uvd":
+        assert sensor.f is not None
+        assert sensor.B is not None
+        u, v, d = z.T
+        at = stereo.triangulate(u, v, d, sensor.f, sensor.B)
+    elif sensor.model == "range-bearing":
+        at = *planar.at_range_bearing(z[:, 0], z[:, 1]), np.zeros(len(z))
+    else:
+        x, y, height = np.pad(z, ((0, 0), (0, 3 - sensor.size))).T
+        at = x, y, height
+    return np.column_stack(point.from_sensor(*at, sensor.mount.packed()))
+
+
+def _expected(points: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
+    """Observations (n, s) of points (n, 3) in the robot frame, and their derivative (n, s, 3)."""
+    mount = sensor.mount.packed()
+    bx, by, bz = points.T
+    x, y, z = point.to_sensor(bx, by, bz, mount)
+    if sensor.model == "uvd":
+        assert sensor.f is not None
+        assert sensor.B is not None
+        x = np.maximum(x, NEAREST)
+        seen = np.column_stack(stereo.project(x, y, z, sensor.f, sensor.B))
+        slope = np.array(stereo.project_jacobian(x, y, z, sensor.f, sensor.B)).reshape(3, 3, -1)
+    elif sensor.model == "range-bearing":
+        seen = np.column_stack(planar.range_bearing(x, y))
+        flat = np.array(planar.range_bearing_jacobian(x, y)).reshape(2, 2, -1)
+        slope = np.pad(flat, ((0, 0), (0, 1), (0, 0)))
+    else:
+        seen = np.column_stack([x, y, z])[:, : sensor.size]
+        slope = np.repeat(np.eye(3)[: sensor.size, :, None], len(x), axis=2)
+    from_robot = np.array(mount[3:]).reshape(3, 3).T
+    return seen, slope.transpose(2, 0, 1) @ from_robot
+
+
+def _begun_anew(trials: Sequence[Trial], broken: Sequence[Indices]) -> list[Trial]:
+    """Trials in which a landmark has another id from each row in ``broken`` on: its n-th new one is one in all trials.
+
+    The ids of landmarks stay what they are, new ones follow; then those of things that are no landmark, likewise.
+    """
+    ids = max(trial.n_landmarks for trial in trials)
+    known = ids if trials[0].landmarks is None else len(trials[0].landmarks)
+    pieces = [_piece(trial, rows) for trial, rows in zip(trials, broken, strict=True)]
+    count = np.ones(ids, np.int64)
+    for trial, piece in zip(trials, pieces, strict=True):
+        np.maximum.at(count, trial.landmark, piece + 1)
+    parent = np.repeat(np.arange(ids), count)
+    place = np.cumsum(count) - count  # of the first of each parent
+    new = np.arange(len(parent)) != place[parent]
+    order = np.lexsort((new, parent >= known))
+    rank = np.argsort(order)
+    parent, new = parent[order], new[order]
+    return [
+        _renumbered(trial, rank[place[trial.landmark] + piece], parent, new)
+        for trial, piece in zip(trials, pieces, strict=True)
+    ]
+
+
+def _piece(trial: Trial, broken: Indices) -> Indices:
+    """How often the landmark of each row (M,) has begun anew up to it; rows are in order of the steps."""
+    order = np.argsort(trial.landmark, kind="stable")
+    breaks = np.isin(order, broken).astype(np.int64)
+    before = np.cumsum(breaks) - breaks
+    first = np.searchsorted(trial.landmark[order], trial.landmark[order])
+    out = np.empty(len(order), np.int64)
+    out[order] = before + breaks - before[first]
+    return out
+
+
+def _renumbered(trial: Trial, landmark: Indices, parent: Indices, new: Array) -> Trial:
+    """A trial with the ids ``landmark`` (M,) of its rows, each a ``new`` one or not, of ``parent`` in the trial."""
+    labels = np.arange(len(parent)) if trial.labels is None else trial.labels[parent]
+    labels[new] = labels.max(initial=-1) + 1 + np.arange(new.sum())
+    source, places = trial.source, trial.landmarks
+    if source is not None:
+        source = np.where(source == trial.landmark, landmark, source)
+    if places is not None:
+        places = places[parent[parent < len(places)]]
+    return replace(trial, landmark=landmark, n_landmarks=len(parent), labels=labels, source=source, landmarks=places)

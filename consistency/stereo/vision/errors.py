@@ -1,0 +1,31 @@
+"""What can be wrong with matches, points and poses; all are :class:`consistency.referee.errors.InputError`."""
+
+from consistency.referee.errors import InputError
+
+
+class MatchError(InputError):
+    """Something that may be one match's fault: ``match`` is its number, from 0, or None."""
+
+    def __init__(self, message: str, match: int | None = None) -> None:
+        super().__init__(message)
+        self.match = match
+
+
+class PointError(MatchError):
+    """A point at infinity, at a camera or behind it, or a match without positive disparity."""
+
+
+class DegenerateError(MatchError):
+    """Points that do not fix a rigid motion: fewer than three, identical, or on one line; or one that is not fixed."""
+
+
+class ConsensusError(InputError):
+    """No motion has enough inliers."""
+
+
+class GimbalLockError(InputError):
+    """A pitch of +-90 degrees, where roll and yaw are not defined."""
+
+
+class ConvergenceError(InputError):
+    """A minimisation that did not reach a minimum."""

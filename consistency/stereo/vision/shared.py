@@ -1,0 +1,189 @@
+"""Errors that the motions of a drive share: calibration of the rig, mounting and clock of the truth.
+
+Pixel noise is independent from match to match; these are not, and no number of matches averages them out. Each motion's
+error against truth is e = J theta + n: theta, the same for all, has a prior as wide as calibrations usually are, and n
+the propagated covariance plus a floor, the scatter of the truth. Both are fitted to a part of a drive by maximum
+likelihood, with theta integrated out, and predicted for another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+from consistency.stereo.vision.bridging import neighbours
+from consistency.stereo.vision.motion import RelativeMotion, diagonal
+from consistency.stereo.vision.pose import RelativePose, cross_matrix
+from consistency.stereo.vision.refinement import refine_reprojection
+from consistency.stereo.vision.rig import StereoRig
+
+# What is shared, and the standard deviation of its prior
+SHARED = {
+    "focal length": 0.005,  # relative
+    "cx": 3.0,  # px
+    "cy": 3.0,
+    "baseline": 0.005,  # relative
+    "roll of the right camera": 0.005,  # rad, about x: rows of the right image
+    "pitch of the right camera": 0.002,  # about y: disparities
+    "yaw of the right camera": 0.005,  # about z
+    "mounting about x": 0.02,  # rad, of the camera in the body that the truth is of
+    "mounting about y": 0.02,
+    "mounting about z": 0.02,
+    "clock of the truth": 0.05,  # s
+}
+RIG = 7  # of these are the rig's
+STEP = 1e-2  # of a prior standard deviation, for derivatives
+LEAST, MOST = 1e-7, 1.0  # m and rad, standard deviations of the floor that are looked at
+FEWEST = 12  # motions: six numbers of the floor beside what is shared
+
+
+@dataclass(frozen=True, eq=False)
+class SharedError:
+    """What the motions of one part of a drive tell about the errors that all share."""
+
+    mean: Array  # (11,), in the order and units of :data:`SHARED`
+    covariance: Array  # (11, 11)
+    floor: Array  # (6,), standard deviations of the truth of a motion, m and rad
+
+    def predict(self, J: Array, S: Array) -> tuple[Array, Array]:
+        """Expected errors (n, 6) of other motions, and their covariances (n, 6, 6).
+
+        Parameters
+        ----------
+        J : (n, 6, 11), of :func:`sensitivities`
+        S : (n, 6, 6), propagated from the noise of the pixels
+        """
+        shared = J @ self.covariance @ np.swapaxes(J, 1, 2)
+        return J @ self.mean, S + shared + np.diag(self.floor**2)
+
+
+def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -> Array:
+    """Derivative (n, 6, 11) of each motion's error by what is shared.
+
+    An error is the difference of the translations (m) and the rotation vector of R R_true' (rad), in the first camera's
+    axes. For the rig's parameters the refinement of the inliers is repeated with another rig. A bridge errs by the rig
+    as the motions do that it is interpolated from.
+
+    Parameters
+    ----------
+    t : (n + 1,), s, of the stereo pairs
+
+    Raises
+    ------
+    InputError
+        Every motion is a bridge, or the refinement with another rig fails.
+    """
+    dt = np.diff(t)
+    speed = np.array([_twist(m.pose) for m in motions]) / dt[:, None]
+    rate = np.gradient(speed, 0.5 * (t[1:] + t[:-1]), axis=0) if len(motions) > 1 else np.zeros_like(speed)
+    J, measured = np.empty((len(motions), 6, len(SHARED))), np.array([not motion.fault for motion in motions], bool)
+    if not measured.any():
+        raise InputError("motions: all are bridges, and have no matches that could tell")
+    for k in np.flatnonzero(measured).tolist():
+        J[k, :, :RIG] = _by_rig(rig, motions[k])
+    for k in np.flatnonzero(~measured).tolist():
+        around, share = neighbours(measured, t, k)
+        J[k, :, :RIG] = np.tensordot(dt[k] * share / dt[around], J[around, :, :RIG], axes=1)
+    for k, motion in enumerate(motions):
+        J[k, :3, RIG:-1] = cross_matrix(motion.pose.t)
+        J[k, 3:, RIG:-1] = motion.pose.R - np.eye(3)
+        J[k, :, -1] = rate[k] * dt[k]
+    return J
+
+
+def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
+    """Shared errors and floor of highest likelihood.
+
+    Parameters
+    ----------
+    errors : (n, 6), against truth
+    J : (n, 6, 11), of :func:`sensitivities`
+    S : (n, 6, 6), propagated from the noise of the pixels
+
+    Raises
+    ------
+    InputError
+        Fewer than 12 motions, or shapes that do not fit.
+    """
+    n = len(errors)
+    if errors.shape != (n, 6) or J.shape != (n, 6, len(SHARED)) or S.shape != (n, 6, 6):
+        raise InputError(f"errors, J, S: shapes {errors.shape}, {J.shape}, {S.shape} do not fit")
+    if n < FEWEST:
+        raise InputError(f"errors: of {n} motions, at least {FEWEST} are needed for a floor of six numbers")
+
+    start = np.log(np.clip(errors.std(axis=0), 10.0 * LEAST, 0.1 * MOST))
+    bounds = optimize.Bounds(np.full(6, np.log(LEAST)), np.full(6, np.log(MOST)))
+    best = optimize.minimize(  # type: ignore[call-overload]  # the stubs do not know jac=True
+        lambda x: posterior(np.exp(x), errors, J, S)[2:], start, jac=True, method="L-BFGS-B", bounds=bounds
+    )
+    floor = np.exp(best.x)
+    mean, covariance, *_ = posterior(floor, errors, J, S)
+    return SharedError(mean, covariance, floor)
+
+
+def posterior(floor: Array, errors: Array, J: Array, S: Array) -> tuple[Array, Array, float, Array]:
+    """Mean and covariance of what is shared; minus twice the log-likelihood, and its derivative by log floor.
+
+    The errors (n, 6) have the covariance V = C + J Pi J', with C that of each motion alone and Pi the prior.
+
+    Parameters
+    ----------
+    floor : (6,), standard deviations
+    J : (n, 6, 11)
+    S : (n, 6, 6)
+    """
+    prior = np.array(list(SHARED.values()))
+    C = S + np.diag(floor**2)
+    W = np.linalg.inv(C)
+    WJ = W @ J
+    H = np.einsum("nia,nib->ab", J, WJ) + np.diag(prior**-2.0)
+    covariance = np.linalg.inv(H)
+    mean = covariance @ np.einsum("nia,ni->a", WJ, errors)
+    weighted = np.einsum("nij,nj->ni", W, errors - J @ mean)  # V^-1 e
+    diagonal = np.einsum("nii->ni", W) - np.einsum("nia,ab,nib->ni", WJ, covariance, WJ)  # of V^-1
+    volume = np.linalg.slogdet(C)[1].sum() + np.linalg.slogdet(H * np.outer(prior, prior))[1]
+    slope = 2.0 * floor**2 * (diagonal - weighted**2).sum(axis=0)
+    return mean, covariance, float((errors * weighted).sum() + volume), slope
+
+
+def _twist(pose: RelativePose) -> Array:
+    return np.concatenate([pose.t, Rotation.from_matrix(pose.R).as_rotvec()])
+
+
+def _by_rig(rig: StereoRig, motion: RelativeMotion) -> Array:
+    """Derivative (6, 7) of the refined pose, by central differences."""
+    i = motion.inliers
+    S0, S1 = diagonal(motion.sigma0[i]), diagonal(motion.sigma1[i])
+    columns = []
+    for k, prior in enumerate(list(SHARED.values())[:RIG]):
+        change = np.zeros(RIG)
+        change[k] = STEP * prior
+        one, other = (
+            refine_reprojection(
+                perturbed(rig, sign * change), motion.uv0[i], motion.uv1[i], motion.pose, S0, S1, robust="cauchy"
+            ).pose
+            for sign in (1.0, -1.0)
+        )
+        turn = Rotation.from_matrix(one.R @ other.R.T).as_rotvec()
+        columns.append(np.concatenate([one.t - other.t, turn]) / (2.0 * STEP * prior))
+    return np.column_stack(columns)
+
+
+def perturbed(rig: StereoRig, change: Array) -> StereoRig:
+    """The rig with other parameters: ``change`` (7,) in the order and units of :data:`SHARED`."""
+    f, cx, cy, baseline = change[:4]
+    scale = np.diag([1.0 + f, 1.0 + f, 1.0])
+    shift = np.array([[0.0, 0.0, cx], [0.0, 0.0, cy], [0.0, 0.0, 0.0]])
+    lenses = []
+    for K in (rig.K_left, rig.K_right):
+        lens = scale @ K
+        lens[:, 2] = K[:, 2]
+        lenses.append(lens + shift)
+    turn = Rotation.from_rotvec(change[4:]).as_matrix()
+    return StereoRig(lenses[0], lenses[1], rig.R @ turn, (1.0 + baseline) * rig.t, rig.image_size)

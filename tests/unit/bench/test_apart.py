@@ -1,0 +1,91 @@
+"""Calls in a thread that takes no signals, and trials that are given up."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+import consistency as cs
+from consistency.bench.filters.compiled import Compiled, Halted
+from consistency.bench.filters.kernel.apart import apart
+from consistency.bench.runs.isolating import Isolation
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Ctrl-C as in a terminal."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_the_main_thread_does_not_make_the_call_itself() -> None:
+    assert apart(threading.current_thread) is not threading.main_thread()
+    inner = apart(lambda: (threading.current_thread(), apart(threading.current_thread)))
+    assert inner[0] is inner[1], "a thread that takes no signals needs no other"
+
+
+def test_results_and_exceptions_come_back() -> None:
+    assert apart(divmod, 7, 2) == (3, 1)
+    with pytest.raises(ZeroDivisionError):
+        apart(divmod, 7, 0)
+
+
+@pytest.mark.usefixtures("ctrl_c")
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize("looks", [True, False])
+def test_ctrl_c_does_not_wait_for_the_call(looks: bool) -> None:
+    told, over = threading.Event(), threading.Event()
+
+    def work() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        (told if looks else over).wait(20.0)
+        over.set()
+
+    begin = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        apart(work, stop=told.set)
+    assert time.monotonic() - begin < 5.0
+    assert told.is_set()
+    assert over.is_set() == looks, "what looks has ended, what does not is left alone"
+    over.set()
+
+
+@pytest.mark.usefixtures("ctrl_c")
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_what_cannot_be_stopped_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    over = threading.Event()
+
+    def work() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        over.wait(20.0)
+
+    monkeypatch.setattr("consistency.bench.filters.kernel.apart.PATIENCE", 20.0)
+    begin = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        apart(work)
+    assert time.monotonic() - begin < 5.0
+    over.set()
+
+
+def test_a_trial_that_was_given_up(linear: cs.Scenario) -> None:
+    filter_ = cs.get_filter("kf")
+    assert isinstance(filter_, Compiled)
+    with pytest.raises(Halted, match="'kf' was told to stop in step 1"):
+        filter_.run(cs.simulate(linear), linear.belief, np.ones(1, np.int64))
+
+
+def test_the_end_of_a_study_gives_up_its_trials(linear: cs.Scenario) -> None:
+    trial, isolation = cs.simulate(linear), Isolation([cs.get_filter("kf")], linear.belief)
+    with isolation:
+        assert len(isolation.run(trial)) == 1
+    with pytest.raises(Halted):
+        isolation.run(trial)
+    with isolation:
+        assert isolation.run(trial)[0].failure is None

@@ -1,0 +1,316 @@
+"""A filter with an error of its own is judged in it, by either way in; the additive error and the map stand beside."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from invariant import Invariant
+from recorded import read_recordings
+
+import consistency as cs
+from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.runs.sequential import run_until_decided
+from consistency.bench.store.curves import curves, run_means
+from consistency.bench.store.judge import analyse, evidence_of, until_decided
+from consistency.bench.store.results import open_results
+from consistency.referee.cli import main
+from consistency.referee.diagnostics import Evidence, Interval, Settings, judge, map_score
+from consistency.referee.diagnostics.export import map_text
+from consistency.referee.diagnostics.records import MapScore
+from consistency.referee.diagnostics.scale import ratio_interval
+from consistency.referee.reading.columns import OWN_COVARIANCE
+from consistency.referee.terminal.table import print_verdicts, verdicts_json
+from consistency.referee.verdicts.baselines import baseline_of
+from consistency.referee.verdicts.files import analyse_recordings
+
+RUNS = 24
+KEYS = ["run", "step", "t", "x", "y", "heading"]
+
+
+@pytest.fixture(scope="module")
+def results(uvd: cs.Scenario) -> cs.Results:
+    return cs.run_trials(uvd, ["ekf-uvd", Invariant()], runs=RUNS, seed=5, jobs=1)
+
+
+@pytest.fixture(scope="module")
+def folder(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("own") / "run"
+    results.write(out)
+    return out
+
+
+def export(results: cs.Results, name: str, out: Path) -> tuple[Path, Path]:
+    """What a user would write of a filter: its poses with the covariance of its own error, and the truth."""
+    rows = results.estimates[results.estimates["filter"] == name]
+    own = rows[list(OWN_COVARIANCE)].rename(columns=lambda column: column.removeprefix("own_"))
+    pd.concat([rows[KEYS], own], axis=1).to_parquet(out / f"{name}.parquet", index=False)
+    assert results.truth is not None
+    results.truth.to_parquet(out / "truth.parquet", index=False)
+    return out / f"{name}.parquet", out / "truth.parquet"
+
+
+@pytest.fixture(scope="module")
+def exported(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return export(results, "right", tmp_path_factory.mktemp("exported"))
+
+
+# --- both ways in give the same number --------------------------------------------------------------
+
+
+def test_both_ways_in_give_the_same_nees_and_verdict(results: cs.Results, exported: tuple[Path, Path]) -> None:
+    c = curves(results, "right")
+    assert c.own is not None
+    [recording] = read_recordings(*exported, error="right")
+    np.testing.assert_allclose(recording.nees, c.own.nees, rtol=1e-9)
+    np.testing.assert_allclose(recording.error[:, 1:], c.own.error[:, 1:], rtol=0, atol=1e-12)
+    ours, theirs = cs.analyse(results)["right"], analyse_recordings([recording])["right"]
+    assert (ours.status, ours.convention) == (theirs.status, theirs.convention)
+    assert ours.statistic == pytest.approx(theirs.statistic, rel=1e-9)
+    assert ours.inflation_interval == pytest.approx(theirs.inflation_interval, rel=1e-9)
+    [wrong] = read_recordings(*exported, error="so2")
+    assert np.nanmax(np.abs(wrong.nees - c.own.nees)) > 1.0, "negative control"
+
+
+def test_both_ways_of_the_invariant_filter_of_the_bench(uvd: cs.Scenario, tmp_path: Path) -> None:
+    results = cs.run_trials(uvd, ["ri-ekf-uvd"], runs=RUNS, seed=5, jobs=1)
+    c = curves(results, "ri-ekf-uvd")
+    [recording] = read_recordings(*export(results, "ri-ekf-uvd", tmp_path), error="right")
+    np.testing.assert_allclose(recording.nees, c.judged.nees, rtol=1e-9)
+    ours, theirs = cs.analyse(results)["ri-ekf-uvd"], analyse_recordings([recording])["ri-ekf-uvd"]
+    assert (ours.status, ours.convention) == (theirs.status, "right")
+    trial = cs.simulate(uvd, 3, seed=5)
+    compiled = run_filter(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
+    stepped = step_through(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
+    np.testing.assert_allclose(stepped.own, compiled.own, rtol=1e-7, atol=1e-12)
+    np.testing.assert_array_equal(c.own.covariance[3, 1:], compiled.own[1:])
+
+
+def test_both_ways_by_the_command_line(
+    folder: Path, exported: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def analysed(*arguments: str) -> dict[str, object]:
+        with pytest.raises(SystemExit) as stop:
+            main(["analyse", *arguments, "--json"])
+        assert not stop.value.code
+        said: dict[str, object] = json.loads(capsys.readouterr().out)["right"]
+        return said
+
+    estimates, truth = (str(path) for path in exported)
+    ours = analysed(str(folder), "--filter", "right")
+    theirs = analysed(estimates, "--truth", truth, "--error", "right")
+    files = (str(folder / "estimates.parquet"), "--truth", str(folder / "truth.parquet"), "--filter", "right")
+    direct, additive = analysed(*files, "--error", "right"), analysed(*files)
+    mixed = analysed(estimates, "--truth", truth, "--error", "so2")
+    anees = ours["statistics"]["mean_anees"]
+    assert ours["statistics"]["convention"] == "right"
+    assert theirs["statistics"]["mean_anees"] == pytest.approx(anees, rel=1e-9)
+    assert direct["statistics"]["mean_anees"] == pytest.approx(anees, rel=1e-9), "the table of the results themselves"
+    assert (theirs["status"], direct["status"]) == (ours["status"], ours["status"])
+    world = ours["statistics"]["world"]
+    assert additive["statistics"]["mean_anees"] == pytest.approx(world["statistics"]["mean_anees"], rel=1e-9)
+    assert additive["status"] == world["status"]
+    assert mixed["statistics"]["mean_anees"] != pytest.approx(anees, rel=0.01), "negative control"
+
+
+def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder: Path) -> None:
+    by_name = {
+        r.name: r for r in read_recordings(folder / "estimates.parquet", folder / "truth.parquet", error="right")
+    }
+    c = curves(open_results(folder), "ekf-uvd")
+    np.testing.assert_array_equal(by_name["ekf-uvd"].covariance[:, 1:], c.covariance[:, 1:])
+    assert not any("own_P" in note for note in by_name["ekf-uvd"].notes)
+    assert any("own_P" in note for note in by_name["right"].notes)
+
+
+# --- what is judged ---------------------------------------------------------------------------------
+
+
+def test_curves_hold_both_errors(results: cs.Results, folder: Path) -> None:
+    for source in (results, open_results(folder)):
+        c = curves(source, "right")
+        rows = results.estimates.query("filter == 'right' and run == 3")
+        assert c.own is not None
+        np.testing.assert_array_equal(c.own.nees[3], rows["own_nees"])
+        np.testing.assert_array_equal(c.own.covariance[3, :, 0, 2], rows["own_P_xh"])
+        np.testing.assert_array_equal(c.own.covariance[3, :, 2, 0], rows["own_P_xh"])
+        np.testing.assert_array_equal(c.nees[3], rows["nees"])
+        assert c.judged is c.own
+        assert (c.convention, curves(source, "ekf-uvd").convention) == ("right", "so2")
+        assert curves(source, "ekf-uvd").own is None
+
+
+def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results: cs.Results) -> None:
+    """Own covariances a quarter of what they should be: the filter is overconfident in its own error alone."""
+    columns = list(OWN_COVARIANCE)
+    table = results.estimates.copy()
+    table[columns] /= 4.0
+    table["own_nees"] *= 4.0
+    v = analyse(replace(results, estimates=table), ["right"])["right"]
+    honest = analyse(results)["right"]
+    assert (v.status, v.convention) == ("overconfident", "right")
+    assert v.world is not None
+    assert honest.world is not None
+    assert v.world.status == honest.world.status != "overconfident"
+    assert v.scale.mean_anees == pytest.approx(4.0 * honest.scale.mean_anees)
+    assert v.world.scale.mean_anees == honest.world.scale.mean_anees
+    assert v.in_world is v.world
+    plain = analyse(results)["ekf-uvd"]
+    assert (plain.world, plain.convention, plain.in_world) == (None, None, plain)
+    assert "world" not in plain.statistics
+    assert "convention" not in plain.statistics
+
+
+def test_run_means_and_baselines_are_of_the_own_error(results: cs.Results) -> None:
+    c = curves(results, "right")
+    np.testing.assert_allclose(run_means(c), np.nanmean(c.own.nees, axis=1), rtol=1e-12)
+    np.testing.assert_allclose(baseline_of(results).filters["right"].nees, run_means(c) / 3.0, rtol=1e-12)
+
+
+def test_a_null_where_the_own_covariance_should_be(results: cs.Results) -> None:
+    table = results.estimates.copy()
+    table.loc[table.index[-5], "own_P_xy"] = np.nan
+    with pytest.raises(cs.InputError, match=r"estimates of 'right': column 'own_P_xy' is null, but manifest\.json"):
+        analyse(replace(results, estimates=table))
+
+
+def test_until_decided_says_both(uvd: cs.Scenario) -> None:
+    results, verdicts = run_until_decided(uvd, [Invariant()], max_runs=13, seed=5, jobs=1)
+    v = verdicts["right"]
+    c = curves(results, "right")
+    assert (v.convention, v.runs) == ("right", len(c.runs))
+    assert v.world is not None
+    assert v.world.scale.mean_anees == pytest.approx(np.nanmean(c.nees[: v.world.runs]))
+    assert v.map is not None
+    assert v.map.runs == v.runs
+    again = analyse(results)["right"]
+    assert (again.status, again.statistic, again.world.statistic) == (v.status, v.statistic, v.world.statistic)
+
+
+def test_a_look_scores_the_maps_of_its_own_runs(results: cs.Results) -> None:
+    from consistency.referee.diagnostics import sequential_design
+
+    v = until_decided(curves(results, "ekf-uvd"), sequential_design(3, max_runs=12))
+    assert (v.runs, v.map.runs) == (12, 12)
+
+
+# --- the map ----------------------------------------------------------------------------------------
+
+
+def test_a_score_by_hand() -> None:
+    nan = np.nan
+    run, nees = np.array([4, 4, 9, 9, 9, 11]), np.array([3.0, 9.0, nan, 1.5, 1.5, nan])
+    score = map_score(run, nees)
+    assert score.ratio == ratio_interval(np.array([2.0, 0.5]), 3), "each run counts once"
+    assert (score.runs, score.landmarks, score.left_out) == (2, 4, 2)
+    assert score.ratio.value == 1.25
+    nothing = map_score(run[-1:], nees[-1:])
+    assert (nothing.runs, nothing.landmarks, nothing.left_out) == (0, 0, 1)
+    assert np.isnan(nothing.ratio.value)
+
+
+def test_the_interval_of_a_score_holds_what_is_right() -> None:
+    """Landmarks of a run share one error: five standard errors below 95 % of 400 intervals hold 1."""
+    rng = np.random.default_rng(3)
+    run = np.repeat(np.arange(30), 8)
+    held = [map_score(run, np.repeat(rng.chisquare(3, 30), 8)).ratio.holds(1.0) for _ in range(400)]
+    assert np.mean(held) > 0.896
+
+
+def test_the_score_is_that_of_the_table(results: cs.Results) -> None:
+    table = results.map
+    means = table[table["filter"] == "ekf-uvd"].groupby("run")["nees"].mean() / 3.0
+    v = analyse(results)["ekf-uvd"]
+    assert v.map.ratio.value == pytest.approx(means.mean())
+    assert (v.map.runs, v.map.landmarks) == (RUNS, len(table) // 2)
+    in_json = [v.statistics[f"map_{key}"] for key in ("ratio", "runs", "landmarks", "left_out")]
+    assert in_json == [v.map.ratio.value, RUNS, len(table) // 2, 0]
+
+
+def test_the_map_is_no_part_of_the_verdict(results: cs.Results) -> None:
+    bad = results.map.assign(nees=1e6)
+    with_map, without = (analyse(replace(results, map=m))["ekf-uvd"] for m in (bad, None))
+    assert with_map.map.ratio.value > 1e5
+    assert without.map is None
+    assert (with_map.status, with_map.reasons, with_map.answers) == (without.status, without.reasons, without.answers)
+    assert not any(key.startswith("map") for key in without.statistics)
+
+
+# --- terminal ---------------------------------------------------------------------------------------
+
+
+def printed(capsys: pytest.CaptureFixture[str], *names: str, results: cs.Results) -> list[str]:
+    print_verdicts(analyse(results, list(names)))
+    return capsys.readouterr().out.splitlines()
+
+
+def test_the_terminal_names_each_error(results: cs.Results, capsys: pytest.CaptureFixture[str]) -> None:
+    head, plain, own, world, *below = printed(capsys, "ekf-uvd", "right", results=results)
+    v = analyse(results)["right"]
+    assert head.split()[:4] == ["filter", "error", "verdict", "ANEES"]
+    assert plain.split()[:2] == ["ekf-uvd", "so2"]
+    assert own.split()[:4] == ["right", "right", v.status, f"{v.scale.mean_anees:.2f}"]
+    assert f"{v.world.accuracy.rmse_position:.3f}" in own.split()
+    assert world.split()[:5] == ["so2,", "beside", "it", v.world.status, f"{v.world.scale.mean_anees:.2f}"]
+    assert below[0].startswith("error right: Log(truth estimate^-1) of SE(2), in the world frame; so2: position")
+    assert below[1].startswith("ratio of the worst axis: ekf-uvd ")
+    assert below[2].startswith("map after the last step, mean NEES / 3: ekf-uvd ")
+    assert f"right {v.map.verdict.status}, {map_text(v.map)}" in below[2]
+
+
+def test_without_maps_and_own_errors_nothing_is_added(results: cs.Results, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = printed(capsys, "ekf-uvd", results=replace(results, map=None))
+    assert len(lines) == 3
+    assert lines[2].startswith("ratio of the worst axis: ekf-uvd ")
+    assert lines[0].split()[:3] == ["filter", "verdict", "ANEES"]
+    with_map = printed(capsys, "ekf-uvd", results=results)
+    assert with_map[:3] == lines
+    assert len(with_map) == 4
+
+
+def test_a_verdict_in_words(results: cs.Results) -> None:
+    v = analyse(results)["right"]
+    text = str(v)
+    assert "  error             right: Log(truth estimate^-1) of SE(2), in the world frame" in text
+    assert "(additive error, 'so2')" in text
+    assert f"after the last step; the map is {v.map.verdict.reasons[0]}" in text
+    plain = str(analyse(replace(results, map=None))["ekf-uvd"])
+    assert "map" not in plain
+    assert "error  " not in plain
+
+
+@pytest.mark.parametrize(
+    ("score", "text"),
+    [
+        (MapScore(Interval(1.5, 1.1, 2.1), 3, 30, 0), "1.50 [1.10, 2.10]"),
+        (MapScore(Interval(1.5, 1.1, 2.1), 3, 30, 2), "1.50 [1.10, 2.10] (2 of 32 landmarks left out)"),
+        (MapScore(Interval(np.nan, np.nan, np.nan), 0, 0, 2), "- (2 of 2 landmarks left out)"),
+    ],
+)
+def test_a_score_in_words(score: MapScore, text: str) -> None:
+    assert map_text(score) == text
+
+
+def test_json_holds_both(results: cs.Results) -> None:
+    said = json.loads(verdicts_json(analyse(results)))
+    own = said["right"]["statistics"]
+    v = analyse(results)["right"]
+    assert (own["convention"], own["mean_anees"]) == ("right", v.scale.mean_anees)
+    assert own["world"]["status"] == v.world.status
+    assert own["world"]["statistics"]["mean_anees"] == v.world.scale.mean_anees
+    assert own["map_ratio_interval"] == list(v.map.ratio[1:])
+
+
+def test_evidence_names_the_error_it_is_of(results: cs.Results) -> None:
+    c = curves(results, "right")
+    own, additive = evidence_of(c, 10), evidence_of(c, 10, additive=True)
+    np.testing.assert_array_equal(own.nees, c.own.nees[:10])
+    np.testing.assert_array_equal(additive.nees, c.nees[:10])
+    np.testing.assert_array_equal(own.covariance, c.own.covariance[:10])
+    np.testing.assert_array_equal(additive.error, c.error[:10])
+    assert isinstance(own, Evidence)
+    assert judge(own, Settings()).status == judge(evidence_of(c, 10), Settings()).status

@@ -1,0 +1,204 @@
+"""Verdicts on thousands of runs: how much memory each run takes, and that blocks change nothing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import consistency as cs
+from consistency.bench.store.curves import curves
+from consistency.bench.store.judge import analyse, verdict_of
+from consistency.bench.store.results import open_results
+from consistency.referee.diagnostics import Evidence, Settings, blocks, judge, summary
+from consistency.referee.diagnostics.sample import sample_of
+from consistency.referee.diagnostics.symmetric import Symmetric
+from consistency.referee.diagnostics.whitening import all_finite, squared_length
+from consistency.referee.terminal.table import verdicts_json
+
+STEPS = 200
+RUNS = 4000
+
+
+def evidence(runs: int, steps: int = STEPS, bias: float = 0.3) -> Evidence:
+    """Errors with a mean, so that every question is asked twice, and covariances in half."""
+    rng = np.random.default_rng(0)
+    P = Symmetric.filled((runs, steps), 3, 0.2)
+    for i in range(3):
+        P.entry(i, i)[:] = 1.0 + i
+    error = rng.standard_normal((runs, steps, 3)) + bias
+    nis = rng.chisquare(2, (runs, steps))
+    return Evidence("f", error, P, nis=nis, nis_dof=np.full((runs, steps), 2), axes=("x", "y", "heading"))
+
+
+def numbers_a_cell(work: Callable[[Evidence], object], runs: int = 1400) -> float:
+    """Most numbers of 8 bytes that ``work`` holds beside what it is given, for each further pair of run and step."""
+    most = []
+    for count in (runs, 3 * runs):
+        given = evidence(count)
+        tracemalloc.start()
+        work(given)
+        most.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    # from 1400 runs on a block of steps is not all of them
+    return (most[1] - most[0]) / (2 * runs * STEPS * 8)
+
+
+def numbers(value: object) -> list[float]:
+    """Every number of a verdict, one after the other."""
+    if isinstance(value, dict | list | tuple | np.ndarray):
+        parts = value.values() if isinstance(value, dict) else value
+        return [number for part in parts for number in numbers(part)]
+    return [float(value)] if isinstance(value, int | float | np.number) else []
+
+
+@pytest.mark.parametrize("settings", [Settings(), Settings(allow="conservative")], ids=["both", "conservative"])
+def test_a_verdict_takes_six_numbers_for_each_step_of_a_run(settings: Settings) -> None:
+    """Four are kept (whitened errors and NEES), one is on the way; the whole-array copies of before took 15."""
+    assert numbers_a_cell(lambda given: judge(given, settings)) < 6.5
+
+
+def test_a_summary_of_runs_takes_hardly_any() -> None:
+    nees = np.random.default_rng(0).chisquare(3, (4200, STEPS))
+    assert numbers_a_cell(lambda g: summary(nees[: len(np.asarray(g.nis))], 3, g.error, g.covariance)) < 0.5
+
+
+@pytest.mark.parametrize("settings", [Settings(tolerance=1.1), Settings(allow="conservative")], ids=["both", "one"])
+def test_small_blocks_say_what_large_ones_do(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = evidence(90, 23)
+    assert given.error is not None
+    given.error[::7, 11:] = np.nan
+    given.error[40:, 15:] *= 3.0
+    whole = judge(given, settings)
+    monkeypatch.setattr(blocks, "ROWS", 400)
+    monkeypatch.setattr(blocks, "FEWER", 100)
+    parts = judge(given, settings)
+    assert parts.reasons == whole.reasons
+    np.testing.assert_allclose(numbers(parts.statistics), numbers(whole.statistics), rtol=1e-12)
+
+
+def test_errors_about_their_mean() -> None:
+    """With variances 1, 2, 3 alone the NEES about the mean has a closed form."""
+    given = evidence(30, 8)
+    P = Symmetric.filled((30, 8), 3, 0.0)
+    for i in range(3):
+        P.entry(i, i)[:] = 1.0 + i
+    sample = sample_of(replace(given, covariance=P), Settings())
+    assert sample is not None
+    assert given.error is not None
+    about = (given.error - given.error.mean(axis=0)) * np.sqrt(30 / 29)
+    nees = (np.square(about) / [1.0, 2.0, 3.0]).sum(axis=-1)
+    np.testing.assert_allclose(sample.centred_means(slice(2, None)), nees[:, 2:].mean(axis=1) / 3)
+    centred = sample.centred()
+    np.testing.assert_allclose(centred.nees, nees)
+    np.testing.assert_allclose(centred.group_means([1]), (np.square(about[..., 1]) / 2.0).mean(axis=1))
+
+
+def test_evidence_is_not_changed_by_a_verdict() -> None:
+    given, same = evidence(40, 20), evidence(40, 20)
+    assert "bias" in judge(given).faults
+    np.testing.assert_array_equal(given.error, same.error)
+    np.testing.assert_array_equal(given.covariance, same.covariance)
+
+
+def test_half_of_a_covariance_says_what_the_whole_does() -> None:
+    given = evidence(40, 20)
+    full = replace(given, covariance=np.asarray(given.covariance))
+    np.testing.assert_array_equal(numbers(judge(given).statistics), numbers(judge(full).statistics))
+
+
+def test_entries_are_those_of_the_matrices() -> None:
+    rng = np.random.default_rng(0)
+    P = rng.standard_normal((4, 5, 3, 3))
+    P += np.swapaxes(P, -1, -2)
+    half = Symmetric.filled((4, 5), 3)
+    for i in range(3):
+        for j in range(i + 1):
+            half.entry(i, j)[:] = P[..., i, j]
+    for each in (half, Symmetric.of(P)):
+        assert each.shape == P.shape
+        np.testing.assert_array_equal(each, P)
+        np.testing.assert_array_equal(each[1:3, ::2], P[1:3, ::2])
+        np.testing.assert_array_equal(each[2, :, 0, 1], P[2, :, 0, 1])
+        np.testing.assert_array_equal(each.part([2, 0]), P[..., [2, 0], :][..., [2, 0]])
+        np.testing.assert_array_equal(each.variances, np.diagonal(P, axis1=-2, axis2=-1))
+    P[1, 2, 0, 2] = P[1, 2, 2, 0] = np.nan
+    half.entry(2, 0)[1, 2] = np.nan
+    for each in (half, Symmetric.of(P)):
+        assert np.argwhere(~each.where_all(np.isfinite)).tolist() == [[1, 2]]
+
+
+@pytest.mark.parametrize("n", range(1, 12))
+def test_lengths_and_missing_components(n: int) -> None:
+    w = np.random.default_rng(0).standard_normal((6, 7, n))
+    np.testing.assert_array_equal(squared_length(w), np.square(w).sum(axis=-1))
+    w[2, 3, n - 1] = np.inf
+    np.testing.assert_array_equal(all_finite(w), np.isfinite(w).all(axis=-1))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Results of 20 and of 4000 runs of 150 steps with maps, the same few runs again and again."""
+    out = tmp_path_factory.mktemp("many")
+    scenario = cs.load_scenario("herath2007-stereo").variant("many", truth__steps=150)
+    few = cs.run_trials(scenario, ["ekf-uvd"], runs=20, seed=1, jobs=1)
+    few.write(out / "few")
+    tables = {name: _again(getattr(few, name), RUNS // 20) for name in ("estimates", "truth", "map")}
+    manifest = few.manifest | {"runs": RUNS}
+    cs.Results(tables["estimates"], few.failures, tables["truth"], few.landmarks, manifest, tables["map"]).write(
+        out / "many"
+    )
+    return out / "few", out / "many"
+
+
+def _again(table: pd.DataFrame, times: int) -> pd.DataFrame:
+    parts = [table.assign(run=table["run"] + 20 * k) for k in range(times)]
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_a_filter_read_in_parts_is_judged_as_in_whole(folders: tuple[Path, Path]) -> None:
+    results = open_results(folders[0])
+    whole = {name: verdict_of(curves(results, name), Settings()) for name in results.filters}
+    assert whole["ekf-uvd"].map is not None
+    assert verdicts_json(analyse(results)) == verdicts_json(whole)
+
+
+MEASURE = """
+import sys
+from pathlib import Path
+{work}
+def most():  # of this program: ru_maxrss is that of the parent, too
+    return 1024 * int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+few, many = map(Path, sys.argv[1:])
+work(few)
+before = most()
+work(many)
+print(most() - before)
+"""
+READ = "from consistency.bench.store.results import open_results\n"
+WORK = {
+    "analyse": READ + "from consistency.bench.store.judge import analyse\nwork = lambda f: analyse(open_results(f))",
+    "report": "from consistency.bench.pages.build import build_report as work",
+    "baseline": "from consistency.referee.verdicts.baselines import read_baseline as work",
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the memory from /proc")
+@pytest.mark.parametrize(("name", "most"), [("analyse", 40), ("report", 40), ("baseline", 45)])
+def test_a_filter_is_read_and_judged_in_bounded_memory(folders: tuple[Path, Path], name: str, most: int) -> None:
+    """Twelve numbers a cell are read, five are worked out; allocators keep about as much again of so little.
+
+    With whole tables or whole-array copies it was 49, 49 and 77.
+    """
+    command = [sys.executable, "-c", MEASURE.format(work=WORK[name]), *map(str, folders)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | {"PYTHONHASHSEED": "0"})
+    grown = int(done.stdout) / (RUNS * 150 * 8)
+    assert grown < most

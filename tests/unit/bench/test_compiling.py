@@ -1,0 +1,315 @@
+"""Kernels compiled side by side: nothing is left behind, whoever is killed, and what is not kept is compiled here."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from consistency.bench.filters.kernel import foreseen, kept
+from consistency.bench.filters.kernel.content import Content
+from consistency.bench.filters.kernel.foreseen import FIRST
+from consistency.bench.filters.kernel.jit import Kernel, Outlook
+from consistency.bench.filters.kernel.slam import robot_width
+from consistency.bench.runs import compiling
+from consistency.bench.runs.findings import experiments
+from consistency.bench.runs.montecarlo import resolve_filters
+from consistency.bench.scenario import load_scenario
+from consistency.bench.sweeps import running
+from consistency.bench.sweeps.folder import SweepFolder
+from consistency.bench.sweeps.plan import load_sweep
+
+Done = Callable[..., tuple[str, str]]
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="kernels are compiled side by side on Linux")
+SCRIPT = """
+import multiprocessing, os, resource, signal, sys, time
+from pathlib import Path
+from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.kernel.jit import Kernel
+from consistency.bench.runs import compiling
+
+def total(values):
+    result = 0.0
+    for value in values:
+        result += value
+    return result
+
+class Sum(Compiled):
+    def __init__(self, name, values):
+        self.name, self.values, self.kernel = name, values, Kernel(total)
+    def outlook(self, *_):
+        return self.kernel.outlook(self.values)
+    def compile(self, *_):
+        if os.getpid() != here:
+            Path(folder, "processes", str(os.getpid())).touch()
+            if what == "die":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if what in ("hang", "abandon"):
+                os.kill(here, signal.SIGINT)
+                time.sleep(60.0)
+        self.kernel.compile(self.values)
+
+def case():
+    os.environ["NUMBA_CACHE_DIR"] = f"{folder}/cache"
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(f"{folder}/{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background of a shell
+    filters = [Sum("two", (1.0, 2.0)), Sum("three", (1.0, 2.0, 3.0)), Sum("again", (4.0, 5.0))]
+    if what == "full":
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
+    if what == "abandon":
+        signal.signal(signal.SIGINT, lambda *_: os.kill(here, signal.SIGKILL))
+    if what == "nobody":
+        os.setgroups([])
+        os.setgid(65534)
+        os.setuid(65534)
+    try:
+        compiling.compile_for(filters, None, None, int(jobs))
+    except KeyboardInterrupt:
+        print("stopped")
+    else:
+        print(*(f.kernel(f.values) for f in filters), *(f.kernel.loaded for f in filters))
+    assert not multiprocessing.active_children()
+
+os.environ["NUMBA_CACHE_DIR"] = os.devnull
+Kernel(total)((1.0,))  # what another user may not read is loaded
+for line in sys.stdin:  # each case in a copy of this process, as loading Numba takes seconds
+    folder, what, jobs = line.rstrip("\\n").split("\\t")
+    if not (child := os.fork()):
+        here = os.getpid()
+        try:
+            case()
+            sys.stdout.flush()
+        except BaseException as error:
+            os.write(2, repr(error).encode())
+            os._exit(1)
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def cases() -> Iterator[subprocess.Popen[str]]:
+    """A process that does a case for each line: folder, what happens, jobs."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdin=pipe, stdout=pipe, text=True) as process:
+        yield process
+        process.stdin.close()  # type: ignore[union-attr]
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder that other users can read, for the cache and the numbers of the processes that have compiled."""
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name)
+        path.chmod(0o755)
+        (path / "processes").mkdir()
+        (path / "processes").chmod(0o777)
+        yield path
+
+
+@pytest.fixture
+def done(cases: subprocess.Popen[str], folder: Path) -> Done:
+    """Does a case, and gives what it says on standard output and error."""
+
+    def done(what: str = "", jobs: int = 2) -> tuple[str, str]:
+        assert cases.stdin is not None
+        assert cases.stdout is not None
+        cases.stdin.write(f"{folder}\t{what}\t{jobs}\n")
+        cases.stdin.flush()
+        status, out, err = int(cases.stdout.readline()), (folder / "out").read_text(), (folder / "err").read_text()
+        assert status == (-signal.SIGKILL if what == "abandon" else 0), err
+        return out.strip(), err
+
+    return done
+
+
+def processes(folder: Path) -> list[int]:
+    return [int(path.name) for path in (folder / "processes").iterdir() if path.name.isdecimal()]
+
+
+def living(folder: Path) -> list[int]:
+    return [number for number in processes(folder) if Path(f"/proc/{number}").exists()]
+
+
+@LINUX
+def test_kernels_are_compiled_side_by_side_and_once(done: Done, folder: Path) -> None:
+    """Two of the three filters have one kernel."""
+    out, err = done()
+    assert out == "3.0 6.0 9.0 1 1 1"
+    assert err == "compiling 2 kernels of two, three: about 1 s, once\n"
+    assert len(processes(folder)) == 2
+    assert not living(folder)
+    assert done() == ("3.0 6.0 9.0 1 1 1", "")
+    assert len(processes(folder)) == 2
+
+
+@LINUX
+def test_one_job_compiles_here(done: Done, folder: Path) -> None:
+    out, err = done(jobs=1)
+    assert out == "3.0 6.0 9.0 0 0 1"
+    assert err.count("\n") == 1
+    assert not processes(folder)
+
+
+@LINUX
+def test_what_killed_compilers_leave_is_compiled_here(done: Done, folder: Path) -> None:
+    assert done("die")[0] == "3.0 6.0 9.0 0 0 1"
+    assert len(processes(folder)) == 2
+
+
+@LINUX
+def test_a_disk_that_is_full_costs_the_cache_alone(done: Done, folder: Path) -> None:
+    """A limit on the size of files, which refuses what is written in the middle of it."""
+    out, err = done("full")
+    assert out == "3.0 6.0 9.0 0 0 0"
+    assert err.count("is not kept") == 1
+    assert {path.suffix for path in (folder / "cache" / "filter-consistency").iterdir()} <= {".lock", ".txt"}
+
+
+@LINUX
+@pytest.mark.parametrize("what", ["hang", "abandon"])
+def test_no_compiler_outlives_who_waits_for_it(done: Done, folder: Path, what: str) -> None:
+    """Whether that is stopped or killed."""
+    assert done(what)[0] == ("stopped" if what == "hang" else "")
+    assert processes(folder)
+    until = time.monotonic() + 10.0
+    while living(folder) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert not living(folder)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can become another user")
+def test_kernels_of_root_serve_other_users(done: Done, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in an image: made by root, read-only to who runs, who can still compile what is missing."""
+    (folder / "processes").chmod(0o777)
+    done(jobs=1)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder / "cache"))
+    out, err = done("nobody")
+    assert out == "3.0 6.0 9.0 0 0 0"  # root's own cache is not for others to read
+    assert "Permission denied" in err
+    kept.open_to_readers()
+    before = sorted(kept.folder().iterdir())
+    assert done("nobody") == ("3.0 6.0 9.0 1 1 1", "")
+    for path in kept.folder().glob("*.kernel"):
+        path.unlink()
+    out, err = done("nobody")
+    assert out == "3.0 6.0 9.0 0 0 0"
+    assert err.count("is not kept") == 1
+    assert {*before} - {*kept.folder().iterdir()} == {path for path in before if path.suffix == ".kernel"}
+
+
+def test_what_others_cannot_read_is_compiled_here(capsys: pytest.CaptureFixture[str]) -> None:
+    made: list[int] = []
+    outlook = Outlook("", is_ready=False, is_shared=False, seconds=4.0)
+    need: Any = SimpleNamespace(filter=SimpleNamespace(name="mine"), outlook=outlook, compile=lambda: made.append(1))
+    compiling._compile([need, need], 2)
+    assert made == [1, 1]
+    assert capsys.readouterr().err == "compiling 2 kernels of mine: about 6 s, once\n"
+
+
+def test_a_few_filters_are_named() -> None:
+    needs: Any = [SimpleNamespace(filter=SimpleNamespace(name=name)) for name in "abcde"]
+    assert compiling._label(needs) == "compiling 5 kernels of a, b, c and 2 more"
+    assert compiling._label(needs[:1]) == "compiling the kernel of a"
+
+
+# --- what is foreseen -------------------------------------------------------------------------------
+
+
+def inner(x: float) -> float:
+    return x + 1.0
+
+
+def outer(x: float) -> float:
+    return inner(x) * 2.0
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    kept.folder().mkdir(mode=0o700)
+    return kept.folder() / foreseen.FILE
+
+
+def test_seconds_are_those_of_this_machine(cache: Path) -> None:
+    assert foreseen.seconds_for(10_000) == pytest.approx(10_000 * FIRST)
+    cache.write_text("1000 2\nnonsense\n1000 4\n0 7\n1000 -1\n1000 nan\n2000 200\n")
+    assert foreseen.seconds_for(10_000) == pytest.approx(40.0)
+    cache.write_text("1 100\n" * 50 + "1000 2\n" * foreseen.RECENT)
+    assert foreseen.seconds_for(10_000) == pytest.approx(20.0)
+
+
+def test_what_compiling_took_is_kept(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foreseen.time, "monotonic", iter([0.0, 3.0, 5.0, 6.0, 7.0, 9.0]).__next__)
+    for size in (1000.0, 500.0):
+        with foreseen.measured(size):
+            pass
+    assert cache.read_text() == "1000 3.000\n500 1.000\n"
+    monkeypatch.setattr(foreseen, "LONGEST", 5)
+    with foreseen.measured(10.0):
+        pass
+    assert cache.read_text() == "10 2.000\n"
+
+
+def test_the_size_is_that_of_all_functions() -> None:
+    sizes = Content(outer, ()).functions
+    assert sizes == {f"{__name__}.{f.__name__}": len(f.__code__.co_code) for f in (inner, outer)}
+
+
+def of_a_part(part: Any) -> int:
+    return robot_width(part)
+
+
+def test_what_only_chooses_a_body_has_no_size() -> None:
+    assert set(Content(of_a_part, ()).functions) == {f"{__name__}.of_a_part"}
+
+
+def test_functions_that_were_compiled_before_count_less(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foreseen, "seconds_for", lambda size: size)
+    kernel = Kernel(total)
+    first = kernel.outlook(1)
+    assert (first.is_ready, first.is_shared, first.seconds) == (False, True, len(total.__code__.co_code))
+    assert kernel(1.0) == 2.0
+    assert kernel.outlook(1.0).is_ready
+    assert kernel.outlook(1) == first._replace(seconds=foreseen.AGAIN * first.seconds)
+    assert float(cache.read_text().split()[0]) == first.seconds
+
+
+def total(x: float) -> float:
+    return x + x
+
+
+def test_seconds_of_several() -> None:
+    """The second kernel of a process shares functions with the first."""
+    assert compiling._wall([10.0], 1) == 10.0
+    assert compiling._wall([10.0, 20.0], 1) == 25.0
+    assert compiling._wall([10.0, 20.0], 2) == 20.0
+    assert compiling._wall([10.0, 10.0, 10.0, 10.0], 2) == 15.0
+
+
+# --- before what takes long -------------------------------------------------------------------------
+
+
+def test_a_sweep_compiles_what_its_cells_need(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[tuple[str, int]] = []
+    monkeypatch.setattr(running, "compile_all", lambda wanted, jobs: asked.extend((f.name, jobs) for f, _, _ in wanted))
+    sweep = load_sweep("small", ["ukf-uvd"])
+    running._compile(sweep, SweepFolder(sweep, tmp_path).all_work(), 2)
+    assert sorted(asked) == sorted([("ukf-uvd", 2), ("ekf-uvd", 2)] * len(sweep.cells))
+
+
+def test_what_experiments_say_that_they_need_fits() -> None:
+    needs = [need for module in experiments().values() for need in getattr(module, "KERNELS", {}).items()]
+    assert len(needs) > 5
+    for world, names in needs:
+        assert len(resolve_filters(names, load_scenario(world).belief)) == len(names)

@@ -1,0 +1,180 @@
+"""What is found once and used again: types of calls and arguments, content of a kernel, the first trial."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import numba
+import numpy as np
+import pytest
+from numba import types
+from numba.core import compiler, targetconfig
+from numba.core.registry import cpu_target
+from numba.core.types import functions
+
+import consistency as cs
+from consistency.bench.filters.kernel import arrays, jit
+from consistency.bench.filters.kernel.inference import remembered_types
+from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.work import Simulated, Work
+from consistency.bench.simulation.world import World
+
+Counts = list[Any]
+stack: Any = targetconfig.ConfigStack
+Flags: Any = compiler.Flags
+
+
+class Small(NamedTuple):
+    value: float
+
+
+class Other(NamedTuple):
+    value: float
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> Counts:
+    """Arguments of the calls of a method, as they come."""
+    calls: Counts = []
+    original: Callable[..., Any] = getattr(owner, name)
+
+    def call(*args: Any) -> Any:
+        calls.append(args[1:])
+        return original(*args)
+
+    monkeypatch.setattr(owner, name, call)
+    return calls
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Counts:
+    """Calls whose type Numba has looked for."""
+    monkeypatch.setattr("consistency.bench.filters.kernel.inference._known", {})
+    return counted(monkeypatch, functions.BaseFunction, "get_call_type")
+
+
+def type_of(*args: Any, function: Any = operator.add, fastmath: bool = False, error_model: str = "numpy") -> Any:
+    """Signature of a function of these types, as a function that is being compiled asks for it."""
+    flags = Flags()
+    flags.fastmath, flags.error_model = fastmath, error_model
+    context: Any = cpu_target.typing_context
+    context.refresh()
+    with stack().enter(flags):
+        return context.resolve_value_type(function).get_call_type(context, args, {})
+
+
+def test_the_type_of_a_call_is_looked_for_once(asked: Counts) -> None:
+    alone = type_of(types.float64, types.int64)
+    with remembered_types():
+        assert {type_of(types.float64, types.int64) for _ in range(3)} == {alone}
+        assert len(asked) == 2
+        assert type_of(types.int64, types.int64) != alone
+        assert len(asked) == 3
+    type_of(types.float64, types.int64)
+    assert len(asked) == 4
+
+
+def test_rules_of_arithmetic_are_not_mixed(asked: Counts) -> None:
+    with remembered_types():
+        for rules in ({}, {"fastmath": True}, {"error_model": "python"}, {}):
+            type_of(types.float64, types.float64, **rules)
+    assert len(asked) == 3
+
+
+def test_functions_and_arguments_are_not_mixed() -> None:
+    pairs = [(types.int64, types.int64), (types.int64, types.float64), (types.float64, types.int64)]
+    cases = [(function, pair) for function in (operator.add, operator.truediv) for pair in pairs]
+    alone = [type_of(*pair, function=function) for function, pair in cases]
+    with remembered_types():
+        for _ in range(2):
+            assert [type_of(*pair, function=function) for function, pair in cases] == alone
+
+
+def test_who_compiles_nothing_asks_numba(asked: Counts) -> None:
+    context: Any = cpu_target.typing_context
+    context.refresh()
+    with remembered_types():
+        for _ in range(2):
+            assert context.resolve_value_type(operator.add).get_call_type(context, (types.int64,) * 2, {})
+    assert len(asked) == 2
+
+
+def test_what_has_no_type_is_looked_for_again(asked: Counts) -> None:
+    with remembered_types():
+        for _ in range(2):
+            with pytest.raises(numba.TypingError):
+                type_of(types.float64, types.none)
+    assert len(asked) == 2
+
+
+def test_arguments_of_other_types_are_other_kinds() -> None:
+    A = np.zeros((3, 4))
+    frozen = A.copy()
+    frozen.setflags(write=False)
+    values = [A, np.zeros((1, 1)), A.T, A[:, ::2], frozen, A[0], A.astype(np.float32), A.astype(int), 1, 1.0, True,
+              np.float64(1.0), Small(1.0), Small(1), Other(1.0), (1.0,), "text"]  # fmt: skip
+    for a in values:
+        for b in values:
+            assert jit._kind(a) != jit._kind(b) or numba.typeof(a) == numba.typeof(b), (a, b)
+
+
+def test_types_of_arguments_are_those_of_numba() -> None:
+    for _ in range(2):
+        args = (Small(2.0), np.zeros(3), 4)
+        assert jit._signature(args) == tuple(numba.typeof(arg) for arg in args)
+
+
+def test_content_is_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Unknown:
+        unknown, key, found = "something", "", 0
+        functions: ClassVar[dict[str, int]] = {}
+
+        def __init__(self, function: Any, signature: Any) -> None:
+            type(self).found += 1
+
+    monkeypatch.setattr(jit, "Content", Unknown)
+    monkeypatch.setattr(jit.Kernel, "_compiled", lambda *_: len)
+    kernel = jit.Kernel(lambda x: x)
+    for x, found in ((1.0, 1), (1, 2)):
+        assert not kernel.is_ready(x)
+        assert kernel.compile(x) is len
+        assert Unknown.found == found
+        assert kernel.is_ready(x)
+        assert kernel.outlook(x).is_ready
+        assert Unknown.found == found
+
+
+def test_the_first_trial_is_simulated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
+    trials = Simulated(world, 3)
+    made = counted(monkeypatch, World, "trial")
+    work = Work(trials, Isolation([], world.belief))
+    work.room_for(1, 1)
+    first = trials.ahead(1)
+    assert made == [(1, 3)]
+    assert trials(1) is first
+    again = trials(1)
+    assert made == [(1, 3)] * 2
+    assert again is not first
+    np.testing.assert_array_equal(again.z, first.z)
+    trials.ahead(1)
+    trials.ahead(2)
+    trials(1)  # of those ahead the last one is kept
+    assert [run for run, _ in made] == [1, 1, 1, 2, 1]
+
+
+def test_arrays_of_kernels() -> None:
+    for new, shape in ((arrays.vector(3), (3,)), (arrays.matrix(2, 3), (2, 3)), (arrays.blocks(4, 2, 3), (4, 2, 3))):
+        assert new.shape == shape
+        assert new.dtype == float
+    for new, shape in (
+        (arrays.filled(3, 0.5), (3,)),
+        (arrays.filled_matrix(2, 3, 0.5), (2, 3)),
+        (arrays.filled_blocks(4, 2, 3, 0.5), (4, 2, 3)),
+    ):
+        np.testing.assert_array_equal(new, np.full(shape, 0.5))
+    np.testing.assert_array_equal(arrays.integers(3, -1), np.full(3, -1))
+    assert arrays.integers(3, -1).dtype == np.int64
+    values = np.array([1.0, 1e16, 1.0, -1e16])
+    assert arrays.sum_of(values) == ((1.0 + 1e16) + 1.0) - 1e16

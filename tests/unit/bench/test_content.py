@@ -1,0 +1,273 @@
+"""What the key of a kernel covers, and who compiles: a small kernel in modules of a user's own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numba
+import pytest
+from numba.core import config
+from numba.core.registry import cpu_target
+
+from consistency.bench.filters.kernel import content, dispatch
+from consistency.bench.filters.kernel.content import Content
+from consistency.bench.filters.kernel.jit import Kernel
+
+SCRIPT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, str(Path(__file__).parent))
+import kinds, rules
+from consistency.bench.filters.kernel.jit import Kernel
+
+kernel = Kernel(rules.total)
+ready = 0
+for name in sys.argv[1].split():
+    rule = getattr(kinds, name)()
+    ready += kernel.is_ready(rule, 10)
+    print(kernel(rule, 10), end=" ")
+    assert kernel.is_ready(rule, 10)
+assert rules.increased(1.0) == 2.0, "a function of Numba's that the kernel calls still serves Python"
+print(kernel.loaded, ready)
+"""
+KINDS = '''
+"""Kinds of rules."""
+from typing import NamedTuple
+from consistency.bench.filters.kernel.dispatch import part
+
+@part()
+class Single(NamedTuple):
+    """One."""
+
+@part()
+class Triple(NamedTuple):
+    """Three."""
+'''
+RULES = '''
+from typing import NamedTuple
+import numba
+import numpy as np
+import numbers_of_mine
+from consistency.bench.filters.kernel.dispatch import generic, implement
+from consistency.bench.filters.kernel.jit import inner
+from kinds import Single, Triple
+from numbers_of_mine import THREE, shift
+
+@generic()
+def one(rule: NamedTuple) -> float:
+    raise NotImplementedError
+
+@inner
+def helped(x: float) -> float:
+    """Twice a half."""
+    return 2.0 * (x / 2.0)
+
+@numba.njit
+def increased(x: float) -> float:
+    return x + 1.0
+
+@implement(one, Single)
+def one_single(rule: Single) -> float:
+    return helped(numbers_of_mine.ONE) + shift(0.0)
+
+@implement(one, Triple)
+def one_triple(rule: Triple) -> float:
+    return increased(THREE[0])
+
+def total(rule, n):
+    values = np.zeros(n)
+    for k in range(n):
+        values[k] = one(rule)
+    return values.sum()
+'''
+NUMBERS = '''
+from consistency.bench.filters.kernel.jit import inner
+
+ONE = 1.0
+THREE = (2.0,)
+
+@inner
+def shift(x: float) -> float:
+    """x, where it was."""
+    return x + 0.0
+'''
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    folder = tmp_path / "scripts"
+    folder.mkdir()
+    for name, text in (("kinds", KINDS), ("rules", RULES), ("numbers_of_mine", NUMBERS), ("uses_rules", SCRIPT)):
+        (folder / f"{name}.py").write_text(textwrap.dedent(text), encoding="utf-8")
+    return folder / "uses_rules.py"
+
+
+def started(script: Path, order: str, **variables: str) -> subprocess.Popen[str]:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(script.parents[1] / "cache")} | variables
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, script, order], env=environment, stdout=pipe, stderr=pipe, text=True)
+
+
+def finished(process: subprocess.Popen[str]) -> tuple[list[float], int, int]:
+    """Values of the kernels, how many were read from disk, and how many were ready beforehand."""
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    *values, loaded, ready = out.split()
+    return [float(value) for value in values], int(loaded), int(ready)
+
+
+def hits(script: Path, order: str, **variables: str) -> int:
+    """Kernels read from disk, which are just those that were ready."""
+    values, loaded, ready = finished(started(script, order, **variables))
+    assert values == [{"Single": 10.0, "Triple": 30.0}[name] for name in order.split()]
+    assert loaded == ready
+    return loaded
+
+
+def test_place_and_time_are_no_content(script: Path) -> None:
+    """And another order in another process has the same keys."""
+    assert hits(script, "Single Triple") == 0
+    (script.parent / "rules.py").touch()
+    moved = shutil.copytree(script.parent, script.parents[1] / "elsewhere") / script.name
+    assert hits(moved, "Triple Single") == 2
+
+
+# --- keys, without compiling ------------------------------------------------------------------------------
+
+TEXTS = {"kinds": KINDS, "numbers_of_mine": NUMBERS, "rules": RULES}
+Keys = Callable[..., str]
+
+
+@pytest.fixture
+def key(monkeypatch: pytest.MonkeyPatch) -> Keys:
+    """Key of the kernel of a kind, with one text in a module replaced by another."""
+
+    def of(module: str = "rules", old: str = "", new: str = "", kind: str = "Single") -> str:
+        assert not old or TEXTS[module].count(old) == 1
+        for name in ("_parts", "_named_bodies"):
+            monkeypatch.setattr(dispatch, name, {})
+        for name, text in TEXTS.items():
+            loaded = ModuleType(name)
+            monkeypatch.setitem(sys.modules, name, loaded)
+            exec(compile(text.replace(old, new) if name == module and old else text, name, "exec"), vars(loaded))
+        rules, kinds = sys.modules["rules"], sys.modules["kinds"]
+        return Content(rules.total, (numba.typeof(getattr(kinds, kind)()), numba.typeof(10))).key
+
+    return of
+
+
+def test_comments_and_docstrings_are_no_content(key: Keys) -> None:
+    assert key() == key()
+    assert key() == key("rules", '"""Twice a half."""', '"""Half of it, twice."""')
+    assert key() == key("numbers_of_mine", '"""x, where it was."""', '"""x."""\n    # as it was')
+    assert key() == key("kinds", '"""One."""', '"""The number one."""\n\n')
+
+
+EDITS = {
+    "body": ("rules", "helped(numbers_of_mine.ONE)", "2.0 * helped(numbers_of_mine.ONE)"),
+    "helper": ("rules", "return 2.0 *", "return 4.0 *"),
+    "helper of another module": ("numbers_of_mine", "return x + 0.0", "return x + 1.0"),
+    "constant of another module": ("numbers_of_mine", "ONE = 1.0", "ONE = 2.0"),
+    "the kernel": ("rules", "return values.sum()", "return values.max()"),
+    "a name": ("kinds", "class Single(NamedTuple):", "class Single(NamedTuple):\n    x: float = 1.0"),
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_what_the_kernel_reads_is_content(key: Keys, name: str) -> None:
+    assert key(*EDITS[name]) != key()
+
+
+def test_constants_in_tuples_and_functions_of_numba_are_content(key: Keys) -> None:
+    triple = key(kind="Triple")
+    assert key("numbers_of_mine", "(2.0,)", "(3.0,)", kind="Triple") != triple
+    assert key("rules", "return x + 1.0", "return 1.0 + x", kind="Triple") != triple
+
+
+def test_what_other_kernels_are_made_of_is_no_content(key: Keys) -> None:
+    assert key("numbers_of_mine", "(2.0,)", "(3.0,)") == key()
+    assert key(kind="Triple") != key()
+
+
+@pytest.mark.parametrize("setting", ["OPT", "LOOP_VECTORIZE", "BOUNDSCHECK"])
+def test_settings_are_content(key: Keys, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
+    before = key()
+    monkeypatch.setattr(config, setting, 17)
+    content._versions.cache_clear()
+    assert key() != before
+    monkeypatch.undo()
+    content._versions.cache_clear()
+
+
+def test_the_processor_is_content(key: Keys, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, codegen = key(), cpu_target.target_context.codegen()
+    monkeypatch.setattr(codegen, "magic_tuple", lambda: ("x86_64", "another", ""))
+    content._versions.cache_clear()
+    assert key() != before
+    monkeypatch.undo()
+    content._versions.cache_clear()
+
+
+def test_what_cannot_be_compared_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    kernel = Kernel(with_something)
+    assert not kernel.is_ready(1j)
+    assert kernel(1j) == 0.0
+    assert kernel.is_ready(1j)
+    assert not list(tmp_path.rglob("*.kernel"))
+
+
+class Something:
+    """Nothing that Numba or a key knows."""
+
+
+real = Something()
+
+
+def with_something(x: complex) -> float:
+    """Reads an attribute; to a key it might be the global of that name."""
+    return x.real
+
+
+# --- processes --------------------------------------------------------------------------------------------
+
+
+def test_of_four_processes_that_start_at_once_one_compiles(script: Path) -> None:
+    found = [finished(process)[1] for process in [started(script, "Single Triple") for _ in range(4)]]
+    assert sorted(found)[-1] == 2
+    assert sum(found) == 6, "each of the two kernels is compiled once, and loaded by the other three"
+
+
+def test_a_killed_compiler_leaves_nothing_that_is_loaded(script: Path) -> None:
+    """Wherever it is killed: before, while or after it writes."""
+    for wait in (0.8, 2.0):
+        process = started(script, "Single Triple")
+        time.sleep(wait)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    values, loaded, ready = finished(started(script, "Single Triple"))
+    assert values == [10.0, 30.0]
+    assert loaded == ready
+    assert hits(script, "Single Triple") == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="there are no modes on this system")
+def test_a_folder_that_others_may_write_is_not_trusted(script: Path) -> None:
+    assert hits(script, "Single") == 0
+    folder = script.parents[1] / "cache" / "filter-consistency"
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)
+    process = started(script, "Single")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 0
+    assert "somebody else may write there" in err
+    assert err.count("\n") == 1

@@ -1,0 +1,163 @@
+"""How reproduce runs scripts: which of them, in which process, and what becomes of one that breaks."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from consistency import Finding, InputError
+from consistency.bench.runs import findings as module
+from consistency.bench.runs.findings import Study, reproduce
+
+SCRIPT = '''"""A question."""
+import os
+import numpy as np
+import pandas as pd
+from consistency import InputError
+
+FINDINGS = {ids}
+{constants}
+
+def main(study):
+    {before}
+    rng = np.random.default_rng([study.seed, {number}])
+    study.tables["table{number}"] = pd.DataFrame({{"x": rng.normal(size=3), "process": os.getpid()}})
+    text = dict.fromkeys(("source", "claim", "statistic", "published", "accept"), "text")
+    return [study.finding(True, "none", id=name, measured=str(rng.normal()), **text) for name in FINDINGS]
+'''
+
+
+@pytest.fixture
+def scripts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of experiments: two that share trials, two in processes of their own, of which one takes long."""
+    folder = tmp_path / "experiments"
+    folder.mkdir()
+    monkeypatch.setattr(module, "data_folder", lambda _: folder)
+    write(folder, 1, ("one", "uno"))
+    write(folder, 2, ("two",), "OWN_PROCESS = True")
+    write(folder, 3, ("three",), "OWN_PROCESS = True\nLONG = True")
+    write(folder, 4, ("four",))
+    return folder
+
+
+def write(folder: Path, number: int, ids: tuple[str, ...], constants: str = "", before: str = "pass") -> None:
+    text = SCRIPT.format(number=number, ids=ids, constants=constants, before=before)
+    (folder / f"e{number:02}_script.py").write_text(text)
+
+
+def measured(findings: list[Finding]) -> dict[str, str]:
+    return {finding.id: finding.measured for finding in findings}
+
+
+def processes(folder: Path) -> dict[str, int]:
+    return {path.stem: int(pd.read_parquet(path)["process"].iloc[0]) for path in folder.glob("*.parquet")}
+
+
+def test_the_same_findings_with_any_number_of_workers(scripts: Path, tmp_path: Path) -> None:
+    alone = reproduce(None, 5, 3, 1, tmp_path / "alone", long=True)
+    beside = reproduce(None, 5, 3, 2, tmp_path / "beside", long=True)
+    assert [finding.id for finding in beside] == ["one", "uno", "two", "three", "four"]
+    assert beside == alone
+    assert (tmp_path / "alone/findings.json").read_bytes() == (tmp_path / "beside/findings.json").read_bytes()
+    assert set(processes(tmp_path / "alone").values()) == {os.getpid()}
+    where = processes(tmp_path / "beside")
+    assert where["table1"] == where["table4"] == os.getpid()
+    assert len({where["table2"], where["table3"], os.getpid()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("only", "long", "expected"),
+    [
+        (None, False, ["one", "uno", "two", "four"]),
+        (["e03_script", "uno"], False, ["uno", "three"]),
+        (["e01_script"], False, ["one", "uno"]),
+        (None, True, ["one", "uno", "two", "three", "four"]),
+        (["three"], False, ["three"]),
+        (["four", "uno"], False, ["uno", "four"]),
+    ],
+)
+def test_long_scripts_wait_to_be_asked_for(
+    scripts: Path, tmp_path: Path, only: list[str] | None, long: bool, expected: list[str]
+) -> None:
+    assert list(measured(reproduce(only, 5, 0, 1, tmp_path / "out", long=long))) == expected
+
+
+def test_scripts_are_said_as_they_begin(
+    scripts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "WAITING", 0.2)
+    said = "import time; from consistency.referee.terminal.progress import say; say('inside'); time.sleep(1)"
+    write(scripts, 2, ("two",), "OWN_PROCESS = True", said)
+    reproduce(["one", "two"], 5, 0, 2, tmp_path / "out")
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[:2] == ["[1 of 2] e01_script: A question.", "[2 of 2] e02_script: A question."]
+    assert lines[2].startswith("still at it in a process of its own")
+    assert "inside" not in lines
+
+
+def test_a_script_that_times_out_is_a_finding(scripts: Path, tmp_path: Path) -> None:
+    write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise TimeoutError('of its own')")
+    assert measured(reproduce(["two"], 5, 0, 2, tmp_path / "out"))["two"] == "TimeoutError: of its own"
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_script_that_breaks_is_a_finding(scripts: Path, tmp_path: Path, jobs: int) -> None:
+    write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise ZeroDivisionError('no')")
+    findings = {finding.id: finding for finding in reproduce(None, 5, 0, jobs, tmp_path / "out")}
+    assert findings["two"].verdict == "not reproduced"
+    assert findings["two"].measured == "ZeroDivisionError: no"
+    assert findings["four"].verdict == "reproduced"
+
+
+def test_a_process_that_dies_is_a_finding(scripts: Path, tmp_path: Path) -> None:
+    write(scripts, 2, ("two",), "OWN_PROCESS = True", "os._exit(7)")
+    found = measured(reproduce(["two", "four"], 5, 0, 2, tmp_path / "out"))
+    assert found["two"].startswith("TerminatedWorkerError: ")
+    assert "EXIT(7)" in found["two"]
+    assert found["four"] != found["two"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_unusable_input_ends_everything(scripts: Path, tmp_path: Path, jobs: int) -> None:
+    write(scripts, 2, ("two",), "OWN_PROCESS = True", "raise InputError('file.toml: key x')")
+    with pytest.raises(InputError, match=r"file\.toml: key x"):
+        reproduce(None, 5, 0, jobs, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_script_apart_runs_no_filter(scripts: Path, tmp_path: Path) -> None:
+    write(scripts, 2, ("two",), "OWN_PROCESS = True", "study.kept['world'] = None")
+    found = measured(reproduce(["two"], 5, 0, 2, tmp_path / "out"))
+    assert found["two"] == "ValueError: OWN_PROCESS is for scripts that run no filter"
+
+
+def test_jobs_out_of_range() -> None:
+    with pytest.raises(InputError, match="jobs must be at least 1, or -1"):
+        Study(jobs=0)
+
+
+def test_processes_end_with_the_work(scripts: Path, tmp_path: Path) -> None:
+    """As Ctrl-C does it: the process of the long script is not waited for."""
+    mark = tmp_path / "started"
+    before = f"import pathlib, time; pathlib.Path({str(mark)!r}).write_text(str(os.getpid())); time.sleep(120)"
+    write(scripts, 3, ("three",), "OWN_PROCESS = True", before)
+    wait = f"import pathlib, time\n    while not pathlib.Path({str(mark)!r}).exists(): time.sleep(0.1)\n"
+    write(scripts, 4, ("four",), before=wait + "    raise KeyboardInterrupt")
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        reproduce(["three", "four"], 5, 0, 2, tmp_path / "out")
+    assert time.monotonic() - begun < 60
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(mark.read_text()), 0)
+
+
+def test_what_nobody_published_holds_or_does_not() -> None:
+    from consistency.bench.types import outcome
+
+    assert [outcome("Herath 2007", verdict) for verdict in ("reproduced", "refuted")] == ["reproduced", "refuted"]
+    assert outcome("this project, measured", "reproduced") == "holds"
+    assert {outcome("this project", verdict) for verdict in ("not reproduced", "refuted")} == {"does not hold"}

@@ -1,0 +1,148 @@
+"""Heat maps of covariance ratios and the table of cells, for sweeps over any axes."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import consistency as cs
+from consistency.bench.pages import heat, write_regime_reports
+from consistency.bench.pages.drawing import Figure, Tiles
+from consistency.bench.pages.heat import colour_of, heat_figure, ink_on
+from consistency.bench.pages.paper import render
+from consistency.bench.sweeps.axes import Axis
+from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
+from consistency.bench.sweeps.plan import Sweep, load_sweep
+from consistency.bench.sweeps.printing import print_regime
+from consistency.bench.sweeps.regime import Regime
+
+LONG = [{"kind": "mismatch", "rate": 0.05}]
+
+
+def result(ratio: float, status: str = "overconfident") -> CellResult:
+    return CellResult(status, status, 12, 0, 3.0, 2.5, 3.5, ratio, ratio / 2, np.inf, 0.1, 0.01, 1.0, 20.0)
+
+
+def sweep_over(**values: list[Any]) -> Sweep:
+    base = cs.load_scenario("herath2007-stereo")
+    effects = [{"kind": "heavy-tails", "rate": 0.1, "sigma": (1.0, 1.0, 1.0)}]
+    axes = tuple(Axis(key.replace("__", "."), tuple(some)) for key, some in values.items())
+    return replace(
+        load_sweep("small"), base=base.variant("base", truth__sensor__effects=effects), axes=axes, filters=("a", "b")
+    )
+
+
+SPEED = {"truth__path__speed": [0.25, 0.5, 1.0]}
+NOISE = {"belief__motion__sigma_v": [0.1, 0.2]}
+TEXT = {"truth__sensor__effects": [[], LONG]}
+HEADING = {"truth__path__heading": [0.0, 1.0]}
+GRIDS: dict[str, dict[str, list[Any]]] = {
+    "one": SPEED, "text": TEXT, "two": SPEED | NOISE, "four": TEXT | SPEED | NOISE | HEADING,
+}  # fmt: skip
+
+
+def regime_of(sweep: Sweep) -> Regime:
+    """Ratio of filter a: 1 + number of the cell; infinite in the last one, none in the first of b."""
+    cells = sweep.cells
+    results = {(cell.number, "a"): result(1.0 + cell.number) for cell in cells}
+    results[cells[-1].number, "a"] = result(np.inf)
+    results[0, "b"] = result(np.nan, "failed")
+    return Regime(sweep, results, {})
+
+
+def tiles(figure: Figure) -> list[Tiles]:
+    return [mark for panel in figure.panels for mark in panel.marks if isinstance(mark, Tiles)]
+
+
+def test_a_tile_stands_where_its_cell_does() -> None:
+    """Speeds from the left, noises from below; the number is that of the cell."""
+    regime = regime_of(sweep_over(**SPEED, **NOISE))
+    (panel,) = heat_figure(regime, "a").panels
+    (mark,) = tiles(heat_figure(regime, "a"))
+    assert panel.x.names == ("0.25", "0.5", "1")
+    assert panel.y.rows == ("0.2", "0.1"), "rows are named from the top"
+    placed = {
+        (panel.x.names[int(x)], panel.y.rows[int(y)]): t for x, y, t in zip(mark.x, mark.y, mark.text, strict=True)
+    }
+    assert placed == {
+        ("0.25", "0.1"): "1.00", ("0.25", "0.2"): "2.00", ("0.5", "0.1"): "3.00", ("0.5", "0.2"): "4.00",
+        ("1", "0.1"): "5.00", ("1", "0.2"): "∞",
+    }  # fmt: skip
+    assert set(mark.below) == {"overconf."}
+    assert mark.columns["status"][0] == "overconfident"
+    assert mark.columns["interval"][0] == "[0.50, ∞]"
+
+
+@pytest.mark.parametrize(("name", "panels"), [("one", 1), ("text", 1), ("two", 1), ("four", 4)])
+def test_every_cell_is_shown_once(name: str, panels: int) -> None:
+    regime = regime_of(sweep_over(**GRIDS[name]))
+    figure = heat_figure(regime, "a")
+    assert len(figure.panels) == panels
+    shown = [text for mark in tiles(figure) for text in mark.text]
+    assert len(shown) == len(regime.sweep.cells)
+    assert len(set(shown)) == len(shown)
+    assert sum(len(sheet.panels) for sheet in figure.sheets) == panels
+    titles = {panel.title for panel in figure.panels}
+    assert len(titles) == panels
+    (mark,) = tiles(heat_figure(regime, "b"))
+    assert (mark.text, mark.below, mark.faces) == (("–",), ("failed",), (heat.NOTHING,))
+
+
+def test_long_values_are_told_apart() -> None:
+    axis = Axis("truth.sensor.effects", tuple([{"kind": "mismatch", "rate": rate}] * 3 for rate in (0.1, 0.2)))
+    texts = [heat.said(axis, i) for i in range(2)]
+    assert len(set(texts)) == 2
+    assert max(map(len, texts)) <= heat.LONGEST
+
+
+def test_colours_say_which_way() -> None:
+    assert colour_of(1.0) == heat.PAPER
+    assert colour_of(heat.FULL) == colour_of(1e9) == colour_of(np.inf) == heat.LARGE.lower()
+    assert colour_of(1.0 / heat.FULL) == colour_of(1e-9) == colour_of(0.0) == heat.SMALL.lower()
+    red, _, blue = (int(colour_of(1.5)[i : i + 2], 16) for i in (1, 3, 5))
+    assert red > blue, "towards vermilion"
+    assert ink_on(heat.PAPER) == "#000000"
+    assert ink_on(heat.SMALL) == "#ffffff"
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_both_painters_draw_it(name: str, tmp_path: Path) -> None:
+    regime = regime_of(sweep_over(**GRIDS[name]))
+    page, sheets = write_regime_reports(regime, tmp_path)
+    assert "overconf." in page.read_text(encoding="utf-8") or name == "four", "long columns are packed"
+    assert sheets.stat().st_size > 10_000
+    for sheet in heat_figure(regime, "a").sheets:
+        assert "overconf." in _words(render(sheet))
+
+
+def _words(svg: bytes) -> str:
+    return io.BytesIO(svg).read().decode()
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_a_terminal_has_a_row_a_cell(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    regime = regime_of(sweep_over(**GRIDS[name]))
+    print_regime(regime)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line]
+    rows = [line for line in lines if "overconfident " in line and "cost" not in line]
+    assert len(rows) == len(regime.sweep.cells)
+    assert "overconfident 1.00" in rows[0]
+    assert "failed" in rows[0]
+    assert "overconfident ∞" in rows[-1]
+
+
+def test_many_cells_are_counted_only(capsys: pytest.CaptureFixture[str]) -> None:
+    print_regime(regime_of(replace(load_sweep("regime"), filters=("a", "b"))))
+    assert len(capsys.readouterr().out.splitlines()) < 10
+
+
+def test_an_infinite_ratio_is_kept() -> None:
+    numbers = plain_numbers(result(np.inf))
+    assert (numbers["ratio"], plain_numbers(result(np.nan))["ratio"]) == ("inf", None)
+    assert result_from(numbers).ratio == np.inf
+    assert np.isnan(result_from(plain_numbers(result(np.nan))).ratio)

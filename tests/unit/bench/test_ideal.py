@@ -1,0 +1,58 @@
+"""A filter that takes its Jacobians at the truth is marked, is told it, and is refused where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import consistency as cs
+from consistency.bench.filters import BOUNDS, usable_names
+from consistency.bench.filters.compiled import is_realisable, problem_for, problem_of
+from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.runs.montecarlo import run_log, simulate_log
+from consistency.bench.store.log import read_log
+
+
+def test_only_the_ideal_filters_are_marked() -> None:
+    assert {name for name in usable_names() if not is_realisable(cs.get_filter(name))} == BOUNDS
+
+
+def test_no_other_filter_is_told_the_truth(uvd: cs.Scenario) -> None:
+    trial = cs.simulate(uvd)
+    for name in ("ekf-uvd", "fej-ekf-uvd", "oc-ekf-uvd"):
+        assert problem_for(cs.get_filter(name), trial, uvd.belief) == problem_of(trial, uvd.belief)
+    told = problem_for(cs.get_filter("ideal-ekf-uvd"), trial, uvd.belief).truth
+    assert told is not None
+    assert told.path is trial.truth
+    assert told.landmarks is trial.landmarks
+
+
+@pytest.mark.parametrize("table", ["truth", "landmarks"])
+def test_a_log_without_truth_is_refused(uvd: cs.Scenario, tmp_path: Path, table: str) -> None:
+    simulate_log(uvd, runs=1, seed=1, out=tmp_path / "log")
+    (tmp_path / "log" / f"{table}.parquet").unlink()
+    with pytest.raises(
+        cs.InputError, match=f"'ideal-ekf-uvd' is a bound .* run 0 has none; a log needs {table}.parquet"
+    ):
+        run_log(read_log(tmp_path / "log"), ["ideal-ekf-uvd"], jobs=1)
+
+
+def test_measurements_alone_are_refused(uvd: cs.Scenario) -> None:
+    trial, filter_ = cs.simulate(uvd), cs.get_filter("ideal-ekf-uvd")
+    with pytest.raises(cs.InputError, match="cannot be stepped on measurements alone"):
+        filter_.init(problem_of(trial, uvd.belief))
+    unknown = replace(trial, truth=None)
+    for run in (run_filter, step_through):
+        with pytest.raises(cs.InputError, match="or leave the filter out"):
+            run(filter_, unknown, uvd.belief)
+
+
+def test_things_that_are_no_landmark_are_refused(uvd: cs.Scenario) -> None:
+    trial, filter_ = cs.simulate(uvd), cs.get_filter("ideal-ekf-uvd")
+    landmark = np.array(trial.landmark)
+    landmark[-1] = trial.n_landmarks
+    with pytest.raises(cs.InputError, match="things that are no landmark"):
+        run_filter(filter_, replace(trial, landmark=landmark, n_landmarks=trial.n_landmarks + 1), uvd.belief)

@@ -1,0 +1,514 @@
+"""Whatever a filter does to its process, its run is a result, and the filter beside it has its bits."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, raises, segfaults
+from threadpoolctl import threadpool_info
+
+import consistency as cs
+from consistency.bench.filters.stepping import run_filter
+from consistency.bench.runs import isolating, supervising
+from consistency.bench.runs.gather import Gathered
+from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.montecarlo import Interrupted
+from consistency.bench.store.results import outcome_of
+from consistency.bench.types import Control, Observation
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, and limits of memory")
+
+RUNS, DOOMED = 3, 1  # of the runs the one that misbehaves
+LONG = 60.0  # s, a time-out that is not expected
+
+
+@pytest.fixture(scope="module")
+def world() -> cs.Scenario:
+    return cs.load_scenario("herath2007-xyz").variant("short", truth__steps=12)
+
+
+@pytest.fixture(scope="module")
+def doomed(world: cs.Scenario) -> Control:
+    return cs.simulate(world, DOOMED).control(1)
+
+
+@pytest.fixture(scope="module")
+def calm(world: cs.Scenario) -> pd.DataFrame:
+    return cs.run_trials(world, [Still("calm"), "ekf-xyz"], runs=RUNS, jobs=1).estimates
+
+
+def rows(estimates: pd.DataFrame, *names: str) -> pd.DataFrame:
+    return estimates[estimates["filter"].isin(names)].reset_index(drop=True)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_filter_that_misbehaves_is_contained(
+    kind: str, world: cs.Scenario, doomed: Control, calm: pd.DataFrame
+) -> None:
+    """One failed run with its step and reason; all other rows as they are without it, to the bit."""
+    act, reason = KINDS[kind]
+    filters = [Still("bad", act, doomed), Still("calm"), "ekf-xyz"]
+    timeout = 1.0 if reason == TIME_OUT else LONG
+    results = cs.run_trials(world, filters, runs=RUNS, jobs=1, timeout=timeout, memory=MEMORY)
+    assert results.failures[["filter", "run", "step"]].to_numpy().tolist() == [["bad", DOOMED, STEP]]
+    assert results.failures["reason"][0].startswith(reason)
+    assert len(results.failures["reason"][0]) < len(reason) + 100
+    pd.testing.assert_frame_equal(rows(results.estimates, "calm", "ekf-xyz"), calm, check_exact=True)
+    expected = rows(calm, "calm").assign(filter="bad")
+    expected = expected[(expected["run"] != DOOMED) | (expected["step"] < STEP)].reset_index(drop=True)
+    pd.testing.assert_frame_equal(rows(results.estimates, "bad"), expected, check_exact=True)
+
+
+def test_a_filter_that_copies_its_process_is_heard_once(
+    world: cs.Scenario, doomed: Control, calm: pd.DataFrame
+) -> None:
+    results = cs.run_trials(world, [Still("bad", forks, doomed)], runs=RUNS, jobs=1, timeout=LONG)
+    assert len(results.failures) == 0
+    pd.testing.assert_frame_equal(results.estimates, rows(calm, "calm").assign(filter="bad"), check_exact=True)
+
+
+# --- each filter has arrays of its own ---------------------------------------------------------
+
+
+def scribbles(self: Still, observation: Observation) -> None:
+    for array in (self.problem.start, observation.z, observation.landmarks):
+        array.flags.writeable = True
+        array[...] = 7
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_arrays_made_writable_change_nothing_for_others(world: cs.Scenario, doomed: Control, apart: bool) -> None:
+    trial = cs.simulate(world, DOOMED)
+    before = {name: array.copy() for name, array in vars(trial).items() if isinstance(array, np.ndarray)}
+    bad = Still("bad", scribbles, doomed)
+    if apart:
+        with Isolation([bad], world.belief) as isolation:
+            isolation.run(trial)
+    else:
+        run_filter(bad, trial, world.belief)
+    assert len(before) >= 7
+    for name, array in before.items():
+        np.testing.assert_array_equal(getattr(trial, name), array)
+
+
+# --- what a run leaves ---------------------------------------------------------------------------
+
+
+def test_nothing_of_the_failed_step_is_kept(world: cs.Scenario, doomed: Control) -> None:
+    """Neither by an exception nor by a crash: no pose, no NIS, no degrees of freedom."""
+    trial = cs.simulate(world, DOOMED)
+    with_info = next(k for k in range(1, 13) if len(trial.observation(k).landmarks))
+    assert with_info < STEP  # negative control: there is something to keep
+    for act in (answers(mean=np.full(3, np.nan)), segfaults):
+        with Isolation([Still("bad", act, doomed)], world.belief) as isolation:
+            [said] = isolation.run(trial)
+        assert said.failure is not None
+        assert said.failure.step == STEP
+        for array in (said.pose, said.covariance, said.nis):
+            assert np.isnan(array[STEP - 1 :]).all()
+        assert not said.nis_dof[STEP - 1 :].any()
+        assert np.isfinite(said.pose[: STEP - 1]).all()
+        assert np.isfinite(said.nis[with_info - 1])
+
+
+def test_a_nees_that_no_number_holds_fails_any_filter(world: cs.Scenario) -> None:
+    """Also one whose own error is out of bounds, or whose NIS is, as a kernel may say it."""
+    trial = cs.simulate(world)
+    with Isolation([Still("calm")], world.belief) as isolation:
+        [said] = isolation.run(trial)
+    assert outcome_of(trial, [said]).failures == ()
+    for array, value, name in ((said.pose, 1e200, "NEES"), (said.nis, np.inf, "NIS")):
+        kept, array[STEP - 1] = array[STEP - 1].copy(), value
+        said.nis_dof[STEP - 1] = 3
+        outcome = outcome_of(trial, [said])
+        assert [(f.step, f.reason) for f in outcome.failures] == [(STEP, f"the {name} is not finite")]
+        assert {len(values) for values in outcome.estimates["calm"].values()} == {STEP - 1}
+        array[STEP - 1] = kept
+
+
+def test_names_and_reasons_stand_on_one_line(world: cs.Scenario, doomed: Control) -> None:
+    with pytest.raises(cs.InputError, match=r"filter: the name 'two\\nlines' has a control character"):
+        cs.run_trials(world, [Still("two\nlines")], runs=1)
+    exception = RuntimeError("one\n::error::two\x1b[2J\udc80")
+    failure = run_filter(Still("bad", raises(exception), doomed), cs.simulate(world, DOOMED), world.belief).failure
+    assert failure is not None
+    assert failure.reason == "RuntimeError: one ::error::two [2J\\udc80"
+
+
+@pytest.mark.parametrize("exception", [SystemExit("enough"), GeneratorExit("gone"), RuntimeError("x" * 10**6)])
+def test_what_a_filter_throws_is_a_result_in_any_process(
+    world: cs.Scenario, doomed: Control, exception: BaseException
+) -> None:
+    failure = run_filter(Still("bad", raises(exception), doomed), cs.simulate(world, DOOMED), world.belief).failure
+    assert failure is not None
+    assert failure.step == STEP
+    assert failure.reason.startswith(f"{type(exception).__name__}: {str(exception)[:1000]}")
+    assert len(failure.reason) < 1100
+
+
+def test_ctrl_c_in_this_process_is_ctrl_c(world: cs.Scenario, doomed: Control) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run_filter(Still("bad", raises(KeyboardInterrupt()), doomed), cs.simulate(world, DOOMED), world.belief)
+
+
+class Cut(dict[str, Any]):
+    """Ctrl-C comes while a run is taken in."""
+
+    def items(self) -> Any:
+        raise KeyboardInterrupt
+
+
+def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world: cs.Scenario, doomed: Control) -> None:
+    with Isolation([Still("bad", segfaults, doomed)], world.belief) as isolation:
+        whole, cut = (
+            (trial, isolation.run(trial)) for trial in (cs.simulate(world, run) for run in (DOOMED, DOOMED + 1))
+        )
+    gathered = Gathered(["bad"], {})
+    gathered.add(outcome_of(*whole))
+    with pytest.raises(KeyboardInterrupt):
+        gathered.add(replace(outcome_of(*cut), maps=Cut()))
+    results = gathered.results({"filters": ["bad"]}, None)
+    assert results.estimates["run"].unique().tolist() == [DOOMED]
+    assert results.truth is not None
+    assert results.truth["run"].unique().tolist() == [DOOMED]
+    assert results.failures[["run", "step"]].to_numpy().tolist() == [[DOOMED, STEP]]
+
+
+class Closes(Still):
+    """Says which process it is in, and closes its standard streams."""
+
+    def init(self, problem: Any) -> Any:
+        state = np.array([float(os.getpid()), float(self.kept[0] in dict(enumerate_files())), 0.0])
+        os.close(self.kept[0])
+        return state
+
+
+def enumerate_files() -> list[tuple[int, bool]]:
+    return [(int(name), True) for name in os.listdir("/proc/self/fd")]
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_process_that_closed_its_streams_is_replaced(world: cs.Scenario, number: int) -> None:
+    """Otherwise the next run would write into whatever file has the number then."""
+    results = cs.run_trials(world, [Closes("closes", kept=[number])], runs=RUNS, jobs=1)
+    assert len(results.failures) == 0
+    assert results.estimates.groupby("run")["x"].first().nunique() == RUNS
+    assert (results.estimates["y"] == 1.0).all()
+
+
+def takes_the_pipe(*_: Any) -> None:
+    """Puts a file of its own in the place of the pipe to the bench."""
+    os.closerange(3, 256)
+    for _ in range(64):
+        os.dup(2)
+
+
+def test_a_reply_goes_to_no_other_file(world: cs.Scenario, doomed: Control, capfd: pytest.CaptureFixture[str]) -> None:
+    results = cs.run_trials(world, [Still("bad", takes_the_pipe, doomed)], runs=RUNS, jobs=1)
+    reason = "its process closed its pipe to the bench"
+    assert results.failures[["run", "reason"]].to_numpy().tolist() == [[DOOMED, reason]]
+    assert "Estimates" not in "".join(capfd.readouterr())
+
+
+def shouts(self: Still, _: Any) -> None:
+    for number in range(20000):
+        print("out", number)
+        print("err", number, file=sys.stderr)
+    if self.kept:
+        sys.stdout.flush()
+        os.abort()
+
+
+@pytest.mark.usefixtures("no_supervisors")
+@pytest.mark.parametrize("dies", [False, True])
+def test_what_a_filter_prints_is_bounded(
+    world: cs.Scenario, doomed: Control, capfd: pytest.CaptureFixture[str], dies: bool
+) -> None:
+    loud = Still("loud", shouts, doomed, kept=[1] * dies)
+    calm = cs.run_trials(world, [loud, Prints("quiet")], runs=RUNS, jobs=1)
+    assert len(calm.failures) == dies
+    out, err = capfd.readouterr()
+    assert "out" not in out
+    assert err.count("filter 'loud' prints more than 16384 bytes; the rest is not shown\n") == 1
+    assert err.count("a word of quiet\n") == RUNS
+    assert "\nout 0\n" in f"\n{err}"
+    assert ("out 19999" in err) == dies
+    assert ("\nconsistency: the last that filter 'loud' printed:\n" in err) == dies
+    assert 16384 < len(err) < 16384 + 2048 + 1000
+
+
+class Prints(Still):
+    def init(self, problem: Any) -> Any:
+        print("a word of quiet")
+        return problem.start
+
+
+class Counts(Still):
+    """Each run says how many runs its object has seen."""
+
+    def init(self, problem: Any) -> Any:
+        self.kept.append(1)
+        return np.full(3, len(self.kept))
+
+
+def test_no_run_depends_on_those_before_it(world: cs.Scenario) -> None:
+    results = [cs.run_trials(world, [Counts("counts")], runs=4, jobs=jobs) for jobs in (1, 2)]
+    for result in results:
+        assert (result.estimates["x"] == 1.0).all()
+    pd.testing.assert_frame_equal(results[0].estimates, results[1].estimates, check_exact=True)
+
+
+def test_trials_that_differ_share_a_process(world: cs.Scenario) -> None:
+    """More steps than before have room, and nothing is left of what was said in an earlier trial."""
+    short, long = (cs.simulate(world.variant(f"w{n}", truth__steps=n)) for n in (12, 60))
+    blind = [
+        replace(trial, first=np.zeros_like(trial.first), landmark=trial.landmark[:0], z=trial.z[:0])
+        for trial in (short, long)
+    ]
+    assert len(short.landmark)
+    with Isolation([Still("calm")], world.belief) as isolation:
+        for trial in (short, *blind, short, long):
+            [said], expected = isolation.run(trial), run_filter(Still("calm"), trial, world.belief)
+            assert said.failure is None
+            for name in ("pose", "covariance", "nis", "nis_dof"):
+                np.testing.assert_array_equal(getattr(said, name), getattr(expected, name))
+
+
+# --- killed from outside ---------------------------------------------------------------------------
+
+
+def kills_once(folder: Path, supervisor: bool) -> Callable[..., None]:
+    """SIGKILL as if from outside; ``folder`` has a file for each process that came to it."""
+
+    def act(*_: Any) -> None:
+        (folder / str(os.getpid())).touch()
+        if len(list(folder.iterdir())) == 1:
+            os.kill(os.getppid() if supervisor else os.getpid(), signal.SIGKILL)
+            time.sleep(100)
+
+    return act
+
+
+def is_gone(pid: int, patience: float = 10.0) -> bool:
+    """Whether a process ends in good time; it may have to be reaped by others than us."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("supervisor", [True, False])
+def test_a_killed_worker_costs_nothing(
+    world: cs.Scenario, doomed: Control, calm: pd.DataFrame, tmp_path: Path, supervisor: bool
+) -> None:
+    results = cs.run_trials(world, [Still("bad", kills_once(tmp_path, supervisor), doomed)], runs=RUNS, jobs=2)
+    assert len(list(tmp_path.iterdir())) == 2
+    assert all(is_gone(int(path.name)) for path in tmp_path.iterdir())
+    assert len(results.failures) == 0
+    expected = rows(calm, "calm").assign(filter="bad")
+    pd.testing.assert_frame_equal(results.estimates, expected, check_exact=True)
+
+
+def test_a_worker_that_is_killed_twice_is_a_failed_run(world: cs.Scenario, doomed: Control) -> None:
+    def act(*_: Any) -> None:
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(100)
+
+    results = cs.run_trials(world, [Still("bad", act, doomed)], runs=RUNS, jobs=1)
+    assert results.failures.to_numpy().tolist() == [
+        ["bad", DOOMED, 1, "the supervisor of its process was killed twice"]
+    ]
+    assert len(results.estimates) == (RUNS - 1) * world.truth.steps
+
+
+# --- processes -------------------------------------------------------------------------------------
+
+
+class Threads(Still):
+    """Says how many threads BLAS has in its process."""
+
+    def init(self, problem: Any) -> Any:
+        counts = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+        return np.array([max(counts), 0.0, 0.0])
+
+
+@pytest.fixture
+def no_supervisors() -> Iterator[None]:
+    """New ones, and those of before set aside: starting one takes a second or more."""
+    before = isolating._idle[:]
+    isolating._idle.clear()
+    yield
+    isolating.dismiss()
+    isolating._idle.extend(before)
+
+
+@pytest.mark.usefixtures("no_supervisors")
+def test_blas_has_one_thread(world: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in isolating.ONE_THREAD:
+        monkeypatch.setenv(name, "2")
+    results = cs.run_trials(world, [Threads("threads")], runs=1, jobs=1)
+    assert (results.estimates["x"] == 1.0).all()
+
+
+def hangs(folder: Path) -> Callable[..., None]:
+    """Leaves its process number in ``folder``, and does not end."""
+
+    def act(*_: Any) -> None:
+        (folder / str(os.getpid())).touch()
+        while True:
+            pass
+
+    return act
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_ends_what_hangs(world: cs.Scenario, doomed: Control, tmp_path: Path, jobs: int) -> None:
+    """What is finished is handed over, and no process is left."""
+
+    def interrupt() -> None:
+        while not list(tmp_path.iterdir()):
+            time.sleep(0.05)
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(Interrupted) as stop:
+        cs.run_trials(world, [Still("bad", hangs(tmp_path), doomed)], runs=RUNS, jobs=jobs)
+    signal.signal(signal.SIGINT, before)
+    finished = stop.value.results.manifest["finished_runs"]
+    assert finished == DOOMED if jobs == 1 else finished < RUNS
+    assert all(is_gone(int(path.name)) for path in tmp_path.iterdir())
+
+
+SCRIPT = """
+import numpy as np
+import consistency as cs
+
+WORD = "here"
+
+class Mine:
+    def init(self, problem):
+        return problem.start
+    def predict(self, state, control):
+        print(WORD, flush=True)
+        while True:
+            pass
+    def update(self, state, observation):
+        return state, None
+    def pose(self, state):
+        return cs.Gaussian(state, np.eye(3))
+
+world = cs.load_scenario("herath2007-xyz").variant("short", truth__steps=5)
+cs.run_trials(world, [Mine()], runs=2, jobs=1)
+"""
+
+
+def test_a_filter_that_hangs_ends_with_the_study(tmp_path: Path) -> None:
+    """A script without a guard on ``__main__`` is killed: its standard error is closed when all its processes are."""
+    (tmp_path / "mine.py").write_text(SCRIPT)
+    process = subprocess.Popen([sys.executable, "mine.py"], cwd=tmp_path, stderr=subprocess.PIPE)
+    assert process.stderr is not None
+    with process:
+        assert process.stderr.readline() == b"here\n"
+        process.kill()
+        reader = threading.Thread(target=process.stderr.read, daemon=True)
+        reader.start()
+        reader.join(30.0)
+        assert not reader.is_alive()
+
+
+# --- refused ---------------------------------------------------------------------------------------
+
+
+def test_a_filter_that_cannot_be_pickled_is_refused(world: cs.Scenario) -> None:
+    with pytest.raises(cs.InputError, match=r"'lock' runs in a process of its own and cannot be pickled.*init"):
+        cs.run_trials(world, [Still("lock", kept=[threading.Lock()])], runs=1, jobs=1)
+
+
+@pytest.mark.usefixtures("no_supervisors")
+def test_a_worker_of_a_pool_is_refused(world: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A daemonic process can start no other."""
+    monkeypatch.setitem(vars(multiprocessing.current_process())["_config"], "daemon", True)
+    with pytest.raises(cs.InputError, match=r"worker of multiprocessing.Pool cannot start; use"):
+        cs.run_trials(world, [Still("calm")], runs=1, jobs=1)
+
+
+@pytest.mark.parametrize("option", ["timeout", "memory"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
+def test_limits_are_positive(world: cs.Scenario, option: str, value: float) -> None:
+    with pytest.raises(cs.InputError, match=f"{option} must be positive, got"):
+        cs.run_trials(world, ["ekf-xyz"], runs=1, jobs=1, **{option: value})  # type: ignore[call-overload]
+
+
+def takes_half(*_: Any) -> None:
+    np.ones(int(0.5 * MEMORY * 2**27))
+
+
+def test_a_filter_within_its_limits_has_the_same_bits(world: cs.Scenario, doomed: Control, calm: pd.DataFrame) -> None:
+    filters = [Still("calm", takes_half, doomed), "ekf-xyz"]
+    limited = cs.run_trials(world, filters, runs=RUNS, jobs=2, timeout=LONG, memory=MEMORY)
+    pd.testing.assert_frame_equal(limited.estimates, calm, check_exact=True)
+
+
+def test_trials_are_read_only_in_a_process(world: cs.Scenario) -> None:
+    class InPlace(Still):
+        def init(self, problem: Any) -> Any:
+            problem.start += 1.0
+            return problem.start
+
+    failures = cs.run_trials(world, [InPlace("in-place")], runs=1, jobs=1).failures
+    assert "read-only" in failures["reason"][0]
+
+
+# --- where processes cannot be forked --------------------------------------------------------------
+
+
+def test_a_process_that_is_spawned(world: cs.Scenario, doomed: Control, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on macOS and Windows: the same bits, and a crash is a failed run with its step."""
+    monkeypatch.setattr(supervising, "_context", multiprocessing.get_context("spawn"))
+    bad = Still("bad", ends, doomed)
+    study = Isolation([bad], world.belief, LONG)._study
+    trials = [cs.simulate(world, run) for run in (DOOMED + 1, DOOMED)]
+    near, far = multiprocessing.Pipe()
+    longest = max(trials, key=lambda trial: len(trial.landmark))
+    host = supervising._Host(study, study.guests["bad"], longest, supervising.Printed("bad"))
+    for trial in trials:
+        reply = host.run(trial, pickle.dumps(supervising.Task("bad", trial, world.belief)), far)
+        assert reply.estimates is not None
+        expected = run_filter(Still("bad"), trial, world.belief)
+        if trial.run == DOOMED:
+            assert reply.estimates.failure is not None
+            assert reply.estimates.failure.step == STEP
+            assert reply.estimates.failure.reason == "its process ended with exit status 5"
+            steps = slice(STEP - 1)
+        else:
+            assert reply.estimates.failure is None
+            steps = slice(None)
+        for name in ("pose", "covariance", "nis", "nis_dof"):
+            np.testing.assert_array_equal(getattr(reply.estimates, name)[steps], getattr(expected, name)[steps])
+    near.close()
+    far.close()
+
+
+def ends(*_: Any) -> None:
+    os._exit(5)

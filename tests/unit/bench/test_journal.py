@@ -1,0 +1,575 @@
+"""Finished runs survive: the journal, its lock, signals, what cannot be written, and tables that were edited."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from edited import accept_changes
+
+import consistency as cs
+from consistency.bench.runs import gather
+from consistency.bench.runs.gather import Gathered
+from consistency.bench.runs.montecarlo import Interrupted
+from consistency.bench.simulation import World
+from consistency.bench.store import journal as journals
+from consistency.bench.store import storage
+from consistency.bench.store.journal import Journal, Unfinished
+from consistency.bench.store.results import Outcome, open_results
+from consistency.referee.system import stopping
+from consistency.referee.system.stopping import Stop, stoppable
+from consistency.referee.terminal.progress import progress, say
+
+FILTER = ["ekf-uvd"]
+RUNS = 6
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
+
+
+def columns(run: int, rows: int = 5) -> dict[str, Any]:
+    numbers = np.random.default_rng(run).standard_normal(rows)
+    numbers[0] = np.nan
+    return {"run": np.full(rows, run), "x": numbers}
+
+
+def fill(journal: Journal, *runs: int) -> None:
+    for run in runs:
+        notes = {"failures": [["f", run, 3, "odd \udce9 letters"]]} if run == 2 else {}
+        journal.append(run, {"estimates f": columns(run), "truth": columns(100 + run, 3)}, notes)
+
+
+def held(journal: Journal, part: str = "estimates f") -> dict[int, bytes]:
+    pieces = {run: b"".join(each.tobytes() for each in piece.values()) for run, piece in journal.pieces(part)}
+    assert list(pieces) == sorted(pieces)
+    return pieces
+
+
+def expected(*runs: int) -> dict[int, bytes]:
+    return {run: b"".join(each.tobytes() for each in columns(run).values()) for run in sorted(runs)}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "journal"
+
+
+@pytest.fixture(scope="module")
+def whole(uvd: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of one go."""
+    folder = tmp_path_factory.mktemp("journal") / "whole"
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=folder)
+    return folder
+
+
+@pytest.fixture
+def at_run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Has something done at the beginning of a run, or of each where its number is ``...``."""
+    trial = World.trial
+
+    def arm(number: Any, work: Callable[..., object]) -> None:
+        def worked(self: World, run: int, seed: int) -> Any:
+            if number is ...:
+                work(run)
+            elif run == number:
+                work()
+            return trial(self, run, seed)
+
+        monkeypatch.setattr(World, "trial", worked)
+
+    yield arm
+    monkeypatch.setattr(World, "trial", trial)
+
+
+# --- the file ------------------------------------------------------------------------------------
+
+
+def test_runs_come_back_in_their_order_with_all_bits(path: Path) -> None:
+    journal = Journal(path)
+    journal.begin({"seed": 3})
+    fill(journal, 4, 0, 2)
+    for each in (journal, Journal(path)):
+        assert held(each) == expected(0, 2, 4)
+        assert each.runs == {0, 2, 4}
+        assert each.notes == {2: {"failures": [["f", 2, 3, "odd \udce9 letters"]]}}
+        assert list(each.pieces("truth"))[1][1]["run"].tolist() == [102] * 3
+        assert list(each.pieces("map f")) == []
+        assert (each.study, each.dropped) == ({"seed": 3}, 0)
+        each.close()
+
+
+def test_a_cut_record_is_dropped_wherever_it_is_cut(path: Path) -> None:
+    journal = Journal(path)
+    fill(journal, 0, 1)
+    before = path.stat().st_size
+    fill(journal, 2)
+    journal.close()
+    entire = path.read_bytes()
+    for size in (*range(before, len(entire), 97), before + 1, before + journals.HEAD.size, len(entire) - 1):
+        path.write_bytes(entire[:size])
+        cut = Journal(path)
+        assert path.stat().st_size == before
+        assert (held(cut), cut.dropped, cut.notes) == (expected(0, 1), size - before, {})
+        fill(cut, 2)
+        cut.close()
+        assert path.read_bytes() == entire
+
+
+@pytest.mark.parametrize("where", [0.4, 0.5, 0.6])
+def test_a_flipped_bit_costs_its_run_alone(path: Path, where: float) -> None:
+    journal = Journal(path)
+    fill(journal, 0, 1, 2)
+    journal.close()
+    damaged = bytearray(path.read_bytes())
+    damaged[int(where * len(damaged))] ^= 1
+    path.write_bytes(damaged)
+    again = Journal(path)
+    assert again.dropped > 0
+    assert held(again) == expected(0, 2)
+    again.close()
+
+
+def test_what_is_no_record_ends_the_journal(path: Path) -> None:
+    journal = Journal(path)
+    fill(journal, 0)
+    journal.close()
+    path.write_bytes(path.read_bytes() + b"\0" * 4096)  # as a power cut may leave
+    again = Journal(path)
+    assert (held(again), again.dropped) == (expected(0), 4096)
+    again.close()
+
+
+class HalfWritten:
+    """A file whose disk is full: it takes half of what is written, and then refuses."""
+
+    def __init__(self, file: Any) -> None:
+        self.file, self.full = file, False
+
+    def write(self, data: memoryview) -> int:
+        if self.full:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self.full = True
+        return int(self.file.write(data[: len(data) // 2]))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.file, name)
+
+
+def test_a_full_disk_leaves_whole_records_and_may_be_freed(path: Path) -> None:
+    journal = Journal(path)
+    fill(journal, 0)
+    file, size = journal._file, path.stat().st_size
+    journal._file = HalfWritten(file)  # type: ignore[assignment]
+    with pytest.raises(OSError, match="No space left"):
+        fill(journal, 1)
+    assert (path.stat().st_size, journal.runs) == (size, {0})
+    journal._file = file
+    fill(journal, 2)
+    journal.close()
+    again = Journal(path)
+    assert (held(again), again.dropped) == (expected(0, 2), 0)
+    again.close()
+
+
+def test_a_journal_that_is_cut_while_it_is_used_is_refused(path: Path) -> None:
+    journal = Journal(path)
+    fill(journal, 0, 1)
+    os.truncate(path, path.stat().st_size - 9)
+    with pytest.raises(cs.InputError, match="cut short by another program"):
+        list(journal.pieces("truth"))
+    journal.close()
+
+
+def test_records_are_brought_to_disk_without_waiting_for_the_next(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced = threading.Event()
+    monkeypatch.setattr(journals, "SYNC_EVERY", 0.02)
+    monkeypatch.setattr(os, "fsync", lambda _: synced.set())
+    journal = Journal(path)
+    fill(journal, 0)
+    synced.clear()
+    fill(journal, 1)
+    assert synced.wait(5.0)
+    journal.close()
+
+
+def test_a_disk_that_fails_later_is_not_unheard(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    journal = Journal(path)
+    fill(journal, 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fails)
+        journal._sync()
+    with pytest.raises(OSError, match="Input/output error"):
+        fill(journal, 1)
+    journal.close()
+
+
+# --- beside an output folder -----------------------------------------------------------------------
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Unfinished(out) as first:
+        fill(first.journal, 0)
+        for options in ({}, {"resume": True}, {"overwrite": True}):
+            with pytest.raises(cs.InputError, match=r"--out .*out: another process is at work on it"):
+                Unfinished(out, **options)
+        fill(first.journal, 1)
+    with Unfinished(out, resume=True) as second:
+        assert second.journal.runs == {0, 1}
+
+
+def test_unfinished_work_is_neither_ignored_nor_dropped_unasked(tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "out"
+    with Unfinished(out) as first:
+        fill(first.journal, 0, 1)
+    for _ in range(2):
+        with pytest.raises(cs.InputError, match=r"with 2 finished runs; add --resume .* to go on, or --overwrite"):
+            Unfinished(out)
+    with Unfinished(out, resume=True) as again:
+        assert again.journal.runs == {0, 1}
+    with Unfinished(out, overwrite=True) as fresh:
+        assert fresh.journal.runs == set()
+    assert list((tmp_path / "deep").iterdir()) == [], "nothing is finished, nothing stays"
+
+
+def test_folders_that_were_made_go_with_what_was_for_nothing(tmp_path: Path) -> None:
+    with Unfinished(tmp_path / "a" / "b" / "out"):
+        (tmp_path / "a" / "mine.txt").write_text("x")
+    assert [path.name for path in tmp_path.rglob("*")] == ["a", "mine.txt"]
+
+
+# --- whatever ends the process -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cut", [0, 1, 7_000])
+def test_what_a_killed_process_leaves_is_gone_on_with(
+    uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any, capsys: Any, cut: int
+) -> None:
+    """What is on disk in the middle of a run is what SIGKILL would leave; a record may be cut besides."""
+    out, left = tmp_path / "first" / "out", tmp_path / "second"
+    at_run(4, lambda: shutil.copytree(out.parent, left))
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out)
+    journal = left / ".out.unfinished" / "journal"
+    os.truncate(journal, journal.stat().st_size - cut)
+    begun: set[int] = set()
+    at_run(..., begun.add)
+    capsys.readouterr()
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=left / "out", resume=True)
+    assert content(left / "out") == content(whole)
+    assert [path.name for path in left.iterdir()] == ["out"]
+    assert begun == ({4, 5} if cut == 0 else {3, 4, 5})
+    assert ("not whole" in capsys.readouterr().err) == (cut > 0)
+
+
+def test_only_what_is_missing_is_done_again(uvd: cs.Scenario, whole: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    with Unfinished(tmp_path / "out") as unfinished:  # another filter's journal
+        unfinished.journal.begin({"scenario_hash": uvd.hash, "filters": FILTER, "error": {}, "seed": 4})
+        fill(unfinished.journal, 0)
+    with pytest.raises(cs.InputError, match="the results to resume have another seed"):
+        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=True)
+    with Unfinished(tmp_path / "out", resume=True) as unfinished:
+        assert unfinished.journal.runs == {0}, "it is still there"
+    monkeypatch.setattr(gather, "Writer", None)
+    with pytest.raises(TypeError):
+        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "other")
+    monkeypatch.undo()
+    monkeypatch.setattr(World, "trial", None)
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "other", resume=True)
+    assert content(tmp_path / "other") == content(whole)
+
+
+def test_killed_while_results_were_replaced(uvd: cs.Scenario, whole: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    """The old folder is away and the new one not there: both are found again."""
+    out, replace = tmp_path / "out", os.replace
+    cs.run_trials(uvd, FILTER, 3, seed=3, jobs=1, out=out)
+
+    def dies(source: Path, target: Path) -> None:
+        if Path(target) == out:
+            raise SystemExit("killed")
+        replace(source, target)
+
+    monkeypatch.setattr(storage.os, "replace", dies)
+    with pytest.raises(SystemExit):
+        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+    monkeypatch.undo()
+    assert not out.exists()
+    monkeypatch.setattr(World, "trial", None)
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+    assert content(out) == content(whole)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_killed_before_the_journal_was_removed(uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any) -> None:
+    """The results are there, and their runs are in the journal, too: they count once."""
+    out, unfinished = tmp_path / "out", tmp_path / ".out.unfinished"
+    at_run(4, lambda: shutil.copytree(unfinished, tmp_path / "copy"))
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out)
+    (tmp_path / "copy").rename(unfinished)
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
+    assert content(out) == content(whole)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_outcomes_in_any_order_give_the_same_bytes(
+    uvd: cs.Scenario, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcomes: list[Outcome] = []
+    add, results = Gathered.add, Gathered.results
+
+    def backwards(self: Gathered, *rest: Any) -> Any:
+        for outcome in reversed(outcomes):
+            add(self, outcome)
+        return results(self, *rest)
+
+    monkeypatch.setattr(Gathered, "add", lambda self, outcome: outcomes.append(outcome))
+    monkeypatch.setattr(Gathered, "results", backwards)
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out")
+    outcomes.clear()
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1).write(tmp_path / "memory")
+    assert content(tmp_path / "out") == content(tmp_path / "memory") == content(whole)
+
+
+def test_a_place_that_was_removed_meanwhile_is_made_again(
+    uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any
+) -> None:
+    """The whole folder above is gone, with the journal in it: the work is not."""
+    at_run(4, lambda: shutil.rmtree(tmp_path / "deep"))
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "deep" / "out")
+    assert content(tmp_path / "deep" / "out") == content(whole)
+
+
+# --- signals -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def handled() -> Iterator[None]:
+    """Ctrl-C as in a terminal; all as it was at the end."""
+    before = {number: signal.getsignal(number) for number in stopping.STOPS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("handled")
+def test_a_second_ctrl_c_soon_is_the_same_wish(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with stoppable() as stop:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        now[0] += 0.9 * stopping.GRACE
+        signal.raise_signal(signal.SIGINT)
+        now[0] += 0.2 * stopping.GRACE
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert (stop.number, stop.status) == (signal.SIGINT, 130)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.usefixtures("handled")
+def test_signals_that_a_program_takes_itself_stay_its_own() -> None:
+    def own(*_: object) -> None: ...
+
+    signal.signal(signal.SIGTERM, own)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    with stoppable(also=stopping.STOPS) as stop, stoppable() as inner:
+        assert inner is stop
+        assert signal.getsignal(signal.SIGINT) is stop
+        assert signal.getsignal(signal.SIGTERM) is own
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    with stoppable(also=stopping.STOPS) as stop:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGHUP)
+        assert stop.status == 129
+    with stoppable():
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL, "a library leaves it alone"
+
+
+@pytest.mark.usefixtures("handled")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_two_ctrl_c_lose_nothing(uvd: cs.Scenario, whole: Path, tmp_path: Path, at_run: Any, jobs: int) -> None:
+    def press() -> None:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.005)
+
+    def twice() -> None:
+        thread = threading.Thread(target=press)
+        thread.start()
+        thread.join()
+
+    at_run(4, twice)
+    with pytest.raises(Interrupted) as stopped:
+        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=jobs, out=tmp_path / "out")
+    assert stopped.value.status == 130
+    there = (tmp_path / "out").exists()
+    assert there or jobs == 2, "of two workers one may be in run 4 before an outcome is taken"
+    if there:
+        done = open_results(tmp_path / "out").finished_runs(FILTER)
+        assert 4 not in done
+        assert jobs == 2 or done == {0, 1, 2, 3}, "of two workers one may be behind"
+    at_run(4, int)
+    cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out", resume=there)
+    assert content(tmp_path / "out") == content(whole)
+
+
+@pytest.mark.usefixtures("handled")
+def test_a_stop_that_was_swallowed_stops_nevertheless(uvd: cs.Scenario, tmp_path: Path, at_run: Any) -> None:
+    def swallowed() -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    at_run(2, swallowed)
+    with pytest.raises(Interrupted):
+        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out")
+    assert open_results(tmp_path / "out").finished_runs(FILTER) == {0, 1, 2}
+
+
+@pytest.mark.usefixtures("handled")
+def test_an_error_that_a_stop_caused_is_a_stop(uvd: cs.Scenario, tmp_path: Path, at_run: Any) -> None:
+    """As where a worker was ended by the same signal."""
+
+    def fails() -> None:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as stop:
+            raise RuntimeError("worker died") from stop
+
+    at_run(2, fails)
+    with pytest.raises(Interrupted):
+        cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=tmp_path / "out")
+    assert open_results(tmp_path / "out").finished_runs(FILTER) == {0, 1}
+
+
+def test_a_stop_is_a_handler_that_remembers() -> None:
+    stop = Stop()
+    with pytest.raises(KeyboardInterrupt):
+        stop(15, None)
+    stop(2, None)
+    assert (stop.number, stop.status) == (15, 143)
+
+
+# --- what cannot be written ------------------------------------------------------------------------
+
+
+class Gone:
+    """A terminal that was closed."""
+
+    def write(self, _: str) -> int:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    def flush(self) -> None:
+        raise BrokenPipeError
+
+    def isatty(self) -> bool:
+        return False
+
+
+class GoneTerminal(Gone):
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("stream", [None, Gone(), GoneTerminal()], ids=["closed", "pipe", "terminal"])
+def test_progress_that_nobody_can_read_ends_nothing(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", stream)
+    say("one line")
+    with progress("runs", 2) as advance:
+        advance(1)
+        advance(1)
+
+
+# --- manifest ----------------------------------------------------------------------------------------
+
+
+def halved(table: pd.DataFrame) -> pd.DataFrame:
+    return table[: len(table) // 2]
+
+
+def doubled(table: pd.DataFrame) -> pd.DataFrame:
+    return pd.concat([table, table])
+
+
+def shifted(table: pd.DataFrame) -> pd.DataFrame:
+    return table.assign(x=table["x"] + 1e-9)
+
+
+@pytest.mark.parametrize("edit", [halved, doubled, shifted])
+@pytest.mark.parametrize("name", ["estimates", "truth", "map", "landmarks"])
+def test_an_edited_table_is_refused(whole: Path, tmp_path: Path, name: str, edit: Any) -> None:
+    shutil.copytree(whole, tmp_path / "out")
+    path = tmp_path / "out" / f"{name}.parquet"
+    edit(pd.read_parquet(path)).to_parquet(path, index=False)
+    said = rf"{name}\.parquet: is not as it was written, .*; write the folder again, or, .* 'contents' of manifest.json"
+    with pytest.raises(cs.InputError, match=said):
+        open_results(tmp_path / "out")
+    accept_changes(tmp_path / "out")
+    if edit is shifted:  # whose rows are whole
+        assert open_results(tmp_path / "out")
+
+
+def test_a_folder_of_before_has_no_digests(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole, tmp_path / "out")
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    for key in ("contents", "machines"):
+        del manifest[key]
+    (tmp_path / "out" / "manifest.json").write_text(json.dumps(manifest))
+    assert open_results(tmp_path / "out").finished_runs(FILTER) == set(range(RUNS))
+
+
+@pytest.mark.parametrize("contents", [[], {"poses": {}}, "all"])
+def test_contents_that_are_none_of_this_bench(whole: Path, tmp_path: Path, contents: Any) -> None:
+    shutil.copytree(whole, tmp_path / "out")
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    (tmp_path / "out" / "manifest.json").write_text(json.dumps(manifest | {"contents": contents}))
+    with pytest.raises(cs.InputError, match=r"manifest\.json: key 'contents' must have tables as keys"):
+        open_results(tmp_path / "out")
+
+
+def test_another_processor_is_named(uvd: cs.Scenario, whole: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    manifest = json.loads((out / "manifest.json").read_text())
+    (here,) = manifest["machines"]
+    assert here["cpu"]
+    assert here["blas"]
+    old = {"cpu": "Z80", "blas": "Prescott"}
+    capsys.readouterr()
+    cs.run_trials(uvd, FILTER, RUNS + 1, seed=3, jobs=1, out=out, resume=True)
+    assert "last digits" not in capsys.readouterr().err
+    manifest = json.loads((out / "manifest.json").read_text())
+    (out / "manifest.json").write_text(json.dumps(manifest | {"machines": [old]}))
+    accept_changes(out)
+    cs.run_trials(uvd, FILTER, RUNS + 2, seed=3, jobs=1, out=out, resume=True)
+    assert "Z80 (BLAS: Prescott) computed the runs that are there" in capsys.readouterr().err
+    assert open_results(out).manifest["machines"] == [old, here]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_no_signal_disturbs_what_must_be_whole() -> None:
+    """Each of those that are taken for Ctrl-C, SIGTERM and SIGHUP among them."""
+    with stopping.undisturbed():
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            assert signal.getsignal(number) is signal.SIG_IGN, number

@@ -1,0 +1,138 @@
+"""Compiled code on disk: what is damaged or not ours is compiled anew, is never loaded, and fails no run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from consistency.bench.filters.kernel import jit, kept, whole
+
+
+def total(n: int) -> float:
+    result = 0.0
+    for k in range(n):
+        result += k
+    return result
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where kernels of this test are kept."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    kept._say.cache_clear()
+    return tmp_path / "cache"
+
+
+def use() -> tuple[bool, int]:
+    """Whether a kernel, as a new process has it, is ready, and how many signatures it then loads from disk."""
+    kernel = jit.Kernel(total)
+    ready = kernel.is_ready(5)
+    assert kernel(5) == kernel(5) == 10.0
+    assert kernel.is_ready(5)
+    return ready, kernel.loaded
+
+
+def code_in(cache: Path) -> Path:
+    (path,) = cache.rglob(f"*{kept.SUFFIX}")
+    return path
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def flip_digest(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[3] ^= 1
+    path.write_bytes(content)
+
+
+def open_to_all(path: Path) -> None:
+    path.chmod(0o666)
+
+
+@pytest.mark.parametrize("damage", [truncate, flip, flip_digest, open_to_all])
+def test_damaged_code_is_compiled_anew_and_said_once(
+    cache: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None]
+) -> None:
+    assert use() == (False, 0)
+    damage(code_in(cache))
+    assert capsys.readouterr().err == ""
+    assert use() == (False, 0)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert ("somebody else" if damage is open_to_all else "compiled anew") in said
+    assert use() == (True, 1)
+    assert capsys.readouterr().err == ""
+
+
+def test_an_empty_file_is_not_loaded(cache: Path) -> None:
+    use()
+    code_in(cache).write_bytes(b"")
+    assert use() == (False, 0)
+    assert use() == (True, 1)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owners on this system")
+def test_code_of_another_owner_is_neither_loaded_nor_overwritten(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    use()
+    before = code_in(cache).read_bytes()
+    monkeypatch.setattr(os, "getuid", lambda: code_in(cache).stat().st_uid + 1)
+    if code_in(cache).stat().st_uid == 0:  # root is trusted: make the owner somebody else
+        for path in (code_in(cache).parent, code_in(cache)):
+            os.chown(path, 12345, -1)
+    assert use() == (False, 0)
+    assert "somebody else may write there" in capsys.readouterr().err
+    assert code_in(cache).read_bytes() == before
+
+
+def test_a_cache_that_cannot_be_written_fails_nothing(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cache.write_text("a file where the cache would be", encoding="utf-8")
+    assert use() == (False, 0)
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_code_that_cannot_be_kept_serves_its_process(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A full disk."""
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    assert use() == (False, 0)
+    assert not list(cache.rglob(".*")) + list(cache.rglob(f"*{kept.SUFFIX}"))
+    assert capsys.readouterr().err.count("No space left on device; compiled code is not kept") == 1
+
+
+def test_what_was_not_used_for_longest_is_removed_first(tmp_path: Path) -> None:
+    for age, name in enumerate("abcd"):
+        path = tmp_path / f"{name}{kept.SUFFIX}"
+        path.write_bytes(bytes(100))
+        os.utime(path, (1e9 - age, 1e9 - age))
+    unfinished, stale = tmp_path / ".new", tmp_path / ".old"
+    for path, time in ((unfinished, 1e9), (stale, 1e9 - 2e5)):
+        path.write_bytes(b"")
+        os.utime(path, (time, time))
+    kept.prune(tmp_path, most=250)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".new", "a.kernel", "b.kernel"]
+
+
+def test_an_untried_numba_compiles_as_it_does(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(whole, "numba", SimpleNamespace(__version__="99.1"))
+    assert not whole.is_supported()
+    assert use() == (False, 0)
+    assert use() == (True, 1)

@@ -1,0 +1,304 @@
+"""Runs until decided and runs of a log, on a journal: whatever ends them, a resume gives the bytes of one go."""
+
+from __future__ import annotations
+
+import json
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import consistency as cs
+from consistency.bench.runs import gather, sequential
+from consistency.bench.runs.montecarlo import Interrupted, run_log, simulate_log
+from consistency.bench.runs.sequential import run_until_decided
+from consistency.bench.runs.work import Work
+from consistency.bench.store.curves import Curves
+from consistency.bench.store.log import read_log
+from consistency.bench.store.results import Outcome, StoredResults, open_results
+from consistency.bench.types import Trial
+from consistency.referee.terminal.table import verdicts_json
+
+OPEN: dict[str, Any] = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "seed": 3, "jobs": 1}  # looks at 12 to 20
+
+
+@pytest.fixture(scope="module")
+def world() -> cs.Scenario:
+    return cs.load_scenario("linear-gaussian").variant("short", truth__steps=40)
+
+
+@pytest.fixture(scope="module")
+def whole(world: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of one go."""
+    out = tmp_path_factory.mktemp("looks") / "whole"
+    run_until_decided(world, ["kf"], out=out, **OPEN)
+    return out
+
+
+@pytest.fixture
+def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], list[int]]:
+    """What is raised in the place of a run; gives the list of the runs that are done."""
+
+    def arm(run: int, error: BaseException) -> list[int]:
+        one, done = Work.__call__, list[int]()
+
+        def stopped(self: Work, number: int) -> Outcome:
+            if number == run:
+                raise error
+            done.append(number)
+            return one(self, number)
+
+        monkeypatch.setattr(Work, "__call__", stopped)
+        return done
+
+    return arm
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
+
+
+def plan_in(folder: Path) -> Any:
+    return json.loads((folder / "manifest.json").read_text())["until_decided"]
+
+
+# --- until decided -----------------------------------------------------------------------------------
+
+
+def test_the_folder_is_that_of_a_plain_run_with_the_plan(world: cs.Scenario, whole: Path, tmp_path: Path) -> None:
+    results, verdicts = run_until_decided(world, ["kf"], **OPEN)
+    cs.run_trials(world, ["kf"], runs=20, seed=3, jobs=1, out=tmp_path / "plain")
+    assert content(whole) == content(tmp_path / "plain")
+    stored = open_results(whole)
+    assert verdicts_json(cs.analyse(stored)) == verdicts_json(verdicts)
+    assert plan_in(whole) == results.manifest["until_decided"]
+    assert (stored.manifest["runs"], stored.manifest["complete"]) == (20, True)
+    assert [path.name for path in whole.parent.iterdir()] == ["whole"]
+
+
+@pytest.mark.parametrize("run", [5, 13, 19], ids=["before a look", "between looks", "the last"])
+def test_what_ends_the_process_takes_no_finished_run(
+    world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, run: int
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(gather.Gathered, "results", None)  # as SIGKILL: nothing is written any more
+        stop_at(run, RuntimeError("killed"))
+        with pytest.raises(RuntimeError, match="killed"):
+            run_until_decided(world, ["kf"], out=tmp_path / "out", **OPEN)
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == [".out.unfinished"]
+    done = stop_at(-1, RuntimeError())
+    _, verdicts = run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
+    assert done == list(range(run, 20))
+    assert content(tmp_path / "out") == content(whole)
+    assert verdicts_json(verdicts) == verdicts_json(cs.analyse(open_results(whole)))
+    assert plan_in(tmp_path / "out") == plan_in(whole)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_killed_while_the_tables_are_written(
+    world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All runs are there and decide: the resume writes them, and does none."""
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(gather.Writer, "add", full)
+        with pytest.raises(cs.InputError, match="20 finished runs are kept, and the same command with --resume"):
+            run_until_decided(world, ["kf"], out=tmp_path / "out", **OPEN)
+    done = stop_at(-1, RuntimeError())
+    run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
+    assert done == []
+    assert content(tmp_path / "out") == content(whole)
+    with pytest.raises(cs.InputError, match="have 20 runs; the plan looks for the last time at 20"):
+        run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
+
+
+@pytest.mark.parametrize("look", [False, True])
+def test_ctrl_c_keeps_what_is_finished(
+    world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, look: bool
+) -> None:
+    """While runs are done, and while a look is taken after the last of them."""
+    with monkeypatch.context() as patch:
+        if look:
+            beside = sequential.beside
+
+            def pressed(verdict: Any, c: Curves, design: Any, runs: int) -> Any:
+                if runs == 20:
+                    raise KeyboardInterrupt
+                return beside(verdict, c, design, runs)
+
+            patch.setattr(sequential, "beside", pressed)
+        else:
+            stop_at(14, KeyboardInterrupt())
+        with pytest.raises(Interrupted) as stop:
+            run_until_decided(world, ["kf"], out=tmp_path / "out", **OPEN)
+    monkeypatch.undo()
+    count = 20 if look else 14
+    assert stop.value.results.manifest["finished_runs"] == count
+    assert open_results(tmp_path / "out").finished_runs(["kf"]) == set(range(count))
+    assert plan_in(tmp_path / "out") == plan_in(whole)
+    run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
+    assert content(tmp_path / "out") == content(whole)
+    assert open_results(tmp_path / "out").manifest["complete"]
+
+
+@pytest.mark.parametrize("how", ["killed", "stopped"])
+def test_another_plan_is_refused(
+    world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    stop_at(14, KeyboardInterrupt() if how == "stopped" else RuntimeError("killed"))
+    with pytest.raises(Interrupted if how == "stopped" else RuntimeError):
+        run_until_decided(world, ["kf"], out=tmp_path / "out", **OPEN)
+    monkeypatch.undo()
+    for change in ({"max_runs": 21}, {"false_alarm": 1e-5}, {"detect": 1.06}, {"power": 0.9}):
+        with pytest.raises(cs.InputError, match="have another plan of looks; use the same command as before"):
+            run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN | change)
+    run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
+    assert content(tmp_path / "out") == content(whole)
+
+
+def test_a_plain_run_goes_on_until_decided(world: cs.Scenario, whole: Path, tmp_path: Path) -> None:
+    """More runs than the first looks take are there: a look sees its own only, so that what it says is the same."""
+    cs.run_trials(world, ["kf"], runs=17, seed=3, jobs=1, out=tmp_path / "out")
+    run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
+    assert content(tmp_path / "out") == content(whole)
+    one = {"max_runs": 12, "seed": 3, "jobs": 1}
+    for runs, message in ((17, "have 17 runs; the plan looks for the last time at 12"), (12, "have 12 runs")):
+        cs.run_trials(world, ["kf"], runs=runs, seed=3, jobs=1, out=tmp_path / str(runs))
+        with pytest.raises(cs.InputError, match=message):
+            run_until_decided(world, ["kf"], out=tmp_path / str(runs), resume=True, **one)
+    runs_seen: list[int] = []
+    read = sequential.curves
+
+    def seen(tables: Any, name: str, steps: int) -> Curves:
+        runs_seen.append(len(tables.runs_of(name)))
+        return read(tables, name, steps)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sequential, "curves", seen)
+        previous = open_results(tmp_path / "17")
+        _, verdicts = run_until_decided(world, ["kf"], previous=previous, **OPEN)
+    assert runs_seen == [12, 15, 18, 20]
+    assert verdicts["kf"].runs == 20
+
+
+def test_two_filters_on_disk_are_those_in_memory(world: cs.Scenario, uvd: cs.Scenario, tmp_path: Path) -> None:
+    """One is decided before the other; maps and failures are there."""
+    options = {"max_runs": 14, "seed": 5, "jobs": 2}
+    memory, said = run_until_decided(uvd, ["ekf-uvd", "ekf-xyz"], **options)
+    assert isinstance(memory, cs.Results)
+    stored, verdicts = run_until_decided(uvd, ["ekf-uvd", "ekf-xyz"], out=tmp_path / "out", **options)
+    assert isinstance(stored, StoredResults)
+    memory.write(tmp_path / "memory")
+    assert content(tmp_path / "out") == content(tmp_path / "memory")
+    assert verdicts_json(verdicts) == verdicts_json(said)
+
+
+def test_a_look_holds_one_filter_and_no_outcome(
+    uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    curves: weakref.WeakSet[Any] = weakref.WeakSet()
+    outcomes: weakref.WeakSet[Any] = weakref.WeakSet()
+    most, read, add = [0, 0], sequential.curves, gather.Gathered.add
+
+    class Counted(Outcome):
+        __hash__ = object.__hash__
+
+    class Held(Curves):
+        __hash__ = object.__hash__
+
+    def held(*arguments: Any) -> Curves:
+        c = Held(**vars(read(*arguments)))
+        curves.add(c)
+        most[0] = max(most[0], len(curves))
+        return c
+
+    def counted(self: gather.Gathered, outcome: Outcome) -> None:
+        known = Counted(**vars(outcome))
+        outcomes.add(known)
+        most[1] = max(most[1], len(outcomes))
+        add(self, known)
+
+    monkeypatch.setattr(sequential, "curves", held)
+    monkeypatch.setattr(gather.Gathered, "add", counted)
+    run_until_decided(uvd, ["ekf-uvd", "ekf-xyz"], max_runs=14, jobs=1, out=tmp_path / "out")
+    assert most == [1, 1]
+
+
+# --- a log -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def log(world: cs.Scenario, tmp_path: Path) -> Path:
+    simulate_log(world, 6, 4, tmp_path / "log")
+    return tmp_path / "log"
+
+
+@pytest.mark.parametrize("how", ["killed", "stopped"])
+def test_a_log_goes_on(log: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    memory = run_log(read_log(log), ["kf"], jobs=1)
+    memory.write(tmp_path / "memory")
+    whole = run_log(read_log(log), ["kf"], jobs=2, out=tmp_path / "whole")
+    assert content(tmp_path / "whole") == content(tmp_path / "memory")
+    assert whole.manifest["log_sha256"] == memory.manifest["log_sha256"]
+    stop_at(4, KeyboardInterrupt() if how == "stopped" else RuntimeError("killed"))
+    with pytest.raises(Interrupted if how == "stopped" else RuntimeError):
+        run_log(read_log(log), ["kf"], jobs=1, out=tmp_path / "out")
+    monkeypatch.undo()
+    assert (tmp_path / "out").exists() == (how == "stopped")
+    done = stop_at(-1, RuntimeError())
+    run_log(read_log(log), ["kf"], jobs=1, out=tmp_path / "out", resume=True)
+    assert done == [4, 5]
+    assert content(tmp_path / "out") == content(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("how", ["killed", "stopped"])
+def test_another_log_is_refused(
+    world: cs.Scenario, log: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    stop_at(4, KeyboardInterrupt() if how == "stopped" else RuntimeError("killed"))
+    with pytest.raises(Interrupted if how == "stopped" else RuntimeError):
+        run_log(read_log(log), ["kf"], jobs=1, out=tmp_path / "out")
+    monkeypatch.undo()
+    simulate_log(world, 6, 5, tmp_path / "other")
+    with pytest.raises(cs.InputError, match="the results to resume have another log"):
+        run_log(read_log(tmp_path / "other"), ["kf"], jobs=1, out=tmp_path / "out", resume=True)
+    with pytest.raises(cs.InputError, match="the results to resume have another scenario"):
+        cs.run_trials(world, ["kf"], 6, 4, 1, out=tmp_path / "out", resume=True)
+    run_log(read_log(log), ["kf"], jobs=1, out=tmp_path / "out", resume=True)
+    assert open_results(tmp_path / "out").manifest["complete"]
+
+
+def test_a_log_whose_runs_are_not_numbered_from_zero(log: Path, tmp_path: Path, stop_at: Any) -> None:
+    for name in ("controls", "observations", "truth"):
+        table = pd.read_parquet(log / f"{name}.parquet")
+        table[table["run"].isin([1, 4, 5])].to_parquet(log / f"{name}.parquet", index=False)
+    done = stop_at(-1, RuntimeError())
+    results = run_log(read_log(log), ["kf"], jobs=1, out=tmp_path / "out")
+    assert done == [1, 4, 5]
+    assert results.finished_runs(["kf"]) == {1, 4, 5}
+    assert results.manifest["runs"] == 3
+
+
+def test_rows_of_a_log_in_any_order(log: Path, tmp_path: Path) -> None:
+    """Trials are those of the runs, however their rows are mixed; of one step they keep their order."""
+    before = read_log(log).trials
+    rng = np.random.default_rng()
+    for name in ("controls", "observations", "truth"):
+        table = pd.read_parquet(log / f"{name}.parquet")
+        table = table.sample(frac=1.0, random_state=int(rng.integers(2**31)))
+        if name == "observations":
+            table = table.sort_values(["step", "landmark"], ascending=[False, True])
+        table.to_parquet(log / f"{name}.parquet", index=False)
+    after = read_log(log).trials
+    for a, b in zip(before, after, strict=True):
+        assert isinstance(b, Trial)
+        for field in ("controls", "first", "landmark", "z", "truth"):
+            assert np.array_equal(getattr(a, field), getattr(b, field)), field

@@ -1,0 +1,135 @@
+"""What a report of several studies opens with: one picture and one table of all verdicts."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import consistency as cs
+from consistency.bench.pages import pdf
+from consistency.bench.pages.answer import answer
+from consistency.bench.pages.blocks import Document, Name, Status, Table
+from consistency.bench.pages.build import build_report, compose
+from consistency.bench.pages.drawing import Figure, Intervals, Span
+from consistency.bench.pages.html import render_html
+from consistency.bench.pages.model import Report
+from consistency.bench.pages.sections import overview
+
+FILTERS = ("ekf-uvd", "ekf-xyz")
+
+
+@pytest.fixture(scope="module")
+def report(uvd, tmp_path_factory) -> Report:
+    """Two worlds with two filters, the second of them judged in the first world alone."""
+    folder = tmp_path_factory.mktemp("overview") / "run"
+    cs.run_trials(uvd, FILTERS, runs=4, seed=61, jobs=1).write(folder)
+    one = build_report(folder)
+    (study,) = one.studies
+    second = replace(study, name="second", tracks=study.tracks[:1])
+    return replace(one, manifest={"studies": ["first", "second"]}, studies=(replace(study, name="first"), second))
+
+
+def opening(report: Report) -> tuple[Figure, Table]:
+    picture, verdicts = overview.SECTION.blocks(report)
+    assert isinstance(picture, Figure)
+    assert isinstance(verdicts, Table)
+    return picture, verdicts
+
+
+def test_every_verdict_is_in_the_table(report: Report) -> None:
+    [(_, rows)] = opening(report)[1].groups
+    expected = [
+        (study.name, track.name, track.verdict.status, f"{track.verdict.scale.mean_anees:.3g}")
+        for study in report.studies
+        for track in study.tracks
+    ]
+    found = [(world, name.text, status.text, anees) for world, name, status, anees, _ in rows]
+    assert [row[:3] for row in found] == [row[:3] for row in expected]
+    assert [float(row[3]) for row in found] == pytest.approx([float(row[3]) for row in expected], rel=1e-2)
+    assert all(isinstance(row[1], Name) and isinstance(row[2], Status) for row in rows)
+
+
+def test_the_picture_has_every_ratio_in_the_row_of_its_world(report: Report) -> None:
+    (panel,) = opening(report)[0].panels
+    assert panel.y.rows == ("first", "second")
+    found = {}
+    for mark in panel.marks:
+        if isinstance(mark, Intervals):
+            for k, world in enumerate(mark.columns["world"]):
+                assert panel.y.rows[round(float(mark.y[k]))] == world
+                found[world, mark.columns["filter"][k]] = mark.x[k], mark.low[k], mark.high[k]
+    expected = {
+        (study.name, track.name): tuple(track.verdict.scale.inflation)
+        for study in report.studies
+        for track in study.tracks
+    }
+    assert found == expected
+    low, high = panel.x.window
+    assert all(low < value < high for value, _, _ in found.values())
+
+
+def test_what_is_tolerated_is_shaded(report: Report) -> None:
+    (panel,) = opening(report)[0].panels
+    factor = report.studies[0].tracks[0].verdict.settings.factor
+    (shade,) = [mark for mark in panel.marks if isinstance(mark, Span)]
+    assert (shade.low, shade.high) == pytest.approx((1.0 / factor, factor))
+
+
+def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
+    study = report.studies[1]
+    blind = replace(study.tracks[0], verdict=replace(study.tracks[0].verdict, scale=None))
+    changed = replace(report, studies=(report.studies[0], replace(study, tracks=(blind,))))
+    picture, verdicts = opening(changed)
+    assert "second" not in [w for m in picture.panels[0].marks if isinstance(m, Intervals) for w in m.columns["world"]]
+    assert verdicts.groups[0][1][-1][3:] == ("–", "–")
+
+
+def test_one_study_opens_with_its_answer_alone(report: Report) -> None:
+    single = replace(report, studies=report.studies[:1])
+    assert overview.SECTION.blocks(single) == ()
+    assert compose(single).opening == ()
+
+
+def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> None:
+    document = compose(report)
+    assert document.figures[0].title == overview.TITLE
+    page = render_html(document)
+    first = page.index("<section")
+    assert (
+        page.index('class="answer"') < page.index(overview.TITLE) < page.index("Every verdict of this report") < first
+    )
+    assert page[:first].count('class="chart') == 1
+
+
+def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
+    monkeypatch.setattr(pdf.paper, "render", lambda sheet: b"")
+    data = json.loads(pdf.render_pdf(compose(report)))
+    assert [block["kind"] for block in data["opening"]] == ["Figure", "Table"]
+    assert data["opening"][0]["caption"].startswith(overview.TITLE)
+
+
+def test_the_answer_counts_where_the_table_names(report: Report) -> None:
+    text = answer(report.studies, ())
+    assert "2 studies put 3 pairs of filter and scenario to the test" in text
+    assert "ekf-uvd" not in text
+    assert "ekf-uvd" in answer(report.studies[:1], ())
+
+
+def test_the_parts_of_a_document_hold_every_figure() -> None:
+    figure = Figure("title", "caption", (), ())
+    assert Document("title", "answer", (), (figure,)).figures == (figure,)
+
+
+def test_ends_that_are_not_known_are_no_reason_for_a_wider_picture(report: Report) -> None:
+    track = report.studies[0].tracks[0]
+    scale = track.verdict.scale
+    wide = replace(scale, inflation=scale.inflation._replace(value=2.0, low=0.5, high=np.inf))
+    changed = replace(track, verdict=replace(track.verdict, scale=wide))
+    studies = (replace(report.studies[0], tracks=(changed,)), replace(report.studies[1], tracks=(changed,)))
+    (panel,) = opening(replace(report, studies=studies))[0].panels
+    assert panel.x.window[1] == pytest.approx(3.0)

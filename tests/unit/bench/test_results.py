@@ -1,0 +1,362 @@
+"""Result folders: written whole or not at all, read back to the bit, and refused clearly when damaged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from edited import accept_changes
+
+import consistency as cs
+from consistency.bench.runs.montecarlo import simulate_log
+from consistency.bench.store.curves import curves
+from consistency.bench.store.storage import require_free
+from consistency.bench.types import Control, Gaussian, Observation
+from consistency.referee.reading.columns import COLUMNS
+
+TABLES = ("estimates", "failures", "truth", "landmarks", "map")
+
+
+class Sleepy:
+    """Stays where it started, and breaks in step 5."""
+
+    name = "sleepy"
+
+    def init(self, problem: Any) -> dict[str, Any]:
+        return {"pose": problem.start, "steps": 0}
+
+    def predict(self, state: dict[str, Any], control: Control) -> dict[str, Any]:
+        return {**state, "steps": state["steps"] + 1}
+
+    def update(self, state: dict[str, Any], observation: Observation) -> tuple[dict[str, Any], None]:
+        return state, None
+
+    def pose(self, state: dict[str, Any]) -> Gaussian:
+        return Gaussian(state["pose"], np.eye(3) if state["steps"] < 5 else -np.eye(3))
+
+
+@pytest.fixture(scope="module")
+def results(xyz: cs.Scenario) -> cs.Results:
+    return cs.run_trials(xyz, ["ekf-xyz", Sleepy()], runs=4, seed=2, jobs=1)
+
+
+@pytest.fixture(scope="module")
+def written(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results") / "out"
+    results.write(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(written: Path, tmp_path: Path) -> Path:
+    """A copy to be damaged."""
+    return Path(shutil.copytree(written, tmp_path / "copy"))
+
+
+def change(folder: Path, name: str, edit: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
+    path = folder / f"{name}.parquet"
+    edit(pd.read_parquet(path)).to_parquet(path, index=False)
+    accept_changes(folder)
+
+
+def put(column: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.DataFrame]:
+    def edit(table: pd.DataFrame) -> pd.DataFrame:
+        if isinstance(value, str) or table[column].dtype == "int64":
+            table[column] = table[column].astype(object if isinstance(value, str) else float)
+        table.loc[row, column] = value
+        return table if not isinstance(value, str) else table.assign(**{column: table[column].astype(str)})
+
+    return edit
+
+
+# --- round trip ----------------------------------------------------------------------------------
+
+
+def test_read_gives_back_what_was_written(results: cs.Results, written: Path) -> None:
+    back = cs.read_results(written)
+    for name in TABLES:
+        pd.testing.assert_frame_equal(getattr(back, name), getattr(results, name), check_exact=True)
+    digests = {name: hashlib.sha256((written / f"{name}.parquet").read_bytes()).hexdigest() for name in TABLES}
+    contents = {name: {"rows": len(getattr(results, name)), "sha256": digests[name]} for name in TABLES}
+    tables = {"tables": sorted(TABLES), "contents": contents}
+    assert back.manifest == json.loads(json.dumps(results.manifest)) | tables
+    assert len(back.failures) > 0
+    assert back.filters == ["ekf-xyz", "sleepy"]
+
+
+def test_scenario_comes_back(xyz: cs.Scenario, written: Path) -> None:
+    scenario = cs.read_results(written).scenario
+    assert scenario == xyz
+    assert scenario.hash == xyz.hash
+
+
+def test_analysis_is_the_same_from_memory_and_from_disk(results: cs.Results, written: Path) -> None:
+    for name, verdict in cs.analyse(cs.read_results(written)).items():
+        again = cs.analyse(results)[name]
+        assert (again.status, again.reasons) == (verdict.status, verdict.reasons)
+
+
+def test_files_have_the_columns_of_the_contract(written: Path) -> None:
+    for name in TABLES:
+        parquet = pq.ParquetFile(written / f"{name}.parquet")
+        assert parquet.schema_arrow.names == [*COLUMNS[name], *(["joint_nees"] if name == "map" else [])]
+        if parquet.metadata.num_row_groups:
+            assert parquet.metadata.row_group(0).column(0).compression == "ZSTD"
+    contract = "filter run step t x y heading P_xx P_xy P_xh P_yy P_yh P_hh nees nis nis_dof"
+    assert list(COLUMNS["estimates"]) == contract.split()
+
+
+def test_manifest_says_where_the_numbers_come_from(written: Path, xyz: cs.Scenario) -> None:
+    manifest = json.loads((written / "manifest.json").read_text())
+    assert manifest["schema_version"] == 1
+    assert manifest["versions"]["numpy"] == np.__version__
+    assert (manifest["seed"], manifest["runs"], manifest["complete"]) == (2, 4, True)
+    assert manifest["scenario_hash"] == xyz.hash
+    assert manifest["failures"] == len(pd.read_parquet(written / "failures.parquet"))
+    assert {"command", "git_commit", "wall_time_s", "scenario"} <= set(manifest)
+
+
+def test_a_failed_run_has_no_rows_from_the_failed_step_on(results: cs.Results) -> None:
+    rows = results.estimates.query("filter == 'sleepy'")
+    assert list(rows["step"]) == [1, 2, 3, 4] * 4
+    assert list(results.failures["step"]) == [5] * 4
+    assert set(results.failures["reason"]) == {"the pose covariance is not positive definite"}
+
+
+def test_nees_is_null_only_while_the_pose_is_not_of_full_rank(results: cs.Results) -> None:
+    table = results.estimates.query("filter == 'ekf-xyz'")
+    null = table.loc[table["nees"].isna(), "step"]
+    assert set(null) == {1}
+    for row in table[table["step"].isin([2, 30])].itertuples():
+        truth = results.truth.query("run == @row.run and step == @row.step")[["x", "y", "heading"]].to_numpy()[0]
+        e = truth - [row.x, row.y, row.heading]
+        e[2] = (e[2] + np.pi) % (2 * np.pi) - np.pi
+        P = np.array([[row.P_xx, row.P_xy, row.P_xh], [row.P_xy, row.P_yy, row.P_yh], [row.P_xh, row.P_yh, row.P_hh]])
+        assert row.nees == pytest.approx(e @ np.linalg.inv(P) @ e, rel=1e-6)
+
+
+def test_curves_put_every_row_in_its_place(results: cs.Results) -> None:
+    c = curves(results, "sleepy")
+    assert c.nees.shape == (4, 60)
+    assert np.array_equal(np.isfinite(c.nees), np.broadcast_to(np.arange(60) < 4, (4, 60)))
+    assert [(failure.run, failure.step) for failure in c.failures] == [(0, 5), (1, 5), (2, 5), (3, 5)]
+    row = results.estimates.query("filter == 'sleepy' and run == 2 and step == 3").iloc[0]
+    true = results.truth.query("run == 2 and step == 3").iloc[0]
+    assert c.error[2, 2, 0] == true["x"] - row["x"]
+    assert c.covariance[2, 2, 0, 2] == c.covariance[2, 2, 2, 0] == row["P_xh"]
+    assert c.nees[2, 2] == row["nees"]
+    assert np.allclose(curves(results, "ekf-xyz").t, 0.1 * np.arange(1, 61))
+    with pytest.raises(cs.InputError, match="filter 'kf' is not in these results; there are: ekf-xyz, sleepy"):
+        curves(results, "kf")
+
+
+@pytest.mark.parametrize("confidence", [0.0, 1.0, 95.0])
+def test_analyse_refuses_a_confidence_outside_zero_to_one(results: cs.Results, confidence: float) -> None:
+    with pytest.raises(cs.InputError, match="confidence must lie between 0 and 1"):
+        cs.analyse(results, confidence=confidence)
+
+
+# --- damaged folders -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("keep", [0, 3, 200])
+def test_file_cut_short(folder: Path, name: str, keep: int) -> None:
+    path = folder / f"{name}.parquet"
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short") as error:
+        cs.read_results(folder)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["estimates", "failures"])
+def test_file_missing(folder: Path, name: str) -> None:
+    (folder / f"{name}.parquet").unlink()
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: missing"):
+        cs.read_results(folder)
+
+
+def test_results_without_truth_are_judged_by_the_nis(results: cs.Results, tmp_path: Path) -> None:
+    replace(results, truth=None, landmarks=None).write(tmp_path / "out")
+    back = cs.read_results(tmp_path / "out")
+    assert back.truth is None
+    assert "no truth" in cs.analyse(back)["ekf-xyz"].reasons[0]
+
+
+@pytest.mark.parametrize("name", ["truth", "landmarks"])
+def test_a_table_that_was_written_and_is_gone(folder: Path, name: str) -> None:
+    """Without its truth an overconfident filter would pass by the NIS."""
+    (folder / f"{name}.parquet").unlink()
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: missing"):
+        cs.read_results(folder)
+
+
+def test_results_do_not_replace_a_log(folder: Path, uvd: cs.Scenario, tmp_path: Path) -> None:
+    simulate_log(uvd, 1, 0, tmp_path / "log")
+    with pytest.raises(cs.InputError, match="holds log, not results"):
+        cs.read_results(folder).write(tmp_path / "log", overwrite=True)
+
+
+@pytest.mark.parametrize(("name", "column"), [("estimates", "P_xh"), ("estimates", "nis"), ("failures", "reason")])
+def test_column_missing(folder: Path, name: str, column: str) -> None:
+    change(folder, name, lambda table: table.drop(columns=column))
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: column '{column}' is missing; needed: filter, run"):
+        cs.read_results(folder)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_number_that_is_not_finite(folder: Path, value: float) -> None:
+    change(folder, "estimates", put("P_xx", 7, value))
+    with pytest.raises(cs.InputError, match=r"estimates\.parquet: column 'P_xx', row 7: not a finite number"):
+        cs.read_results(folder)
+
+
+def test_nees_and_nis_may_be_null(folder: Path) -> None:
+    change(folder, "estimates", put("nees", 7, np.nan))
+    assert np.isnan(cs.read_results(folder).estimates["nees"][7])
+
+
+@pytest.mark.parametrize("column", ["x", "nees"])
+def test_words_in_a_column_of_numbers(folder: Path, column: str) -> None:
+    change(folder, "estimates", put(column, 4, "far"))
+    with pytest.raises(cs.InputError, match=rf"estimates\.parquet: column '{column}', row \d: not a"):
+        cs.read_results(folder)
+
+
+def test_half_a_step(folder: Path) -> None:
+    change(folder, "truth", put("step", 5, 4.5))
+    with pytest.raises(cs.InputError, match=r"truth\.parquet: column 'step', row 5: not a whole number \(4\.5\)"):
+        cs.read_results(folder)
+
+
+MANIFESTS = {
+    "not JSON": ("{", "not valid JSON"),
+    "a list": ("[1]", "schema_version"),
+    "no version": ("{}", "schema_version"),
+    "another version": ('{"schema_version": 99}', "schema_version"),
+    "no filters": ('{"schema_version": 1}', "holds no estimates"),
+}
+
+
+@pytest.mark.parametrize("case", MANIFESTS)
+def test_bad_manifest(folder: Path, case: str) -> None:
+    text, complaint = MANIFESTS[case]
+    (folder / "manifest.json").write_text(text)
+    with pytest.raises(cs.InputError, match=complaint) as error:
+        cs.read_results(folder)
+    assert str(folder) in str(error.value)
+
+
+def test_no_manifest_and_no_folder(folder: Path, tmp_path: Path) -> None:
+    (folder / "manifest.json").unlink()
+    with pytest.raises(cs.InputError, match=r"manifest\.json: missing"):
+        cs.read_results(folder)
+    with pytest.raises(cs.InputError, match="nowhere: no such folder"):
+        cs.read_results(tmp_path / "nowhere")
+
+
+# --- writing -----------------------------------------------------------------------------------------
+
+
+class DiskFull(OSError):
+    pass
+
+
+@pytest.fixture
+def full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second table does not fit any more."""
+    write, calls = pq.ParquetWriter.write_table, []
+
+    def write_table(self: pq.ParquetWriter, *args: Any, **kwargs: Any) -> Any:
+        calls.append(1)
+        if len(calls) > 1:
+            raise DiskFull(28, "No space left on device")
+        return write(self, *args, **kwargs)
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", write_table)
+
+
+@pytest.mark.usefixtures("full_disk")
+def test_an_error_while_writing_leaves_nothing_behind(results: cs.Results, tmp_path: Path) -> None:
+    with pytest.raises((DiskFull, cs.InputError), match="No space left"):
+        results.write(tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("full_disk")
+def test_an_error_while_overwriting_keeps_the_old_folder(results: cs.Results, folder: Path) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises((DiskFull, cs.InputError), match="No space left"):
+        results.write(folder, overwrite=True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+
+def test_overwrite_replaces_the_whole_folder(results: cs.Results, folder: Path) -> None:
+    (folder / "stale.txt").write_text("old")
+    results.write(folder, overwrite=True)
+    assert not (folder / "stale.txt").exists()
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    assert len(cs.read_results(folder).estimates) == len(results.estimates)
+
+
+def test_existing_folder_is_refused(folder: Path) -> None:
+    with pytest.raises(cs.InputError, match=r"--out .*copy: exists already; .* --overwrite"):
+        require_free(folder, overwrite=False)
+    require_free(folder, overwrite=True)
+
+
+def test_overwrite_refuses_what_is_not_ours(tmp_path: Path) -> None:
+    photos, file = tmp_path / "photos", tmp_path / "notes.txt"
+    photos.mkdir()
+    (photos / "cat.jpg").write_bytes(b"x")
+    file.write_text("x")
+    for path in (photos, file):
+        with pytest.raises(cs.InputError, match=r"not an output folder of this bench.*not overwritten"):
+            require_free(path, overwrite=True)
+    assert (photos / "cat.jpg").exists()
+
+
+@pytest.mark.parametrize("text", ['{"name": "some web page", "icons": []}', "{", "[]"])
+def test_overwrite_refuses_the_manifest_of_something_else(tmp_path: Path, text: str) -> None:
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "manifest.json").write_text(text)
+    with pytest.raises(cs.InputError, match="not overwritten"):
+        require_free(site, overwrite=True)
+
+
+def test_dangling_link_is_refused(tmp_path: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(cs.InputError, match="exists already"):
+        require_free(link, overwrite=False)
+
+
+def test_place_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(cs.InputError, match=r"--out .*: cannot be written \("):
+        require_free(tmp_path / "file" / "below", overwrite=False)
+
+
+def test_asking_whether_a_folder_is_free_leaves_nothing(tmp_path: Path) -> None:
+    require_free(tmp_path / "deep" / "out", overwrite=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_resuming_keeps_what_the_user_put_there(folder: Path) -> None:
+    (folder / "notes.txt").write_text("mine")
+    results = cs.read_results(folder)
+    results.write(folder, overwrite=True, keep_others=True)
+    assert (folder / "notes.txt").read_text() == "mine"
+    results.write(folder, overwrite=True)
+    assert not (folder / "notes.txt").exists()

@@ -1,0 +1,298 @@
+"""Scenario files: what is read, and what every kind of mistake is answered with."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+from pydantic import ValidationError
+
+import consistency as cs
+from consistency.bench.scenario import data_folder
+
+EXPECTED = {
+    "esde-xy", "iekf-slam-xy", "ocekf-slam-xy", "range-bearing",
+    "herath2007-optimistic", "herath2007-stereo", "herath2007-wide-baseline", "herath2007-xyz", "linear-gaussian",
+    "long-loop",
+    *(f"herath2007-{issue}" for issue in ("bias", "drift", "fov", "growth", "junction", "mismatch", "selection")),
+}  # fmt: skip
+Edit = Callable[[dict], None]
+
+
+def table(name: str = "herath2007-stereo") -> dict:
+    return tomllib.loads((data_folder("scenarios") / f"{name}.toml").read_text(encoding="utf-8"))
+
+
+def put(path: str, value: object) -> Edit:
+    """Set ``a.b.c`` of a file's data."""
+
+    def edit(data: dict) -> None:
+        *parents, key = path.split(".")
+        for parent in parents:
+            data = data[parent]
+        data[key] = value
+
+    return edit
+
+
+def drop(path: str) -> Edit:
+    def edit(data: dict) -> None:
+        *parents, key = path.split(".")
+        for parent in parents:
+            data = data[parent]
+        del data[key]
+
+    return edit
+
+
+def load(tmp_path: Path, *edits: Edit, name: str = "herath2007-stereo") -> cs.Scenario:
+    data = table(name)
+    for edit in edits:
+        edit(data)
+    path = tmp_path / "mine.toml"
+    path.write_text(tomli_w.dumps(data), encoding="utf-8")
+    return cs.load_scenario(path)
+
+
+# --- what is read --------------------------------------------------------------------------------
+
+
+def test_built_in_scenarios_are_known() -> None:
+    assert set(cs.scenario_names()) >= EXPECTED
+
+
+@pytest.mark.parametrize("name", sorted(EXPECTED))
+def test_every_built_in_scenario_loads_and_shows_a_landmark(name: str) -> None:
+    scenario = cs.load_scenario(name)
+    assert scenario.name == name
+    assert scenario.summary
+    assert len(cs.simulate(scenario.variant("short", truth__steps=30)).z) > 0
+
+
+def test_by_path_a_scenario_is_named_after_its_file(tmp_path: Path) -> None:
+    scenario = load(tmp_path)
+    assert scenario.name == "mine"
+    assert scenario.truth == cs.load_scenario("herath2007-stereo").truth
+
+
+def test_units_become_si(tmp_path: Path) -> None:
+    degrees = load(tmp_path)
+    assert degrees.truth.motion.sigma_omega == pytest.approx(np.deg2rad(5.0), rel=1e-15)
+    assert degrees.truth.path.heading == pytest.approx(np.pi / 2)
+    radians = load(
+        tmp_path,
+        drop("truth.motion.sigma_omega_deg"), put("truth.motion.sigma_omega", np.deg2rad(5.0)),
+        drop("truth.path.radius_m"), put("truth.path.radius", 4.0),
+        drop("truth.sensor.f_px"), put("truth.sensor.f", 150.0),
+    )  # fmt: skip
+    assert radians.truth == degrees.truth
+
+
+def test_degrees_reach_into_lists(tmp_path: Path) -> None:
+    mount = {"position_m": [0.1, 0.0, 0.2], "rotation_deg": [0.0, -10.0, 90.0]}
+    scenario = load(tmp_path, put("belief.sensor.mount", mount))
+    assert np.allclose(scenario.belief.sensor.mount.rotation, np.deg2rad([0.0, -10.0, 90.0]))
+
+
+def test_truth_and_belief_are_apart() -> None:
+    optimistic = cs.load_scenario("herath2007-optimistic")
+    assert optimistic.belief.motion.sigma_v == 0.5 * optimistic.truth.motion.sigma_v
+    assert optimistic.truth == cs.load_scenario("herath2007-xyz").truth
+
+
+# --- identity ------------------------------------------------------------------------------------
+
+
+def test_hash_follows_content_only(tmp_path: Path) -> None:
+    base = cs.load_scenario("herath2007-stereo")
+    assert load(tmp_path, put("summary", "told differently")).hash == base.hash
+    assert base.variant("renamed").hash == base.hash
+    others = [
+        base.variant("a", truth__steps=499),
+        base.variant("b", belief__motion__sigma_v=0.051),
+        base.variant("c", truth__landmarks__seed=1),
+        base.variant("d", belief__sigma_points__alpha=0.5),
+    ]
+    assert len({base.hash, *(other.hash for other in others)}) == 5
+    assert re.fullmatch("[0-9a-f]{16}", base.hash)
+
+
+def test_hash_does_not_depend_on_the_order_or_the_unit_of_keys(tmp_path: Path) -> None:
+    base = cs.load_scenario("herath2007-stereo")
+
+    def reverse(data: dict) -> None:
+        data["truth"] = dict(reversed(data["truth"].items()))
+
+    assert load(tmp_path, reverse).hash == base.hash
+
+
+def test_variant_changes_what_is_named_and_nothing_else() -> None:
+    base = cs.load_scenario("herath2007-stereo")
+    far = base.variant("far", truth__sensor__range=(0.5, 8.0))
+    assert far.name == "far"
+    assert far.truth.sensor.range == (0.5, 8.0)
+    assert base.truth.sensor.range == (0.5, 4.0)
+    assert far.variant("back", truth__sensor__range=(0.5, 4.0)).truth == base.truth
+
+
+@pytest.mark.parametrize("key", ["truth__sensor__rnage", "truth__nothing__here", "truth__motion__sigma_v__x"])
+def test_variant_refuses_a_path_that_is_not_there(key: str) -> None:
+    with pytest.raises((ValidationError, KeyError, TypeError, ValueError)):
+        cs.load_scenario("herath2007-stereo").variant("typo", **{key: 1.0})
+
+
+def test_variant_is_validated() -> None:
+    with pytest.raises(ValueError, match="sigma_v"):
+        cs.load_scenario("herath2007-stereo").variant("bad", truth__motion__sigma_v=-1.0)
+
+
+def test_scenario_is_frozen() -> None:
+    scenario = cs.load_scenario("herath2007-stereo")
+    with pytest.raises(ValidationError, match="frozen"):
+        scenario.truth.steps = 3  # type: ignore[misc]
+
+
+# --- mistakes ------------------------------------------------------------------------------------
+
+UNKNOWN = {
+    "colour": ["summary", "truth", "belief"],
+    "truth.colour": ["dt", "steps", "path", "landmarks", "motion", "sensor"],
+    "truth.path.colour": ["radius", "speed", "start", "heading", "shape"],
+    "truth.landmarks.colour": ["count", "seed", "x", "y", "z", "layout"],
+    "truth.motion.colour": ["model", "sigma_v", "sigma_omega", "noise_on"],
+    "truth.sensor.colour": ["B", "disparity", "f", "image", "principal_point", "range", "sigma", "mount"],
+    "belief.colour": ["motion", "sensor", "sigma_points"],
+    "belief.motion.colour": ["sigma_v", "sigma_omega"],
+    "belief.sensor.colour": ["model", "sigma", "f", "B", "mount"],
+}
+
+
+@pytest.mark.parametrize("key", UNKNOWN)
+def test_unknown_key_is_named_with_what_is_allowed_there(tmp_path: Path, key: str) -> None:
+    with pytest.raises(cs.InputError) as error:
+        load(tmp_path, put(key, 1))
+    text = str(error.value)
+    assert f"key '{key}'" in text
+    assert "mine.toml" in text
+    allowed = text.split("allowed here: ")[1].split(", ")
+    assert set(UNKNOWN[key]) <= set(allowed)
+    assert "name" not in allowed
+
+
+@pytest.mark.parametrize("where", ["truth.sensor.mount", "belief.sensor.mount", "belief.sigma_points"])
+def test_unknown_key_in_a_nested_table(tmp_path: Path, where: str) -> None:
+    with pytest.raises(cs.InputError, match=rf"mine\.toml: key '{where}\.colour': unknown key; allowed here: "):
+        load(tmp_path, put(where, {"colour": 1}))
+
+
+BAD: dict[str, tuple[tuple[Edit, ...], str]] = {
+    "negative motion noise": ((put("truth.motion.sigma_v", -0.1),), r"'truth\.motion\.sigma_v'.*greater than or equal"),
+    "negative belief": ((put("belief.motion.sigma_v", -0.1),), r"'belief\.motion\.sigma_v'"),
+    "zero sensor noise": ((put("belief.sensor.sigma_px", [0.0, 1.0, 1.0]),), r"'belief\.sensor\.sigma\.0'.*greater"),
+    "two sigmas": ((put("belief.sensor.sigma_px", [1.0, 1.0]),), r"'belief\.sensor\.sigma"),
+    "noise is not a number": ((put("truth.motion.sigma_v", float("nan")),), r"'truth\.motion\.sigma_v'.*finite"),
+    "infinite range": ((put("truth.sensor.range_m", [0.5, float("inf")]),), r"'truth\.sensor\.range\.1'.*finite"),
+    "missing key": ((drop("truth.dt_s"),), r"'truth\.dt': missing"),
+    "missing table": ((drop("belief"),), r"'belief': missing"),
+    "missing shape": ((drop("truth.path.shape"),), r"'truth\.path\.shape': missing"),
+    "wrong type": ((put("truth.steps", "many"),), r"'truth\.steps'.*integer.*'many'"),
+    "half a step": ((put("truth.steps", 10.5),), r"'truth\.steps'.*integer"),
+    "no step": ((put("truth.steps", 0),), r"'truth\.steps'.*greater than 0"),
+    "table in place of a number": ((put("truth.dt_s", {"x": 1}),), r"'truth\.dt'"),
+    "number in place of a table": ((put("truth.motion", 3),), r"'truth\.motion'"),
+    "both units": ((put("truth.motion.sigma_omega", 0.1),), r"'truth\.motion'.*'sigma_omega'.*given twice"),
+    "unknown shape": ((put("truth.path.shape", "spiral"),), r"'truth\.path\.shape': 'spiral'.*'circle'.*'waypoints'"),
+    "unknown layout": ((put("truth.landmarks.layout", "grid"),), r"'truth\.landmarks\.layout': 'grid'.*'uniform'"),
+    "unknown sensor": ((put("truth.sensor.model", "lidar"),), r"'truth\.sensor\.model': 'lidar'.*'xyz'.*'uvd'"),
+    "unknown noise target": ((put("truth.motion.noise_on", "wheel"),), r"'truth\.motion\.noise_on'.*'odometry'"),
+    "sensors differ": (
+        (put("belief.sensor.model", "xyz"), drop("belief.sensor.sigma_px"), put("belief.sensor.sigma", [0.1] * 3)),
+        r"belief\.sensor\.model is 'xyz'.*'uvd' \(truth\.sensor\.model\)",
+    ),
+    "rig unknown": ((drop("belief.sensor.B_m"),), r"'belief\.sensor'.*needs f \(px\) and B \(m\)"),
+    "unit of another sensor": (
+        (drop("belief.sensor.sigma_px"), put("belief.sensor.sigma_m", [0.1, 0.1, 0.1])),
+        r"'belief\.sensor\.sigma_m'.*unknown key",
+    ),
+    "unit of another key": ((put("truth.path.speed_deg", 28.6),), r"'truth\.path\.speed_deg'.*unknown key"),
+    "range reversed": ((put("truth.sensor.range_m", [4.0, 0.5]),), r"'truth\.sensor'.*range must be"),
+    "box reversed": ((put("truth.landmarks.x_m", [8.0, -8.0]),), r"'truth\.landmarks'.*x must be \[low, high\]"),
+    "negative disparity": ((put("truth.sensor.disparity_px", [-1.0, 32.0]),), r"'truth\.sensor\.disparity\.0'"),
+    "half a linear world": ((put("truth.motion.model", "linear"),), r"'truth'.*'linear' together"),
+    "name inside": ((put("name", "other"),), r"'name': not allowed here"),
+    "corner too round": (
+        (
+            drop("truth.path.radius_m"), put("truth.path.shape", "rounded-rectangle"), put("truth.path.length", 4.0),
+            put("truth.path.width", 2.0), put("truth.path.corner_radius", 1.5),
+        ),
+        r"'truth\.path'.*corner_radius must be at most half",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_mistake_is_answered_with_file_and_key(tmp_path: Path, case: str) -> None:
+    edits, pattern = BAD[case]
+    with pytest.raises(cs.InputError, match=pattern) as error:
+        load(tmp_path, *edits)
+    text = str(error.value)
+    assert text.startswith(str(tmp_path / "mine.toml"))
+    assert "\n" not in text
+
+
+def test_reversed_disparity_range_is_refused(tmp_path: Path) -> None:
+    """Nothing could ever be found in it."""
+    with pytest.raises(cs.InputError, match=r"disparity"):
+        load(tmp_path, put("truth.sensor.disparity_px", [32.0, 1.0]))
+
+
+@pytest.mark.parametrize("value", [True, "0.1"])
+def test_a_number_is_neither_true_nor_text(tmp_path: Path, value: object) -> None:
+    with pytest.raises(cs.InputError, match=r"truth\.motion\.sigma_v"):
+        load(tmp_path, put("truth.motion.sigma_v", value))
+
+
+def test_linear_world_needs_noise_on_motion(tmp_path: Path) -> None:
+    with pytest.raises(cs.InputError, match=r"noise_on = 'motion'"):
+        load(tmp_path, put("truth.motion.noise_on", "odometry"), name="linear-gaussian")
+
+
+def test_image_needs_a_focal_length(tmp_path: Path) -> None:
+    with pytest.raises(cs.InputError, match=r"'truth\.sensor'.*image needs f"):
+        load(tmp_path, drop("truth.sensor.f_px"), name="herath2007-xyz")
+
+
+def test_more_than_one_mistake_is_counted(tmp_path: Path) -> None:
+    with pytest.raises(cs.InputError, match=r"\(and 1 more\)"):
+        load(tmp_path, put("truth.steps", -1), put("belief.motion.sigma_v", -1.0))
+
+
+def test_toml_syntax_error_is_said_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "broken.toml"
+    path.write_text("summary = 'x'\n[truth\n", encoding="utf-8")
+    with pytest.raises(cs.InputError, match=r"broken\.toml: not valid TOML.*line 2"):
+        cs.load_scenario(path)
+
+
+def test_not_text_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(cs.InputError, match=r"binary\.toml: not valid TOML"):
+        cs.load_scenario(path)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(cs.InputError, match=r"nowhere\.toml: cannot be read \(No such file"):
+        cs.load_scenario(tmp_path / "nowhere.toml")
+
+
+def test_unknown_name_with_a_suggestion() -> None:
+    with pytest.raises(cs.InputError, match=r"unknown scenario 'herath2007-stero' \(did you mean 'herath2007-stereo'"):
+        cs.load_scenario("herath2007-stero")
+    with pytest.raises(cs.InputError, match="unknown scenario 'zzz'; known: esde-xy, herath2007-bias, "):
+        cs.load_scenario("zzz")

@@ -1,0 +1,421 @@
+"""Sweeps: the grid, the folder that goes on, the map; small linear worlds, a few runs of a Kalman filter."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import consistency as cs
+from consistency.bench.runs.sequential import run_until_decided
+from consistency.bench.scenario import data_folder
+from consistency.bench.sweeps import cell as cells
+from consistency.bench.sweeps import folder as folders
+from consistency.bench.sweeps import running
+from consistency.bench.sweeps.cell import CellResult, cost_of, run_cell
+from consistency.bench.sweeps.folder import SweepFolder, Work, open_sweep
+from consistency.bench.sweeps.plan import Sweep, load_sweep, sweep_names
+from consistency.bench.sweeps.regime import Regime, ranked, read_regime, regime_of, write_regime
+from consistency.bench.sweeps.running import run_sweep
+from consistency.referee.errors import InputError
+
+LINEAR = """
+summary = "Two noises of the odometry in a linear world"
+base = "small.toml"
+filters = ["kf"]
+seed = 3
+[rule]
+false_alarm = 0.01
+max_runs = 12
+[grid]
+odometry = [1.0, 2.0]
+density = [0.5, 1.0]
+"""
+
+
+@pytest.fixture
+def at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with ``small.toml``, a linear world of 30 steps, and ``grid.toml``, four cells of it."""
+    text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
+    (tmp_path / "small.toml").write_text(text.replace("steps = 500", "steps = 30"))
+    (tmp_path / "grid.toml").write_text(LINEAR)
+    monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
+    return tmp_path
+
+
+def edited(at: Path, old: str, new: str, name: str = "other.toml") -> Path:
+    """The sweep with a part of its text replaced."""
+    assert old in LINEAR
+    (at / name).write_text(LINEAR.replace(old, new))
+    return at / name
+
+
+# --- the grid -----------------------------------------------------------------------------------
+
+
+def test_a_grid_changes_truth_and_belief_alike() -> None:
+    sweep = load_sweep("regime")
+    assert len(sweep.cells) == 150
+    base, cell = sweep.base, next(c for c in sweep.cells if c.indices == (4, 2, 0, 0))
+    truth, belief = cell.scenario.truth, cell.scenario.belief
+    assert (truth.sensor.rig, belief.sensor.B) == ((150.0, 0.6), 0.6)
+    assert truth.sensor.disparity == belief.sensor.disparity == pytest.approx((1.0, 32.0 * 0.6 / 0.09))
+    assert truth.sensor.range == (0.5, 5.0)
+    assert truth.landmarks.count == 30
+    for key in ("sigma_v", "sigma_omega"):
+        expected = 0.3 * getattr(base.truth.motion, key)
+        assert getattr(truth.motion, key) == getattr(belief.motion, key) == pytest.approx(expected)
+    assert cell.text.startswith("baseline 0.6 m, range of landmarks 5 m, density of landmarks ×0.25")
+
+
+def test_the_published_rig_is_a_cell_of_the_regime_map() -> None:
+    """Baseline 9 cm, all landmarks, odometry as published: only the range differs."""
+    sweep = load_sweep("regime")
+    cell = next(c for c in sweep.cells if c.indices == (1, 2, 2, 1))
+    assert cell.scenario.hash == sweep.base.variant("far", truth__sensor__range=(0.5, 5.0)).hash
+
+
+def test_keys_of_the_scenario_are_axes_too(at: Path) -> None:
+    path = edited(at, "odometry = [1.0, 2.0]", 'truth.path.radius = [3.0, 4.0]\n"motion.sigma_v" = [0.1]')
+    sweep = load_sweep(path)
+    assert [axis.key for axis in sweep.axes] == ["truth.path.radius", "motion.sigma_v", "density"]
+    scenario = sweep.cells[-1].scenario
+    assert scenario.truth.motion.sigma_v == scenario.belief.motion.sigma_v == 0.1
+    assert [c.scenario.truth.path.radius for c in sweep.cells] == [3.0, 3.0, 4.0, 4.0]
+    with pytest.raises(InputError, match="both set"):
+        load_sweep(edited(at, "density = [0.5, 1.0]", "motion.sigma_v = [0.1]"))
+
+
+def test_a_key_may_end_in_its_unit_and_hold_lists(at: Path) -> None:
+    keys = "truth.path.heading_deg = [0, 90]\ntruth.sensor.range = [[0.5, 3.0], [0.5, 4.0]]"
+    path = edited(at, "density = [0.5, 1.0]", keys)
+    sweep = load_sweep(path)
+    assert len(sweep.cells) == 8
+    assert sorted({c.scenario.truth.path.heading for c in sweep.cells}) == pytest.approx([0.0, np.pi / 2])
+    assert {c.scenario.truth.sensor.range for c in sweep.cells} == {(0.5, 3.0), (0.5, 4.0)}
+    assert len({c.name for c in sweep.cells}) == 8
+
+
+def test_a_cell_depends_on_nothing_but_itself(at: Path) -> None:
+    """Neither the order of values, nor other cells, nor other filters change seed and place of a cell."""
+    whole = load_sweep(at / "grid.toml")
+    part = load_sweep(edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "density = [1.0]\nodometry = [2.0]"))
+    alone = part.cells[0]
+    same = next(c for c in whole.cells if c.scenario.hash == alone.scenario.hash)
+    assert whole.seed_of(same) == part.seed_of(alone)
+    assert len({whole.seed_of(c) for c in whole.cells}) == 4
+    assert replace(whole, seed=4).seed_of(same) != whole.seed_of(same)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 6, 7])
+def test_shares_cover_the_grid_once(at: Path, parts: int) -> None:
+    sweep = load_sweep("regime")
+    shares = [sweep.share(part, parts) for part in range(1, parts + 1)]
+    assert sorted(c.number for share in shares for c in share) == list(range(150))
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+    # no share has all the slow cells, those of the longest range, or one noise alone
+    assert all(0 < sum(c.indices[1] == 4 for c in share) < len(share) for share in shares)
+    assert all({c.indices[3] for c in share} == {0, 1} for share in shares)
+
+
+def test_built_in_sweeps_are_fine() -> None:
+    assert {"regime", "small"} <= set(sweep_names())
+    assert all(load_sweep(name).cells for name in sweep_names())
+
+
+BAD = {
+    "filter that does not fit": ('"kf"', '"ekf-uvd"', "works on a sensor uvd, not 'linear'"),
+    "unknown filter": ('"kf"', '"kff"', "did you mean 'kf'"),
+    "baseline without a baseline": ("density = [0.5, 1.0]", "baseline = [0.1]", "'grid.baseline', value 0.1: a sensor"),
+    "zero": ("odometry = [1.0, 2.0]", "odometry = [0.0, 1.0]", "'grid.odometry': values must be positive numbers, got"),
+    "text": ("odometry = [1.0, 2.0]", 'odometry = ["much"]', "'grid.odometry': values must be positive"),
+    "no list": ("odometry = [1.0, 2.0]", "odometry = 1.0", "'grid.odometry': must be a list"),
+    "empty list": ("odometry = [1.0, 2.0]", "odometry = []", "'grid.odometry': must be a list of one value or more"),
+    "a value twice": ("odometry = [1.0, 2.0]", "odometry = [1.0, 1]", "'grid.odometry': a value is given twice"),
+    "unknown key": ("density =", "truth.sensor.colour =", "'grid.truth.sensor.colour': unknown; allowed: baseline"),
+    "unknown quantity": ("density =", "colour =", "'grid.colour': unknown; allowed: baseline, range"),
+    "bad value": ("density = [0.5, 1.0]", "truth.dt = [-1.0]", "'grid.truth.dt', value -1.0: key 'truth.dt'"),
+    "range below its start": ("density = [0.5, 1.0]", "range = [0.1]", "'grid.range', value 0.1: key 'truth.sensor'"),
+    "unknown key of the file": ("seed = 3", "sed = 3", "key 'sed': unknown key; allowed here: summary, base"),
+    "unknown base": ('"small.toml"', '"small"', "unknown scenario 'small'"),
+    "missing base": ('"small.toml"', '"none.toml"', "none.toml: cannot be read"),
+    "no such rule": ("max_runs = 12", "max_runs = 0", "key 'rule.max_runs'"),
+    "detect 1": ("max_runs = 12", "detect = 1.0", "detect must be"),
+    "no grid": ("[grid]\nodometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "[grid]", "key 'grid'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_sweeps(at: Path, case: str) -> None:
+    """One sentence that names the file and the key; nothing is run or written."""
+    old, new, expected = BAD[case]
+    path = edited(at, old, new)
+    with pytest.raises(InputError) as refusal:
+        load_sweep(path)
+    assert expected in str(refusal.value)
+    assert str(refusal.value).startswith(f"{path}: ") or "none.toml" in str(refusal.value)
+
+
+# --- the folder ---------------------------------------------------------------------------------
+
+
+def numbers(folder: SweepFolder) -> dict[tuple[int, str], CellResult]:
+    return dict(folder.results())
+
+
+def test_a_cell_has_the_verdict_of_a_run_until_decided(at: Path) -> None:
+    sweep = load_sweep(at / "grid.toml")
+    folder, missing = run_sweep(sweep, at / "out", jobs=1)
+    assert missing == 0
+    cell = sweep.cells[2]
+    results, verdicts = run_until_decided(
+        cell.scenario, ["kf"], **sweep.rule.model_dump(), seed=sweep.seed_of(cell), jobs=1
+    )
+    verdict, found = verdicts["kf"], folder.results()[2, "kf"]
+    assert (found.status, found.runs) == (verdict.status, verdict.runs)
+    assert found.ratio == pytest.approx(verdict.inflation, rel=1e-4)
+    assert verdict.accuracy is not None
+    assert found.rmse_position == pytest.approx(verdict.accuracy.rmse_position, rel=1e-4)
+    runs = pd.read_csv(folder.place(Work(cell, "kf")) / "runs.csv")
+    assert list(runs["run"]) == list(range(verdict.runs))
+    nees = results.estimates.groupby("run")["nees"].mean().to_numpy()
+    np.testing.assert_allclose(runs["nees"], nees, rtol=1e-4)
+    assert np.sqrt((runs["rmse_position"] ** 2).mean()) == pytest.approx(found.rmse_position, rel=1e-3)
+    assert runs["reason"].isna().all()
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_stopped_sweep_goes_on(at: Path, monkeypatch: pytest.MonkeyPatch, inside: bool) -> None:
+    """Stopped between cells, or while one writes: what is finished stays, and all numbers are those of one go."""
+    sweep, calls = load_sweep(at / "grid.toml"), []
+    whole, _ = run_sweep(sweep, at / "whole", jobs=1)
+
+    def stops(*arguments: Any, **options: Any) -> Any:
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        calls.append(arguments)
+        return run_cell(*arguments, **options)
+
+    def stops_while_writing(self: SweepFolder, work: Work, outcome: Any, wall: float) -> None:
+        if len(list((at / "out").rglob("runs.csv"))) == 2:
+            with monkeypatch.context() as patch:
+                patch.setattr(pd.DataFrame, "to_csv", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+                write(self, work, outcome, wall)
+        write(self, work, outcome, wall)
+
+    write = SweepFolder.write
+    with monkeypatch.context() as patch:
+        patch.setattr(*((SweepFolder, "write", stops_while_writing) if inside else (running, "run_cell", stops)))
+        with pytest.raises(KeyboardInterrupt):
+            run_sweep(sweep, at / "out", jobs=1)
+    assert len(list((at / "out").rglob("runs.csv"))) == 2
+    hidden = [path.name for path in (at / "out").rglob(".*") if path.is_dir()]
+    assert hidden == [".kf.unfinished"] * inside  # the runs of the cell; nothing else is half written
+    kept = {path: path.read_bytes() for path in (at / "out").rglob("runs.csv")}
+    done: list[Any] = []
+    monkeypatch.setattr(running, "run_cell", lambda *a, **o: (done.append(a), run_cell(*a, **o))[1])
+    folder, missing = run_sweep(sweep, at / "out", jobs=1)
+    assert (missing, len(done)) == (0, 2)
+    assert {path: path.read_bytes() for path in kept} == kept
+    assert repr(numbers(folder)) == repr(numbers(whole))
+
+
+def test_a_stop_that_is_taken_for_an_error_is_no_result(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where Ctrl-C comes inside a serialiser of pydantic, which makes another exception of it."""
+
+    def swallows(*_: Any, **__: Any) -> Any:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as stop:
+            raise ValueError("while serialising") from stop
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored where the shell said so
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(cells, "run_until_decided", swallows)
+            with pytest.raises(KeyboardInterrupt):
+                run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert open_sweep(at / "out").results() == {}
+    assert run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)[1] == 0
+
+
+def test_shares_fill_one_folder(at: Path) -> None:
+    sweep = load_sweep(at / "grid.toml")
+    whole, _ = run_sweep(sweep, at / "whole", jobs=1)
+    left = [run_sweep(sweep, at / "out", part, 3, jobs=1)[1] for part in (3, 1, 2)]
+    assert left == [3, 1, 0]
+    assert repr(numbers(open_sweep(at / "out"))) == repr(numbers(whole))
+    with pytest.raises(InputError, match="must be I/N"):
+        run_sweep(sweep, at / "out", 4, 3)
+
+
+def test_more_values_and_filters_go_into_the_same_folder(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+    done: list[str] = []
+    monkeypatch.setattr(running, "run_cell", lambda *a, **o: (done.append(a[2]), run_cell(*a, **o))[1])
+    more = load_sweep(edited(at, "odometry = [1.0, 2.0]", "odometry = [1.0, 1.5, 2.0]"))
+    folder, _ = run_sweep(more, at / "out", jobs=1)
+    assert (len(done), len(folder.results())) == (2, 6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [("max_runs = 12", "max_runs = 13", "max_runs"), ("seed = 3", "seed = 4", "seed"), ("seed", "seed", "source code")],
+)
+def test_changed_inputs_are_refused_or_run_again(
+    at: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, what: str
+) -> None:
+    run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+    before = {path: path.read_bytes() for path in (at / "out").rglob("*.*") if path.is_file()}
+    if what == "source code":
+        monkeypatch.setattr(folders, "code_digest", lambda: "another")
+    sweep = load_sweep(edited(at, old, new, "grid.toml"))
+    with pytest.raises(InputError, match=rf"made with another {what} .*\(and 3 more\); add --overwrite"):
+        run_sweep(sweep, at / "out", jobs=1)
+    assert {path: path.read_bytes() for path in before} == before
+    assert SweepFolder(sweep, at / "out").results() == {}  # nothing is mixed into a map
+    folder, missing = run_sweep(sweep, at / "out", jobs=1, overwrite=True)
+    assert (missing, len(folder.results())) == (0, 4)
+
+
+def test_a_changed_world_is_refused(at: Path) -> None:
+    run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+    text = (at / "small.toml").read_text()
+    (at / "small.toml").write_text(text.replace("steps = 30", "steps = 31"))
+    with pytest.raises(InputError, match="made with another scenario"):
+        run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+
+
+def test_a_folder_of_something_else_is_refused(at: Path) -> None:
+    (at / "mine").mkdir()
+    (at / "mine" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not a folder of 'consistency sweep'"):
+        run_sweep(load_sweep(at / "grid.toml"), at / "mine", overwrite=True)
+    assert [path.name for path in (at / "mine").iterdir()] == ["notes.txt"]
+    cs.run_trials(cs.load_scenario(at / "small.toml"), ["kf"], runs=2, out=at / "results")
+    with pytest.raises(InputError, match="holds results, not a sweep"):
+        run_sweep(load_sweep(at / "grid.toml"), at / "results")
+
+
+def test_a_cell_that_raises_is_a_result(at: Path) -> None:
+    """Nothing is in view in one cell, and the filter fails in no other."""
+    path = edited(at, "density = [0.5, 1.0]", "truth.sensor.range = [[0.001, 0.002], [0.5, 4.0]]")
+    folder, missing = run_sweep(load_sweep(path), at / "out", jobs=1)
+    assert missing == 0
+    broken = [r for r in folder.results().values() if r.status == "failed"]
+    assert len(broken) == 2
+    assert all("no landmark comes into view" in r.diagnosis and r.runs == 0 for r in broken)
+    assert np.isnan(broken[0].rmse_position)
+
+
+def test_any_exception_is_a_result(at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def breaks(*_: Any, **__: Any) -> Any:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr(cells, "run_until_decided", breaks)
+    folder, missing = run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+    assert missing == 0
+    assert {r.diagnosis for r in folder.results().values()} == {"failed: ZeroDivisionError: by nothing"}
+
+
+def test_a_damaged_cell_is_named(at: Path) -> None:
+    folder, _ = run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
+    path = next((at / "out").rglob("kf")) / "manifest.json"
+    data = json.loads(path.read_text())
+    del data["result"]["anees"]
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match="key 'result' is damaged"):
+        folder.results()
+
+
+def test_the_cost_is_that_of_a_step(uvd: cs.Scenario) -> None:
+    cost, microseconds = cost_of("ekf-uvd", "ekf-uvd", uvd, 0)
+    assert cost == 1.0
+    assert 0.1 < microseconds < 1e4
+
+
+# --- the map ------------------------------------------------------------------------------------
+
+
+def result(status: str = "consistent", rmse: float = 0.1, cost: float = 1.0) -> CellResult:
+    return CellResult(status, status, 48, 0, 3.0, 2.5, 3.5, 1.0, 0.9, 1.1, rmse, 0.01, cost, 20.0)
+
+
+def test_a_map_is_the_same_from_its_files(at: Path) -> None:
+    sweep = load_sweep(at / "grid.toml")
+    folder, _ = run_sweep(sweep, at / "out", jobs=1)
+    regime = regime_of(folder)
+    paths = write_regime(regime, at / "out")
+    assert [path.name for path in paths] == ["map.json", "map.csv", "map.parquet"]
+    for source in (at / "out", at / "out" / "map.json"):
+        again = read_regime(source)
+        assert repr(again.results) == repr(regime.results)
+        assert again.sweep == sweep
+    table = pd.read_csv(at / "out" / "map.csv")
+    assert list(table.columns[:3]) == ["odometry", "density", "filter"]
+    assert sorted(map(tuple, table[["odometry", "density"]].to_numpy())) == [(1, 0.5), (1, 1), (2, 0.5), (2, 1)]
+    shutil.copy(at / "out" / "map.json", at / "cut.json")
+    (at / "cut.json").write_text((at / "cut.json").read_text()[:-40])
+    (at / "list.json").write_text("[]")
+    for bad, match in (("cut", "not valid JSON"), ("none", "cannot be read"), ("list", "is no map")):
+        with pytest.raises(InputError, match=match):
+            read_regime(at / f"{bad}.json")
+
+
+def test_filters_are_ranked_by_rmse_and_then_cost() -> None:
+    found = {"slow": result(rmse=0.1000, cost=3.0), "fast": result(rmse=0.1005), "worse": result(rmse=0.2, cost=0.5)}
+    assert [name for name, _ in ranked(found)] == ["fast", "slow", "worse"]
+
+
+def test_only_consistent_filters_are_trusted() -> None:
+    sweep = replace(load_sweep("small"), filters=("ekf-uvd", "ukf-uvd", "ckf-uvd"))
+    pairs = (("ekf-uvd", result("overconfident")), ("ukf-uvd", result()), ("ckf-uvd", result("undecided")))
+    regime = Regime(sweep, {(0, name): r for name, r in pairs}, {})
+    assert [name for name, _ in regime.trusted(sweep.cells[0])] == ["ukf-uvd"]
+    assert regime.missing == 9
+
+
+def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
+    from consistency.bench.pages.html import render_html
+    from consistency.bench.pages.pdf import render_pdf
+    from consistency.bench.pages.regime import LOOKS, compose_regime
+
+    sweep = load_sweep("small")
+    statuses = list(LOOKS)
+    results = {
+        (cell.number, name): result(statuses[(2 * cell.number + i) % len(statuses)], rmse=np.nan if i else 0.1)
+        for cell in sweep.cells for i, name in enumerate(sweep.filters)
+    }  # fmt: skip
+    document = compose_regime(Regime(sweep, results, {"kind": "map"}))
+    assert "Of 4 cells, consistent are ekf-uvd in 1 and parked-ekf-uvd in 0" in document.answer
+    assert [figure.title for figure in document.figures] == [*sweep.filters, *sweep.filters]  # verdicts, then ratios
+    assert {key.text for figure in document.figures for key in figure.keys} >= set(statuses)
+    page = render_html(document)
+    assert "ekf-uvd: 0.100 m, ×1" in page
+    assert page.count(">0.5 m<") == 2
+    looks = {(look.colour, look.marker, look.edge) for look in LOOKS.values()}
+    assert len({marker for _, marker, _ in looks}) == len(LOOKS) - 1  # only undecided shares a shape, hollow
+    assert render_pdf(document).startswith(b"%PDF")
+    unfinished = compose_regime(Regime(sweep, dict(list(results.items())[:3]), {"kind": "map"}))
+    assert "not finished: 5 of 8" in unfinished.answer
+
+
+def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at: Path) -> None:
+    from consistency.bench.pages.html import render_html
+    from consistency.bench.pages.regime import compose_regime
+
+    path = edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "truth.sensor.range = [[0.5, 3.0], [0.5, 4.0]]")
+    sweep: Sweep = load_sweep(path)
+    document = compose_regime(Regime(sweep, {(0, "kf"): result(), (1, "kf"): result()}, {}))
+    assert [figure.title for figure in document.figures] == ["kf"]
+    assert "range [0.5, 3.0]" in render_html(document)

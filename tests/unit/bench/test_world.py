@@ -1,0 +1,321 @@
+"""The simulated world against the contract, brute force and exact distributions.
+
+Every statistical test here is a two-sided chi-square test with a false-alarm rate of 1e-5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import consistency as cs
+from consistency.bench.filters.plain import Unicycle
+from consistency.bench.filters.plain_sensors import PointSensor
+from consistency.bench.simulation import draw_landmarks, planned_controls, planned_path, require_landmarks_in_view
+from consistency.bench.types import Control, Trial
+from consistency.referee.geometry import rotation
+from consistency.referee.types import Array
+
+FALSE_ALARM = 1e-5
+Small = Callable[..., cs.Scenario]
+
+
+def variance_fits(normalised: Array) -> bool:
+    """Whether the sum of squares of standard normal values is inside its 1 - 1e-5 interval."""
+    total = float(np.sum(np.square(normalised)))
+    low, high = stats.chi2.interval(1 - FALSE_ALARM, normalised.size)
+    return bool(low <= total <= high)
+
+
+def steps_of(trial: Trial) -> Array:
+    return np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
+
+
+def same(a: Trial, b: Trial) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(_arrays(a), _arrays(b), strict=True))
+
+
+def _arrays(t: Trial) -> tuple[Array, ...]:
+    assert t.truth is not None
+    assert t.landmarks is not None
+    return t.start, t.controls, t.first, t.landmark, t.z, t.truth, t.landmarks
+
+
+# --- seeds -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["herath2007-xyz", "herath2007-stereo", "linear-gaussian"])
+def test_a_run_depends_on_nothing_but_scenario_seed_and_number(small: Small, name: str) -> None:
+    scenario = small(name)
+    alone = cs.simulate(scenario, run=7, seed=3)
+    among = [cs.simulate(scenario, run=run, seed=3) for run in range(9)]
+    assert same(alone, among[7])
+    assert alone.run == 7
+    for other in (among[6], among[8], cs.simulate(scenario, run=7, seed=4)):
+        assert not same(alone, other)
+        assert not np.array_equal(alone.controls, other.controls) or name == "linear-gaussian"
+
+
+def test_belief_and_name_do_not_change_the_world(small: Small) -> None:
+    told_less = small("herath2007-xyz", belief__motion__sigma_v=0.4, belief__sensor__sigma=(1.0, 1.0, 1.0))
+    assert same(cs.simulate(small("herath2007-xyz"), 2, 5), cs.simulate(told_less, 2, 5))
+
+
+def test_motion_noise_does_not_depend_on_the_sensor(small: Small) -> None:
+    blind = small("herath2007-xyz", truth__sensor__range=(0.5, 1.0), truth__sensor__sigma=(1.0, 1.0, 1.0))
+    a, b = cs.simulate(small("herath2007-xyz")), cs.simulate(blind)
+    assert np.array_equal(a.controls, b.controls)
+    assert len(a.z) != len(b.z)
+
+
+def test_a_longer_trial_begins_like_the_shorter_one(small: Small) -> None:
+    short, long = (cs.simulate(small("herath2007-xyz", truth__steps=steps)) for steps in (60, 90))
+    assert np.array_equal(long.controls[:60], short.controls)
+    assert np.array_equal(long.z[: len(short.z)], short.z)
+
+
+def test_streams_of_runs_and_purposes_are_independent(small: Small) -> None:
+    """Correlation of any two of 16 streams of 3000 values in order of drawing: Fisher's z, 1e-5 over all pairs."""
+    scenario = small("herath2007-xyz", truth__steps=1500)
+    motion, planned = scenario.truth.motion, planned_controls(scenario.truth)
+    streams = []
+    for run in range(8):
+        trial = cs.simulate(scenario, run)
+        noise = (planned - trial.controls)[:, 1:] / [motion.sigma_v, motion.sigma_omega]
+        streams += [noise.ravel(), (trial.z - _noise_free(scenario, trial)).ravel()[:3000]]
+    correlation = np.corrcoef(np.array(streams))[np.triu_indices(16, 1)]
+    bound = stats.norm.isf(FALSE_ALARM / 2 / len(correlation)) / np.sqrt(3000 - 3)
+    assert np.abs(np.arctanh(correlation)).max() < bound
+
+
+@pytest.mark.parametrize("name", ["herath2007-xyz", "linear-gaussian"])
+def test_landmarks_are_the_same_in_all_runs_and_inside_their_box(small: Small, name: str) -> None:
+    scenario = small(name)
+    worlds = [cs.simulate(scenario, run, seed).landmarks for run, seed in ((0, 0), (1, 0), (0, 9))]
+    assert np.array_equal(worlds[0], worlds[1])
+    assert np.array_equal(worlds[0], worlds[2])
+    box = scenario.truth.landmarks
+    low, high = np.array([box.x, box.y, box.z]).T
+    assert worlds[0].shape == (box.count, 3)
+    assert np.all((worlds[0] >= low) & (worlds[0] <= high))
+    other = small(name, truth__landmarks__seed=1)
+    assert not np.array_equal(draw_landmarks(other.truth), worlds[0])
+
+
+def test_listed_landmarks_stand_where_they_are_listed(small: Small) -> None:
+    points = [[3.0, 1.0, 0.5], [2.0, 2.0, 0.0]]
+    scenario = small("herath2007-xyz", truth__landmarks={"layout": "listed", "points": points})
+    assert np.array_equal(cs.simulate(scenario).landmarks, points)
+
+
+# --- what is seen ------------------------------------------------------------------------------
+
+
+def seen_by_hand(scenario: cs.Scenario, path: Array, landmarks: Array) -> set[tuple[int, int]]:
+    """The contract's rule, landmark by landmark: true position in range, true projection in the image."""
+    sensor = scenario.truth.sensor
+    turn, seen = rotation(*sensor.mount.rotation), set()
+    for step, (px, py, heading) in enumerate(path[1:], start=1):
+        for label, landmark in enumerate(landmarks):
+            body = rotation(0, 0, heading).T @ (landmark - [px, py, 0.0])
+            x, y, z = turn.T @ (body - sensor.mount.position)
+            if not sensor.range[0] <= np.sqrt(x * x + y * y + z * z) <= sensor.range[1]:
+                continue
+            if sensor.image is not None:
+                column = sensor.centre[0] - sensor.f * y / x
+                row = sensor.centre[1] - sensor.f * z / x
+                if x <= 0 or not (0 <= column < sensor.image[0] and 0 <= row < sensor.image[1]):
+                    continue
+            seen.add((step, label))
+    return seen
+
+
+WORLDS: dict[str, dict[str, Any]] = {
+    "as published": {},
+    "principal point aside": {"truth__sensor__principal_point": (100.0, 60.0)},
+    "no image": {"truth__sensor__image": None},
+    "robot pushed about": {"truth__motion__noise_on": "motion", "truth__motion__sigma_omega": 0.5},
+}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_seen_is_what_is_in_range_and_in_the_image(small: Small, world: str) -> None:
+    scenario = small("herath2007-xyz", truth__steps=40, **WORLDS[world])
+    trial = cs.simulate(scenario, run=1)
+    expected = seen_by_hand(scenario, trial.truth, trial.landmarks)
+    assert expected
+    assert set(zip(steps_of(trial), trial.landmark, strict=True)) == expected
+    if world == "robot pushed about":  # negative control: the planned path is not what decides
+        assert expected != seen_by_hand(scenario, planned_path(scenario.truth), trial.landmarks)
+
+
+def test_seen_by_a_mounted_sensor(small: Small, tilted: dict[str, list[float]]) -> None:
+    scenario = small("herath2007-xyz", truth__steps=40, truth__sensor__mount=tilted)
+    trial = cs.simulate(scenario)
+    seen = set(zip(steps_of(trial), trial.landmark, strict=True))
+    assert seen == seen_by_hand(scenario, trial.truth, trial.landmarks)
+    plain = small("herath2007-xyz", truth__steps=40)
+    assert seen != seen_by_hand(plain, trial.truth, trial.landmarks)
+
+
+def test_measured_disparity_outside_the_search_range_is_no_observation(small: Small) -> None:
+    far = {"truth__sensor__range": (0.5, 14.0)}  # f B / x is 0.96 px at 14 m
+    narrow = cs.simulate(small("herath2007-stereo", **far, truth__sensor__disparity=(1.5, 5.0)))
+    wide = cs.simulate(small("herath2007-stereo", **far, truth__sensor__disparity=(1e-9, 1e9)))
+    found = (wide.z[:, 2] >= 1.5) & (wide.z[:, 2] <= 5.0)
+    assert (wide.z[:, 2] < 1.5).any()
+    assert (wide.z[:, 2] > 5.0).any()
+    assert np.array_equal(narrow.z, wide.z[found])
+    assert np.array_equal(narrow.landmark, wide.landmark[found])
+    assert np.array_equal(steps_of(narrow), steps_of(wide)[found])
+
+
+def test_observations_are_ordered(uvd: cs.Scenario) -> None:
+    trial = cs.simulate(uvd)
+    assert trial.first[0] == 0
+    assert trial.first[-1] == len(trial.landmark) == len(trial.z)
+    for step in range(1, trial.steps + 1):
+        assert np.all(np.diff(trial.observation(step).landmarks) > 0)
+
+
+def test_nothing_in_view_is_unusable_input(small: Small) -> None:
+    scenario = small("herath2007-xyz", truth__landmarks={"layout": "listed", "points": [[500.0, 0.0, 0.0]]})
+    with pytest.raises(cs.InputError, match=r"no landmark comes into view.*truth\.sensor.*truth\.landmarks"):
+        require_landmarks_in_view(scenario)
+    assert len(cs.simulate(scenario).z) == 0
+
+
+# --- noise -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["herath2007-xyz", "herath2007-stereo", "linear-gaussian"])
+def test_observation_noise_has_the_stated_variance(small: Small, name: str) -> None:
+    sigma = (0.02, 0.05, 0.11) if name != "herath2007-stereo" else (1.34, 1.53, 0.2)
+    scenario = small(name, truth__sensor__sigma=sigma, truth__steps=250)
+    trial = cs.simulate(scenario)
+    residual = trial.z - _noise_free(scenario, trial)
+    for axis in range(3):
+        assert variance_fits(residual[:, axis] / sigma[axis])
+        assert not variance_fits(residual[:, axis] / (1.3 * sigma[axis]))  # negative control
+
+
+def _noise_free(scenario: cs.Scenario, trial: Trial) -> Array:
+    sensor = PointSensor(scenario.belief.sensor, uvd=scenario.truth.sensor.model == "uvd")
+    pose, landmark = trial.truth[steps_of(trial)], trial.landmarks[trial.landmark]
+    if scenario.truth.sensor.model != "linear":
+        return sensor.measure(pose, landmark)
+    reference = planned_path(scenario.truth)[steps_of(trial)]
+    H = np.array([sensor.jacobians(p, m)[0] for p, m in zip(reference, landmark, strict=True)])
+    return sensor.measure(reference, landmark) + np.einsum("mij,mj->mi", H, pose - reference)
+
+
+@pytest.mark.parametrize("noise_on", ["odometry", "motion"])
+def test_motion_noise_has_the_stated_variance(small: Small, noise_on: str) -> None:
+    scenario = small("herath2007-xyz", truth__steps=1500, truth__motion__noise_on=noise_on)
+    trial = cs.simulate(scenario)
+    driven = _driven(trial)
+    motion = scenario.truth.motion
+    for axis, sigma in ((0, motion.sigma_v), (1, motion.sigma_omega)):
+        noise = driven[:, axis] - trial.controls[:, 1 + axis]
+        assert variance_fits(noise / sigma)
+        assert not variance_fits(noise / (1.3 * sigma))  # negative control
+
+
+def _driven(trial: Trial) -> Array:
+    """The true (v, omega) of each step, from the true poses by eq. 18."""
+    dt, move = trial.controls[:, 0], np.diff(trial.truth, axis=0)
+    heading = trial.truth[:-1, 2]
+    forward = np.cos(heading) * move[:, 0] + np.sin(heading) * move[:, 1]
+    sideways = -np.sin(heading) * move[:, 0] + np.cos(heading) * move[:, 1]
+    assert np.allclose(sideways, 0.0, rtol=0, atol=1e-12)
+    return np.column_stack([forward, move[:, 2]]) / dt[:, None]
+
+
+def test_noise_on_odometry_drives_the_path_and_tells_noise(small: Small) -> None:
+    scenario = small("herath2007-xyz")
+    a, b = cs.simulate(scenario, 0), cs.simulate(scenario, 1)
+    assert np.array_equal(a.truth, planned_path(scenario.truth))
+    assert np.array_equal(a.truth, b.truth)
+    assert not np.array_equal(a.controls, b.controls)
+
+
+def test_noise_on_motion_tells_the_plan_and_drives_noise(small: Small) -> None:
+    scenario = small("herath2007-xyz", truth__motion__noise_on="motion")
+    a, b = cs.simulate(scenario, 0), cs.simulate(scenario, 1)
+    assert np.array_equal(a.controls, planned_controls(scenario.truth))
+    assert np.array_equal(a.controls, b.controls)
+    assert not np.array_equal(a.truth, b.truth)
+
+
+def test_start_is_exact_and_time_counts_from_zero(uvd: cs.Scenario) -> None:
+    trial = cs.simulate(uvd)
+    assert np.array_equal(trial.truth[0], trial.start)
+    assert np.allclose(trial.t, 0.1 * np.arange(61))
+
+
+# --- the linear world ----------------------------------------------------------------------------
+
+
+def test_linear_world_superposes(small: Small) -> None:
+    """Three times the noise is three times the deviation, in the path and in every observation."""
+    changes = {"truth__motion__sigma_v": 0.3, "truth__motion__sigma_omega": 0.5}
+    threefold = {key: 3 * value for key, value in changes.items()}
+    once = small("linear-gaussian", **changes, truth__sensor__sigma=(0.1, 0.2, 0.3))
+    thrice = small("linear-gaussian", **threefold, truth__sensor__sigma=(0.3, 0.6, 0.9))
+    a, b = cs.simulate(once), cs.simulate(thrice)
+    reference = planned_path(once.truth)
+    assert np.allclose(b.truth - reference, 3 * (a.truth - reference), rtol=0, atol=1e-12)
+    assert np.array_equal(a.landmark, b.landmark)
+    nominal = PointSensor(once.belief.sensor, uvd=False).measure(reference[steps_of(a)], a.landmarks[a.landmark])
+    assert np.allclose(b.z - nominal, 3 * (a.z - nominal), rtol=0, atol=1e-12)
+    assert np.abs(a.truth - reference).max() > 0.1
+
+
+def test_nonlinear_world_does_not_superpose(small: Small) -> None:
+    """Negative control of the test above."""
+    changes = {"truth__motion__noise_on": "motion", "truth__motion__sigma_v": 0.3}
+    a = cs.simulate(small("herath2007-xyz", **changes, truth__motion__sigma_omega=0.5))
+    changes["truth__motion__sigma_v"] = 0.9
+    b = cs.simulate(small("herath2007-xyz", **changes, truth__motion__sigma_omega=1.5))
+    reference = planned_path(small("herath2007-xyz").truth)
+    assert not np.allclose(b.truth - reference, 3 * (a.truth - reference), rtol=0, atol=1e-3)
+
+
+def test_linear_world_moves_by_the_jacobians_at_the_plan(linear: cs.Scenario) -> None:
+    """Deviation <- F deviation + G noise: the part across the planned heading has no noise of its own."""
+    trial, reference = cs.simulate(linear), planned_path(linear.truth)
+    deviation, noises = trial.truth - reference, []
+    for k in range(trial.steps):
+        F, G = Unicycle().jacobians(reference[k], Control(*planned_controls(linear.truth)[k]))
+        noise, _, _, _ = np.linalg.lstsq(G, deviation[k + 1] - F @ deviation[k], rcond=None)
+        assert np.allclose(G @ noise, deviation[k + 1] - F @ deviation[k], rtol=0, atol=1e-12)
+        noises.append(noise)
+    assert variance_fits(np.array(noises) / [linear.truth.motion.sigma_v, linear.truth.motion.sigma_omega])
+
+
+def test_linear_world_sees_the_same_in_every_run(linear: cs.Scenario) -> None:
+    a, b = cs.simulate(linear, 0), cs.simulate(linear, 1)
+    assert np.array_equal(a.landmark, b.landmark)
+    assert np.array_equal(a.first, b.first)
+    assert not np.array_equal(a.truth, b.truth)
+    expected = seen_by_hand(linear, planned_path(linear.truth), a.landmarks)
+    assert set(zip(steps_of(a), a.landmark, strict=True)) == expected
+
+
+def test_a_world_out_of_the_search_range_is_refused() -> None:
+    scenario = cs.load_scenario("herath2007-stereo").variant("near", truth__sensor__disparity=(100.0, 132.0))
+    with pytest.raises(cs.InputError, match=r"no landmark comes into view.*disparity"):
+        cs.run_trials(scenario, ["ekf-uvd"], runs=1)
+
+
+def test_waypoints_that_lead_nowhere_are_refused() -> None:
+    path = {
+        "shape": "waypoints", "points": [(1.0, 2.0)], "turn_rate": 1.0,
+        "start": (1.0, 2.0), "heading": 0.0, "speed": 1.0,
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="other than start"):
+        cs.load_scenario("herath2007-xyz").variant("still", truth__path=path)

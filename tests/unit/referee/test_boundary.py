@@ -1,0 +1,301 @@
+"""What readers of each kind refuse, or take as it is: cases that the fuzzer would not find again soon."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hostile import STEPS, write_all
+from mutations import bomb, claimed
+from recorded import read_recordings
+
+import consistency as cs
+from consistency.bench.store.parquet import read_parquet
+from consistency.bench.sweeps.plan import load_sweep
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.verdicts.baselines import read_baseline
+
+
+def read(path: Path, **options: Path) -> Evidence:
+    """The recording of the first estimator."""
+    return read_recordings(Path(path), **options)[0]
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("boundary")
+    write_all(folder)
+    return folder
+
+
+@pytest.fixture
+def files(valid: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(valid, tmp_path / "files"))
+
+
+# --- tables of estimates ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", ["1e308", "-1e308", "3e30", "inf"])
+def test_an_estimate_beyond_all_measure_is_a_failed_run(files: Path, value: str) -> None:
+    path = files / "table" / "est.csv"
+    table = pd.read_csv(path, dtype=str)
+    table.loc[5, "x"] = value
+    table.to_csv(path, index=False)
+    recording = read(path, truth=files / "table" / "truth.csv")
+    assert [(failure.run, failure.step) for failure in recording.failures] == [(0, 6)]
+    assert "not finite" in recording.failures[0].reason
+    assert np.nanmax(recording.nees) < 1e6
+
+
+def test_a_truth_beyond_all_measure_is_refused(files: Path) -> None:
+    path = files / "table" / "truth.csv"
+    table = pd.read_csv(path, dtype=str)
+    table.loc[5, "x"] = "1e308"
+    table.to_csv(path, index=False)
+    with pytest.raises(cs.InputError, match=r"truth\.csv, line 7: column 'x': not a finite number \(1e\+?308\)"):
+        read(files / "table" / "est.csv", truth=path)
+
+
+def test_large_numbers_of_a_trajectory(files: Path) -> None:
+    path = files / "tum" / "cov.txt"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    lines[4] = " ".join([lines[4].split()[0], *["1e308"] * 36])
+    path.write_text("\n".join(lines), encoding="utf-8")
+    at = files / "tum"
+    recording = read(at / "est.tum", truth=at / "truth.tum", covariance=path)
+    assert [failure.step for failure in recording.failures] == [5]
+
+
+# --- Parquet ----------------------------------------------------------------------------------------
+
+
+def test_notes_of_other_programs_change_nothing(files: Path) -> None:
+    """They may make a column the index of the table, or give it another type."""
+    path = files / "results" / "truth.parquet"
+    before = read_parquet(path.parent, "truth")
+    notes = {"index_columns": ["step"], "columns": [], "column_indexes": [], "pandas_version": "2"}
+    table = pq.read_table(path).replace_schema_metadata({"pandas": json.dumps(notes)})
+    pq.write_table(table, path)
+    pd.testing.assert_frame_equal(read_parquet(path.parent, "truth"), before)
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        (pa.array([2**60 + 1] * 117), r"column 'run', row 0: not a whole number"),
+        (pa.array([True] * 117), r"column 'run' cannot be read as numbers \(bool\)"),
+        (pa.array([True, None] + [False] * 115), r"column 'run' cannot be read as numbers \(object\)"),
+        (pa.array([[0]] * 117), r"column 'run'.*not a|column 'run' cannot be read as numbers"),
+        (pa.array([0] * 117, pa.timestamp("ns")), r"column 'run' cannot be read as numbers"),
+    ],
+    ids=["large", "bool", "bool with gaps", "list", "time"],
+)
+def test_a_column_of_runs_is_of_whole_numbers(files: Path, column: pa.Array, said: str) -> None:
+    path = files / "results" / "truth.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(0, "run", column), path)
+    with pytest.raises(cs.InputError, match=rf"truth\.parquet: {said}"):
+        read_parquet(path.parent, "truth")
+
+
+# --- archives ---------------------------------------------------------------------------------------
+
+
+def test_a_small_archive_of_a_gigabyte_is_refused_before_it_is_read(files: Path) -> None:
+    bomb(files / "archive" / "est.npz", np.random.default_rng(0))
+    with pytest.raises(cs.InputError, match=r"est\.npz: would take 0\.625 GiB in memory"):
+        read(files / "archive" / "est.npz")
+
+
+def test_an_array_that_claims_more_than_it_holds_is_refused(files: Path) -> None:
+    for seed in range(8):
+        path = shutil.copy(files / "archive" / "nees.npz", files / "copy.npz")
+        claimed(Path(path), np.random.default_rng(seed))
+        with pytest.raises(cs.InputError, match=r"copy\.npz: is not a NumPy archive, damaged"):
+            read(path)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_packed_archive_holds_the_same(files: Path, method: int) -> None:
+    path = files / "archive" / "nees.npz"
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(files / "packed.npz", "w", method) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    assert np.array_equal(read(files / "packed.npz").nees, read(path).nees)
+
+
+@pytest.mark.parametrize("key", ["errors", "covariances", "nis", "nis_dof"])
+def test_complex_numbers_are_refused(files: Path, key: str) -> None:
+    path = files / "archive" / "est.npz"
+    with np.load(path) as archive:
+        data = dict(archive)
+    np.savez(path, **data | {key: data[key] + 0j})
+    with pytest.raises(cs.InputError, match=rf"key '{key}' holds complex128, not numbers"):
+        read(path)
+
+
+# --- cameras ----------------------------------------------------------------------------------------
+
+
+def test_a_singular_matrix_of_a_camera_is_named(files: Path) -> None:
+    from consistency.stereo.vision.calibration import read_calibration
+
+    path = files / "kitti" / "calib.txt"
+    path.write_text(path.read_text(encoding="utf-8").replace("P1: 700", "P1: 0"), encoding="utf-8")
+    with pytest.raises(cs.InputError, match=r"calib\.txt: key 'P1': the matrix of its camera is singular"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[" * 20_000, "nested too deep"),
+        ("%YAML:1.0\n---\nK1: " + "[" * 1_000_000, "nested too deep"),
+        ("K1: " + "- " * 20_000, "nested too deep"),
+        ("a: &a [1, 1]\nK1: [*a, *a]\n", "aliases"),
+        ("K1: 1\nK1: 2\n", "key 'K1' is there twice"),
+        ("K1: 2020-99-99\n", "cannot be read as YAML"),
+        ("K1: [1" + "0" * 400 + "]\n", "key 'K1': must be numbers"),
+        ("x" * (2**20 + 1), "at most 1 MiB are read"),
+    ],
+    ids=["brackets", "OpenCV", "lists", "aliases", "twice", "date", "number", "large"],
+)  # fmt: skip
+def test_yaml_that_is_hostile(tmp_path: Path, text: str, said: str) -> None:
+    pytest.importorskip("yaml")
+    pytest.importorskip("cv2")
+    from consistency.stereo.vision.calibration import read_calibration
+
+    path = tmp_path / "c.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(cs.InputError, match=rf"c\.yaml: .*{said}"):
+        read_calibration(path)
+
+
+# --- baselines and sweeps ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("runs", [2**63, 1], "filters.one.runs.0"),
+        ("runs", [0] * 9, "a run is there twice"),
+        ("dof", 10**400, "filters.one.dof"),
+        ("dof", True, "filters.one.dof"),
+        ("nees", [1.0], "not equally long"),
+        ("nees", [-1.0] * 9, "filters.one.nees.0"),
+        ("squared", [[1.0]] * 9, "not equally long"),
+        ("failures", -1, "filters.one.failures"),
+    ],
+    ids=str,
+)
+def test_a_changed_baseline_is_refused(files: Path, key: str, value: object, said: str) -> None:
+    path = files / "baseline" / "base.json"
+    data = json.loads(path.read_text(encoding="utf-8"))
+    assert len(read_baseline(path).filters["one"].runs) == len(data["filters"]["one"]["nees"])
+    data["filters"]["one"][key] = value
+    path.write_text(json.dumps(data), encoding="utf-8")
+    with pytest.raises(cs.InputError, match=rf"base\.json: damaged; write it again \(.*{said}"):
+        read_baseline(path)
+
+
+def test_a_grid_of_more_cells_than_there_is_room_for(files: Path) -> None:
+    path = files / "sweep" / "sweep.toml"
+    values = ", ".join(str(k / 1000) for k in range(1, 301))
+    text = path.read_text(encoding="utf-8").split("[grid]")[0]
+    path.write_text(f"{text}[grid]\nspeed = [{values}]\nodometry = [{values}]\n", encoding="utf-8")
+    with pytest.raises(cs.InputError, match=r"sweep\.toml: key 'grid': makes 90000 cells; at most 20000"):
+        load_sweep(path)
+
+
+def test_one_bad_step_sizes_nothing(files: Path) -> None:
+    path = files / "results" / "estimates.parquet"
+    table = pd.read_parquet(path)
+    table.loc[STEPS - 1, "step"] = 10**12
+    table.to_parquet(path, index=False)
+    with pytest.raises(cs.InputError, match=r"estimates\.parquet: step 1000000000000 of run 0"):
+        cs.analyse(cs.read_results(path.parent))
+
+
+# --- results ----------------------------------------------------------------------------------------
+
+
+def edited(files: Path, column: str, new: float) -> Path:
+    """Results in which one number of a step was changed."""
+    path = files / "results" / "estimates.parquet"
+    table = pd.read_parquet(path).astype({column: float})
+    table.loc[40, column] = new
+    table.to_parquet(path, index=False)
+    return path.parent
+
+
+@pytest.mark.parametrize(
+    ("column", "new", "said"),
+    [
+        ("x", 1e61, "column 'x', row 40: too large a number"),
+        ("P_xx", -1e300, "column 'P_xx', row 40: too large a number"),
+        ("nees", 1e61, "column 'nees', row 40: too large a number"),
+        ("nis", np.inf, "column 'nis', row 40: not a finite number"),
+        ("nis_dof", 2.0**31, "column 'nis_dof', row 40: too large a number"),
+        ("x", 1e40, "estimates of 'one', run 3, step 5: the NEES is not that of the error"),
+        ("P_yy", 1e-200, "estimates of 'one', run 3, step 5: the NEES is not that of the error"),
+    ],
+)
+def test_numbers_whose_squares_would_overflow_are_refused(files: Path, column: str, new: float, said: str) -> None:
+    folder = edited(files, column, new)
+    with pytest.raises(cs.InputError, match=said):
+        cs.analyse(cs.read_results(folder))
+
+
+def test_large_numbers_that_go_together_are_judged(files: Path) -> None:
+    """Without a warning, as the whole suite treats them as errors; the verdict is on what is there."""
+    with np.errstate(all="raise", under="ignore"):
+        verdict = cs.analyse(cs.read_results(edited(files, "nees", 1e60)))["one"]
+    assert verdict.status in ("overconfident", "heavy-tailed", "inconsistent", "undecided")
+
+
+@pytest.mark.parametrize("name", ["est.npz", "nees.npz"])
+def test_degrees_of_freedom_beyond_whole_numbers_are_refused(files: Path, name: str) -> None:
+    path = files / "archive" / name
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    key = "nis_dof" if name == "est.npz" else "dof"
+    for value in (2.0**31, np.float16(np.inf), 1e300, np.float32(2.5)):
+        np.savez(path, **arrays | {key: np.array(value)})
+        with pytest.raises(cs.InputError, match="whole number"):
+            read(path)
+
+
+def test_counts_of_rows_that_disagree_are_refused(files: Path) -> None:
+    """The number of rows of a group, which no checksum is over, is one less: a row would be passed over."""
+    path = files / "results" / "truth.parquet"
+    content = path.read_bytes()
+    rows = pq.read_metadata(path).num_rows
+    group = b"\x16" + varint(rows)
+    at = content.rindex(group)
+    path.write_bytes(content[:at] + b"\x16" + varint(rows - 1) + content[at + len(group) :])
+    with pytest.raises(cs.InputError, match=r"truth\.parquet: .*numbers of rows do not agree"):
+        read_parquet(path.parent, "truth")
+
+
+def varint(value: int) -> bytes:
+    """A whole number as the compact protocol of Thrift has it."""
+    coded, out = 2 * value, b""
+    while coded > 127:
+        coded, out = coded >> 7, out + bytes([coded & 127 | 128])
+    return out + bytes([coded])
+
+
+def test_a_number_of_a_grid_that_no_float_holds_is_refused(files: Path) -> None:
+    path = files / "sweep" / "sweep.toml"
+    text = path.read_text(encoding="utf-8").replace("odometry = [", f"odometry = [\n    {10**400},")
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(cs.InputError, match=r"key 'grid\.odometry'"):
+        load_sweep(path)

@@ -1,0 +1,393 @@
+"""The calibration of the referee: worlds, how their gates are counted, and the committed table."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import calibration
+import calibration_cases
+import calibration_rows
+import calibration_worlds as worlds
+import numpy as np
+import pytest
+from calibration_cases import Case, Claim
+from calibration_gates import Draw, Gate, joined, random_walk_filter, turned
+from calibration_rows import Row, kept
+from recorded import read_recordings
+from scipy import stats
+
+from consistency.referee.diagnostics import nees, nis_of
+from consistency.referee.sources import planar_error
+
+ROOT = Path(__file__).parents[3]
+TABLE = json.loads((ROOT / "reports/reference/calibration.json").read_text(encoding="utf-8"))
+ROWS = calibration_rows.rows_of(TABLE)
+RIGHT = {name: world for name, world in (worlds.WORLDS | worlds.LOGS).items() if name != "linear-gaussian"}
+
+
+@pytest.fixture(autouse=True)
+def _pool(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for the runs of the Kalman filter, whose errors are exact by their own tests."""
+    error = np.random.default_rng(7).standard_normal((301, 100, 3))
+    monkeypatch.setitem(worlds.POOL, "linear-gaussian", (error, np.eye(3)))
+
+
+# --- the committed table ------------------------------------------------------------------------------------
+
+
+def test_every_case_was_measured_with_all_its_gates() -> None:
+    measured = {(r.world, r.question, r.ratio, r.runs, r.stated, r.bound): r.gates for r in ROWS}
+    for case in calibration_cases.cases():
+        for claim in case.claims:
+            gates = measured[(case.world, claim.question, case.ratio, case.runs, claim.stated, claim.bound)]
+            assert gates >= case.gates, (case, claim)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.question}-{row.world}-{row.ratio:.3g}-{row.runs}")
+def test_what_was_measured_keeps_the_promise(row: Row) -> None:
+    assert kept(row)
+
+
+def test_the_documentation_shows_it() -> None:
+    assert calibration_rows.markdown(TABLE) in (ROOT / "docs/referee.md").read_text(encoding="utf-8")
+
+
+def test_every_question_and_world_of_the_table_is_explained() -> None:
+    assert {row.question for row in ROWS} == set(TABLE["questions"])
+    assert {row.world for row in ROWS} == set(TABLE["worlds"])
+
+
+# --- promises -----------------------------------------------------------------------------------------------
+
+ALARMS = Row("w", "false alarm", 1.0, 21, 1, 0.05, "<=", 1000, 50)
+POWER = Row("w", "power", 1.5, 61, 1, 0.95, ">=", 1000, 950)
+
+
+@pytest.mark.parametrize(
+    ("row", "good"),
+    [
+        (ALARMS, True), (replace(ALARMS, found=0), True), (replace(ALARMS, found=66), True),
+        (replace(ALARMS, found=70), False), (replace(ALARMS, stated=0.01, found=21), False),
+        (POWER, True), (replace(POWER, found=1000), True), (replace(POWER, found=935), True),
+        (replace(POWER, found=930), False),
+        (replace(ALARMS, stated=0.0, found=0), True), (replace(ALARMS, stated=0.0, found=1), False),
+    ],
+)  # fmt: skip
+def test_a_promise_is_broken_beyond_its_binomial_limit(row: Row, good: bool) -> None:
+    assert kept(row) is good
+
+
+def test_the_quick_rows_of_a_referee_that_keeps_its_promises_fail_less_than_once_in_5000() -> None:
+    """At rates exactly as stated, which is as bad as a promise that is kept can be."""
+    claims = [(case.gates, claim) for case in calibration_cases.quick_cases() for claim in case.claims]
+    confidence = calibration_cases.quick_confidence(len(claims))
+    chance = 0.0
+    for gates, claim in claims:
+        found = np.arange(gates + 1)
+        rows = (Row("w", claim.question, 1.0, 1, 1, claim.stated, claim.bound, gates, int(k)) for k in found)
+        broken = np.array([not kept(row, confidence) for row in rows])
+        chance += float(stats.binom.pmf(found, gates, claim.stated)[broken].sum())
+    assert 2e-6 < chance < 2e-4
+
+
+def test_the_quick_rows_see_what_was_wrong_once() -> None:
+    """43 % of false alarms in the body frame, and an all-clear for 19 in 20 of gates that nothing was shown of."""
+    confidence = calibration_cases.quick_confidence(100)
+    claims = {case.world: (case.gates, c) for case in calibration_cases.quick_cases() for c in case.claims}
+    for world, (gates, claim) in claims.items():
+        if claim.bound == "<=":
+            found = round(0.43 * gates)
+            assert not kept(Row(world, "q", 1.0, 1, 1, claim.stated, claim.bound, gates, found), confidence)
+
+
+def test_every_case_counts_something_and_can_be_answered() -> None:
+    for case in [*calibration_cases.cases(), *calibration_cases.quick_cases()]:
+        assert case.world in calibration.ANY
+        assert all(claim.counted in calibration.COUNTED for claim in case.claims)
+        assert all(claim.question in calibration_rows.QUESTIONS for claim in case.claims)
+
+
+def test_all_right_worlds_are_asked_for_false_alarms() -> None:
+    asked = [case for case in calibration_cases.cases() if case.claims[0].question == "false alarm"]
+    for runs, rate, _ in calibration_cases.alarm_plans():
+        assert {c.world for c in asked if (c.runs, c.false_alarm) == (runs, rate)} == set(worlds.WORLDS)
+
+
+# --- worlds -------------------------------------------------------------------------------------------------
+
+
+def p_values(gate: Gate, step: int) -> list[float]:
+    """That one step of a gate is N(0, P), whose runs are independent: of the NEES, and of the NIS."""
+    found = []
+    if gate.error is not None or gate.nees is not None:
+        if gate.error is not None:
+            there = np.isfinite(gate.error[:, step]).all(axis=-1)
+            values, dof = nees(gate.error[there, step], gate.covariance[there, step]), gate.error.shape[-1]
+        else:
+            values, dof = gate.nees[:, step], gate.dof
+        found.append(stats.kstest(values, "chi2", args=(dof,)).pvalue)
+        found.append(
+            2 * min(stats.chi2.sf(values.sum(), dof * len(values)), stats.chi2.cdf(values.sum(), dof * len(values)))
+        )
+    nis, dof = gate.nis, gate.nis_dof
+    if gate.innovations is not None:
+        nis, dof = nis_of(gate.innovations, gate.innovation_covariances)
+    if nis is not None:
+        found.append(two_sided(np.nansum(nis[:, step]), dof[:, step].sum()))
+    return found
+
+
+def two_sided(total: float, dof: int) -> float:
+    return 2.0 * float(min(stats.chi2.sf(total, dof), stats.chi2.cdf(total, dof)))
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_every_step_of_a_right_world_is_as_stated(name: str) -> None:
+    """Under 150 p values at 1e-7; one and the same in every run of the tests."""
+    rng = np.random.default_rng(20070)
+    gate = RIGHT[name].draw(Draw(rng, 3000, 30))
+    for step in (0, 14, 29):
+        assert min(p_values(gate, step)) > 1e-7
+    assert max(p_values(gate.wrong_by(1.5), 0)) < 1e-3  # negative control
+    if gate.innovations is not None or gate.nis is not None:
+        assert gate.optimal_gain == (name == "NIS alone")
+
+
+@pytest.mark.parametrize("name", worlds.HEAVY)
+def test_heavy_tails_have_the_stated_covariance(name: str) -> None:
+    """Means of squares over 6,000 runs, whose standard error is worked out from the sample: 6 of them."""
+    gate = worlds.HEAVY[name].draw(Draw(np.random.default_rng(20070), 6000, 4))
+    assert gate.error is not None
+    products = np.einsum("rti,rtj->rij", gate.error, gate.error).reshape(6000, 9) / 4
+    away = products.mean(axis=0) - np.eye(3).ravel()
+    assert (np.abs(away) < 6 * products.std(axis=0) / np.sqrt(6000)).all()
+    assert np.abs(gate.error).max() > 6.0 or name.startswith("t10")  # the tails are there
+
+
+def test_worlds_depend_over_steps_as_they_say() -> None:
+    rng = np.random.default_rng(20070)
+
+    def neighbours(name: str) -> np.ndarray:
+        error = worlds.WORLDS[name].draw(Draw(rng, 400)).error
+        assert error is not None
+        return np.array([np.corrcoef(e[:-1].ravel(), e[1:].ravel())[0, 1] for e in error])
+
+    of_run = neighbours("AR(.) of the run")
+    assert np.quantile(of_run, 0.1) < 0.3 < 0.8 < np.quantile(of_run, 0.9)
+    assert np.std(neighbours("period of the run")) > 0.5
+    slow = worlds.WORLDS["20 % slow, n = 1"].draw(Draw(rng, 1000)).error
+    assert slow is not None
+    share = (slow == slow[:, :1]).all(axis=(1, 2)).mean()
+    assert stats.binomtest(round(1000 * share), 1000, 0.2).pvalue > 1e-6
+    dependent = worlds.WORLDS["fully dependent"].draw(Draw(rng, 3)).error
+    assert dependent is not None
+    assert (dependent == dependent[:, :1]).all()
+
+
+def test_innovations_of_a_gain_that_is_not_optimal_are_not_white() -> None:
+    for name in ("Schmidt-Kalman", "fixed gain"):
+        gate = worlds.WORLDS[name].draw(Draw(np.random.default_rng(20070), 400))
+        u = gate.innovations
+        assert u is not None
+        assert (u[:, 1:] * u[:, :-1]).mean() > 0.1 * np.square(u).mean()
+
+
+def test_errors_of_a_filter_have_its_variance_and_turn_with_it() -> None:
+    """Means of products over 4,000 runs against their stated values, 6 standard errors of theirs."""
+    draw = Draw(np.random.default_rng(20070), 4000, 6)
+    error, variance = random_walk_filter(draw, start=2.0, process=0.5, noise=3.0, n=2)
+    stretched, variance = error * [1.0, 3.0], variance * [1.0, 9.0]
+    np.testing.assert_allclose(variance[0, 0], 1.0 / (1.0 / 2.5 + 1.0 / 3.0))  # information adds up
+    heading = np.array([0.0, 0.3, 1.2, -2.0, 4.0, 0.7])
+    for each in (0.0 * heading, heading):
+        body, covariance = turned(stretched, variance, np.broadcast_to(each, (4000, 6)))
+        products = np.einsum("rti,rtj->rtij", body, body)
+        away = products.mean(axis=0) - covariance[0]
+        assert (np.abs(away) < 6 * products.std(axis=0) / np.sqrt(4000)).all()
+    np.testing.assert_allclose(body[:, 1], stretched[:, 1] @ [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+
+
+def test_gates_take_their_own_runs_of_the_pool() -> None:
+    case = Case("linear-gaussian", 43, 7, ())
+    gates = [calibration.Growing(case, number, 1)(43).error for number in range(7)]
+    assert len(np.unique(np.concatenate(gates)[:, 0, 0])) == 301
+    grown = calibration.Growing(case, 2, 1)
+    grown(10)
+    np.testing.assert_array_equal(grown(43).error, gates[2])
+
+
+def test_runs_of_the_pool_are_all_taken_before_any_is_taken_again() -> None:
+    pool, _ = worlds.POOL["linear-gaussian"]
+    rng = np.random.default_rng(0)
+    taken = [worlds.linear_gaussian(Draw(rng, 43, first=43 * gate)).error for gate in range(14)]
+    first, second = np.concatenate(taken[:7]), np.concatenate(taken[7:])
+    for turn in (first, second):
+        assert len(np.unique(turn[:, 0, 0])) == len(pool)
+    assert (first != second).any()
+
+
+# --- planar poses -------------------------------------------------------------------------------------------
+
+
+def test_poses_have_exactly_the_left_invariant_errors_that_were_drawn(tmp_path: Path) -> None:
+    """In memory and as a file for ``analyse --error left``; under another convention they are others."""
+    truth, estimate, covariance = worlds.left_poses(Draw(np.random.default_rng(20070), 6, 20))
+    recording = worlds.recorded(truth, estimate, covariance)
+    path = tmp_path / "poses.npz"
+    np.savez(path, estimates=estimate, truth=truth, covariances=covariance)
+    (read,) = read_recordings(path, error="left")
+    np.testing.assert_array_equal(recording.error, read.error)
+    np.testing.assert_array_equal(recording.covariance, read.covariance)
+    np.testing.assert_array_equal(recording.nees, read.nees)
+    assert recording.failures == read.failures == ()
+    (other,) = read_recordings(path, error="so2")
+    assert np.abs(other.error - read.error).max() > 0.01
+
+
+def test_an_estimate_less_its_error_is_the_truth() -> None:
+    rng = np.random.default_rng(20070)
+    pose, error = rng.standard_normal((2, 50, 3))
+    error[0] = 0.0
+    motion = worlds._composed(pose, worlds._se2_exp(error))
+    np.testing.assert_allclose(planar_error(motion, pose, "left"), error, atol=1e-12)
+
+
+# --- gates and rows -----------------------------------------------------------------------------------------
+
+CASE = Case("AR(.95)", 30, 4, (Claim("false alarm", "fault", 0.05, "<="), Claim("all-clear", "consistent", 0.9, ">=")))
+
+
+def test_a_gate_depends_on_its_number_and_not_on_how_it_is_drawn() -> None:
+    case = replace(CASE, mode="until decided")
+    at_once, grown = calibration.Growing(case, 3, 1), calibration.Growing(case, 3, 1)
+    for runs in (5, 5, 12, 30, 8):
+        part = grown(runs)
+        assert part.error is not None
+        assert len(part.error) == len(part.covariance) == runs
+    np.testing.assert_array_equal(grown(30).first(12).error, grown(12).error)
+    assert not np.array_equal(at_once(5).error, calibration.Growing(case, 4, 1)(5).error)
+    np.testing.assert_array_equal(at_once(5).error, grown(5).error)
+
+
+def test_a_fault_scales_every_covariance_that_is_stated() -> None:
+    gate = worlds.WORLDS["fixed gain"].draw(Draw(np.random.default_rng(1), 4, 5))
+    wrong = gate.wrong_by(2.0)
+    np.testing.assert_allclose(wrong.covariance, gate.covariance / 2.0)
+    np.testing.assert_allclose(wrong.innovation_covariances, gate.innovation_covariances / 2.0)
+    np.testing.assert_array_equal(wrong.error, gate.error)
+    alone = worlds.WORLDS["NIS alone"].draw(Draw(np.random.default_rng(1), 4, 5))
+    np.testing.assert_allclose(alone.wrong_by(0.5).nis, 0.5 * alone.nis)
+    values = worlds.WORLDS["independent"].draw(Draw(np.random.default_rng(1), 4, 5))
+    np.testing.assert_allclose(joined([values, values]).wrong_by(3.0).nees[4:], 3.0 * values.nees)
+
+
+def test_outcomes_are_counted_as_each_claim_says() -> None:
+    outcomes = [
+        calibration.Outcome(status, fault, wrong_scale, located, runs)
+        for status, fault, wrong_scale, located, runs in (
+            ("consistent", False, False, False, 10),
+            ("overconfident", True, True, True, 20),
+            ("undecided", False, False, False, 90),
+            ("conservative", True, True, False, 40),
+            ("biased", True, False, False, 40),
+        )
+    ]
+    counts = {
+        "fault": 3, "consistent": 1, "overconfident": 1, "conservative": 1, "scale": 2, "wrong scale": 2, "located": 1,
+    }  # fmt: skip
+    claims = tuple(Claim("q", counted, 0.05, "<=") for counted in counts)
+    rows = calibration.rows_of_case(replace(CASE, claims=claims, mode="until decided"), outcomes)
+    assert [row.found for row in rows] == list(counts.values())
+    assert {(row.mean_runs, row.late_runs, row.looks, row.gates) for row in rows} == {(40.0, 90.0, 0, 5)}
+
+
+def test_a_right_and_a_wrong_filter_are_told_apart() -> None:
+    """Fixed seed; a right one is found at fault 5 times of 8 with probability below 2e-5."""
+    right = calibration.judged(CASE, range(8), 3)
+    wrong = calibration.judged(replace(CASE, ratio=4.0), range(3), 3)
+    assert sum(outcome.fault for outcome in right) < 5
+    assert [outcome.status for outcome in wrong] == ["overconfident"] * 3
+    (decided,) = calibration.judged(replace(CASE, ratio=4.0, runs=200, mode="until decided"), range(1), 3)
+    assert decided.status == "overconfident"
+    assert decided.runs < 200
+
+
+def test_the_e_process_stops_where_it_crosses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "_evidence_values", lambda means, dof: np.cumprod(np.full(len(means), 2.0)))
+    (outcome,) = calibration.judged(replace(CASE, mode="e-process", ratio=3.0), range(1), 3)
+    assert (outcome.runs, outcome.status, outcome.fault) == (5, "overconfident", True)  # 2^5 is the first above 20
+    monkeypatch.setattr(calibration, "_evidence_values", lambda means, dof: np.full(len(means), 19.9))
+    (outcome,) = calibration.judged(replace(CASE, mode="e-process", ratio=3.0), range(1), 3)
+    assert (outcome.runs, outcome.fault) == (30, False)
+
+
+def test_means_of_runs_take_the_steps_that_a_run_has() -> None:
+    gate = worlds.WORLDS["ragged"].draw(Draw(np.random.default_rng(2), 5, 10))
+    assert gate.error is not None
+    assert gate.covariance is not None
+    for run, mean in enumerate(calibration.run_means(gate)):
+        there = np.isfinite(gate.error[run, :, 0])
+        pairs = zip(gate.error[run, there], gate.covariance[run, there], strict=True)
+        by_hand = [e @ np.linalg.inv(P) @ e for e, P in pairs]
+        np.testing.assert_allclose(mean, np.mean(by_hand))
+
+
+def test_rows_do_not_depend_on_the_number_of_workers() -> None:
+    one, two = (list(calibration.measure([replace(CASE, gates=30)], 5, workers)) for workers in (1, 2))
+    assert one == two
+    assert [row.question for row in one] == ["false alarm", "all-clear"]
+
+
+def test_rows_of_other_modules_join_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = {
+        "world": "gated", "question": "monitor", "ratio": 1.0, "runs": 1, "looks": 0, "stated": 0.05, "bound": "<=",
+        "gates": 100, "found": 3, "mean_runs": 1.0, "late_runs": 1.0,
+    }  # fmt: skip
+    module = SimpleNamespace(rows=lambda quick, seed: [row], ABOUT={"gated": "with a gate", "monitor": "an alarm"})
+    monkeypatch.setattr(calibration, "MODULES", ("there", "nowhere"))
+    monkeypatch.setattr(calibration.importlib.util, "find_spec", lambda name: name == "there" or None)
+    monkeypatch.setattr(calibration.importlib, "import_module", lambda name: module)
+    rows, about = calibration.further_rows(True, 1)
+    table = calibration_rows.document(rows, about, seed=1)
+    assert table["worlds"] == {"gated": "with a gate"}
+    assert table["questions"] == {"monitor": "an alarm"}
+    assert "| monitor | gated | 1 | 1 | ≤ 5 % | 3.0 % (1, 1) | 100 |" in calibration_rows.markdown(table)
+    assert calibration_rows.rows_of(json.loads(json.dumps(table))) == rows
+
+
+# --- command ------------------------------------------------------------------------------------------------
+
+
+def test_the_table_replaces_what_stands_between_its_marks(tmp_path: Path) -> None:
+    path = tmp_path / "referee.md"
+    start, end = calibration_rows.MARKS
+    path.write_text(f"before\n{start}\nold\n{end}\nafter\n")
+    table = calibration_rows.document([ALARMS, POWER], {"w": "a world"}, seed=1)
+    calibration_rows.write_docs(table, path)
+    text = path.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("\nafter\n")
+    assert "old" not in text
+    assert "| false alarm | w | 1 | 21 | ≤ 5 % | 5.0 % | 1000 |" in text
+    calibration_rows.write_docs(table, path)
+    assert path.read_text() == text
+    path.write_text("no marks")
+    with pytest.raises(ValueError, match="needs the marks"):
+        calibration_rows.write_docs(table, path)
+
+
+@pytest.mark.parametrize(("found", "status"), [(5, 0), (90, 1)])
+def test_a_broken_promise_is_the_exit_status(
+    found: int, status: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = replace(ALARMS, gates=100, found=found)
+    monkeypatch.setattr(calibration, "measure", lambda *arguments: iter([row]))
+    monkeypatch.setattr(calibration, "further_rows", lambda *arguments: ([], {"w": "a world"}))
+    assert calibration.main(["--quick", "--out", str(tmp_path / "t.json")]) == status
+    said = capsys.readouterr().out
+    assert f"promises broken: {status} (by chance: less than once in 5,000 runs)" in said
+    assert "seed " in said
+    assert json.loads((tmp_path / "t.json").read_text())["rows"][0]["found"] == found

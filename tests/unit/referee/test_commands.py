@@ -1,0 +1,297 @@
+"""What is said where optional packages are missing: by commands, by names of the package, by arguments."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+import typer
+
+import consistency as cs
+from consistency.bench.sweeps.plan import load_sweep
+from consistency.referee import extras
+from consistency.referee.cli.app import app, main
+from consistency.referee.cli.commands import COMMANDS
+from consistency.referee.extras import EXTRAS, MissingPackageError, explained, missing, packages, remedy, require
+from consistency.referee.reading.shipped import summaries
+
+ROOT = Path(__file__).parents[3]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+SENTENCE = re.compile(r"consistency: .* needs? [\w>=., -]+: pip install \S.*\n")
+
+
+@pytest.fixture
+def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package is not known to come from anywhere."""
+    monkeypatch.setattr(extras, "_from_origin", lambda _: [])
+
+
+def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
+    """The packages are neither found nor imported."""
+    for name in modules:
+        monkeypatch.setitem(sys.modules, name, None)
+    extras.is_installed.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def forgotten() -> None:
+    extras.is_installed.cache_clear()
+
+
+# --- the extras ------------------------------------------------------------------------------------
+
+
+def test_the_extras_are_those_of_the_project() -> None:
+    def names(requirements: Iterable[str]) -> set[str]:
+        return {re.split("[>=]", each)[0] for each in requirements}
+
+    listed = PROJECT["optional-dependencies"]
+    assert set(listed) == {*EXTRAS, "all", "docs", "dev"}
+    for extra, of_extra in EXTRAS.items():
+        assert names(each.removeprefix("filter-consistency") for each in listed[extra]) == names(of_extra)
+        assert {each for each in of_extra if ">=" in each} <= set(listed[extra])
+    (every,) = listed["all"]
+    included = every.removeprefix("filter-consistency[").rstrip("]").split(",")
+    assert set(packages(*included)) == set(packages(*EXTRAS))
+
+
+def test_the_core_is_small() -> None:
+    assert {re.split("[>=]", r)[0] for r in PROJECT["dependencies"]} == {"numpy", "scipy", "typer", "rich"}
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_sentence_names_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    require("this", "bench", "report")
+    without(monkeypatch, "numba", "tomli_w", "bokeh")
+    with pytest.raises(MissingPackageError) as refusal:
+        require("this", "bench", "report")
+    assert str(refusal.value) == "this needs numba, tomli-w, bokeh: pip install numba tomli-w bokeh"
+    assert isinstance(refusal.value, ImportError)
+    assert isinstance(refusal.value, cs.InputError)
+    assert extras.is_installed("ros")
+    assert not extras.is_installed("vision")
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_package_that_is_too_old_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "version", {"numpy": "1.26.4", "scipy": "1.16.0rc1", "rich": "14.1.0"}.__getitem__)
+    assert missing("bench") == ["numpy>=2.0"]
+    assert remedy("bench") == "numpy>=2.0: pip install 'numpy>=2.0'"
+
+
+def test_the_python_that_the_bench_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    without(monkeypatch, "numba")
+    monkeypatch.setattr(sys, "version_info", (3, 10, 13))
+    assert remedy("vision") == "Python 3.11 or later; this is 3.10"
+    assert "Python" not in remedy("plot")
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_one_of_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    without(monkeypatch, "distributed", "submitit", "numba")
+    assert remedy("cluster", own="submitit") == "numba, submitit: pip install numba submitit"
+    assert remedy("ulog") == "pyulog: pip install pyulog"  # is there, and could not be loaded
+
+
+@pytest.mark.parametrize(
+    ("record", "expected"),
+    [
+        ({"url": "file://{at}", "dir_info": {}}, ["{at}[bench,plot]"]),
+        ({"url": "file://{at}", "dir_info": {"editable": True}}, ["-e", "{at}[bench,plot]"]),
+        ({"url": "file:///no/such/place.whl", "archive_info": {}}, []),
+        (
+            {
+                "url": "https://host/repository",
+                "vcs_info": {"vcs": "git", "commit_id": "abc", "requested_revision": "v1"},
+            },
+            ["filter-consistency[bench,plot] @ git+https://host/repository@v1"],
+        ),
+        ({"url": "file://{at}", "vcs_info": {"vcs": "git", "commit_id": "a"}}, ["{at}[bench,plot]"]),
+        ({"url": "file:///usr", "vcs_info": {"vcs": "git", "commit_id": "a"}}, []),  # no project is there
+        ({"url": "https://host/a.whl", "archive_info": {}}, ["filter-consistency[bench,plot] @ https://host/a.whl"]),
+        (None, []),
+    ],
+)
+def test_the_place_that_it_came_from(
+    record: dict[str, object] | None, expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "a place"
+    place.mkdir()
+    (place / "pyproject.toml").touch()
+
+    class Installed:
+        def read_text(self, name: str) -> str | None:
+            assert name == "direct_url.json"
+            return (
+                None if record is None else json.dumps(record).replace("{at}", place.as_uri().removeprefix("file://"))
+            )
+
+    monkeypatch.setattr(metadata, "distribution", lambda _: Installed())
+    words = [word.replace("{at}", str(place)) for word in expected]
+    assert extras._from_origin(("bench", "plot")) == words
+    without(monkeypatch, "bokeh")
+    expected = [word.replace("bench,plot", "report") for word in words] or ["bokeh"]
+    assert shlex.split(remedy("report")) == ["bokeh:", "pip", "install", *expected]
+
+
+def test_no_text_installs_from_an_index() -> None:
+    """A name with an extra stands only in pyproject.toml, and before " @ " and a place."""
+    files = [
+        *(path for folder in ("consistency", "docs", "tests", "benchmarks", "experiments", "scenarios", ".github")
+          for path in (ROOT / folder).rglob("*")
+          if path.suffix in {".py", ".md", ".ipynb", ".yml", ".toml"} and "_build" not in path.parts),
+        *ROOT.glob("*.md"),
+    ]  # fmt: skip
+    name = "pip install " + "filter-consistency"
+    found = [path for path in files if re.search(rf"{name}|{name.replace('l f', 'l .f')}", path.read_text("utf-8"))]
+    assert found == []
+    assert len(files) > 500
+
+
+# --- names -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_name_of_the_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = """
+import sys
+sys.modules |= dict.fromkeys(["pandas", "numba"])
+import consistency as cs
+try:
+    cs.run_trials
+except ImportError as error:
+    print(error)
+try:
+    from consistency import nonsense
+except ImportError as error:
+    print(type(error).__name__)
+print(cs.anees.__name__, "run_trials" in dir(cs))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    sentence, other, here = done.stdout.splitlines()
+    assert sentence.startswith("consistency.run_trials needs numba, pandas: pip install ")
+    assert (other, here) == ("ImportError", "anees True")
+
+
+def test_another_module_that_is_missing_is_not_explained() -> None:
+    assert explained(ModuleNotFoundError(name="no_such_module"), "this") is None
+    assert explained(ModuleNotFoundError(), "this") is None
+    assert explained(ModuleNotFoundError(name="numba.no_such_module"), "this") is None  # numba is there
+
+
+# --- commands --------------------------------------------------------------------------------------
+
+
+def status_of(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as end:
+        main(list(words))
+    out, err = capsys.readouterr()
+    return int(end.value.code or 0), out, err
+
+
+@pytest.mark.parametrize("name", [name for name, row in COMMANDS.items() if row.extras])
+def test_a_command_without_its_packages(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever its options are; its help is there."""
+    module = "bokeh" if name == "report" else "numba"
+    without(monkeypatch, module)
+    status, out, err = status_of(capsys, name, "--no-such-option")
+    assert (status, out) == (2, "")
+    assert err.startswith(f"consistency: '{name}' needs {module}: pip install ")
+    assert SENTENCE.fullmatch(err)
+    for words in ([name, "--help"], [name, "--help", "--help"]):  # the second goes through typer
+        status, out, err = status_of(capsys, *words)
+        assert (status, err) == (0, "")
+        assert re.match(rf"Usage: .* {name} ", out)
+
+
+def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    _, before, _ = status_of(capsys, "--help")
+    assert "[bench]" not in before
+    without(monkeypatch, "numba", "bokeh")
+    _, after, _ = status_of(capsys, "--help")
+    lines = dict(re.findall(r"^  ([a-z]+) +(\S.*)$", after, re.MULTILINE))
+    assert set(COMMANDS) <= set(lines)
+    for name, row in COMMANDS.items():
+        mark = f"[{','.join(row.extras)}] " if row.extras else ""
+        assert lines[name].startswith(mark), name
+        assert row.extras or not lines[name].startswith("[")
+    assert "[report,bench,vision]: needs bokeh, numba: pip install " in after
+    _, alone, _ = status_of(capsys, "-h")
+    assert alone == after
+
+
+@pytest.mark.parametrize("words", [["plan", "linear-gaussian", "--filter", "kf"], ["analyse", "results"]])
+def test_arguments_that_need_the_bench(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "manifest.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    loaded = {
+        n: m
+        for n, m in sys.modules.items()
+        if n.startswith(("consistency.bench.runs", "consistency.bench.store.results"))
+    }
+    parents = {name: sys.modules[name.rpartition(".")[0]] for name in loaded}
+    for name, module in loaded.items():
+        monkeypatch.setattr(parents[name], name.rpartition(".")[2], module)  # to be what it was after this test
+        monkeypatch.delitem(sys.modules, name)
+    without(monkeypatch, "pandas")
+    status, out, err = status_of(capsys, *words)
+    assert (status, out) == (2, "")
+    assert err.startswith(f"consistency: '{words[0]}' with these arguments needs pandas: pip install ")
+
+
+def test_only_the_called_command_is_loaded() -> None:
+    code = """
+import sys
+from consistency.referee.cli import main
+try:
+    main(["plan", "--dof", "3", "--json"])
+except SystemExit as end:
+    print(end.code)
+print(*sorted(name for name in sys.modules if name.startswith("consistency.referee.cli.")))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    names = ["app", "commands", "files", "judging", "options"]
+    assert done.stdout.splitlines()[-2:] == ["None", " ".join(f"consistency.referee.cli.{name}" for name in names)]
+
+
+def test_a_command_is_a_row_and_a_function() -> None:
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    assert len(commands) == len(COMMANDS)
+    for name in COMMANDS:
+        assert commands[name].name == name
+        assert commands[name].help
+
+
+# --- list ------------------------------------------------------------------------------------------
+
+
+def test_the_list_says_what_the_files_say() -> None:
+    listed = summaries()
+    assert listed["scenarios"] == {name: cs.load_scenario(name).summary for name in cs.scenario_names()}
+    assert listed["sweeps"] == {name: load_sweep(name).summary for name in listed["sweeps"]}
+    assert {"regime", "small"} <= set(listed["sweeps"])
+    assert all(listed["experiments"].values())
+    assert len(listed["experiments"]) > 20
+
+
+def test_the_list_on_the_core(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    _, before, silent = status_of(capsys, "list")
+    without(monkeypatch, "numba", "pandas")
+    status, after, err = status_of(capsys, "list")
+    assert (status, after, silent) == (0, before, "")
+    assert err.startswith("consistency: to run what is listed needs numba, pandas: pip install ")
+    assert "herath2007-stereo" in after
+    assert "parked-ekf-uvd" in after

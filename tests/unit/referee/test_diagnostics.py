@@ -1,0 +1,240 @@
+"""NEES, intervals, coverage and normality against scipy and formulas by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.spatial.distance import mahalanobis
+
+import consistency as cs
+from consistency.referee.diagnostics import chi2_mean_interval, coverage, detectable_ratio, normality, rmse
+from consistency.referee.types import Array
+
+# exact 95 % intervals of chi-square(3 N) / N, computed outside this project
+INTERVALS = {
+    50: (2.359690308058058, 3.716008940075865),
+    100: (2.5391232260248975, 3.4987446882991526),
+    1000: (2.8500849365197927, 3.1537034935989814),
+}
+
+
+def covariances(rng: np.random.Generator, shape: tuple[int, ...], n: int) -> Array:
+    A = rng.normal(size=(*shape, n, n + 2))
+    return A @ np.swapaxes(A, -1, -2)
+
+
+# --- NEES --------------------------------------------------------------------------------------
+
+
+@given(st.integers(1, 6), st.integers(0, 10**6))
+def test_nees_is_the_squared_mahalanobis_distance(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    e, P = rng.normal(size=n), covariances(rng, (), n)
+    assert float(cs.nees(e, P)) == pytest.approx(mahalanobis(e, np.zeros(n), np.linalg.inv(P)) ** 2, rel=1e-8)
+
+
+def test_nees_by_hand() -> None:
+    assert cs.nees([1.0, 2.0], [[2.0, 0.0], [0.0, 4.0]]) == pytest.approx(0.5 + 1.0)
+    # off-diagonal terms count: P^-1 = [[4, -2], [-2, 4]] / 3 for [[1, .5], [.5, 1]]
+    assert cs.nees([1.0, 1.0], [[1.0, 0.5], [0.5, 1.0]]) == pytest.approx(4.0 / 3.0)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("batch", [(), (2,), (3,), (5,), (3, 3), (4, 3), (2, 3, 3)])
+def test_a_batch_gives_what_single_ones_give(rng: np.random.Generator, n: int, batch: tuple[int, ...]) -> None:
+    """Also where N = n, which ``solve(P, e)`` with (N, n) silently takes for one matrix of right-hand sides."""
+    e, P = rng.normal(size=(*batch, n)), covariances(rng, batch, n)
+    values = np.asarray(cs.nees(e, P))
+    assert values.shape == batch
+    for index in np.ndindex(*batch):
+        assert values[index] == pytest.approx(float(e[index] @ np.linalg.inv(P[index]) @ e[index]), rel=1e-9)
+
+
+def test_one_covariance_serves_many_errors(rng: np.random.Generator) -> None:
+    e, P = rng.normal(size=(3, 3)), covariances(rng, (), 3)
+    assert np.allclose(cs.nees(e, P), [x @ np.linalg.inv(P) @ x for x in e])
+
+
+def test_nees_is_chi_square(rng: np.random.Generator) -> None:
+    """Sum of 5000 values; two-sided chi-square test, false-alarm rate 1e-5."""
+    P = covariances(rng, (5000,), 3)
+    e = np.einsum("kij,kj->ki", np.linalg.cholesky(P), rng.normal(size=(5000, 3)))
+    low, high = stats.chi2.interval(1 - 1e-5, 15000)
+    assert low < cs.nees(e, P).sum() < high
+    assert not low < cs.nees(e, 0.8 * P).sum() < high  # negative control
+
+
+def test_nees_does_not_depend_on_units(rng: np.random.Generator) -> None:
+    """Millimetres and degrees give the same value, with correlations close to one as well."""
+    e, P = np.array([1e-3, -2e-3, 0.01]), np.array([[1e-6, 9.9e-7, 0], [9.9e-7, 1e-6, 0], [0, 0, 1e-4]])
+    D = np.diag([1e3, 1e3, 180 / np.pi])
+    assert cs.nees(D @ e, D @ P @ D) == pytest.approx(float(cs.nees(e, P)), rel=1e-9)
+
+
+def test_nees_leaves_its_arguments_alone(rng: np.random.Generator) -> None:
+    e, P = rng.normal(size=(4, 3)), covariances(rng, (4,), 3)
+    before = e.copy(), P.copy()
+    cs.nees(e, P)
+    assert np.array_equal(e, before[0])
+    assert np.array_equal(P, before[1])
+
+
+NOT_DEFINITE = [np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 0.0, 1.0]), np.ones((3, 3)), np.zeros((3, 3)), -np.eye(3)]
+
+
+@pytest.mark.parametrize("P", NOT_DEFINITE, ids=["negative", "zero", "rank one", "nothing", "all negative"])
+def test_nees_refuses_a_covariance_that_is_not_positive_definite(P: Array) -> None:
+    with pytest.raises(ValueError, match="not positive definite"):
+        cs.nees(np.ones(3), P)
+    stack = np.array([np.eye(3), np.eye(3), P, np.eye(3)])
+    with pytest.raises(ValueError, match=r"not positive definite at index \(2,\)"):
+        cs.nees(np.ones((4, 3)), stack)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_nees_refuses_what_is_not_finite(value: float) -> None:
+    e, P = np.ones((2, 2, 3)), np.broadcast_to(np.eye(3), (2, 2, 3, 3)).copy()
+    bad_e, bad_P = e.copy(), P.copy()
+    bad_e[1, 0, 2], bad_P[0, 1, 2, 2] = value, value
+    with pytest.raises(ValueError, match=r"the error is not finite at index \(1, 0\)"):
+        cs.nees(bad_e, P)
+    with pytest.raises(ValueError, match=r"the covariance is not finite at index \(0, 1\)"):
+        cs.nees(e, bad_P)
+
+
+def test_nees_refuses_a_covariance_that_is_not_symmetric() -> None:
+    P = np.eye(3)
+    P[0, 1] = 1e-4
+    with pytest.raises(ValueError, match="not symmetric"):
+        cs.nees(np.ones(3), P)
+    P[0, 1] = 1e-12  # rounding
+    assert cs.nees(np.ones(3), P) == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("e", "P"),
+    [((3,), (2, 2)), ((3,), (3,)), ((), (1, 1)), ((4, 3), (4, 3, 2)), ((3,), (3, 4))],
+)
+def test_nees_refuses_shapes_that_do_not_fit(e: tuple[int, ...], P: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="must be"):
+        cs.nees(np.ones(e), np.ones(P))
+
+
+def test_nees_refuses_batches_that_do_not_fit() -> None:
+    with pytest.raises(ValueError, match=r"\(4, 3\)|broadcast"):
+        cs.nees(np.ones((4, 3)), np.broadcast_to(np.eye(3), (5, 3, 3)))
+
+
+def test_anees_averages_over_the_runs_that_have_a_value() -> None:
+    values = np.array([[np.nan, 1.0, 2.0, 3.0], [np.nan, 3.0, np.nan, 5.0]])
+    assert np.array_equal(cs.anees(values), [np.nan, 2.0, 2.0, 4.0], equal_nan=True)
+
+
+# --- intervals -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("runs", INTERVALS)
+def test_anees_interval_equals_the_reference(runs: int) -> None:
+    assert cs.anees_interval(3, runs) == pytest.approx(INTERVALS[runs], rel=1e-12)
+
+
+def test_published_interval() -> None:
+    """Herath et al. (2007) sec. 4.5 prints [2.36, 3.72] for 50 runs."""
+    assert tuple(round(end, 2) for end in cs.anees_interval(dof=3, runs=50)) == (2.36, 3.72)
+
+
+@given(st.integers(1, 9), st.integers(1, 500), st.floats(0.5, 0.9999))
+def test_anees_interval_leaves_equal_tails(dof: int, runs: int, confidence: float) -> None:
+    low, high = cs.anees_interval(dof, runs, confidence)
+    chi2 = stats.chi2(dof * runs)
+    assert chi2.cdf(low * runs) == pytest.approx((1 - confidence) / 2, rel=1e-6)
+    assert chi2.sf(high * runs) == pytest.approx((1 - confidence) / 2, rel=1e-6)
+    assert low < dof < high or runs * dof < 3  # the mean of few degrees of freedom may lie aside the median
+
+
+def test_interval_stays_exact_far_in_the_tail() -> None:
+    """As the band over all steps needs it: 1 - 1e-13 is close to one."""
+    low, high = chi2_mean_interval(150, 1 - 1e-12)
+    tail = (1 - (1 - 1e-12)) / 2
+    assert stats.chi2.sf(150 * high, 150) == pytest.approx(tail, rel=1e-6)
+    assert stats.chi2.cdf(150 * low, 150) == pytest.approx(tail, rel=1e-6)
+
+
+@pytest.mark.parametrize(("dof", "runs"), [(0, 50), (3, 0), (-1, 50)])
+def test_anees_interval_refuses_counts_below_one(dof: int, runs: int) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        cs.anees_interval(dof, runs)
+
+
+@pytest.mark.parametrize("confidence", [0.0, 1.0, -0.5, 95.0, float("nan")])
+def test_interval_refuses_a_confidence_outside_zero_to_one(confidence: float) -> None:
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        cs.anees_interval(3, 50, confidence)
+
+
+def test_detectable_ratio_is_detected_with_its_power() -> None:
+    """The NEES of a covariance that is too small by the ratio is the ratio times chi-square."""
+    for runs, power in ((50, 0.95), (400, 0.9)):
+        ratio = detectable_ratio(3, runs, 0.01, power)
+        _, high = cs.anees_interval(3, runs, 0.99)
+        assert stats.chi2.sf(high * runs / ratio, 3 * runs) == pytest.approx(power)
+        assert ratio > 1
+        one_sided = detectable_ratio(3, runs, 0.01, power, two_sided=False)
+        assert stats.chi2.sf(stats.chi2.isf(0.01, 3 * runs) / one_sided, 3 * runs) == pytest.approx(power)
+        assert one_sided < ratio
+
+
+# --- coverage and error ----------------------------------------------------------------------------
+
+
+def test_coverage_counts_by_axis() -> None:
+    error = np.array([[1.9, 2.1], [-2.0, 0.0], [0.0, -3.0], [5.0, 1.0]])
+    P = np.broadcast_to(np.eye(2), (4, 2, 2))
+    assert np.array_equal(coverage(error, P), [0.75, 0.5])
+    assert np.array_equal(coverage(error, 9.0 * P), [1.0, 1.0])
+    assert np.array_equal(coverage(error, P, bound=1.0), [0.25, 0.5])
+
+
+def test_coverage_leaves_out_what_has_no_value() -> None:
+    error = np.array([[1.0, np.nan], [9.0, np.nan], [np.nan, np.nan]])
+    P = np.broadcast_to(np.eye(2), (3, 2, 2)).copy()
+    assert np.array_equal(coverage(error, P), [0.5, np.nan], equal_nan=True)
+    P[0] = np.nan
+    assert coverage(error, P)[0] == 0.0
+
+
+def test_rmse_by_hand() -> None:
+    error = np.array([[[3.0, 4.0], [0.0, 0.0]], [[np.nan, 1.0], [0.0, 5.0]]])
+    assert rmse(error) == pytest.approx(np.sqrt((25 + 0 + 25) / 3))
+    assert np.isnan(rmse(np.full((2, 2, 3), np.nan)))
+
+
+# --- normality ---------------------------------------------------------------------------------------
+
+
+def test_normality_of_a_gaussian_sample(rng: np.random.Generator) -> None:
+    """K-squared is asymptotically chi-square(2); accepted unless p < 1e-5."""
+    sample = rng.normal(2.0, 3.0, 4000)
+    result = normality(sample)
+    assert result.p_value > 1e-5
+    assert result.p_value == pytest.approx(stats.chi2.sf(result.statistic, 2))
+    assert result.mean == pytest.approx(sample.mean())
+    assert result.std == pytest.approx(np.sqrt(np.sum((sample - sample.mean()) ** 2) / 3999))
+    centred = sample - sample.mean()
+    assert result.skewness == pytest.approx(np.mean(centred**3) / np.mean(centred**2) ** 1.5)
+    assert result.excess_kurtosis == pytest.approx(np.mean(centred**4) / np.mean(centred**2) ** 2 - 3)
+
+
+def test_normality_refuses_other_distributions(rng: np.random.Generator) -> None:
+    """Negative controls: skewed, heavy-tailed and light-tailed samples."""
+    for sample in (rng.exponential(size=2000), rng.standard_t(3, 2000), rng.uniform(size=2000)):
+        assert normality(sample).p_value < 1e-5
+
+
+@pytest.mark.parametrize("sample", [np.ones(19), np.ones((20, 2)), np.array([*range(30), np.nan])])
+def test_normality_refuses_what_it_cannot_judge(sample: Array) -> None:
+    with pytest.raises(ValueError, match="at least 20 finite values"):
+        normality(sample)

@@ -1,0 +1,182 @@
+"""The direction in which errors are largest: eigenvectors by hand, and what it finds that the mean NEES does not.
+
+Seeds are fixed and were not chosen; counts have limits at 1e-5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from draws import autoregression, fully_dependent, independent, slow_axis, verdict_on
+from scipy import stats
+
+from consistency.referee.diagnostics import largest_direction, ratio_interval
+from consistency.referee.diagnostics.scale import scale_test
+from consistency.referee.types import Array
+
+SURE = 1e-5
+
+
+def by_hand(w: Array) -> tuple[float, Array, Array]:
+    """p value, the mean square of each run along the direction of the other half, and the direction of all."""
+    moments = []
+    for run in w:
+        rows = run[np.isfinite(run).all(axis=1)]
+        if len(rows):
+            moments.append(sum(np.outer(row, row) for row in rows) / len(rows))
+
+    def direction(chosen: list[Array]) -> Array:
+        values, vectors = np.linalg.eig(sum(chosen) / len(chosen))
+        return np.real(vectors[:, np.argmax(np.real(values))])
+
+    longest = max(int(np.isfinite(run).all(axis=1).sum()) for run in w)
+    even, odd = direction(moments[1::2]), direction(moments[0::2])  # directions for runs 0, 2, ... and 1, 3, ...
+    along = np.array([u @ M @ u for M, u in zip(moments, [even, odd] * len(moments), strict=False)])
+    p = min(scale_test(along[0::2], 1, longest).above, scale_test(along[1::2], 1, longest).above)
+    return min(1.0, 2.0 * p), along, direction(moments)
+
+
+@pytest.mark.parametrize("runs", [2, 3, 11, 38, 61])
+@pytest.mark.parametrize("n", [2, 3])
+def test_by_hand(runs: int, n: int) -> None:
+    rng = np.random.default_rng(41)
+    w = independent(rng, runs, 7, n) @ rng.standard_normal((n, n))
+    w[0, 3:] = np.nan
+    result = largest_direction(w)
+    p, along, u = by_hand(w)
+    assert result.p_value == pytest.approx(p, rel=1e-9)
+    assert result.ratio == pytest.approx(tuple(ratio_interval(along)), rel=1e-9)
+    assert abs(result.direction @ u) == pytest.approx(1.0)
+    assert np.linalg.norm(result.direction) == pytest.approx(1.0)
+
+
+def test_halves_of_fewer_than_twenty_runs_are_exact() -> None:
+    """Chi-square with one degree of freedom a run, of both halves; Bonferroni."""
+    w = independent(np.random.default_rng(42), 14, 5, 2) * 1.2
+    _, along, _ = by_hand(w)
+    expected = 2 * min(stats.chi2.sf(along[k::2].sum(), 7) for k in (0, 1))
+    assert largest_direction(w).p_value == pytest.approx(min(expected, 1.0), rel=1e-9)
+
+
+def test_a_run_without_a_value_has_no_part() -> None:
+    w = independent(np.random.default_rng(43), 13, 5, 3)
+    with_gaps = np.insert(w, [0, 4, 9], np.nan, axis=0)
+    assert largest_direction(with_gaps).p_value == pytest.approx(largest_direction(w).p_value)
+
+
+def test_where_it_cannot_be_asked() -> None:
+    rng = np.random.default_rng(44)
+    for w in (independent(rng, 30, 5, 1), independent(rng, 1, 5, 3), np.full((4, 5, 3), np.nan)):
+        result = largest_direction(w)
+        assert np.isnan(result.p_value)
+        assert result.direction.shape == (w.shape[-1],)
+        assert np.isnan(result.ratio).all()
+
+
+def test_the_direction_is_that_of_the_large_errors() -> None:
+    """x1.8 along (1, 2, -2) / 3; the ratio is known from runs that did not choose it."""
+    rng = np.random.default_rng(45)
+    u = np.array([1.0, 2.0, -2.0]) / 3
+    w = independent(rng, 200, 10, 3) @ (np.eye(3) + (np.sqrt(1.8) - 1.0) * np.outer(u, u))
+    result = largest_direction(w)
+    assert abs(result.direction @ u) > 0.97
+    assert result.ratio.holds(1.8)
+    assert result.p_value < SURE
+
+
+@pytest.mark.parametrize("world", [fully_dependent, autoregression, slow_axis])
+@pytest.mark.parametrize("n", [2, 6])
+def test_a_right_filter_is_not_found(world: Callable[..., Array], n: int) -> None:
+    """100 draws of 50 runs at 5 %."""
+    rng = np.random.default_rng(46)
+    found = sum(largest_direction(world(rng, 50, 10, n)).p_value <= 0.05 for _ in range(100))
+    assert found <= stats.binom.isf(SURE, 100, 0.05)
+
+
+def test_one_that_is_too_large_everywhere_is_not_found() -> None:
+    """100 draws of 50 runs, fully dependent, n = 2, each with half of the stated variance."""
+    rng = np.random.default_rng(47)
+    assert not any(largest_direction(np.sqrt(0.5) * fully_dependent(rng, 50, 1, 2)).p_value < 0.05 for _ in range(100))
+
+
+# --- in a verdict that allows what is conservative ----------------------------------------------------------
+
+
+def correlated(w: Array, correlation: float = 0.8) -> Array:
+    """The first two components correlated; variances stay 1."""
+    w = w.copy()
+    w[..., 1] = correlation * w[..., 0] + np.sqrt(1.0 - correlation**2) * w[..., 1]
+    return w
+
+
+def oblique(w: Array) -> Array:
+    """x1.6 in a direction between the axes, the rest x0.7."""
+    u = 0.5 ** np.arange(w.shape[-1])
+    u /= np.linalg.norm(u)
+    along = w @ u
+    return np.sqrt(0.7) * w + (np.sqrt(1.6) - np.sqrt(0.7)) * along[..., None] * u
+
+
+FAULTS = [(correlated, 2), (correlated, 3), (oblique, 6)]
+
+
+@pytest.mark.parametrize("world", [independent, autoregression])
+@pytest.mark.parametrize(("fault", "n"), FAULTS)
+def test_an_oblique_fault_is_found(fault: Callable[[Array], Array], n: int, world: Callable[..., Array]) -> None:
+    """100 runs, allow="conservative"; missed in 2 % at most, so that five draws have 8 in 10^5 to miss four."""
+    rng = np.random.default_rng(48)
+    draws = [verdict_on(fault(world(rng, 100, 60, n)), allow="conservative") for _ in range(5)]
+    found = [v for v in draws if "scale in some direction" in v.faults]
+    assert len(found) >= 4
+    if fault is correlated:
+        assert {v.status for v in found} == {"overconfident"}
+        assert any("in the direction" in v.reasons[0] for v in found)
+
+
+def test_an_oblique_fault_beside_small_errors_is_overconfident() -> None:
+    rng = np.random.default_rng(52)
+    verdicts = [verdict_on(oblique(independent(rng, 100, 60, 6)), allow="conservative") for _ in range(10)]
+    assert {v.status for v in verdicts} == {"overconfident"}
+
+
+def test_the_sentence_on_an_oblique_fault_names_what_is_too_small() -> None:
+    """x1.6 along (1, 1, 1, 1, 1, 1), the rest x0.7: every axis by itself is too large, and the direction is named."""
+    rng, u = np.random.default_rng(53), np.full(6, 6**-0.5)
+    for _ in range(5):
+        w = np.sqrt(0.7) * independent(rng, 100, 60, 6)
+        w += (np.sqrt(1.6 / 0.7) - 1.0) * (w @ u)[..., None] * u
+        text = verdict_on(w, allow="conservative").reasons[0]
+        assert "too large" not in text
+        assert "covariance too small by x1." in text
+        assert "in the direction +0." in text
+
+
+def test_the_sentence_names_the_direction() -> None:
+    w = correlated(independent(np.random.default_rng(49), 100, 20, 3), 0.8)
+    verdict = verdict_on(w, allow="conservative")
+    assert "covariance too small by x1." in verdict.reasons[0]
+    assert "in the direction +0.7" in verdict.reasons[0]
+    assert "axis 2" not in verdict.reasons[0]
+    s = verdict.statistics
+    assert s["largest"][0] == pytest.approx(1.8, rel=0.1)
+    assert s["largest"][1] < s["largest"][0] < s["largest"][2]
+    assert np.abs(s["largest_direction"][:2]) == pytest.approx(np.full(2, np.sqrt(0.5)), abs=0.05)
+
+
+def test_it_is_asked_only_where_too_large_is_allowed() -> None:
+    w = independent(np.random.default_rng(50), 40, 5, 3)
+    asked = {a.question for a in verdict_on(w, allow="conservative").answers}
+    assert "scale in some direction" in asked
+    assert not {"shape", "shape in some step", "distribution"} & asked
+    assert "scale in some direction" not in {a.question for a in verdict_on(w).answers}
+
+
+def test_a_large_axis_beside_small_ones_is_overconfident() -> None:
+    """x1.6 in one axis and x0.5 in the others: what is too large is allowed, so that only one side speaks."""
+    rng = np.random.default_rng(51)
+    w = independent(rng, 100, 20, 3) * np.sqrt([1.6, 0.5, 0.5])
+    verdict = verdict_on(w, allow="conservative")
+    assert {"scale of an axis", "scale in some direction"} <= set(verdict.faults)
+    assert verdict.status == "overconfident"

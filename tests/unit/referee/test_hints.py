@@ -1,0 +1,479 @@
+"""Files that are mixed up in one way are told so in words, and right ones are not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import hints as world
+import numpy as np
+import pytest
+from recorded import read_recordings
+from scipy.linalg import expm
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.geometry import wrap
+from consistency.referee.geometry.conventions import planar_error, spatial_error
+from consistency.referee.sources.fits import FACTOR, Fit, fit_of
+from consistency.referee.sources.frames import Frame, carried, fitted_frame, moved
+from consistency.referee.sources.hints import _ned, decades, hints, turns
+from consistency.referee.sources.poses import Poses
+from consistency.referee.sources.sheet import Places
+from consistency.referee.types import Array
+
+RUNS, STEPS = 3, 60
+SIX = ("x", "y", "z", "roll", "pitch", "yaw")
+THREE = ("x", "y", "heading")
+DEGREES = 180.0 / np.pi
+ANGLES = np.array([1.0, 1.0, DEGREES])
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(22)
+
+
+def covariance(rng: np.random.Generator, sigma: Sequence[float], plain: bool) -> Array:
+    root = np.eye(len(sigma)) + (0.0 if plain else 0.3) * rng.normal(size=(len(sigma),) * 2)
+    P = root @ root.T
+    scale = np.array(sigma) * np.exp(0.2 * rng.normal()) / np.sqrt(np.diag(P))
+    return np.asarray(P * np.outer(scale, scale))
+
+
+def hat(xi: Array) -> Array:
+    x, y, z, a, b, c = xi
+    return np.array([[0, -c, b, x], [c, 0, -a, y], [-b, a, 0, z], [0, 0, 0, 0]])
+
+
+def spatial(rng: np.random.Generator, convention: str = "so3", plain: bool = False) -> list[Poses]:
+    """Drives whose errors have the stated covariance in ``convention``: so3 or left."""
+    runs = []
+    for _ in range(RUNS):
+        t, heading = 0.1 * np.arange(STEPS), rng.uniform(-3, 3) + np.cumsum(rng.normal(0, 0.1, STEPS))
+        steps = 0.5 * np.column_stack([np.cos(heading), np.sin(heading), 0.1 * np.sin(t)])
+        at = rng.uniform(-5, 5, 3) + np.cumsum(steps, axis=0)
+        turn = Rotation.from_euler("ZYX", np.column_stack([heading, 0.1 * np.sin(t), 0.1 * np.cos(2 * t)]))
+        P = covariance(rng, (0.05, 0.08, 0.12, 0.004, 0.006, 0.01), plain)
+        xi = rng.normal(size=(STEPS, 6)) @ np.linalg.cholesky(P).T
+        true = np.hstack([at + xi[:, :3], (Rotation.from_rotvec(xi[:, 3:]) * turn).as_quat()])
+        if convention == "left":
+            T = np.tile(np.eye(4), (STEPS, 1, 1))
+            T[:, :3, :3], T[:, :3, 3] = turn.as_matrix(), at
+            T = T @ np.array([expm(hat(each)) for each in xi])
+            true = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
+        runs.append(poses(t, np.hstack([at, turn.as_quat()]), P, true, "spatial", convention))
+    return runs
+
+
+def planar(rng: np.random.Generator, plain: bool = False) -> list[Poses]:
+    runs = []
+    for _ in range(RUNS):
+        t, heading = 0.1 * np.arange(STEPS), rng.uniform(-3, 3) + np.cumsum(rng.normal(0, 0.1, STEPS))
+        at = rng.uniform(-5, 5, 2) + np.cumsum(0.5 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+        P = covariance(rng, (0.05, 0.08, 0.01), plain)
+        own = np.column_stack([at, wrap(heading)])
+        true = own + rng.normal(size=(STEPS, 3)) @ np.linalg.cholesky(P).T
+        true[:, 2] = wrap(true[:, 2])
+        runs.append(poses(t, own, P, true, "planar", "so2"))
+    return runs
+
+
+def poses(t: Array, own: Array, P: Array, true: Array, manifold: str, convention: str) -> Poses:
+    place, stated = Places("line {}".format, np.arange(len(t))), np.ones(len(t), bool)
+    return Poses(place, t, own, np.tile(P, (len(t), 1, 1)), stated, t, true, manifold, convention, 0.01)  # type: ignore[arg-type]
+
+
+def weighed(p: Poses, part: slice, factor: float) -> Poses:
+    scale = np.ones(p.covariance.shape[-1])
+    scale[part] = factor
+    return replace(p, covariance=p.covariance * np.outer(scale, scale))
+
+
+def deviations(p: Poses) -> Poses:
+    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
+    return replace(p, covariance=sigma[:, :, None] * np.eye(sigma.shape[1]))
+
+
+SWAP = [3, 4, 5, 0, 1, 2]
+W_FIRST = [0, 1, 2, 6, 3, 4, 5]
+FAR = np.array([10.0, -3.0, 1.0])
+Make = Callable[[np.random.Generator], list[Poses]]
+Mess = Callable[[Poses], Poses]
+MIXED: dict[str, tuple[Make, Mess, str]] = {
+    "blocks": (
+        spatial, lambda p: replace(p, covariance=p.covariance[:, SWAP][:, :, SWAP]),
+        "the covariance has its two blocks in the other order (--covariance-order)",
+    ),
+    "gtsam": (
+        lambda rng: spatial(rng, "left"),
+        lambda p: replace(p, convention="so3", covariance=p.covariance[:, SWAP][:, :, SWAP]),
+        "the error is 'left' (--error left) and the covariance has its two blocks in the other order",
+    ),
+    "quaternions": (
+        spatial, lambda p: replace(p, estimate=p.estimate[:, W_FIRST]),
+        "the quaternions of the estimates are w x y z",
+    ),
+    "true quaternions": (
+        spatial, lambda p: replace(p, truth=p.truth[:, W_FIRST]), "the quaternions of the truth are w x y z",
+    ),
+    "world to body": (
+        spatial, lambda p: replace(p, estimate=p.estimate * [1, 1, 1, -1, -1, -1, 1]), "turn world into body",
+    ),
+    "variances in degrees": (spatial, lambda p: weighed(p, slice(3, 6), DEGREES), "its angles are in degrees"),
+    "variances in mm": (spatial, lambda p: weighed(p, slice(0, 3), 1e3), "its positions are in millimetres"),
+    "estimates in mm": (
+        spatial, lambda p: weighed(replace(p, estimate=p.estimate * ([1e3] * 3 + [1] * 4)), slice(0, 3), 1e3),
+        "the positions of the estimates and their covariance are in millimetres",
+    ),
+    "truth in mm": (
+        spatial, lambda p: replace(p, truth=p.truth * ([1e3] * 3 + [1] * 4)), "positions of the truth are in millim",
+    ),
+    "deviations": (lambda rng: spatial(rng, plain=True), deviations, "its diagonal holds standard deviations"),
+    "information": (spatial, lambda p: replace(p, covariance=np.linalg.inv(p.covariance)), "information matrix"),
+    "turned world": (spatial, lambda p: moved(p, Frame.about_z(-np.pi / 4.5, FAR)), "turned by 40."),
+    "headings in degrees": (
+        planar, lambda p: replace(p, estimate=p.estimate * ANGLES), "the headings of the estimates are in degrees",
+    ),
+    "true headings in degrees": (
+        planar, lambda p: replace(p, truth=p.truth * ANGLES), "the headings of the truth are in degrees",
+    ),
+    "planar deviations": (lambda rng: planar(rng, plain=True), deviations, "its diagonal holds standard deviations"),
+    "shifted world": (
+        planar, lambda p: moved(p, Frame.about_z(0.0, FAR[:2])), "the world of the estimates is shifted by (-",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MIXED)
+def test_a_mix_up_is_named(name: str, rng: np.random.Generator) -> None:
+    make, mess, words = MIXED[name]
+    runs = make(rng)
+    axes = SIX if runs[0].manifold == "spatial" else THREE
+    assert hints("est", axes, runs) == []
+    (said,) = hints("est", axes, [mess(p) for p in runs])
+    assert said.startswith("est: the NEES")
+    assert words in said
+
+
+@pytest.mark.parametrize("name", ["turned world", "shifted world"])
+def test_one_world_is_named_with_its_size_before_a_world_of_each_run(name: str) -> None:
+    """In 20 draws; a frame for each run always fits as well."""
+    make, mess, _ = MIXED[name]
+    for seed in range(30, 50):
+        runs = make(np.random.default_rng(seed))
+        (said,) = hints("est", SIX if runs[0].manifold == "spatial" else THREE, [mess(p) for p in runs])
+        assert f"the world of the estimates is {name.split()[0]} by" in said
+
+
+def test_worlds_of_each_run_are_named(rng: np.random.Generator) -> None:
+    runs = [moved(p, Frame.about_z(0.7 * i, FAR)) for i, p in enumerate(spatial(rng))]
+    (said,) = hints("est", SIX, runs)
+    assert said.endswith("each run is turned about z and shifted by itself to meet the truth; add --align posyaw")
+
+
+@pytest.mark.parametrize("ratio", [0.2, 5.0])
+def test_a_filter_that_is_wrong_by_itself_gets_no_hint(ratio: float, rng: np.random.Generator) -> None:
+    for make, axes in ((spatial, SIX), (planar, THREE)):
+        runs = [replace(p, covariance=p.covariance / ratio) for p in make(rng)]
+        assert decades(runs)[0] == pytest.approx(np.log10(ratio), abs=0.15)
+        assert hints("est", axes, runs) == []
+
+
+@pytest.mark.parametrize(("name", "factor"), [(name, case[4][-1]) for name, case in world.MIXED.items()])
+def test_a_mix_up_of_less_than_a_decade_is_named(name: str, factor: float, rng: np.random.Generator) -> None:
+    """Far above the smallest factor in the table of the benchmark, so that chance misses none but once in 1e5."""
+    kind, convention, sigma, mess, _, words = world.MIXED[name]
+    plain = name.startswith("deviations")
+    runs = world.log(rng, kind, 20, 50, 0.3, sigma=sigma(factor), convention=convention, correlated=not plain)
+    assert hints("est", world.AXES[kind], runs) == []
+    (said,) = hints("est", world.AXES[kind], [mess(p) for p in runs])
+    assert words in said
+
+
+@pytest.mark.parametrize("wrong", world.WRONG)
+@pytest.mark.parametrize("kind", list(world.AXES))
+def test_honest_logs_get_no_hint(kind: str, wrong: str, rng: np.random.Generator) -> None:
+    for runs, steps, rho in ((1, 300, 0.9), (10, 50, 0.5)):
+        assert hints("est", world.AXES[kind], world.log(rng, kind, runs, steps, rho, wrong)) == []
+
+
+def test_both_worlds_of_north_and_east_are_named(rng: np.random.Generator) -> None:
+    """In the plane and in space, there with bodies that have z down too or not."""
+    north = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    down = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+    for both in (False, True):
+        turned = [moved(p, Frame(north, np.zeros(3))) for p in spatial(rng, plain=True)]
+        for p in turned:
+            if both:
+                p.estimate[:, 3:] = (Rotation.from_quat(p.estimate[:, 3:]) * down).as_quat()
+        (said,) = hints("est", SIX, turned)
+        assert "x north, y east, z down" in said
+        assert ("their bodies have z down" in said) == both
+    swapped = []
+    for p in planar(rng, plain=True):
+        own = np.column_stack([p.estimate[:, 1], p.estimate[:, 0], wrap(np.pi / 2 - p.estimate[:, 2])])
+        order = [1, 0, 2]
+        swapped.append(replace(p, estimate=own, covariance=p.covariance[:, order][:, :, order]))
+    (said,) = hints("est", THREE, swapped)
+    assert "in a plane of x north, y east" in said
+
+
+@pytest.mark.parametrize("convention", ["so3-body", "left"])
+def test_a_body_that_is_turned_over_takes_its_covariance_along(convention: str, rng: np.random.Generator) -> None:
+    """NEES of a log whose estimates are undone is what it was before."""
+    north = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    p = replace(spatial(rng)[0], convention=convention)
+    there = moved(p, Frame(north, np.zeros(3)))
+    there.estimate[:, 3:] = (
+        Rotation.from_quat(there.estimate[:, 3:]) * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+    ).as_quat()
+    S = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, -1.0]) if convention == "so3-body" else np.diag([1.0, -1.0, -1.0] * 2)
+    there = replace(there, covariance=S @ there.covariance @ S)
+    *_, undo = _ned(convention)
+    np.testing.assert_allclose(decades([undo.change(there)]), decades([p]), atol=1e-9)
+
+
+def test_a_file_beside_itself_and_one_of_few_digits(rng: np.random.Generator) -> None:
+    runs = spatial(rng)
+    same = [replace(p, truth=p.estimate.copy()) for p in runs]
+    few = [replace(p, truth=np.round(p.estimate, 7)) for p in runs]
+    for copy in (same, few):
+        (said,) = hints("est", SIX, copy)
+        assert "truth and estimates seem to be the same file" in said
+    near = [replace(p, truth=p.estimate + 1e-4 * rng.normal(size=p.estimate.shape)) for p in runs]
+    assert not any("same file" in said for said in hints("est", SIX, near))
+    assert not any("same file" in said for said in hints("est", SIX, [p.some(2) for p in same[:1]]))
+
+
+# --- how well errors fit ----------------------------------------------------------------------------
+
+
+def test_independent_estimates_by_hand() -> None:
+    """White errors count each, errors that are constant over a run once a run; AR(r) by (1 - r^2) / (1 + r^2).
+
+    Of correlated errors of a single run down to a third of that is found, of ten runs 1 / 1.2.
+    """
+    rng = np.random.default_rng(7)
+    steps = 4000
+    white = rng.normal(size=(steps, 2))
+    slow = lfilter([np.sqrt(1 - 0.8**2)], [1.0, -0.8], white, axis=0)
+    expected = steps * (1 - 0.64) / (1 + 0.64)
+    assert fit(white).size == pytest.approx(steps, rel=0.15)
+    assert 0.85 * expected / 3.0 < fit(slow).size < 1.15 * expected
+    assert 0.8 * expected < fit(*np.split(slow, 10)).size < 1.15 * expected
+    constant = [np.full((50, 2), value) for value in rng.normal(size=5)]
+    assert fit(*constant).size <= 5.0 * 1.05
+
+
+def test_simple_faults_explain_what_they_make() -> None:
+    """A factor f in n components gains (f - 1 - log f) n / 2, up to the largest factor; a bias b gains b^2 / 2."""
+    rng = np.random.default_rng(8)
+    w = rng.normal(size=(200_000, 3))
+    w = (w - w.mean(axis=0)) / w.std(axis=0)
+    P = np.diag([4.0, 1.0, 0.25])
+    for scale in ([3.0, 3.0, 3.0], [1.0, 3.0, 1.0], [0.4, 0.4, 1.0], [1.0, 0.4, 1.0]):
+        f = np.square(scale)
+        f = np.clip(f, 1.0 / FACTOR, FACTOR)
+        squares = np.square(scale)
+        gain = 0.5 * (squares - squares / f - np.log(f)).sum()
+        found = fit(w * scale, P=P)
+        assert found.simple() - found.likelihood == pytest.approx(gain, rel=0.02)
+    found = fit(w + np.array([0.0, 2.0, 0.0]), P=P)
+    assert found.simple() - found.likelihood >= 2.0 - 1e-6
+    assert fit(w, P=P).likelihood == pytest.approx(-1.5 - 0.5 * np.log(np.linalg.det(P)), rel=1e-3)
+
+
+def test_what_is_right_and_what_is_not() -> None:
+    """Each part of it: scale, an axis, the mean, correlations, the median; a right one is refused once in 1,000."""
+    rng = np.random.default_rng(9)
+    w = rng.normal(size=(2000, 2))
+    w = np.linalg.solve(np.linalg.cholesky(np.cov(w.T)), (w - w.mean(axis=0)).T).T
+    assert fit(w).right()
+    t = rng.standard_t(3, size=w.shape)
+    for other in (
+        w * 1.2,
+        w / 1.2,
+        w * [1.25, 0.8],
+        w + np.array([0.2, 0.0]),
+        w @ [[1.0, 0.2], [0.0, 0.98]],
+        t / t.std(axis=0),
+    ):
+        assert not fit(other).right()
+    assert fit(w).fault() == pytest.approx(0.0, abs=1e-3)
+    assert fit(2.0 * w).fault() == pytest.approx(0.5 * 2 * (4.0 - np.log(4.0) - 1.0), rel=1e-2)
+
+
+def fit(*whitened: Array, P: Array | None = None) -> Fit:
+    """Errors of runs with these whitened errors (k, n) and a covariance (n, n), I where None."""
+    n = whitened[0].shape[1]
+    P = np.eye(n) if P is None else P
+    runs = []
+    for w in whitened:
+        e = w @ np.linalg.cholesky(P).T
+        runs.append(poses(np.arange(len(e)) * 0.1, np.zeros_like(e), P, e, "vector", "vector"))
+    found = fit_of(runs)
+    assert found is not None
+    return found
+
+
+def test_no_guess_that_fits_is_no_hint(rng: np.random.Generator) -> None:
+    runs = [replace(p, covariance=p.covariance / 1000.0) for p in planar(rng)]
+    assert decades(runs)[0] > 2.5
+    assert hints("est", THREE, runs) == []
+
+
+# --- frames -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", [-2.0, 0.3])
+def test_the_frame_is_found(angle: float, rng: np.random.Generator) -> None:
+    for make, shift in ((spatial, FAR), (planar, FAR[:2])):
+        runs = make(rng)
+        for p in runs:
+            p.truth[:, : len(shift)] = p.estimate[:, : len(shift)]
+        frame = Frame.about_z(angle, shift)
+        found = fitted_frame([moved(p, frame) for p in runs])
+        assert found is not None
+        assert found.heading == pytest.approx(-angle, abs=1e-9)
+        back = moved(moved(runs[0], frame), found)
+        np.testing.assert_allclose(back.estimate[:, : len(shift)], runs[0].estimate[:, : len(shift)], atol=1e-9)
+        assert not any("world" in note for note in hints("est", SIX if len(shift) == 3 else THREE, runs))
+
+
+@pytest.mark.parametrize("convention", ["so3", "so3-body", "left", "right"])
+def test_errors_in_space_are_carried_over(convention: str) -> None:
+    """To first order: the change of the error by small errors of each kind, in the moved world, is the matrix."""
+    own = np.array([[3.0, -1.0, 2.0, *Rotation.from_euler("ZYX", [0.7, 0.2, -0.3]).as_quat()]])
+    step, world = 1e-6, Frame(Rotation.from_rotvec([0.2, -0.5, 0.9]), FAR)
+    found = np.zeros((6, 6))
+    for i, xi in enumerate(step * np.eye(6)):
+        true = np.zeros((1, 7))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_quat(own[0, 3:]).as_matrix(), own[0, :3]
+        E = expm(hat(xi))
+        G = {"left": T @ E, "right": E @ T}.get(convention, T.copy())
+        if convention.startswith("so3"):
+            G[:3, 3] += xi[:3]
+            G[:3, :3] = E[:3, :3] @ T[:3, :3] if convention == "so3" else T[:3, :3] @ E[:3, :3]
+        true[0] = [*G[:3, 3], *Rotation.from_matrix(G[:3, :3]).as_quat()]
+        both = [moved(poses(np.zeros(1), each, np.eye(6), each, "spatial", convention), world) for each in (own, true)]
+        found[:, i] = spatial_error(both[1].estimate, both[0].estimate, convention)[0] / step
+    np.testing.assert_allclose(found, carried(convention, world, 6), atol=1e-4)
+
+
+@pytest.mark.parametrize("convention", ["so2", "left", "right"])
+def test_errors_in_the_plane_are_carried_over(convention: str) -> None:
+    own, step, world = np.array([[3.0, -1.0, 0.4]]), 1e-6, Frame.about_z(0.9, FAR[:2])
+    change, found = np.zeros((3, 3)), np.zeros((3, 3))
+    for i, xi in enumerate(step * np.eye(3)):
+        pair = [poses(np.zeros(1), each, np.eye(3), each, "planar", convention) for each in (own, own + xi)]
+        change[:, i] = planar_error(own + xi, own, convention)[0] / step
+        both = [moved(p, world).estimate for p in pair]
+        found[:, i] = planar_error(both[1], both[0], convention)[0] / step
+    np.testing.assert_allclose(found, carried(convention, world, 3) @ change, atol=1e-4)
+
+
+# --- files ------------------------------------------------------------------------------------------
+
+
+def test_the_hint_is_a_note_of_what_was_read(tmp_path: Path, rng: np.random.Generator) -> None:
+    p = spatial(rng)[0]
+    for name, values in (("est", p.estimate), ("truth", p.truth), ("P", p.covariance.reshape(STEPS, 36))):
+        np.savetxt(tmp_path / f"{name}.txt", np.column_stack([p.t, values]), fmt="%.17g")
+    files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
+    wrong = read_recordings(*files, covariance_order="rotation-translation")[0].notes
+    assert any("in the other order (--covariance-order)" in note for note in wrong)
+    assert not any("about right if" in note for note in read_recordings(*files)[0].notes)
+
+
+def trials(rng: np.random.Generator, runs: int = 20, steps: int = 40) -> tuple[Array, Array, Array]:
+    """Truth and estimates (runs, steps, 3) of planar poses that turn past pi, and right covariances."""
+    sigma = np.array([0.2, 0.3, 0.02])
+    truth = np.cumsum(rng.normal(size=(runs, steps, 3)) * [0.1, 0.1, 0.2], axis=1) + np.array([0, 0, 3.0])
+    return truth, truth - sigma * rng.normal(size=truth.shape), np.broadcast_to(np.diag(sigma**2), (*truth.shape, 3))
+
+
+def write_steps(path: Path, pose: Array, P: Array) -> Path:
+    """A table with runs and steps, and no times."""
+    pairs = [("xx", 0, 0), ("xy", 0, 1), ("xh", 0, 2), ("yy", 1, 1), ("yh", 1, 2), ("hh", 2, 2)]
+    lines = ["run,step,x,y,heading," + ",".join(f"P_{name}" for name, *_ in pairs)]
+    for run, step in np.ndindex(pose.shape[:2]):
+        numbers = [*pose[run, step], *(P[run, step, i, j] for _, i, j in pairs)]
+        lines.append(f"{run},{step + 1}," + ",".join(f"{value:.12g}" for value in numbers))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda pose, P: (pose, P), None),
+        (
+            lambda pose, P: (pose * [1, 1, DEGREES], P),
+            "the headings of the estimates are in degrees; multiply them by pi / 180",
+        ),
+        (
+            lambda pose, P: (pose * [1e3, 1e3, 1], P),
+            "the positions of the estimates are in millimetres; divide them by 1000",
+        ),
+        (lambda pose, P: (pose, np.linalg.inv(P)), "it is an information matrix; invert it"),
+    ],
+)
+def test_files_that_know_steps_and_no_times_get_hints(
+    change: Callable[[Array, Array], tuple[Array, Array]], said: str | None, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    truth, right, P = trials(rng)
+    estimates, stated = change(right, P)
+    write_steps(tmp_path / "truth.csv", truth, P)
+    write_steps(tmp_path / "est.csv", estimates, stated)
+    np.savez(tmp_path / "est.npz", truth=truth, estimates=estimates, covariances=stated)
+    (table,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
+    (archive,) = read_recordings(tmp_path / "est.npz", error="so2")
+    for record in (table, archive):
+        hints_given = [note for note in record.notes if "about right if" in note]
+        assert [note.partition("about right if ")[2] for note in hints_given] == ([] if said is None else [said])
+
+
+def test_errors_alone_get_the_hints_of_covariances(tmp_path: Path, rng: np.random.Generator) -> None:
+    truth, estimates, P = trials(rng)
+    np.savez(tmp_path / "errors.npz", errors=truth - estimates, covariances=np.linalg.inv(P))
+    (record,) = read_recordings(tmp_path / "errors.npz")
+    assert any(note.endswith("it is an information matrix; invert it") for note in record.notes)
+
+
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_an_angle_whose_errors_jump_by_a_turn_is_named(wrapped: bool, tmp_path: Path, rng: np.random.Generator) -> None:
+    truth, estimates, P = trials(rng)
+    if wrapped:
+        truth, estimates = (np.dstack([pose[..., :2], wrap(pose[..., 2])]) for pose in (truth, estimates))
+    np.savez(tmp_path / "poses.npz", truth=truth, estimates=estimates, covariances=P)
+    np.savez(tmp_path / "errors.npz", errors=truth - estimates, covariances=P, axes=["x", "y", "yaw"])
+    jumps = int((np.abs(truth - estimates)[..., 2] > np.pi).sum())
+    for name, axis, remedy in (
+        ("poses", "e3", "add --error so2, if these are x, y, heading"),
+        ("errors", "yaw", "wrap it to [-pi, pi]"),
+    ):
+        (record,) = read_recordings(tmp_path / f"{name}.npz")
+        said = f"{name}: the error of {axis} is off by 2 pi in {jumps} of 800 steps, as that of an angle; {remedy}"
+        assert [note for note in record.notes if "2 pi" in note] == ([said] if wrapped else [])
+    assert jumps == 0 or wrapped
+    assert jumps > 2 or not wrapped
+    (judged,) = read_recordings(tmp_path / "poses.npz", error="so2")
+    assert not any("2 pi" in note for note in judged.notes)
+
+
+def test_errors_that_are_far_off_by_themselves_are_no_angle(rng: np.random.Generator) -> None:
+    error = 6.0 + 0.3 * rng.normal(size=(10, 40, 1))
+    assert turns("name", ["e1"], error, np.full((10, 40, 1, 1), 0.01**2), "wrap it") == []
+    assert turns("name", ["e1"], error, np.full((10, 40, 1, 1), 0.5**2), "wrap it") == []
+
+
+def test_steps_are_no_clock(tmp_path: Path, rng: np.random.Generator) -> None:
+    truth, estimates, P = trials(rng)
+    along = np.arange(40)[:, None] * [2.0, 1.0, 0.0]
+    write_steps(tmp_path / "truth.csv", truth + along, P)
+    write_steps(tmp_path / "late.csv", np.roll(estimates + along, 1, axis=1)[:, 1:], P[:, 1:])
+    (record,) = read_recordings(tmp_path / "late.csv", tmp_path / "truth.csv")
+    assert not any("offset" in note or "clock" in note for note in record.notes), record.notes

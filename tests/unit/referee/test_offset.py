@@ -1,0 +1,252 @@
+"""Clocks that differ, on runs whose offset is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from recorded import read_recordings
+from scipy import stats
+
+import consistency as cs
+from consistency.referee.geometry import wrap
+from consistency.referee.sources.offset import clock_shift, offset_of, steps_of
+from consistency.referee.sources.poses import Poses
+from consistency.referee.sources.sheet import Places
+from consistency.referee.types import Array
+
+SIGMA = np.array([0.3, 0.3, 0.02])
+TRUE_T = np.arange(-2.0, 12.0, 0.02)
+
+
+def path(rng: np.random.Generator, speed: float) -> Array:
+    """A winding drive at every 0.02 s, (700, 3)."""
+    heading = rng.uniform(-3, 3) + 0.4 * np.sin(rng.uniform(-1, 1) * TRUE_T) + 0.2 * TRUE_T
+    steps = 0.02 * speed * np.column_stack([np.cos(heading), np.sin(heading)])
+    return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])
+
+
+def run_of(rng: np.random.Generator, offset: float, noise: float = 1.0, speed: float = 5.0) -> Poses:
+    """100 estimates in 10 s, whose clock is ``offset`` early."""
+    t, truth = 0.1 * np.arange(100), path(rng, speed)
+    poses = Poses(
+        Places("line {}".format, np.arange(100)), t, np.zeros((100, 3)), np.tile(np.diag(SIGMA**2), (100, 1, 1)),
+        np.ones(100, bool), TRUE_T, truth, "planar", "so2", 0.01,
+    )  # fmt: skip
+    estimate = poses.known(offset).truth - noise * SIGMA * rng.normal(size=(100, 3))
+    return replace(poses, estimate=estimate)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng()
+
+
+@pytest.mark.parametrize("offset", [-0.35, -0.012, 0.0, 0.04, 0.7])
+def test_without_noise_it_is_found_to_the_millisecond(rng: np.random.Generator, offset: float) -> None:
+    found = offset_of([run_of(rng, offset, noise=1e-3) for _ in range(5)])
+    assert found is not None
+    assert found.value == pytest.approx(offset, abs=5e-4)
+    assert found.low <= found.value <= found.high
+
+
+def test_a_step_goes_to_the_offset(rng: np.random.Generator) -> None:
+    steps = steps_of(run_of(rng, 0.02, noise=1e-3), 0.0, 3)
+    np.testing.assert_allclose(steps, 0.02, atol=2e-3)
+
+
+def test_the_interval_by_hand(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Student's t of the steps that five runs would go from the offset: 2.7764 standard errors with 4 of freedom."""
+    steps = iter([0.001, -0.002, 0.004, 0.0, 0.002])
+    monkeypatch.setattr("consistency.referee.sources.offset.steps_of", lambda *_: np.array([next(steps)]))
+    found = offset_of([run_of(rng, 0.04, noise=1e-3) for _ in range(5)])
+    assert found is not None
+    reach = 2.776445 * np.sqrt(5e-6 / 5)  # squares about the mean of 0.001 add up to 20e-6
+    assert found.high - found.value == pytest.approx(reach, rel=1e-6)
+    assert found.value - found.low == pytest.approx(reach, rel=1e-6)
+    t = (found.value + 0.001) / np.sqrt(5e-6 / 5)
+    assert found.p_value == pytest.approx(2.0 * stats.t.sf(t, 4), rel=1e-6)
+    assert not found.alone
+
+
+@pytest.mark.parametrize(
+    ("nees", "then", "alone"), [(5.0, 2.0, False), (5.0, 3.0, True), (3.9, 1.0, True), (4.1, 1.0, False)]
+)
+def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(
+    nees: float, then: float, alone: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mean NEES over its degrees of freedom as it is, and 0.04 s later: beyond 4, and less than half of that."""
+    asked = []
+
+    def steps(poses: Poses, shift: float, parts: int) -> Array:
+        asked.append(parts)
+        return np.array([0.001, -0.001, np.nan, 0.0])
+
+    slope = (nees - then) / 0.04**2
+    monkeypatch.setattr(
+        "consistency.referee.sources.offset._size", lambda _, shift, __: then + slope * (shift - 0.04) ** 2
+    )
+    monkeypatch.setattr("consistency.referee.sources.offset.steps_of", steps)
+    found = offset_of([run_of(rng, 0.0)])
+    assert found is not None
+    assert asked == [12]
+    assert found.alone is alone
+    assert found.value == pytest.approx(0.04, abs=1e-4)
+    assert found.explained == pytest.approx(1.0 - then / nees, abs=1e-4)
+    asked.clear()
+    several = offset_of([run_of(rng, 0.0)] * 2)
+    assert several is not None
+    assert not several.alone
+    assert asked == [1, 1]
+
+
+@pytest.mark.parametrize(("steps", "p"), [((0.0, 0.0), None), ((0.0, np.nan, 0.0), None), ((0.0, 0.0, 0.0), 0.0)])
+def test_steps_that_agree_are_certain_and_two_are_none(
+    steps: tuple[float, ...], p: float | None, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("consistency.referee.sources.offset._size", lambda _, shift, __: 1.0 + (shift - 0.04) ** 2)
+    monkeypatch.setattr("consistency.referee.sources.offset.steps_of", lambda *_: np.array(steps))
+    found = offset_of([run_of(rng, 0.0)])
+    assert (None if found is None else found.p_value) == p
+
+
+def test_steps_that_agree_on_no_offset_find_none(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("consistency.referee.sources.offset._size", lambda _, shift, __: 1.0 + abs(shift))
+    monkeypatch.setattr("consistency.referee.sources.offset.steps_of", lambda *_: np.zeros(4))
+    found = offset_of([run_of(rng, 0.0)])
+    assert found is not None
+    assert (found.value, found.p_value) == (0.0, 1.0)
+
+
+def test_with_noise_it_is_named(rng: np.random.Generator) -> None:
+    """40 ms at 5 m/s are 0.2 m beside a sigma of 0.3 m. The estimate spreads by 1.2 ms: 10 times that is never seen."""
+    runs = [run_of(rng, 0.04) for _ in range(20)]
+    found = offset_of(runs)
+    assert found is not None
+    assert found.found
+    assert found.value == pytest.approx(0.04, abs=0.012)
+    shift, notes = clock_shift("est", runs, None)
+    assert shift == 0.0
+    assert "seem to differ by 0.0" in notes[0]
+    assert "--time-offset 0.0" in notes[0]
+    shift, notes = clock_shift("est", runs, "estimate")
+    assert shift == found.value
+    assert "is added to the timestamps" in notes[0]
+
+
+def test_a_right_clock_is_left_alone(rng: np.random.Generator) -> None:
+    """Each is named with probability 1e-4: more than 2 of 60 with 4e-8."""
+    assert sum(bool(clock_shift("est", [run_of(rng, 0.0) for _ in range(8)], None)[1]) for _ in range(60)) <= 2
+
+
+def test_the_error_of_a_single_run_is_not_laid_on_the_clock(rng: np.random.Generator) -> None:
+    """An error along the path looks the same; only one far too large for the covariance is named."""
+    for noise in (1.0, 0.01):  # the second is sure of the offset
+        assert clock_shift("est", [run_of(rng, 0.04, noise)], None)[1] == []
+    assert "of estimates and truth seem to differ by" in clock_shift("est", [run_of(rng, 0.3)], None)[1][0]
+
+
+def test_where_nothing_moves_there_is_none(rng: np.random.Generator) -> None:
+    runs = [run_of(rng, 0.0) for _ in range(4)]
+    still = [replace(run, truth=np.zeros_like(run.truth), estimate=0.1 * SIGMA * run.estimate) for run in runs]
+    assert offset_of(still) is None
+    with pytest.raises(cs.InputError, match="--time-offset estimate: nothing moves in est"):
+        clock_shift("est", still, "estimate")
+
+
+# --- files ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tables(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Estimates of 12 runs that are 0.1 s early, with their truths."""
+    estimates, truths = [], []
+    for number in range(12):
+        run = run_of(rng, 0.1)
+        P = {name: SIGMA[i] ** 2 for i, name in enumerate(("P_xx", "P_yy", "P_hh"))}
+        columns = dict(zip(("x", "y", "heading"), run.estimate.T, strict=True))
+        estimates.append(pd.DataFrame({"run": number, "t": run.t} | columns | P | {"P_xy": 0, "P_xh": 0, "P_yh": 0}))
+        true = dict(zip(("x", "y", "heading"), run.truth.T, strict=True))
+        truths.append(pd.DataFrame({"run": number, "t": run.true_t} | true))
+    pd.concat(estimates).to_csv(tmp_path / "est.csv", index=False)
+    pd.concat(truths).to_csv(tmp_path / "truth.csv", index=False)
+    return tmp_path
+
+
+def test_tables_are_read_with_an_offset(tables: Path) -> None:
+    """NEES 3 expected, of 1,200: 2.5 and 3.5 are 7 sigma away."""
+    files = tables / "est.csv", tables / "truth.csv"
+    for option, right in ((None, False), (0.1, True), ("estimate", True), (-0.1, False)):
+        [record] = read_recordings(*files, time_offset=option)
+        assert record.nees is not None
+        assert (2.5 < np.nanmean(record.nees) < 3.5) == right, option
+    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
+    assert cs.judge(cs.read(*files, time_offset=0.1)).status != "overconfident"
+
+
+def test_trajectories_are_read_with_an_offset(tmp_path: Path, rng: np.random.Generator) -> None:
+    for folder in ("est", "truth", "P"):
+        (tmp_path / folder).mkdir()
+    for number in range(6):
+        run = run_of(rng, 0.1)
+        for folder, t, pose in (("est", run.t, run.estimate), ("truth", run.true_t, run.truth)):
+            half = 0.5 * pose[:, 2]
+            zero = np.zeros(len(t))
+            up = rng.normal(size=(len(t), 3)) * 0.01 if folder == "est" else np.zeros((len(t), 3))
+            turn = np.column_stack([0.5 * up[:, 1:], np.sin(half), np.cos(half)])
+            turn /= np.linalg.norm(turn, axis=1)[:, None]
+            np.savetxt(tmp_path / folder / f"{number}.txt", np.column_stack([t, pose[:, :2], zero + up[:, 0], turn]))
+        P = np.diag([*SIGMA[:2] ** 2, 1e-4, 1e-4, 1e-4, SIGMA[2] ** 2]).ravel()
+        np.savetxt(tmp_path / "P" / f"{number}.txt", np.column_stack([run.t, np.tile(P, (len(run.t), 1))]))
+    files = tmp_path / "est", tmp_path / "truth", tmp_path / "P"
+    early, right = (np.nanmean(read_recordings(*files, time_offset=o)[0].nees) for o in (None, "estimate"))  # type: ignore[arg-type]
+    assert early > 6.8
+    assert 5.0 < right < 6.8
+    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("soon", "--time-offset soon: must be a number of seconds, or 'estimate'"),
+        ("nan", "--time-offset nan: must be a number of seconds, or 'estimate'"),
+        ("1000", "no t of run 0"),
+    ],
+)
+def test_bad_offsets(tables: Path, option: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from consistency.referee.cli import main
+
+    with pytest.raises(SystemExit) as end:
+        main(["analyse", str(tables / "est.csv"), "--truth", str(tables / "truth.csv"), "--time-offset", option])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_offsets_need_clocks(tables: Path) -> None:
+    with pytest.raises(cs.InputError, match="--time-offset needs --truth"):
+        read_recordings(tables / "est.csv", time_offset=1)
+    for name in ("est.csv", "truth.csv"):
+        table = pd.read_csv(tables / name)
+        table["t"] = table.groupby("run").cumcount()
+        table.rename(columns={"t": "step"}).to_csv(tables / name, index=False)
+    with pytest.raises(cs.InputError, match="--time-offset: needs a column t"):
+        read_recordings(tables / "est.csv", tables / "truth.csv", time_offset=1.0)
+
+
+def test_what_has_truth_is_judged_at_every_offset(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a shift leaves it without truth: an offset explains nothing by leaving estimates out."""
+    asked = []
+
+    def size(_: object, shift: float, judged: np.ndarray) -> float:
+        asked.append(bool(judged.all()))
+        return 1.0 + (shift - 0.04) ** 2
+
+    monkeypatch.setattr("consistency.referee.sources.offset._size", size)
+    run = run_of(rng, 0.0)
+    within = (run.true_t >= run.t[0]) & (run.true_t <= run.t[-1] + 1e-9)  # any shift leaves some without truth
+    offset_of([replace(run, true_t=run.true_t[within], truth=run.truth[within])])
+    assert len(asked) > 20
+    assert all(asked)

@@ -1,0 +1,943 @@
+"""Files of other estimators: errors against independent maths, verdicts of filterpy's filter, and every refusal."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from documents import blocks
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from recorded import read_recordings
+from scipy import stats
+from scipy.linalg import expm, logm
+from scipy.spatial.transform import Rotation
+
+import consistency as cs
+from consistency.referee.cli import main
+from consistency.referee.diagnostics import Settings, nees
+from consistency.referee.errors import InputError
+from consistency.referee.sources import (
+    planar_error,
+    se2_log,
+    se3_log,
+    spatial_error,
+)
+from consistency.referee.sources.matching import associate, common_times
+from consistency.referee.types import Array
+from consistency.referee.verdicts.files import analyse_recordings
+
+ROOT = Path(__file__).parents[3]
+POSE_COLUMNS = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]
+coordinate = st.floats(-50, 50).map(lambda value: round(value, 9))  # logm itself fails on subnormal numbers
+angle = st.floats(-3.1, 3.1).map(lambda value: round(value, 9))
+few = settings(max_examples=25)  # logm is slow
+
+
+# --- the conventions, against matrix logarithms --------------------------------------------------
+
+
+def hat(twist: Array) -> Array:
+    """Matrix of the Lie algebra: (x, y, heading) -> (3, 3), (x, y, z, rotation vector) -> (4, 4)."""
+    n = 2 if len(twist) == 3 else 3
+    out = np.zeros((n + 1, n + 1))
+    out[:n, n] = twist[:n]
+    if n == 2:
+        out[:2, :2] = [[0, -twist[2]], [twist[2], 0]]
+    else:
+        a, b, c = twist[3:]
+        out[:3, :3] = [[0, -c, b], [c, 0, -a], [-b, a, 0]]
+    return out
+
+
+def vee(matrix: Array) -> Array:
+    if len(matrix) == 3:
+        return np.array([matrix[0, 2], matrix[1, 2], matrix[1, 0]])
+    return np.array([*matrix[:3, 3], matrix[2, 1], matrix[0, 2], matrix[1, 0]])
+
+
+def matrix(pose: Array) -> Array:
+    """Homogeneous matrix of (x, y, heading) or of (x, y, z, qx, qy, qz, qw)."""
+    if len(pose) == 3:
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        return np.array([[c, -s, pose[0]], [s, c, pose[1]], [0, 0, 1]])
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]
+    return out
+
+
+def spatial(position: Array, turn: Array) -> Array:
+    return np.concatenate([position, Rotation.from_rotvec(turn).as_quat()])
+
+
+vector3 = st.tuples(coordinate, coordinate, coordinate).map(np.array)
+turn3 = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(lambda values: np.round(values, 9))
+
+
+@few
+@given(x=coordinate, y=coordinate, heading=angle)
+def test_se2_log_is_the_matrix_logarithm(x: float, y: float, heading: float) -> None:
+    pose = np.array([x, y, heading])
+    np.testing.assert_allclose(se2_log(pose), vee(np.real(logm(matrix(pose)))), atol=1e-9)
+
+
+@few
+@given(position=vector3, turn=turn3)
+def test_se3_log_is_the_matrix_logarithm(position: Array, turn: Array) -> None:
+    pose = spatial(position, turn)
+    np.testing.assert_allclose(se3_log(pose), vee(np.real(logm(matrix(pose)))), atol=1e-8)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.00999, 0.01001, 0.1, 1.0, 3.0, 3.14159, np.pi - 1e-9])
+def test_log_undoes_the_exponential_at_every_angle(size: float) -> None:
+    """Also across the switch to the series, and near pi, where eq. 146 as printed divides zero by zero."""
+    twist = np.array([3.0, -4.0, 5.0, *(size * np.array([2.0, -1.0, 2.0]) / 3.0)])
+    exponential = expm(hat(twist))
+    pose = np.concatenate([exponential[:3, 3], Rotation.from_matrix(exponential[:3, :3]).as_quat()])
+    np.testing.assert_allclose(se3_log(pose), twist, rtol=1e-6, atol=1e-12)
+    planar = np.array([3.0, -4.0, size])
+    T = expm(hat(planar))
+    np.testing.assert_allclose(se2_log(np.array([T[0, 2], T[1, 2], size])), planar, rtol=1e-9, atol=1e-12)
+
+
+@few
+@given(true=vector3, true_turn=turn3, estimate=vector3, turn=turn3)
+def test_spatial_errors_by_matrices(true: Array, true_turn: Array, estimate: Array, turn: Array) -> None:
+    one, two = spatial(true, true_turn), spatial(estimate, turn)
+    X, Y = matrix(one), matrix(two)
+    if np.linalg.norm(se3_log(spatial(np.zeros(3), Rotation.from_matrix(X[:3, :3] @ Y[:3, :3].T).as_rotvec()))) > 3.1:
+        return  # at pi the logarithm has two branches
+    left, right = np.linalg.inv(Y) @ X, X @ np.linalg.inv(Y)
+    np.testing.assert_allclose(spatial_error(one, two, "left"), vee(np.real(logm(left))), atol=1e-7)
+    np.testing.assert_allclose(spatial_error(one, two, "right"), vee(np.real(logm(right))), atol=1e-7)
+    for convention, turned in (("so3", right), ("so3-body", left)):
+        error = spatial_error(one, two, convention)
+        np.testing.assert_allclose(error[:3], true - estimate)
+        np.testing.assert_allclose(error[3:], vee(np.real(logm(turned)))[3:], atol=1e-7)
+
+
+@few
+@given(true=st.tuples(coordinate, coordinate, angle), estimate=st.tuples(coordinate, coordinate, angle))
+def test_planar_errors_by_matrices(true: tuple[float, ...], estimate: tuple[float, ...]) -> None:
+    one, two = np.array(true), np.array(estimate)
+    X, Y = matrix(one), matrix(two)
+    if abs(planar_error(one, two, "so2")[2]) > 3.1:
+        return
+    np.testing.assert_allclose(planar_error(one, two, "left"), vee(np.real(logm(np.linalg.inv(Y) @ X))), atol=1e-8)
+    np.testing.assert_allclose(planar_error(one, two, "right"), vee(np.real(logm(X @ np.linalg.inv(Y)))), atol=1e-8)
+
+
+def test_headings_are_wrapped_except_in_a_vector() -> None:
+    true, estimate = np.array([0.0, 0.0, np.pi - 0.1]), np.array([0.0, 0.0, 0.1 - np.pi])
+    np.testing.assert_allclose(planar_error(true, estimate, "so2")[2], -0.2)
+    np.testing.assert_allclose(planar_error(true, estimate, "vector")[2], 2 * np.pi - 0.2)
+
+
+# --- trajectories whose errors have the stated covariance ------------------------------------------
+
+DRAW: dict[str, Callable[[Array, Array, Array], tuple[Array, Array]]] = {
+    # estimate T (4, 4), error xi (6,), its exponential (4, 4) -> true position and rotation
+    "left": lambda T, xi, E: ((T @ E)[:3, 3], (T @ E)[:3, :3]),
+    "right": lambda T, xi, E: ((E @ T)[:3, 3], (E @ T)[:3, :3]),
+    "so3": lambda T, xi, E: (T[:3, 3] + xi[:3], E[:3, :3] @ T[:3, :3]),
+    "so3-body": lambda T, xi, E: (T[:3, 3] + xi[:3], T[:3, :3] @ E[:3, :3]),
+}
+RUNS, STEPS = 5, 80
+
+
+def covariance6(rng: np.random.Generator) -> Array:
+    """One with every correlation, and very different along its axes."""
+    sigma = np.array([0.1, 0.5, 0.02, 0.02, 0.005, 0.1])
+    root = np.tril(rng.normal(0, 0.4, (6, 6)), -1) + np.eye(6)
+    C = root @ root.T
+    d = np.sqrt(np.diag(C))
+    return sigma[:, None] * (C / np.outer(d, d)) * sigma
+
+
+def write_trajectories(at: Path, convention: str, order: str = "translation-rotation", triangle: bool = False) -> None:
+    """Folders est, truth, P with a file for each run."""
+    rng = np.random.default_rng(20180)
+    for folder in ("est", "truth", "P"):
+        (at / folder).mkdir()
+    for run in range(RUNS):
+        estimates, truths, matrices = [], [], []
+        for step in range(STEPS):
+            t = 1.6e9 + 0.05 * step
+            P = covariance6(rng)
+            xi = np.linalg.cholesky(P) @ rng.normal(size=6)
+            estimate = spatial(rng.uniform(-20, 20, 3), rng.uniform(-1.5, 1.5, 3))
+            position, turn = DRAW[convention](matrix(estimate), xi, expm(hat(xi)))
+            if order == "rotation-translation":
+                swap = [3, 4, 5, 0, 1, 2]
+                P = P[np.ix_(swap, swap)]
+            estimates.append([t, *estimate])
+            truths.append([t, *position, *Rotation.from_matrix(turn).as_quat()])
+            matrices.append([t, *(P[np.triu_indices(6)] if triangle else P.ravel())])
+        for folder, rows in (("est", estimates), ("truth", truths), ("P", matrices)):
+            np.savetxt(at / folder / f"run{run}.txt", rows, fmt="%.17g", header="made")
+
+
+def mean_nees(at: Path, convention: str | None, order: str | None = None) -> float:
+    [recording] = read_recordings(at / "est", at / "truth", at / "P", convention, covariance_order=order)
+    assert recording.error is not None
+    assert recording.covariance is not None
+    assert recording.error.shape == (RUNS, STEPS, 6)
+    return float(nees(recording.error, recording.covariance).mean())
+
+
+BAND = stats.chi2.ppf([0.5e-4, 1 - 0.5e-4], 6 * RUNS * STEPS) / (RUNS * STEPS)
+
+
+@pytest.mark.parametrize("convention", DRAW)
+def test_nees_of_a_trajectory_in_each_convention(convention: str, tmp_path: Path) -> None:
+    """False-alarm rate 1e-4 for each convention; declared as any other it is far outside (negative control)."""
+    write_trajectories(tmp_path, convention)
+    assert BAND[0] < mean_nees(tmp_path, convention) < BAND[1]
+    for wrong in set(DRAW) - {convention}:
+        assert mean_nees(tmp_path, wrong) > 2 * BAND[1]
+
+
+def test_order_of_the_covariance_and_its_triangle(tmp_path: Path) -> None:
+    """False-alarm rate 1e-4. The default convention is so3."""
+    write_trajectories(tmp_path, "so3", "rotation-translation", triangle=True)
+    assert BAND[0] < mean_nees(tmp_path, None, "rotation-translation") < BAND[1]
+    assert not BAND[0] < mean_nees(tmp_path, None) < BAND[1]
+
+
+def test_layouts_of_one_line(tmp_path: Path) -> None:
+    """Covariance behind the pose: 44 or 29 columns; 20 are two recordings that equal the blocks."""
+    write_trajectories(tmp_path, "so3-body")
+    est, P = (np.loadtxt(tmp_path / folder / "run0.txt") for folder in ("est", "P"))
+    truth = tmp_path / "truth/run0.txt"
+    [whole] = read_recordings(tmp_path / "est/run0.txt", truth, tmp_path / "P/run0.txt", "so3-body")
+    full = P[:, 1:].reshape(-1, 6, 6)
+    i, j = np.triu_indices(3)
+    layouts = {
+        "44.txt": np.hstack([est, P[:, 1:]]),
+        "29.txt": np.hstack([est, full[(slice(None), *np.triu_indices(6))]]),
+        "20.txt": np.hstack([est, full[:, 3:, 3:][:, i, j], full[:, :3, :3][:, i, j]]),
+    }
+    for name, rows in layouts.items():
+        np.savetxt(tmp_path / name, rows, fmt="%.17g")
+    for name in ("44.txt", "29.txt"):
+        [one] = read_recordings(tmp_path / name, truth, None, "so3-body")
+        np.testing.assert_allclose(one.error, whole.error)
+        np.testing.assert_allclose(one.covariance, whole.covariance, rtol=1e-12)
+    position, rotation = read_recordings(tmp_path / "20.txt", truth)
+    assert (position.axes, rotation.axes) == (("x", "y", "z"), ("roll", "pitch", "yaw"))
+    assert (position.name, rotation.name) == ("20 position", "20 rotation")
+    assert whole.error is not None
+    assert whole.covariance is not None
+    np.testing.assert_allclose(position.error, whole.error[..., :3])
+    np.testing.assert_allclose(rotation.error, whole.error[..., 3:])
+    np.testing.assert_allclose(rotation.covariance, whole.covariance[..., 3:, 3:], rtol=1e-12)
+
+
+def test_runs_of_different_lengths_and_gaps(tmp_path: Path) -> None:
+    write_trajectories(tmp_path, "so3")
+    shorten(tmp_path / "est/run1.txt", slice(0, 50))
+    shorten(tmp_path / "truth/run2.txt", slice(20, None))
+    [r] = read_recordings(tmp_path / "est", tmp_path / "truth", tmp_path / "P")
+    assert r.covariance is not None
+    there = np.isfinite(r.covariance[:, :, 0, 0])
+    assert there[1].tolist() == [True] * 50 + [False] * 30
+    assert there[2].tolist() == [False] * 20 + [True] * 60  # a common clock keeps the steps in place
+    assert there[[0, *range(3, RUNS)]].all()
+    assert any("20 of 370 estimates have no truth" in note for note in r.notes)
+    assert any("1 run of 5 (1) end before step 80" in note for note in r.notes)
+    assert r.failures == ()
+
+
+def shorten(path: Path, keep: slice) -> None:
+    np.savetxt(path, np.loadtxt(path)[keep], fmt="%.17g")
+
+
+def test_clocks_of_different_days_are_counted_from_the_start() -> None:
+    columns, t = common_times([np.array([0.0, 0.1, 0.2]), np.array([50.0, 50.1])])
+    assert [column.tolist() for column in columns] == [[0, 1, 2], [0, 1]]
+    assert np.isnan(t).all()
+    columns, t = common_times([np.array([0.1, 0.2]), np.array([0.0, 0.1, 0.2])])
+    assert [column.tolist() for column in columns] == [[1, 2], [0, 1, 2]]
+    assert t.tolist() == [0.0, 0.1, 0.2]
+
+
+def test_a_failing_trajectory_and_warnings(tmp_path: Path) -> None:
+    write_trajectories(tmp_path, "so3")
+    path = tmp_path / "est/run3.txt"
+    rows = np.loadtxt(path)
+    rows[20:, 1:] = np.nan
+    np.savetxt(path, rows, fmt="%.17g")
+    for path in (tmp_path / "truth").iterdir():  # w first, and a truth that jumps about between its samples
+        rows = np.loadtxt(path)
+        rows[:, 0] -= 0.02
+        np.savetxt(path, rows[:, [0, 1, 2, 3, 7, 4, 5, 6]], fmt="%.17g")
+    [r] = read_recordings(tmp_path / "est", tmp_path / "truth", tmp_path / "P")
+    assert [(f.run, f.step) for f in r.failures] == [(3, 21)]
+    assert r.failures[0].reason.startswith("estimate is not finite (")
+    assert r.failures[0].reason.endswith("run3.txt, line 21)")
+    assert r.error is not None
+    assert np.isnan(r.error[3, 20:]).all()
+    assert any("degrees in the median" in note for note in r.notes)
+    assert any("give a truth of a higher rate" in note for note in r.notes)
+
+
+@pytest.mark.parametrize(
+    ("spatial_kind", "planar_kind"), [("so3", "so2"), ("so3-body", "so2"), ("left", "left"), ("right", "right")]
+)
+def test_a_planar_robot_in_messages_of_six(spatial_kind: str, planar_kind: str, tmp_path: Path) -> None:
+    """Zeros for z, roll and pitch: with three axes the errors are those of the planar poses."""
+    rng = np.random.default_rng()
+    t, n = 0.1 * np.arange(40), 40
+    true = np.column_stack([rng.uniform(-9, 9, (n, 2)), rng.uniform(-3, 3, n)])
+    own = true + rng.normal(0, [0.3, 0.2, 0.1], (n, 3))
+    A = rng.normal(size=(n, 3, 3))
+    P3 = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    P = np.zeros((n, 6, 6))
+    P[np.ix_(range(n), [0, 1, 5], [0, 1, 5])] = P3
+    for name, pose in (("est", own), ("truth", true)):
+        half = 0.5 * pose[:, 2]
+        zero = np.zeros((n, 1))
+        rows = np.column_stack([t, pose[:, :2], zero, zero, zero, np.sin(half), np.cos(half)])
+        np.savetxt(tmp_path / f"{name}.txt", rows, fmt="%.17g")
+    np.savetxt(tmp_path / "P.txt", np.column_stack([t, P.reshape(n, 36)]), fmt="%.17g")
+    files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
+    [r] = read_recordings(*files, spatial_kind, axes=["x", "y", "yaw"])
+    assert r.axes == ("x", "y", "yaw")
+    assert r.error is not None
+    assert r.covariance is not None
+    np.testing.assert_allclose(r.error[0], planar_error(true, own, planar_kind), atol=1e-12)
+    np.testing.assert_allclose(r.covariance[0], P3, rtol=1e-12)
+    hint = r"variance zero: z, roll, pitch\); judge only what the filter estimates: --axes x,y,yaw for a trajectory"
+    with pytest.raises(InputError, match=hint):
+        read_recordings(*files)
+    with pytest.raises(InputError, match=r"--axes x,heading: 'heading' is not one of x, y, z, roll, pitch, yaw"):
+        read_recordings(*files, axes=["x", "heading"])
+
+
+# --- association ---------------------------------------------------------------------------------
+
+
+@given(
+    st.lists(st.integers(0, 10**6).map(lambda value: value / 1e5), min_size=1, max_size=20, unique=True),
+    st.integers(0, 10**6),
+)
+def test_association_by_brute_force(reference: list[float], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ref, times = np.sort(reference), np.sort(rng.uniform(-1, 11, 15))
+    own, match = associate(times, ref, 0.5)
+    assert len(set(match)) == len(match)
+    assert (np.diff(own) > 0).all()
+    assert (np.diff(match) > 0).all()
+    distance = np.abs(times[:, None] - ref)
+    nearest = distance.argmin(axis=1)
+    for k in range(len(ref)):
+        wants = [i for i in range(len(times)) if distance[i, k] == distance[i].min() and nearest[i] == k]
+        wants = [i for i in wants if distance[i, k] <= 0.5]
+        assert [int(i) for i, j in zip(own, match, strict=True) if j == k] == (
+            [min(wants, key=lambda i: distance[i, k])] if wants else []
+        )
+
+
+def test_the_tolerance_of_times_is_inside() -> None:
+    """Also of seconds since 1970, which a double holds to a quarter of a microsecond."""
+    for start in (0.0, 1.7e9):
+        own, match = associate(start + np.array([0.5, 2.6]), start + np.array([0.0, 2.0]), 0.5)
+        assert (own.tolist(), match.tolist()) == ([0], [0])
+    own, _ = associate(np.array([1.7e9 + 0.4]), np.array([1.7e9 + 0.3]), 0.1)  # apart by 0.1 and a rounding error
+    assert own.tolist() == [0]
+
+
+# --- tables: poses ---------------------------------------------------------------------------------
+
+
+def poses(runs: int = 3, steps: int = 5) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Estimates and truth of a pose with a known, full covariance."""
+    rng = np.random.default_rng(3)
+    P = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]])
+    run, step = (a.ravel() for a in np.meshgrid(np.arange(runs), np.arange(1, steps + 1), indexing="ij"))
+    true = pd.DataFrame({"run": run, "step": step, "t": 0.1 * step})
+    true[["x", "y", "heading"]] = rng.normal(0, 3, (len(true), 3))
+    est = true.copy()
+    est[["x", "y", "heading"]] += rng.multivariate_normal(np.zeros(3), P, len(true))
+    est[POSE_COLUMNS] = P[np.triu_indices(3)]
+    return est, true
+
+
+Edit = Callable[[pd.DataFrame], Any]
+
+
+def write(at: Path, edit: Edit | None = None, edit_truth: Edit | None = None) -> tuple[Path, Path]:
+    for name, table, change in zip(("est.csv", "truth.csv"), poses(), (edit, edit_truth), strict=True):
+        changed = change(table) if change else None
+        (table if changed is None else changed).to_csv(at / name, index=False)
+    return at / "est.csv", at / "truth.csv"
+
+
+def one(estimates: Path, truth: Path | None, **options: Any) -> Any:
+    [recording] = read_recordings(estimates, truth, **options)
+    return recording
+
+
+def test_a_table_is_read_back_to_the_last_digit(tmp_path: Path) -> None:
+    est, true = poses()
+    r = one(*write(tmp_path))
+    expected = true[["x", "y", "heading"]].to_numpy() - est[["x", "y", "heading"]].to_numpy()
+    np.testing.assert_allclose(r.error, expected.reshape(3, 5, 3), rtol=0, atol=1e-15)  # wrapping rounds once more
+    assert (r.name, r.axes, r.convention, r.runs.tolist()) == ("est", ("x", "y", "heading"), "so2", [0, 1, 2])
+    np.testing.assert_allclose(r.t, [0.1, 0.2, 0.3, 0.4, 0.5])
+    assert r.covariance[2, 4].tolist() == [[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]]
+    for suffix in ("parquet", "csv"):  # Parquet, shuffled rows, and semicolons: the same
+        shuffled = est.sample(frac=1, random_state=1)
+        if suffix == "csv":
+            shuffled.to_csv(tmp_path / "again.csv", index=False, sep=";")
+        else:
+            shuffled.to_parquet(tmp_path / "again.parquet")
+        again = one(tmp_path / f"again.{suffix}", tmp_path / "truth.csv")
+        np.testing.assert_array_equal(again.error, r.error)
+        np.testing.assert_array_equal(again.covariance, r.covariance)
+
+
+def test_without_run_and_step(tmp_path: Path) -> None:
+    """One run, matched by time; a truth without runs serves all."""
+    est, truth = write(tmp_path, lambda e: e[e["run"] == 0].drop(columns=["run", "step"]), lambda t: t[t["run"] == 0])
+    alone = one(est, truth)
+    assert alone.runs.tolist() == [0]
+    assert alone.error.shape == (1, 5, 3)
+    shared = write(tmp_path, None, lambda t: t[t["run"] == 1].drop(columns=["run", "step"]))
+    several = one(*shared)
+    assert several.error.shape == (3, 5, 3)
+    assert several.convention == "so2"
+
+
+@pytest.mark.parametrize("convention", ["left", "right"])
+def test_invariant_errors_of_planar_poses(convention: str, tmp_path: Path) -> None:
+    est, true = poses()
+    r = one(*write(tmp_path), error=convention)
+    one_, two = true[["x", "y", "heading"]].to_numpy()[7], est[["x", "y", "heading"]].to_numpy()[7]
+    X, Y = matrix(one_), matrix(two)
+    T = np.linalg.inv(Y) @ X if convention == "left" else X @ np.linalg.inv(Y)
+    np.testing.assert_allclose(r.error[1, 2], vee(np.real(logm(T))), atol=1e-9)
+
+
+def test_filters_are_recordings(tmp_path: Path) -> None:
+    est, truth = write(tmp_path, lambda e: pd.concat([e.assign(filter="a"), e.assign(filter="b", x=e["x"] + 9)]))
+    assert [r.name for r in read_recordings(est, truth)] == ["a", "b"]
+    assert list(analyse_recordings(read_recordings(est, truth), ["b"])) == ["b"]
+    with pytest.raises(InputError, match="--filter c: is not in these files; there are: a, b"):
+        analyse_recordings(read_recordings(est, truth), ["c"])
+
+
+def set_cell(row: int, column: str, value: float) -> Edit:
+    def edit(table: pd.DataFrame) -> None:
+        table[column] = table[column].astype(float)
+        table.loc[row, column] = value
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value", "reason"),
+    [
+        (7, "x", np.nan, "estimate is not finite"),
+        (7, "heading", np.inf, "estimate is not finite"),
+        (7, "P_xh", np.nan, "covariance is not finite"),
+        (7, "P_yy", -1.0, "covariance is not positive definite"),
+        (7, "P_xy", 0.5, "covariance is not positive definite"),
+        (7, "P_xx", 0.0, "covariance is not positive definite"),
+        (5, "P_xx", -1.0, "covariance is not positive definite"),
+    ],
+)
+def test_a_broken_row_is_a_failed_run(row: int, column: str, value: float, reason: str, tmp_path: Path) -> None:
+    est, truth = write(tmp_path, set_cell(row, column, value))
+    r = one(est, truth)
+    step = row - 5
+    assert [(f.filter, f.run, f.step) for f in r.failures] == [("est", 1, step + 1)]
+    assert r.failures[0].reason == f"{reason} ({est}, line {row + 2})"
+    assert np.isnan(r.error[1, step:]).all()
+    assert np.isnan(r.covariance[1, step:]).all()
+    assert np.isfinite(r.error[1, :step]).all()
+    assert np.isfinite(r.error[[0, 2]]).all()
+    verdict = analyse_recordings([r])["est"]
+    assert not verdict.consistent
+    assert verdict.statistics["failures"] == [[1, step + 1, r.failures[0].reason]]
+
+
+def test_a_start_known_exactly_is_left_out(tmp_path: Path) -> None:
+    def singular(table: pd.DataFrame) -> None:
+        table.loc[table["step"] == 1, POSE_COLUMNS] = 0.0
+        table.loc[table["step"] == 2, POSE_COLUMNS] = [1.0, 1.0, 0.0, 1.0, 0.0, 1.0]  # rank 2
+
+    r = one(*write(tmp_path, singular))
+    assert r.failures == ()
+    assert np.isnan(r.nees[:, :2]).all()
+    assert np.isnan(r.covariance[:, :2]).all()
+    np.testing.assert_allclose(r.nees[:, 2:], nees(r.error[:, 2:], r.covariance[:, 2:]))
+    assert np.isfinite(r.error).all()
+    assert any("6 estimates before the covariance has full rank" in note for note in r.notes)
+    assert analyse_recordings([r])["est"].statistics["left_out_steps"] == [1, 2]
+
+
+def test_step_0_is_the_start_only_where_nothing_is_uncertain(tmp_path: Path) -> None:
+    def shift(table: pd.DataFrame) -> None:
+        table["step"] -= 1
+
+    kept = one(*write(tmp_path, shift, shift))
+    assert kept.error.shape == (3, 5, 3)
+    assert any("which has 0 to 4" in note for note in kept.notes)
+
+    def exact(table: pd.DataFrame) -> None:
+        shift(table)
+        table.loc[table["step"] == 0, POSE_COLUMNS] = 0.0
+
+    start = one(*write(tmp_path, exact, shift))
+    assert start.error.shape == (3, 4, 3)
+    np.testing.assert_array_equal(start.error, kept.error[:, 1:])
+
+
+def test_short_and_missing_runs_are_told(tmp_path: Path) -> None:
+    r = one(*write(tmp_path, lambda e: e[(e["run"] != 1) & ((e["run"] != 2) | (e["step"] < 4))]))
+    assert r.runs.tolist() == [0, 2]
+    assert np.isnan(r.error[1, 3:]).all()
+    assert any("no estimates of 1 run of the truth (1)" in note for note in r.notes)
+    assert any("1 run of 2 (2) end before step 5" in note for note in r.notes)
+
+
+def test_nis_alone(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    table = pd.DataFrame({"run": np.repeat(range(20), 50), "step": np.tile(np.arange(1, 51), 20)})
+    table["nis"], table["nis_dof"] = 4 * rng.chisquare(2, 1000), 2
+    table.loc[3, ["nis", "nis_dof"]] = np.nan
+    table.to_csv(tmp_path / "nis.csv", index=False)
+    r = one(tmp_path / "nis.csv", None)
+    assert (r.error, r.covariance, r.nees, r.dof) == (None, None, None, 0)
+    undeclared = analyse_recordings([r])["nis"]
+    assert (undeclared.status, undeclared.faults) == ("undecided", ())
+    assert "declares an optimal gain" in undeclared.reasons[0]
+    assert "reported and not judged" in undeclared.reasons[1]
+    assert analyse_recordings([r], optimal_gain=True)["nis"].status == "overconfident"
+
+
+def test_our_own_files_get_our_own_verdict(uvd: cs.Scenario, tmp_path: Path) -> None:
+    results = cs.run_trials(uvd, ["ekf-uvd"], runs=3, jobs=1)
+    results.write(tmp_path / "out")
+    r = one(tmp_path / "out/estimates.parquet", tmp_path / "out/truth.parquet")
+    ours, theirs = cs.analyse(results)["ekf-uvd"], analyse_recordings([r])["ekf-uvd"]
+    assert (theirs.status, theirs.statistics["left_out_steps"]) == (ours.status, ours.statistics["left_out_steps"])
+    np.testing.assert_allclose(theirs.statistics["anees"], ours.statistics["anees"], rtol=1e-9)
+
+
+# --- archives --------------------------------------------------------------------------------------
+
+
+def archive(at: Path, **arrays: Any) -> Path:
+    np.savez(at / "a.npz", **arrays)
+    return at / "a.npz"
+
+
+def gaussian(scale: float = 1.0) -> dict[str, Any]:
+    rng = np.random.default_rng(5)
+    P = np.array([[0.04, 0.01], [0.01, 0.09]])
+    errors = rng.multivariate_normal([0, 0], scale * P, (40, 30))
+    return {"errors": errors, "covariances": np.broadcast_to(P, (40, 30, 2, 2))}
+
+
+def test_three_kinds_of_archives_agree(tmp_path: Path) -> None:
+    """Consistent errors: false-alarm rate 0.05 of the verdict, so it is asked at 1 - 1e-4."""
+    arrays = gaussian()
+    by_error = one(archive(tmp_path, **arrays, axes=["px", "py"]), None)
+    assert by_error.axes == ("px", "py")
+    truth = np.random.default_rng(6).normal(size=(40, 30, 2))
+    estimates = {"estimates": truth - arrays["errors"], "truth": truth, "covariances": arrays["covariances"]}
+    by_truth = one(archive(tmp_path, **estimates), None)
+    np.testing.assert_allclose(by_truth.error, by_error.error, atol=1e-12)
+    values = nees(error=arrays["errors"], covariance=arrays["covariances"])
+    by_nees = one(archive(tmp_path, nees=values, dof=2), None)
+    assert by_nees.error is None
+    for r in (by_error, by_truth, by_nees):
+        verdict = analyse_recordings([r], settings=Settings(false_alarm=1e-4))["a"]
+        assert verdict.status == "consistent"
+        np.testing.assert_allclose(verdict.statistics["mean_anees"], values.mean())
+    for bad in (gaussian(2.0), {"nees": 2 * values, "dof": 2}):
+        assert analyse_recordings([one(archive(tmp_path, **bad), None)])["a"].status == "overconfident"
+
+
+def test_lengths_failures_and_starts_of_archives(tmp_path: Path) -> None:
+    arrays = gaussian()
+    errors = arrays["errors"].copy()
+    errors[3, 20:] = np.nan
+    errors[5, 10:] = np.nan
+    lengths = np.full(40, 30)
+    lengths[5] = 10
+    r = one(archive(tmp_path, errors=errors, covariances=arrays["covariances"], lengths=lengths), None)
+    assert [(f.run, f.step) for f in r.failures] == [(3, 21)]
+    values = np.full((2, 5), 2.0)
+    values[0, 0] = values[1, 3] = np.nan
+    r = one(archive(tmp_path, nees=values, dof=2), None)
+    assert [(f.run, f.step) for f in r.failures] == [(1, 4)]
+    assert np.isnan(r.nees[1]).tolist() == [False, False, False, True, True]
+
+
+def test_poses_in_an_archive_take_a_convention(tmp_path: Path) -> None:
+    est, true = poses()
+    estimates, truth = (table[["x", "y", "heading"]].to_numpy().reshape(3, 5, 3) for table in (est, true))
+    path = archive(tmp_path, estimates=estimates, truth=truth, covariances=np.tile(np.eye(3), (3, 5, 1, 1)))
+    np.testing.assert_allclose(one(path, None, error="left").error, planar_error(truth, estimates, "left"))
+    np.testing.assert_allclose(one(path, None).error, truth - estimates)
+
+
+# --- the commands of the manual ----------------------------------------------------------------------
+
+
+def consistency(*arguments: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as end:
+        main(list(arguments))
+    out, err = capsys.readouterr()
+    return int(end.value.code or 0), out, err
+
+
+def example(word: str) -> str:
+    """The block of the manual that holds a word."""
+    (found,) = (block.text for block in blocks("docs/files.md", "python") if word in block.text)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "status"),
+    [
+        (None, "consistent"),
+        (("believed = 1.0", "believed = 0.5"), "overconfident"),
+        (("believed = 1.0", "believed = 2.0"), "conservative"),
+        (("kf.Q = start.copy(), P0.copy(), F, H, Q", "kf.Q = start.copy(), P0.copy(), F, H, 0.5 * Q"), "overconfident"),
+    ],
+)
+def test_the_filterpy_filter_of_the_manual(
+    change: tuple[str, str] | None, status: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """The manual's seed, so no false alarm of its own; the three wrong filters are the negative control."""
+    text = example("KalmanFilter(")
+    if change:
+        assert change[0] in text
+        text = text.replace(*change)
+    (tmp_path / "make.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path("make.py")
+    arguments = ("analyse", "estimates.csv", "--truth", "truth.csv", "--state", "px,py,vx,vy")
+    code, out, err = consistency(*arguments, "--json", "--fail-on", "inconsistent", capsys=capsys)
+    verdict = json.loads(out)["estimates"]
+    assert verdict["status"] == status
+    assert code == (status != "consistent")
+    assert verdict["statistics"]["axes"] == ["px", "py", "vx", "vy"]
+    assert "error convention vector" in err
+
+
+def test_the_notebook_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "make.py").write_text(example("KalmanFilter("))
+    (tmp_path / "notebook.py").write_text(example("record.plot("))
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path("make.py")
+    assert runpy.run_path("notebook.py")["verdict"].status == "consistent"
+    assert (tmp_path / "mine.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_archive_of_the_manual(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "make.py").write_text(example("errors.npz"))
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path("make.py")
+    code, out, _ = consistency("analyse", "errors.npz", "--json", capsys=capsys)
+    assert code == 0
+    assert json.loads(out)["errors"]["status"] == "consistent"
+
+
+# --- refusals ----------------------------------------------------------------------------------------
+
+TUM = "0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n0.2 2 0 0 0 0 0 1\n"
+P36 = "".join(f"{t} {' '.join(str(float(v)) for v in np.eye(6).ravel())}\n" for t in (0.0, 0.1, 0.2))
+EST = ("est.csv", "--truth", "truth.csv")
+LINE = ("t.txt", "--truth", "truth.txt", "--covariance", "P.txt")
+
+
+def csv(edit: Edit | None = None, edit_truth: Edit | None = None) -> Callable[[Path], Any]:
+    return lambda at: write(at, edit, edit_truth)
+
+
+def text(**files: str) -> Callable[[Path], Any]:
+    whole = {"t": TUM, "truth": TUM, "P": P36} | files
+
+    def make(at: Path) -> None:
+        for name, content in whole.items():
+            (at / f"{name}.txt").write_text(content)
+
+    return make
+
+
+def raw(content: str) -> Callable[[Path], Any]:
+    def make(at: Path) -> None:
+        write(at)
+        (at / "est.csv").write_text(content)
+
+    return make
+
+
+def npz(**arrays: Any) -> Callable[[Path], Any]:
+    return lambda at: archive(at, **arrays)
+
+
+def columns(*names: str) -> Edit:
+    return lambda table: table.drop(columns=list(names))
+
+
+def twice(table: pd.DataFrame) -> pd.DataFrame:
+    return pd.concat([table, table.iloc[[3]]])
+
+
+HEADER = ",".join(["step", "x", "y", "heading", *POSE_COLUMNS]) + "\n"
+ERRORS, MATRICES = np.zeros((2, 3, 2)), np.tile(np.eye(2), (2, 3, 1, 1))
+ASYMMETRIC = np.array([[1.0, 0.5], [0.4, 1.0]])
+BAD: dict[str, tuple[Callable[[Path], Any], tuple[str, ...], str]] = {
+    "no such file": (csv(), ("nowhere.csv", *EST[1:]), "nowhere.csv: no such file"),
+    "no such truth": (csv(), ("est.csv", "--truth", "other.csv"), "other.csv: no such file"),
+    "unknown kind": (
+        lambda at: (at / "est.xls").write_text(""),
+        ("est.xls",),
+        "est.xls: unknown kind of file",
+    ),
+    "empty file": (raw(""), EST, "est.csv: is empty"),
+    "header alone": (raw(HEADER), EST, "est.csv: holds no row"),
+    "short line": (
+        raw(HEADER + "1,0,0,0,1,0,0,1,0,1\n2,0,0\n"),
+        EST,
+        "est.csv, line 3: has 3 columns, the header has 10",
+    ),
+    "binary": (lambda at: (at / "est.csv").write_bytes(b"\xff\xfe\x00PAR1"), ("est.csv",), "est.csv: not a text file"),
+    "column twice": (raw("x,x\n1,2\n"), EST, "column 'x' is there twice"),
+    "no truth": (csv(), ("est.csv",), "needs --truth FILE, or columns nis and nis_dof"),
+    "missing state": (csv(columns("heading")), EST, "est.csv: column 'heading' is missing"),
+    "missing state of the truth": (csv(None, columns("y")), EST, "truth.csv: column 'y' is missing"),
+    "missing covariance": (csv(columns("P_xh")), EST, "est.csv: column 'P_xh' is missing"),
+    "other state": (csv(), (*EST, "--state", "x,vx"), "est.csv: column 'vx' is missing"),
+    "state twice": (csv(), (*EST, "--state", "x,x"), "--state x,x: needs names of columns, each once"),
+    "no key": (csv(columns("step", "t")), EST, "est.csv: column 'step' or 't' is missing"),
+    "no common key": (csv(columns("t"), columns("step")), EST, "truth.csv: column 'step' is missing"),
+    "text": (
+        csv(lambda e: e.astype({"x": object}).assign(x="one")),
+        EST,
+        "est.csv, line 2: column 'x': not a number (one)",
+    ),
+    "fraction of a step": (
+        csv(set_cell(4, "step", 4.5)),
+        EST,
+        "est.csv, line 6: column 'step': not a whole number (4.5)",
+    ),
+    "NaN step": (csv(set_cell(4, "step", np.nan)), EST, "est.csv, line 6: column 'step': not a finite number"),
+    "NaN truth": (csv(None, set_cell(4, "y", np.nan)), EST, "truth.csv, line 6: column 'y': not a finite number"),
+    "asymmetric": (
+        csv(lambda e: e.assign(P_y_x=e["P_xy"] + 0.01)),
+        EST,
+        "est.csv, line 2: the covariance is not symmetric",
+    ),
+    "row twice": (csv(twice), EST, "est.csv, line 17: step 4 of run 0 is there twice"),
+    "runs without run": (csv(columns("run")), EST, "is there twice; several runs need a column 'run'"),
+    "time runs back": (
+        csv(lambda e: e.drop(columns=["run", "step"]), columns("step")),
+        EST,
+        "est.csv, line 7: t 0.1 is less than the one",
+    ),
+    "run without truth": (csv(None, lambda t: t[t["run"] < 2]), EST, "truth.csv: holds no run 2"),
+    "no common step": (
+        csv(None, lambda t: t.assign(step=t["step"] + 99)),
+        EST,
+        "no step of run 0 (1 to 5) is in truth.csv (100",
+    ),
+    "no common time": (csv(columns("step"), lambda t: t.assign(t=t["t"] + 99)), EST, "within 0.01 s (--max-dt)"),
+    "shifted steps": (
+        csv(None, lambda t: t.assign(t=t["t"] + 0.1)),
+        EST,
+        "est.csv, line 2: t is 0.1, but 0.2 in the same step",
+    ),
+    "covariance zero": (
+        csv(lambda e: e.assign(**dict.fromkeys(POSE_COLUMNS, 0.0))),
+        EST,
+        "the covariance is zero in every step",
+    ),
+    "covariance singular": (
+        csv(lambda e: e.assign(P_hh=0.0, P_xh=0.0, P_yh=0.0)),
+        EST,
+        "singular in every step (variance zero: heading)",
+    ),
+    "unknown convention": (
+        csv(),
+        (*EST, "--error", "se2"),
+        "--error se2: must be one of so2, left, right, vector, so3, so3-body",
+    ),
+    "spatial convention": (csv(), (*EST, "--error", "so3"), "--error so3: for x, y, heading it is one of so2"),
+    "convention of a vector": (csv(), (*EST, "--state", "x,y", "--error", "left"), "needs the states x,y,heading"),
+    "covariance of a table": (csv(), (*EST, "--covariance", "truth.csv"), "--covariance: does not go with est.csv"),
+    "max-dt without time": (csv(columns("t")), (*EST, "--max-dt", "1"), "--max-dt: needs a column t"),
+    "negative max-dt": (csv(), (*EST, "--max-dt", "-1"), "--max-dt -1: must be 0 or more"),
+    "nis without dof": (csv(lambda e: e.assign(nis=1.0)), EST, "column 'nis_dof' is missing"),
+    "negative nis": (csv(lambda e: e.assign(nis=-1.0, nis_dof=2)), EST, "est.csv, line 2: nis -1"),
+    "unknown filter": (csv(), (*EST, "--filter", "a"), "--filter a: is not in these files; there are: est"),
+    "confidence": (csv(), (*EST, "--confidence", "1.5"), "confidence must lie between 0 and 1"),
+    "cut Parquet": (
+        lambda at: (at / "est.parquet").write_bytes(b"PAR1"),
+        ("est.parquet",),
+        "est.parquet: cannot be read as Parquet",
+    ),
+    "TUM without truth": (text(), ("t.txt", "--covariance", "P.txt"), "a trajectory needs --truth"),
+    "TUM without covariance": (text(), LINE[:3], "t.txt: holds no covariance; give --covariance FILE"),
+    "TUM too few columns": (text(t=TUM + "0.3 1 2\n"), LINE, "t.txt, line 4: has 3 columns"),
+    "TUM not a number": (text(t=TUM.replace("0.1 1", "0.1 one")), LINE, "t.txt, line 2: not a number in '0.1 one"),
+    "TUM quaternion": (
+        text(t=TUM + "# c\n0.3 1 2 3 0.5 0 0 1\n"),
+        LINE,
+        "t.txt, line 5: the quaternion has length 1.118",
+    ),
+    "TUM timestamp twice": (text(t=TUM + "0.2 0 0 0 0 0 0 1\n"), LINE, "t.txt, line 4: timestamp 0.2 is there twice"),
+    "TUM back in time": (
+        text(truth=TUM + "0.1 0 0 0 0 0 0 1\n"),
+        LINE,
+        "truth.txt, line 4: timestamp 0.1 is less than",
+    ),
+    "TUM NaN timestamp": (text(t=TUM + "nan 0 0 0 0 0 0 1\n"), LINE, "t.txt, line 4: the timestamp is not finite"),
+    "TUM NaN truth": (text(truth=TUM + "0.3 nan 0 0 0 0 0 1\n"), LINE, "truth.txt, line 4: the truth is not finite"),
+    "TUM no overlap": (
+        text(truth=TUM.replace("0.", "9.")),
+        LINE,
+        "no estimate has a truth within 0.01 s (--max-dt): t is 0 to 0.2",
+    ),
+    "TUM no covariance in time": (
+        text(P=P36.replace("\n0.", "\n9.").replace("0.0 1.0", "9.0 1.0", 1)),
+        LINE,
+        "has a covariance within",
+    ),
+    "TUM empty": (text(t="# nothing\n"), LINE, "t.txt: is empty"),
+    "TUM covariance of 9": (
+        text(P="0.0 1 0 0 0 1 0 0 0 1\n"),
+        LINE,
+        "P.txt, line 1: has 10 columns; should be t and 36 numbers",
+    ),
+    "TUM asymmetric": (
+        text(P=P36.replace("0.1 1.0 0.0", "0.1 1.0 0.5")),
+        LINE,
+        "P.txt, line 2: the covariance is not symmetric",
+    ),
+    "TUM order": (
+        text(),
+        (*LINE, "--covariance-order", "xyz"),
+        "--covariance-order xyz: must be translation-rotation or",
+    ),
+    "TUM convention": (text(), (*LINE, "--error", "so2"), "--error so2: for a trajectory in space it is one of so3"),
+    "TUM state": (text(), (*LINE, "--state", "x,y"), "--state: does not go with t.txt"),
+    "empty folder": (
+        lambda at: (at / "d").mkdir(),
+        ("d", "--truth", "d"),
+        "d: holds no .txt or .tum file and no manifest.json",
+    ),
+    "folder of nothing": (lambda at: (at / "d").mkdir(), ("d",), "holds no results of"),
+    "truth of another run": (
+        lambda at: [(text()(at)), (at / "d").mkdir(), (at / "e").mkdir(), (at / "d/a.txt").write_text(TUM)],
+        ("d", "--truth", "e", "--covariance", "e"),
+        "--truth e: holds no file 'a' with .txt or .tum",
+    ),
+    "one covariance of many runs": (
+        lambda at: [(text()(at)), (at / "d").mkdir(), (at / "d/a.txt").write_text(TUM)],
+        ("d", "--truth", "truth.txt", "--covariance", "P.txt"),
+        "--covariance P.txt: must be a folder like d",
+    ),
+    "npz keys": (npz(errors=ERRORS), ("a.npz",), "a.npz: needs errors and covariances; or"),
+    "npz unknown key": (npz(errors=ERRORS, covariances=MATRICES, noise=1), ("a.npz",), "key 'noise' does not go with"),
+    "npz shape": (
+        npz(errors=ERRORS, covariances=MATRICES[:1]),
+        ("a.npz",),
+        "'covariances' has shape (1, 3, 2, 2), needs (2, 3, 2, 2)",
+    ),
+    "truth values": (
+        csv(lambda table: table.assign(P_xx=True)),
+        EST,
+        "est.csv, line 2: column 'P_xx': a truth value or a date, which is to be written as a number (True)",
+    ),
+    "truth values with gaps": (
+        csv(lambda table: table.assign(P_xx=[np.nan] * 3 + [False] * 12)),
+        EST,
+        "est.csv, line 5: column 'P_xx': a truth value or a date",
+    ),
+    "truth values of the truth": (csv(None, lambda table: table.assign(x=False)), EST, "truth.csv, line 2: column 'x'"),
+    "name of two lines": (
+        lambda at: poses()[0].assign(filter="a\n::error::b").to_parquet(at / "est.parquet"),
+        ("est.parquet", "--truth", "est.parquet"),
+        r"est.parquet: column 'filter': the name 'a\n::error::b' has a control character; rename it",
+    ),
+    "file of two lines": (
+        lambda at: write(at)[0].rename(at / "est\x1b[2J.csv"),
+        ("est\x1b[2J.csv", "--truth", "truth.csv"),
+        r"file: the name 'est\x1b[2J.csv' has a control character",
+    ),
+    "dates": (
+        lambda at: poses()[0].assign(t=pd.Timestamp("2024-01-01 00:00:07")).to_parquet(at / "est.parquet"),
+        ("est.parquet", "--truth", "est.parquet"),
+        "est.parquet, row 0: column 't': a truth value or a date, which is to be written as a number (2024-01-01",
+    ),
+    "npz symmetry": (
+        npz(errors=ERRORS, covariances=np.tile(ASYMMETRIC, (2, 3, 1, 1))),
+        ("a.npz",),
+        "a.npz, run 0, step 1: the covariance is not symmetric",
+    ),
+    "npz dof": (npz(nees=np.ones((2, 3)), dof=2.5), ("a.npz",), "key 'dof' must be one whole number"),
+    "npz dof without end": (npz(nees=np.ones((2, 3)), dof=np.inf), ("a.npz",), "key 'dof' must be one whole number"),
+    "npz negative": (npz(nees=-np.ones((2, 3)), dof=2), ("a.npz",), "key 'nees', run 0, step 1: -1 is negative"),
+    "npz convention": (
+        npz(errors=ERRORS, covariances=MATRICES),
+        ("a.npz", "--error", "left"),
+        "whose convention is settled",
+    ),
+    "npz objects": (
+        npz(errors=np.array(["a"]), covariances=MATRICES),
+        ("a.npz",),
+        "key 'errors' holds <U1, not numbers",
+    ),
+    "npz truth": (
+        npz(errors=ERRORS, covariances=MATRICES),
+        ("a.npz", "--truth", "t.csv"),
+        "--truth: does not go with a.npz, an archive; it has a key 'truth' in its place",
+    ),
+    "npz ragged": (
+        npz(errors=np.array([ERRORS[0], ERRORS[1, :2]], dtype=object), covariances=MATRICES),
+        ("a.npz",),
+        "a.npz: key 'errors' holds Python objects, as of runs of different lengths; pad them with NaN",
+    ),
+    "not an npz": (lambda at: (at / "a.npz").write_text("no"), ("a.npz",), "a.npz: is not a NumPy archive"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit 2 and one line that names what is wrong."""
+    make, arguments, expected = BAD[case]
+    make(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    code, out, err = consistency("analyse", *arguments, capsys=capsys)
+    assert (code, out) == (2, "")
+    assert expected in err
+    assert len(err.splitlines()) == 1
+    assert len(err) < 400
+
+
+def test_results_folders_take_no_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/manifest.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    code, _, err = consistency("analyse", "out", "--error", "so2", capsys=capsys)
+    assert (code, err) == (2, "consistency: --error: does not go with out, a folder of 'consistency run'\n")

@@ -1,0 +1,598 @@
+"""Relative poses over windows: groups, covariances by finite differences, windows, frames, files and refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import relative_poses as world
+from documents import blocks
+from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
+
+import consistency as cs
+from consistency.referee.cli import main as command
+from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics.independence import ENOUGH
+from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error, spatial_error
+from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
+from consistency.referee.notebook.records import Record
+from consistency.referee.sources.relative import Stretch, windows_of
+from consistency.referee.sources.windows import Relative, relative_of, windows
+from consistency.referee.system.provenance import plain
+from consistency.referee.types import Array
+from consistency.referee.verdicts.baselines import baseline_of_files
+from consistency.referee.verdicts.comparison import compare_with
+from consistency.referee.verdicts.files import analyse_recordings
+
+GROUPS = tuple(world.SIGMA)
+SURE = 1e-5  # false-alarm rate of a verdict in a test
+DATA = Path(os.environ.get("CONSISTENCY_DATA", Path(__file__).parents[4] / "shared" / "data"))
+
+
+def main(arguments: list[str]) -> int:
+    """Exit status of the command."""
+    with pytest.raises(SystemExit) as end:
+        command(arguments)
+    return int(end.value.code or 0)
+
+
+def random_poses(rng: np.random.Generator, group: str, number: int) -> Array:
+    return exp(rng.normal(size=(number, len(AXES[group]))))
+
+
+def error_of(group: str, truth: Array, estimate: Array, convention: str) -> Array:
+    of = planar_error if group == "SE(2)" else spatial_error
+    return of(vectors(truth), vectors(estimate), convention)
+
+
+# --- groups ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_matrices_inverse_log_and_adjoint(group: str, rng: np.random.Generator) -> None:
+    T, U = random_poses(rng, group, 20), random_poses(rng, group, 20)
+    np.testing.assert_allclose(matrices(vectors(T)), T, atol=1e-12)
+    np.testing.assert_allclose(inverse(T) @ T, np.broadcast_to(np.eye(T.shape[-1]), T.shape), atol=1e-12)
+    np.testing.assert_allclose(exp(log(T)), T, atol=1e-9)
+    e = 0.1 * rng.normal(size=(20, len(AXES[group])))
+    moved = np.einsum("nij,nj->ni", adjoint(T), e)
+    np.testing.assert_allclose(T @ exp(e) @ inverse(T), exp(moved), atol=1e-9)
+    np.testing.assert_allclose(adjoint(T) @ adjoint(U), adjoint(T @ U), atol=1e-9)
+    np.testing.assert_allclose(composed(np.stack([T[0], U[0], T[1]]))[2], T[0] @ U[0] @ T[1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("group", "convention"), [("SE(2)", c) for c in PLANAR if c != "vector"] + [("SE(3)", c) for c in SPATIAL]
+)
+def test_every_convention_becomes_the_left_error(group: str, convention: str, rng: np.random.Generator) -> None:
+    T = random_poses(rng, group, 10)
+    truth = T @ exp(1e-6 * rng.normal(size=(10, len(AXES[group]))))
+    left, own = (error_of(group, truth, T, c) for c in ("left", convention))
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", to_left(T, convention), own), left, atol=1e-10)
+
+
+# --- covariances, by finite differences --------------------------------------------------------------
+
+
+def numerical(of: Callable[[Array], Array], n: int, step: float = 1e-6) -> Array:
+    """Jacobian of a function of (n,) at zero, by central differences."""
+    return np.stack([(of(step * u) - of(-step * u)) / (2.0 * step) for u in np.eye(n)], axis=-1)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_motions_make_up_the_covariance_of_a_window(group: str, rng: np.random.Generator) -> None:
+    simulated, n, size = drive(rng, group, 8), len(AXES[group]), 4
+    found = windows_of(motion_stretch(simulated), Relative(size, "step", True, True))
+    assert len(found.t) == 2
+    for window in range(2):
+        D = simulated.motions[window * size : (window + 1) * size]
+
+        def end(e: Array, D: Array = D) -> Array:
+            return log(inverse(composed(D)[-1:]) @ composed(D @ exp(e.reshape(size, n)))[-1:])[0]
+
+        J = numerical(end, size * n)
+        S = np.kron(np.eye(size), simulated.covariance[0])
+        np.testing.assert_allclose(found.covariance[window], J @ S @ J.T, rtol=1e-6, atol=1e-11)
+        true = inverse(simulated.truth[window * size]) @ simulated.truth[(window + 1) * size]
+        np.testing.assert_allclose(found.error[window], log(inverse(composed(D)[-1]) @ true[None])[0], atol=1e-10)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group: str, rng: np.random.Generator) -> None:
+    stretch, n, kind = pose_stretch(rng, group, 3, 5, 1.0, 0), len(AXES[group]), DECLARED[group]
+    found = windows_of(stretch, Relative(1, "step"))
+    T = matrices(stretch.estimate)
+    for k in (1, 2):
+
+        def window(e: Array, k: int = k) -> Array:
+            both = np.stack([e[:n], e[n:]])
+            moved = T[k - 1 : k + 1] @ exp(np.einsum("nij,nj->ni", to_left(T[k - 1 : k + 1], kind), both))
+            return log(inverse(inverse(T[k - 1]) @ T[k])[None] @ (inverse(moved[0]) @ moved[1]))[0]
+
+        J = numerical(window, 2 * n)
+        assert stretch.cross is not None
+        joint = np.block(
+            [[stretch.covariance[k - 1], stretch.cross[k]], [stretch.cross[k].T, stretch.covariance[k]]]
+        )  # fmt: skip
+        np.testing.assert_allclose(found.covariance[k - 1], J @ joint @ J.T, rtol=1e-6, atol=1e-10)
+
+
+# --- frames ------------------------------------------------------------------------------------------
+
+
+def statistics(stretches: list[Stretch], size: str, motions: bool) -> dict[str, object]:
+    return dict(plain(verdict_of(stretches, size, motions).statistics))
+
+
+def verdict_of(stretches: list[Stretch], size: str, motions: bool) -> Verdict:
+    return analyse_recordings([recorded(stretches, size, motions)])["log"]
+
+
+def same(a: object, b: object) -> None:
+    assert type(a) is type(b)
+    if isinstance(a, dict):
+        assert isinstance(b, dict)
+        assert a.keys() == b.keys()
+        for key in a:
+            same(a[key], b[key])
+    elif isinstance(a, list):
+        assert isinstance(b, list)
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            same(x, y)
+    elif isinstance(a, float):
+        assert a == pytest.approx(b, rel=1e-9, abs=1e-9, nan_ok=True)
+    else:
+        assert a == b
+
+
+@pytest.mark.parametrize("size", ["5", "1s", "2m"])
+@pytest.mark.parametrize("group", GROUPS)
+def test_another_world_of_the_truth_changes_no_number_of_motions(
+    group: str, size: str, rng: np.random.Generator
+) -> None:
+    stretch = motion_stretch(drive(rng, group, 200))
+    G = exp(3.0 * rng.normal(size=(1, len(AXES[group]))))
+    turned = replace(stretch, truth=vectors(G @ matrices(stretch.truth)))
+    same(statistics([stretch], size, True), statistics([turned], size, True))
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_another_world_of_either_changes_no_number_of_poses(group: str, rng: np.random.Generator) -> None:
+    runs = [pose_stretch(rng, group, 8, 5, 1.0, run) for run in range(21)]
+    kind, n = DECLARED[group], len(AXES[group])
+    turned = []
+    for run in runs:
+        G, H = exp(2.0 * rng.normal(size=(2, n)))[:, None]
+        T = matrices(run.estimate)
+        # the covariance of the same uncertainty, about the axes of the other world
+        J = np.linalg.inv(to_left(G @ T, kind)) @ to_left(T, kind)
+        assert run.cross is not None
+        cross = run.cross.copy()
+        cross[1:] = J[:-1] @ run.cross[1:] @ np.swapaxes(J[1:], 1, 2)
+        turned.append(
+            replace(
+                run, estimate=vectors(G @ T), truth=vectors(H @ matrices(run.truth)),
+                covariance=carried(J, run.covariance), cross=cross,
+            )
+        )  # fmt: skip
+    same(statistics(runs, "1", False), statistics(turned, "1", False))
+
+
+# --- windows -------------------------------------------------------------------------------------------
+
+
+def test_windows_in_steps_seconds_and_metres() -> None:
+    t, rows = np.arange(11) * 0.5, np.arange(11)
+    place = np.column_stack([np.cumsum([0, 1, 1, 1, 3, 1, 1, 1, 1, 1, 1.0]), np.zeros(11)])
+
+    def cut(text: str) -> list[tuple[int, int]]:
+        relative = relative_of(text)
+        assert relative is not None
+        first, last, _ = windows(t, place, rows, relative, "f")
+        return list(zip(first.tolist(), last.tolist(), strict=True))
+
+    assert cut("4") == [(0, 4), (4, 8)]
+    assert cut("2s") == [(0, 4), (4, 8)]
+    assert cut("1.2s") == [(0, 3), (3, 6), (6, 9)]
+    assert cut("3m") == [(0, 3), (3, 4), (4, 7), (7, 10)]
+
+
+def test_a_window_over_missing_rows_is_left_out() -> None:
+    rows = np.array([0, 2, 4, 9, 11, 13])
+    first, last, left_out = windows(np.arange(14.0), np.zeros((6, 2)), rows, Relative(2, "s"), "f")
+    assert (first.tolist(), last.tolist(), left_out) == ([0, 2, 9, 11], [2, 4, 11, 13], 1)
+
+
+def test_rows_without_truth_change_no_other_window(rng: np.random.Generator) -> None:
+    stretch, size = motion_stretch(drive(rng, "SE(2)", 12)), Relative(2, "step", True, True)
+    there = np.delete(np.arange(13), 3)
+    whole, some = windows_of(stretch, size), windows_of(replace(stretch, rows=there, truth=stretch.truth[there]), size)
+    same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.start[:, None] == some.start))
+    assert len(here) >= 4
+    np.testing.assert_array_equal(some.error[here], whole.error[same])
+    np.testing.assert_array_equal(some.covariance[here], whole.covariance[same])
+
+
+def test_time_on_a_common_clock_of_1970_is_no_matter_of_rounding() -> None:
+    t = 1.7e9 + np.arange(101) * 0.1
+    first, last, _ = windows(t, np.zeros((101, 2)), np.arange(101), Relative(1, "s"), "f")
+    assert (last - first == 10).all()
+    assert len(first) == 10
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "1.5", "ten", "10h", "nan", "inf", "1e", "s", ""])
+def test_sizes_that_are_none(text: str) -> None:
+    with pytest.raises(cs.InputError, match="must be a whole number of steps"):
+        relative_of(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"), [("100", "100 steps"), ("1", "1 step"), ("10s", "10 s"), ("0.5 m", "0.5 m")]
+)
+def test_sizes_as_they_are_shown(text: str, shown: str) -> None:
+    relative = relative_of(text)
+    assert relative is not None
+    assert relative.text == shown
+
+
+# --- verdicts --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_right_motions_are_consistent_and_wrong_ones_are_found(group: str, rng: np.random.Generator) -> None:
+    """One of the two fails by chance in fewer than 1e-5 of all draws: 100 windows, and a ratio of 4."""
+    for ratio, status in ((1.0, "consistent"), (4.0, "overconfident"), (0.2, "conservative")):
+        record = recorded([motion_stretch(drive(rng, group, 500, ratio))], "5", True)
+        verdict = cs.judge(cs_record(record), false_alarm=SURE, detect=4.0)
+        assert verdict.status == status
+        assert (verdict.runs, verdict.steps, verdict.unit) == (100, 1, "window")
+        assert "windows" in verdict.reasons[0] or status != "consistent"
+
+
+def cs_record(record: Evidence) -> Record:
+    return Record(**{name: getattr(record, name) for name in record.__dataclass_fields__})
+
+
+def test_windows_that_may_depend_are_steps_of_their_run(rng: np.random.Generator) -> None:
+    runs = [pose_stretch(rng, "SE(2)", 11, 5, 1.0, run) for run in range(25)]
+    verdict = verdict_of(runs, "1", False)
+    assert (verdict.runs, verdict.steps, verdict.unit) == (25, 10, "run")
+
+
+def test_declared_windows_are_runs(rng: np.random.Generator) -> None:
+    runs = [pose_stretch(rng, "SE(2)", 11, 5, 1.0, run) for run in range(3)]
+    relative = replace(Relative(1, "step"), independent=True)
+    record = world.relative_recording("log", "log", runs, AXES["SE(2)"], range(3), relative)
+    verdict = analyse_recordings([record])["log"]
+    assert (verdict.runs, verdict.steps, verdict.unit) == (30, 1, "window")
+    np.testing.assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
+
+
+@pytest.mark.parametrize("row", [1, 7, 12, 29])
+def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> None:
+    stretch = motion_stretch(drive(rng, "SE(3)", 29))
+    stretch.estimate[row] = np.nan
+    record = recorded([stretch], "5", True)
+    assert [f.reason for f in record.failures] == [f"estimate is not finite (row {row})"]
+    found = windows_of(stretch, Relative(5, "step", True))
+    assert (found.start[-1], found.t[-1]) == (stretch.t[row - 1], stretch.t[row])
+    verdict = analyse_recordings([record])["log"]
+    assert verdict.runs == (row - 1) // 5 + 1
+    assert verdict.status != "consistent"
+    assert any(f"1 of {verdict.runs} windows failed, first window {verdict.runs}: " in r for r in verdict.reasons)
+
+
+def test_a_covariance_that_is_not_finite_is_named(rng: np.random.Generator) -> None:
+    stretch = motion_stretch(drive(rng, "SE(2)", 20))
+    stretch.covariance[8, 0, 0] = np.inf
+    assert recorded([stretch], "5", True).failures[0].reason == "covariance is not finite (row 8)"
+    found = windows_of(stretch, Relative(5, "step", True))
+    np.testing.assert_array_equal(found.error[-1], 0.0)
+    assert np.isnan(found.covariance[-1]).all()
+
+
+def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
+    for group in GROUPS:
+        stretch = pose_stretch(rng, group, 6, 5, 1.0, 0)
+        stretch.estimate[0] = np.nan
+        record = recorded([stretch], "1", False)
+        assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
+        assert windows_of(stretch, Relative(1, "step")).start.tolist() == [stretch.t[0]]
+        assert analyse_recordings([record])["log"].status == "failed"
+
+
+def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None:
+    """Errors of a bias of three sigma, and of a noisy truth: certain but for 1e-5."""
+    simulated = drive(rng, "SE(2)", 200)
+    biased = simulated.motions @ exp(np.array([[0.1, 0.0, 0.0]]) + 0.01 * rng.normal(size=(200, 3)))
+    truth = composed(np.concatenate([np.eye(3)[None], biased]))
+    notes = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True).notes
+    assert any("neighbouring windows go the same way" in note for note in notes)
+    jitter = simulated.truth @ exp(rng.normal(size=(201, 3)) * [0.3, 0.3, 0.0])
+    notes = recorded([motion_stretch(replace(simulated, truth=jitter))], "1", True).notes
+    assert any("neighbouring windows go opposite ways" in note for note in notes)
+
+
+def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Evidence:
+    """Independent windows of poses, by declaration only; true errors are 3 times what is stated."""
+    runs = [pose_stretch(rng, "SE(2)", steps + 1, 5, 9.0, run) for run in range(windows // steps)]
+    return world.relative_recording(
+        "log", "log", runs, AXES["SE(2)"], range(3), replace(Relative(1, "step"), independent=True)
+    )
+
+
+def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
+    """Errors x9: found by 150 windows, and neither a fault nor an all-clear is said with 140."""
+    few = analyse_recordings([declared(rng, ENOUGH - 10)])["log"]
+    assert few.status == "undecided"
+    assert few.faults == ()
+    assert few.answers == ()
+    assert few.reasons[0].startswith("undecided: 140 windows are too few windows to show independence, which takes 150")
+    assert "the covariance ratio would be" in few.reasons[0]
+    assert few.equivalence is not None
+    assert not few.equivalence.shown
+    enough = analyse_recordings([declared(rng, ENOUGH)])["log"]
+    assert enough.status == "overconfident"
+    right = replace(declared(rng, 30), unshown="")
+    assert analyse_recordings([right])["log"].runs == 30
+    base = baseline_of_files([declared(rng, 50)], "log")
+    with pytest.raises(cs.InputError, match="at least 8 runs"):
+        compare_with(base, base, [])
+
+
+def test_motions_are_judged_however_few(rng: np.random.Generator) -> None:
+    assert recorded([motion_stretch(drive(rng, "SE(2)", 20))], "1", True).unshown == ""
+
+
+def test_a_failed_window_stays_failed(rng: np.random.Generator) -> None:
+    stretch = pose_stretch(rng, "SE(2)", 30, 5, 1.0, 0)
+    stretch.estimate[20] = np.nan
+    relative = replace(Relative(1, "step"), independent=True)
+    record = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), relative)
+    assert analyse_recordings([record])["log"].status == "failed"
+
+
+def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng: np.random.Generator) -> None:
+    """True motions that err by 0.2 or 5 sigma for 50 windows at a time: certain but for 1e-5."""
+    simulated = drive(rng, "SE(2)", 400)
+    n = 3
+    root = np.linalg.cholesky(simulated.covariance[0])
+    size = np.where(np.arange(400) // 50 % 2, 5.0, 0.2)[:, None]
+    moved = simulated.motions @ exp(size * rng.normal(size=(400, n)) @ root.T)
+    truth = composed(np.concatenate([np.eye(3)[None], moved]))
+    record = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True)
+    assert any("errors of neighbouring windows are of like size" in note for note in record.notes)
+    verdict = analyse_recordings([record])["log"]
+    assert verdict.reasons[0].endswith("the motions do not seem to be independent, on which this rests")
+    plain_one = recorded([motion_stretch(drive(rng, "SE(2)", 19))], "1", True)
+    assert (plain_one.caption, plain_one.unshown) == ("", "")
+
+
+def test_windows_too_wide_for_first_order_are_named(rng: np.random.Generator) -> None:
+    simulated = drive(rng, "SE(2)", 200, sigma=np.array([0.01, 0.01, 0.05]))
+    assert any("to first order is doubtful" in note for note in recorded([motion_stretch(simulated)], "50", True).notes)
+    assert not any("first order" in note for note in recorded([motion_stretch(simulated)], "1", True).notes)
+
+
+# --- files -----------------------------------------------------------------------------------------------
+
+
+def lines(path: Path, *columns: Array) -> Path:
+    np.savetxt(path, np.column_stack(columns), fmt="%.17g")
+    return path
+
+
+@pytest.fixture
+def motion_file(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """motions.tum with truth.tum beside it, 120 motions."""
+    s = motion_stretch(drive(rng, "SE(3)", 120))
+    lines(tmp_path / "truth.tum", s.t, s.truth)
+    return lines(tmp_path / "motions.tum", s.t, s.estimate, s.covariance.reshape(-1, 36))
+
+
+def test_motions_as_tum(motion_file: Path) -> None:
+    record = cs.read(motion_file, motion_file.parent / "truth.tum", relative="1s", motions=True)
+    assert record.window == "1 s"
+    assert record.error is not None
+    assert record.error.shape == (1, 12, 6)
+    np.testing.assert_allclose(record.t, np.arange(1, 13), atol=1e-9)
+    planar = cs.read(
+        motion_file, motion_file.parent / "truth.tum", relative=10, motions=True, axes=["x", "y", "yaw"]
+    )  # fmt: skip
+    assert planar.axes == ("x", "y", "yaw")
+    np.testing.assert_allclose(planar.error, record.error[:, :, [0, 1, 5]], atol=1e-12)
+
+
+def test_poses_with_cross_covariances_as_tum(tmp_path: Path, rng: np.random.Generator) -> None:
+    s = pose_stretch(rng, "SE(3)", 9, 5, 1.0, 0)
+    assert s.cross is not None
+    lines(tmp_path / "est.tum", s.t, s.estimate)
+    lines(tmp_path / "truth.tum", s.t, s.truth)
+    cross = np.nan_to_num(s.cross).reshape(-1, 36)
+    P = lines(tmp_path / "P.txt", s.t, s.covariance.reshape(-1, 36), cross)
+    record = cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=1)
+    found = windows_of(s, Relative(1, "step"))
+    np.testing.assert_allclose(record.covariance[0], found.covariance, rtol=1e-9)
+    np.testing.assert_allclose(record.error[0], found.error, atol=1e-12)
+    with pytest.raises(cs.InputError, match="line 3: --relative 2: the window spans 2 rows"):
+        cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=2)
+    keep = np.arange(9) != 4
+    lines(tmp_path / "some.tum", s.t[keep], s.estimate[keep])
+    with pytest.raises(cs.InputError, match=r"line 5: no pose of .* has this time"):
+        cs.read(tmp_path / "some.tum", tmp_path / "truth.tum", P, relative=1)
+
+
+def table(path: Path, s: Stretch, cross: bool) -> Path:
+    columns = {"step": np.arange(len(s.t)), "t": s.t} | dict(zip(("x", "y", "heading"), s.estimate.T, strict=True))
+    for i, a in enumerate("xyh"):
+        for j, b in enumerate("xyh"):
+            columns |= {f"P_{a}{b}": s.covariance[:, i, j]} if i <= j else {}
+            columns |= {f"C_{a}{b}": s.cross[:, i, j]} if cross and s.cross is not None else {}
+    pd.DataFrame(columns).to_csv(path, index=False)
+    truth = {"step": np.arange(len(s.t)), "t": s.t} | dict(zip(("x", "y", "heading"), s.truth.T, strict=True))
+    pd.DataFrame(truth).to_csv(path.with_name("truth.csv"), index=False)
+    return path
+
+
+def test_tables_and_archives_of_motions(tmp_path: Path, rng: np.random.Generator) -> None:
+    s = motion_stretch(drive(rng, "SE(2)", 40))
+    expected = recorded([s], "5", True)
+    record = cs.read(table(tmp_path / "m.csv", s, False), tmp_path / "truth.csv", relative="0.5s", motions=True)
+    np.testing.assert_allclose(record.nees, expected.nees, rtol=1e-9)
+    np.savez(tmp_path / "m.npz", estimates=s.estimate, truth=s.truth, covariances=s.covariance)
+    np.testing.assert_allclose(cs.read(tmp_path / "m.npz", relative=5, motions=True).nees, expected.nees, rtol=1e-9)
+    with pytest.raises(cs.InputError, match="--relative 1s needs a column t"):
+        cs.read(tmp_path / "m.npz", relative="1s", motions=True)
+
+
+def test_tables_and_archives_of_poses_with_cross_covariances(tmp_path: Path, rng: np.random.Generator) -> None:
+    s = pose_stretch(rng, "SE(2)", 9, 5, 1.0, 0)
+    assert s.cross is not None
+    expected = recorded([s], "1", False)
+    record = cs.read(table(tmp_path / "p.csv", s, True), tmp_path / "truth.csv", relative=1)
+    np.testing.assert_allclose(record.nees, expected.nees, rtol=1e-9)
+    arrays = {"estimates": s.estimate, "truth": s.truth, "covariances": s.covariance, "cross_covariances": s.cross}
+    np.savez(tmp_path / "p.npz", **arrays)
+    np.testing.assert_allclose(cs.read(tmp_path / "p.npz", relative=1).nees, expected.nees, rtol=1e-9)
+    declared = cs.read(tmp_path / "p.npz", relative=1, windows="independent")
+    assert cs.judge(declared).runs == 8
+    np.savez(tmp_path / "q.npz", **arrays | {"cross_covariances": s.cross[:4]})
+    with pytest.raises(cs.InputError, match="key 'cross_covariances' has shape"):
+        cs.read(tmp_path / "q.npz", relative=1)
+    data = pd.read_csv(tmp_path / "p.csv").drop(columns="C_yx")
+    data.to_csv(tmp_path / "p.csv", index=False)
+    with pytest.raises(cs.InputError, match="column 'C_yx' is missing"):
+        cs.read(tmp_path / "p.csv", tmp_path / "truth.csv", relative=1)
+
+
+# --- refusals and commands -------------------------------------------------------------------------------
+
+
+def test_marginal_covariances_are_refused_with_the_remedy(
+    motion_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [str(motion_file), "--truth", str(motion_file.parent / "truth.tum")]
+    cases = {
+        ("--relative", "10"): "covariances of two poses do not tell that of the motion between them; give their cross",
+        ("--motions",): "--motions: motions share no world with the truth; judge them with --relative",
+        ("--windows", "independent"): "--windows goes with --relative",
+        ("--relative", "10", "--windows", "all"): "--windows must be 'independent', got 'all'",
+        ("--relative", "10", "--motions", "--time-offset", "estimate"): "needs poses in one world",
+        ("--relative", "1000s", "--motions"): "only 12 s have truth; ask for shorter windows",
+        ("--relative", "0.01s", "--motions"): "rows with truth are 0.1 s apart in the median; ask for longer windows",
+        ("--relative", "2x", "--motions"): "--relative 2x: must be a whole number of steps",
+    }
+    for options, text in cases.items():
+        assert main(["analyse", *files, *options]) == 2
+        said = capsys.readouterr()
+        assert text in said.err
+        assert len(said.err.strip().splitlines()) == 1
+        assert not said.out
+
+
+def test_what_has_no_poses_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    s = motion_stretch(drive(rng, "SE(2)", 10))
+    path = table(tmp_path / "m.csv", s, False)
+    with pytest.raises(cs.InputError, match="--relative needs poses x, y, heading"):
+        cs.read(path, tmp_path / "truth.csv", error="vector", relative=1, motions=True)
+    with pytest.raises(cs.InputError, match="--relative needs --truth FILE"):
+        cs.read(path, relative=1, motions=True)
+    np.savez(tmp_path / "e.npz", errors=np.ones((30, 4, 2)), covariances=np.broadcast_to(np.eye(2), (30, 4, 2, 2)))
+    with pytest.raises(cs.InputError, match="--relative needs the keys estimates, truth, covariances"):
+        cs.read(tmp_path / "e.npz", relative=1)
+
+
+def test_the_command_and_its_report(motion_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = motion_file.parent / "look"
+    files = [str(motion_file), "--truth", str(motion_file.parent / "truth.tum"), "--motions", "--relative", "0.5s"]
+    assert main(["analyse", *files, "--report", str(out)]) == 0
+    said = capsys.readouterr()
+    assert "24 windows of 0.5 s" in said.err
+    assert "what is constant over a window" in said.err
+    assert "of 24" in said.out
+    page = (out / "report.html").read_text()
+    assert "24 windows of 0.5 s" in page
+    assert "NEES of the motion over each window of 0.5 s" in page
+    assert "24 windows, each of which counts as a run" in page
+    assert "Windows of a log count as runs of one step here" in page
+    told = json.loads((out / "verdict.json").read_text())["motions"]["statistics"]
+    assert (told["runs"], told["unit"], told["convention"]) == (24, "window", "left")
+
+
+# --- the front-end -----------------------------------------------------------------------------------------
+
+
+def simulated_motions(rng: np.random.Generator, number: int) -> tuple[list[object], Array]:
+    """Motions of a front-end, and true poses (number + 1, 4, 4); errors are of roll, pitch, yaw."""
+    from consistency.referee.geometry import rotation
+    from consistency.stereo.vision.motion import RelativeMotion
+    from consistency.stereo.vision.pose import RelativePose
+
+    root = np.diag([0.02, 0.01, 0.03, 0.002, 0.004, 0.003]) @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6)))
+    found, steps = list[object](), [np.eye(4)]
+    none, of = np.empty((0, 4)), np.zeros(0, bool)
+    for _ in range(number):
+        vector = np.concatenate([[0.1, 0.0, 1.0], 0.4 * rng.normal(size=3)])
+        true = vector + root @ rng.normal(size=6)
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = rotation(*true[3:]), true[:3]
+        steps.append(step)
+        fields = dict.fromkeys(RelativeMotion.__dataclass_fields__)
+        values = {"pose": RelativePose.from_vector(vector), "covariance": root @ root.T, "inliers": of, "uv0": none}
+        motion = object.__new__(RelativeMotion)
+        for name in fields:
+            object.__setattr__(motion, name, values.get(name))
+        found.append(motion)
+    return found, composed(np.array(steps))
+
+
+def test_motions_of_the_front_end_are_read_and_right(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Without images: 400 motions with large turns; x1.5 is found in all but 1e-5 of all draws."""
+    from consistency.stereo.frontend.tum import motions_text
+    from consistency.stereo.vision.odometry import motion_covariances
+
+    motions, truth = simulated_motions(rng, 400)
+    R, t = np.array([m.pose.R for m in motions]), np.array([m.pose.t for m in motions])  # type: ignore[attr-defined]
+    stamps = 0.1 * np.arange(401)
+    (tmp_path / "motions.tum").write_text(motions_text(stamps, R, t, motion_covariances(motions)))  # type: ignore[arg-type]
+    lines(tmp_path / "truth.tum", stamps, vectors(truth))
+    for size, count in (("1", 400), ("0.4s", 100)):
+        record = cs.read(tmp_path / "motions.tum", tmp_path / "truth.tum", relative=size, motions=True)
+        verdict = cs.judge(record, false_alarm=SURE)
+        assert verdict.runs == count
+        assert verdict.faults == ()
+    assert verdict.scale is not None
+    assert cs.judge(record, false_alarm=SURE, detect=1.5).status == "consistent"
+
+
+@pytest.mark.parametrize(
+    ("name", "truth", "size", "count"),
+    [("kitti06_f0-50", "poses.txt", "0.5s", 10), ("euroc_static", "groundtruth_first97.csv", "1", 5)],
+)
+@pytest.mark.slow
+def test_a_real_sequence_from_images_to_windows(tmp_path: Path, name: str, truth: str, size: str, count: int) -> None:
+    """Images, motions, windows: the verdict of docs/front-end.md, where the covariance is of pixel noise alone."""
+    pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
+    if not (DATA / name).is_dir():
+        pytest.skip(f"no {DATA / name}; set CONSISTENCY_DATA to the folder that holds {name}")
+    log_folder = tmp_path / "log"
+    assert main(["frontend", str(DATA / name), "--truth", str(DATA / name / truth), "--out", str(log_folder)]) == 0
+    record = cs.read(log_folder / "motions.tum", log_folder / "truth.tum", relative=size, motions=True)
+    verdict = cs.judge(record)
+    assert (verdict.runs, verdict.status) == (count, "overconfident")
+
+
+def test_the_example_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (example,) = (block.text for block in blocks("docs/files.md", "python") if "wheels" in block.text)
+    names: dict[str, Record] = {}
+    exec(example, names)
+    verdict = cs.judge(names["record"])
+    assert (verdict.runs, verdict.unit, verdict.status) == (60, "window", "consistent")

@@ -1,0 +1,103 @@
+"""Sections of a report on filters with an error of their own, and on maps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from invariant import Invariant
+
+import consistency as cs
+from consistency.bench.pages import write_reports
+from consistency.bench.pages.blocks import Name, Status, Table
+from consistency.bench.pages.build import build_report
+from consistency.bench.pages.model import Study
+from consistency.bench.pages.sections import anees, maps, own_errors, verdicts
+from consistency.bench.pages.wording import brief
+from consistency.referee.diagnostics import Interval, MapScore
+
+
+@pytest.fixture(scope="module")
+def results(uvd: cs.Scenario) -> cs.Results:
+    return cs.run_trials(uvd, ["ekf-uvd", Invariant()], runs=6, seed=5, jobs=1)
+
+
+@pytest.fixture(scope="module")
+def folder(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("report") / "run"
+    results.write(out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def study(folder: Path) -> Study:
+    return build_report(folder).studies[0]
+
+
+def rows_of(blocks: tuple[object, ...]) -> tuple[tuple[object, ...], ...]:
+    [found] = [block for block in blocks if isinstance(block, Table)]
+    [(_, rows)] = found.groups
+    return rows
+
+
+def test_both_errors_stand_below_each_other(study: Study) -> None:
+    track = study.tracks[1]
+    v = track.verdict
+    own, world = rows_of(own_errors.SECTION.blocks(study))
+    name = Name("right", track.look)
+    assert own[:4] == (name, "right, its own", Status(v.status), brief(v.scale.mean_anees))
+    assert world[:4] == ("", "so2, additive", Status(v.world.status), brief(v.world.scale.mean_anees))
+    assert brief(v.scale.inflation.low) in own[4]
+    caption = own_errors.caption(study)
+    assert caption.startswith("right: Log(truth estimate^-1) of SE(2), in the world frame; so2: position difference")
+
+
+def test_captions_name_the_filters_with_an_error_of_their_own(study: Study) -> None:
+    assert "Judged in an error of their own, but for the RMSE: right (right)" in verdicts.caption(study)
+    assert anees.caption(anees.read(study)).endswith("In the filter's own error: right (right).")
+    alone = replace(study, tracks=study.tracks[:1])
+    assert "own" not in anees.caption(anees.read(alone)).replace("shown", "")
+    assert "error of their own" not in verdicts.caption(alone)
+    assert own_errors.SECTION.blocks(alone) == ()
+
+
+def test_the_rmse_is_that_of_the_pose_in_the_world(study: Study) -> None:
+    track = study.tracks[1]
+    heads = [column.head for column in verdicts.columns(study)]
+    cell = verdicts.row(track)[heads.index("RMSE position (m)")]
+    assert cell == f"{track.verdict.world.accuracy.rmse_position:.3f}"
+    assert cell != f"{track.verdict.accuracy.rmse_position:.3f}", "negative control"
+
+
+def _of_map(score: MapScore) -> tuple[Interval, ...]:
+    return score.ratio, score.verdict.joint.both, score.verdict.joint.map
+
+
+def test_maps_of_all_filters(study: Study) -> None:
+    rows = rows_of(maps.SECTION.blocks(study))
+    score = study.tracks[0].verdict.map
+    ends = [f"{brief(i.value)} [{brief(i.low)}, {brief(i.high)}]" for i in _of_map(score)]
+    count = len(study.results.map) // 2
+    assert rows[0][0] == Name("ekf-uvd", study.tracks[0].look)
+    assert rows[0][1:] == (score.verdict.status, *ends, "6", str(count), "0")
+    assert len(rows) == 2
+    sentences = [getattr(block, "text", "") for block in maps.SECTION.blocks(study)]
+    assert f"Map of ekf-uvd: {score.verdict.reasons[0]}." in sentences
+    without = tuple(replace(track, verdict=replace(track.verdict, map=None)) for track in study.tracks)
+    assert len(rows_of(maps.SECTION.blocks(replace(study, tracks=(study.tracks[0], without[1]))))) == 1
+    assert maps.SECTION.blocks(replace(study, tracks=without)) == ()
+
+
+def test_both_formats_hold_both_sections(folder: Path, tmp_path: Path) -> None:
+    write_reports(folder, tmp_path / "r.html", tmp_path / "r.pdf", False)
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    for text in (
+        "Errors of their own",
+        "right, its own",
+        "so2, additive",
+        "Mean NEES / 3 of landmarks",
+        "no verdict on a pose depends on it",
+    ):
+        assert text in page
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")

@@ -1,0 +1,282 @@
+"""The report of another estimator's files, and the same from Python."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure as Drawn
+from recorded import read_recordings
+from scipy import stats
+
+import consistency as cs
+from consistency.bench.pages.blocks import Table, Text
+from consistency.bench.pages.drawing import Band, Figure, Line, Points
+from consistency.referee import cli
+from consistency.referee.pages.files import (
+    clock_of,
+    compose_files,
+    observed_coverage,
+    record_figures,
+    shown_run,
+    unit_of,
+)
+from consistency.referee.verdicts.files import analyse_recordings
+
+RUNS, STEPS = 30, 25
+
+
+def errors_of(rng: np.random.Generator, n: int = 2, ratio: float = 1.0) -> dict[str, Any]:
+    P = np.diag(0.1 * np.arange(1, n + 1))
+    errors = np.sqrt(ratio) * rng.multivariate_normal(np.zeros(n), P, size=(RUNS, STEPS))
+    return {"errors": errors, "covariances": np.broadcast_to(P, (RUNS, STEPS, n, n)).copy()}
+
+
+@pytest.fixture
+def archive(tmp_path: Path, rng: np.random.Generator) -> Path:
+    np.savez(tmp_path / "mine.npz", **errors_of(rng), axes=["x", "yaw"], t=1.7e9 + 0.1 * np.arange(STEPS))
+    return tmp_path / "mine.npz"
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng()
+
+
+def main(arguments: list[str]) -> int:
+    """Exit status of a command."""
+    try:
+        cli.main(arguments)
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def document(path: Path) -> Any:
+    records = read_recordings(path)
+    return compose_files(records, analyse_recordings(records), path.name, {"command": "consistency analyse"})
+
+
+def figures(of: Any) -> dict[str, Figure]:
+    return {figure.title: figure for figure in of.figures}
+
+
+def test_the_verdict_stands_on_top_and_the_pictures_first(archive: Path) -> None:
+    made = document(archive)
+    sentence = cs.judge(cs.read(archive)).reasons[0]
+    assert made.answer == f"mine is {sentence}."
+    assert [block.title for block in made.chapters[0].blocks] == ["Errors and stated bounds", "NEES", "Coverage"]
+    assert [chapter.anchor for chapter in made.chapters] == ["estimator-0", "verdicts", "provenance"]
+
+
+def test_what_the_files_do_not_tell_has_no_column(archive: Path) -> None:
+    (shown,) = [block for block in document(archive).chapters[1].blocks if isinstance(block, Table)][:1]
+    heads = [column.head for column in shown.columns]
+    assert {"Filter", "Verdict", "Mean ANEES", "RMSE position (m)", "Failed runs"} <= set(heads)
+    assert "NIS / dof" not in heads
+    assert [len(row) for _, rows in shown.groups for row in rows] == [len(heads)]
+
+
+def test_the_cells_of_a_wide_table_name_their_heads(archive: Path, tmp_path: Path) -> None:
+    """A narrow screen shows each row by itself; a narrow table needs none."""
+    assert main(["analyse", str(archive), "--report", str(tmp_path / "r")]) == 0
+    source = (tmp_path / "r/report.html").read_text("utf-8")
+    (wide,) = re.findall(r'<table class="[^"]*\bwide">.*?</table>', source, re.S)
+    heads = [re.sub(r"<.*?>", "", head) for head in re.findall(r"<th scope=\"col\".*?>(.*?)</th>", wide)]
+    assert re.findall(r'data-head="(.*?)"', wide) == heads[1:]
+    assert source.count("data-head=") == len(heads) - 1
+
+
+def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive: Path) -> None:
+    record = read_recordings(archive)[0]
+    panels = figures(document(archive))["Errors and stated bounds"].panels
+    assert [panel.y.label for panel in panels] == ["x (m)", "yaw (deg)"]
+    assert record.error is not None
+    for panel, factor, variance, error in zip(panels, (1.0, 180 / np.pi), (0.1, 0.2), record.error[0].T, strict=True):
+        line = panel.marks[-1]
+        assert isinstance(line, Line)
+        np.testing.assert_allclose(line.x, 0.1 * np.arange(STEPS), atol=1e-6)
+        np.testing.assert_allclose(line.y, factor * error)
+        np.testing.assert_allclose(line.bound, 2.0 * factor * np.sqrt(variance))
+    assert "Time 0 is 1700000000.00 s." in figures(document(archive))["NEES"].caption
+
+
+def test_without_times_steps_are_on_the_axis(tmp_path: Path, rng: np.random.Generator) -> None:
+    np.savez(tmp_path / "e.npz", **errors_of(rng))
+    clock = clock_of(read_recordings(tmp_path / "e.npz")[0].t)
+    assert (clock.word, clock.values[0], clock.values[-1]) == ("step", 1, STEPS)
+    assert unit_of("e1") == ("", 1.0)
+
+
+def test_coverage_is_that_of_the_errors(tmp_path: Path) -> None:
+    """Errors at the quantiles of a Gaussian with 4 times the stated variance: known shares, without chance."""
+    n = 4000
+    z = 2.0 * stats.norm.ppf((np.arange(n) + 0.5) / n)
+    np.savez(tmp_path / "e.npz", errors=z.reshape(40, 100, 1), covariances=np.ones((40, 100, 1, 1)))
+    p = np.array([0.1, 0.5, 0.9])
+    found = observed_coverage(read_recordings(tmp_path / "e.npz")[0], p)
+    expected = 2.0 * stats.norm.cdf(stats.norm.ppf(0.5 + 0.5 * p) / 2.0) - 1.0
+    assert set(found) == {"e1", "all together"}
+    for shares in found.values():
+        np.testing.assert_allclose(shares, expected, atol=2e-3)
+
+
+def test_the_longest_run_is_shown(tmp_path: Path, rng: np.random.Generator) -> None:
+    np.savez(tmp_path / "e.npz", **errors_of(rng), lengths=np.array([STEPS - 3] * 4 + [STEPS] * (RUNS - 4)))
+    assert shown_run(read_recordings(tmp_path / "e.npz")[0]) == 4
+
+
+def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path: Path, rng: np.random.Generator) -> None:
+    np.savez(tmp_path / "e.npz", **{key: value[0] for key, value in errors_of(rng).items()})
+    record = read_recordings(tmp_path / "e.npz")[0]
+    found = record_figures(record, cs.judge(cs.read(tmp_path / "e.npz")))
+    assert [key.text for key in found[0].keys] == ["run 0", "2-sigma bounds"]
+    assert found[1].caption.startswith("NEES; 2 is expected")
+
+
+def test_runs_of_one_step_stand_side_by_side(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A factor or a calibration: no curve along the steps, which would be a point."""
+    errors = rng.normal(size=(RUNS, 1, 2))
+    covariances = np.broadcast_to(np.diag([0.25, 4.0]), (RUNS, 1, 2, 2))
+    np.savez(tmp_path / "e.npz", errors=errors, covariances=covariances, axes=["x", "yaw"])
+    record = cs.read(tmp_path / "e.npz")
+    of_errors, of_nees, _ = record_figures(record, cs.judge(record))
+    for panel, factor, sigma, error in zip(
+        of_errors.panels, (1.0, 180 / np.pi), (0.5, 2.0), errors[:, 0].T, strict=True
+    ):
+        band, _, points = panel.marks
+        assert isinstance(band, Band)
+        assert isinstance(points, Points)
+        np.testing.assert_array_equal(points.x, np.arange(RUNS))
+        np.testing.assert_allclose(points.y, factor * error)
+        np.testing.assert_allclose((band.low, band.high), factor * np.full((2, RUNS), [[-2 * sigma], [2 * sigma]]))
+    band, _, points = of_nees.panels[0].marks
+    np.testing.assert_allclose(points.y, errors[:, 0] ** 2 @ [4.0, 0.25])
+    np.testing.assert_allclose(stats.chi2.cdf((band.low[0], band.high[0]), 2), (0.025, 0.975))
+
+
+@pytest.mark.parametrize("steps", [1, STEPS])
+def test_every_panel_of_a_plot_has_a_legend(steps: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    """One for all errors, and one each above NEES and coverage."""
+    np.savez(tmp_path / "e.npz", **{key: value[:, :steps] for key, value in errors_of(rng).items()})
+    record = cs.read(tmp_path / "e.npz")
+    for figure, others in ((record.plot(), 1), (cs.judge(record).plot(), 2)):
+        assert figure.legends
+        of_panels = [axes.get_legend() for axes in figure.axes if axes.axison]
+        assert [legend is not None for legend in of_panels] == [False, False, *(others * [True])]
+        assert [text.get_text() for text in of_panels[-1].get_texts()] == ["expected", "e1", "e2", "all together"]
+
+
+def test_what_is_not_there_is_not_drawn(tmp_path: Path, rng: np.random.Generator) -> None:
+    np.savez(tmp_path / "n.npz", nees=rng.chisquare(3, (RUNS, STEPS)), dof=3)
+    assert set(figures(document(tmp_path / "n.npz"))) >= {"NEES", "Coverage"}
+    assert "Errors and stated bounds" not in figures(document(tmp_path / "n.npz"))
+    rows = "".join(f"{r},{k},{rng.chisquare(2)},2\n" for r in range(RUNS) for k in range(1, STEPS + 1))
+    (tmp_path / "i.csv").write_text("run,step,nis,nis_dof\n" + rows)
+    made = document(tmp_path / "i.csv")
+    assert [f.title for f in made.chapters[0].blocks if isinstance(f, Figure)] == ["Innovations"]
+    with pytest.raises(cs.InputError, match="neither errors nor NEES to draw"):
+        cs.read(tmp_path / "i.csv").plot()
+
+
+def test_each_of_several_estimators_has_its_sentence(tmp_path: Path, rng: np.random.Generator) -> None:
+    lines = ["filter,run,step,a,P_a_a"]
+    for name, scale in (("good", 1.0), ("bad", 3.0)):
+        lines += [
+            f"{name},{r},{k},{scale * rng.normal()},1" for r in range(RUNS) for k in range(1, STEPS + 1)
+        ]  # fmt: skip
+    (tmp_path / "e.csv").write_text("\n".join(lines))
+    (tmp_path / "t.csv").write_text("step,a\n" + "".join(f"{k},0\n" for k in range(1, STEPS + 1)))
+    records = read_recordings(tmp_path / "e.csv", tmp_path / "t.csv", state=["a"])
+    made = compose_files(records, analyse_recordings(records), "e.csv", {})
+    assert [chapter.title for chapter in made.chapters[:2]] == ["good", "bad"]
+    assert isinstance(made.chapters[1].blocks[0], Text)
+    assert made.chapters[1].blocks[0].text.startswith("bad is overconfident")
+    with pytest.raises(cs.InputError, match=r"holds several estimators \(good, bad\); choose one with filter="):
+        cs.read(tmp_path / "e.csv", tmp_path / "t.csv", state=["a"])
+    with pytest.raises(cs.InputError, match="filter 'ugly' is not in"):
+        cs.read(tmp_path / "e.csv", tmp_path / "t.csv", state=["a"], filter="ugly")
+    assert (
+        cs.judge(cs.read(tmp_path / "e.csv", tmp_path / "t.csv", state=["a"], filter="bad")).status == "overconfident"
+    )
+
+
+# --- the command ------------------------------------------------------------------------------------
+
+
+def test_one_command_writes_page_paper_and_numbers(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = archive.parent / "deep" / "out"
+    assert main(["analyse", str(archive), "--report", str(out)]) == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        "manifest.json", "report.html", "report.pdf", "verdict.json",
+    ]  # fmt: skip
+    printed = capsys.readouterr().out
+    assert str(out / "report.html") in printed
+    verdict = cs.judge(cs.read(archive))
+    assert json.loads((out / "verdict.json").read_text())["mine"]["reasons"] == list(verdict.reasons)
+    assert verdict.reasons[0].split(",")[0] in (out / "report.html").read_text()
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert main(["analyse", str(archive), "--report", str(out)]) == 2
+    refused = capsys.readouterr()  # below the verdict
+    assert refused.out == printed.split(str(out))[0]
+    assert refused.err.endswith("exists already; choose another folder or add --overwrite\n")
+    assert main(["analyse", str(archive), "--report", str(out), "--json"]) == 2
+    assert set(json.loads(capsys.readouterr().out)) == {"mine"}
+    assert main(["analyse", str(archive), "--report", str(out), "--overwrite"]) == 0
+
+
+def test_a_verdict_that_fails_counts_before_a_report_that_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    errors = np.random.default_rng(5).normal(0.0, 3.0, (60, 1, 2))
+    np.savez(tmp_path / "bad.npz", errors=errors, covariances=np.broadcast_to(np.eye(2), (60, 1, 2, 2)))
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    command = ["analyse", str(tmp_path / "bad.npz"), "--report", str(taken)]
+    for more, status in (([], 2), (["--fail-on", "inconsistent"], 1), (["--fail-on", "inconsistent", "--json"], 1)):
+        assert main([*command, *more]) == status
+        out, err = capsys.readouterr()
+        assert "overconfident" in out
+        assert f"consistency: --report {taken}: exists already" in err
+        assert "--json" not in more or json.loads(out)["bad"]["status"] == "overconfident"
+    assert not list(taken.iterdir())
+
+
+def test_what_a_report_is_not_for(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["analyse", str(archive), "--overwrite"]) == 2
+    assert "--overwrite goes with --report" in capsys.readouterr().err
+    scenario = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
+    cs.run_trials(scenario, ["kf"], runs=2, jobs=1).write(tmp_path / "results")
+    assert main(["analyse", str(tmp_path / "results"), "--report", str(tmp_path / "r")]) == 2
+    assert f"use 'consistency report {tmp_path / 'results'}'" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
+
+
+# --- Python -----------------------------------------------------------------------------------------
+
+
+def test_a_record_and_its_verdict_draw_themselves(archive: Path, tmp_path: Path) -> None:
+    record = cs.read(archive)
+    assert repr(record) == f"<Record mine: {RUNS} runs x {STEPS} steps, error - of x, yaw>"
+    verdict = cs.judge(record, false_alarm=0.01, detect=2.0)
+    assert (verdict.settings.false_alarm, verdict.settings.detect) == (0.01, 2.0)
+    assert isinstance(record.plot(), Drawn)
+    assert len(verdict.plot(tmp_path / "v.png").axes) == 4  # x, yaw, NEES, coverage
+    assert (tmp_path / "v.png").read_bytes().startswith(b"\x89PNG")
+    assert "data:image/png;base64," in verdict._repr_html_()
+    assert "<th" in record._repr_html_()
+    with pytest.raises(cs.InputError, match=r"must end in \.png, \.pdf, \.svg"):
+        record.plot(tmp_path / "v.jpg")
+    with pytest.raises(cs.InputError, match="--false-alarm must lie between 0 and 1"):
+        cs.judge(record, false_alarm=2.0)
+
+
+def test_names_of_files_are_shown_as_they_are(tmp_path: Path, rng: np.random.Generator) -> None:
+    np.savez(tmp_path / "<b>a&b.npz", **errors_of(rng))
+    record = cs.read(tmp_path / "<b>a&b.npz")
+    assert "<b>" not in record._repr_html_()
+    assert "<b>" not in cs.judge(record)._repr_html_()

@@ -1,0 +1,349 @@
+"""The test of run means against computations of its own: a likelihood maximised, runs left out one by one.
+
+Everything random has a fixed seed that was not chosen, and no assertion here depends on luck but the counts, which have
+limits at 1e-5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from draws import autoregression, fully_dependent
+from scipy import optimize, special, stats
+
+from consistency.referee.diagnostics import mean_test, ratio_interval
+from consistency.referee.diagnostics.scale import acceptance, run_means, scale_test
+from consistency.referee.types import Array
+
+SURE = 1e-5
+
+
+# --- an oracle ---------------------------------------------------------------------------------------
+
+
+def log_nu_of_spread(means: Array) -> float:
+    """log(2 / CV^2), nothing corrected."""
+    return float(np.log(2.0 * means.mean() ** 2 / means.var(ddof=1)))
+
+
+def covariance_of_left_out(a: list[float], b: list[float]) -> float:
+    """(N - 1) / N times the sum of products of differences from the mean, Efron & Stein (1981)."""
+    N = len(a)
+    return (N - 1) ** 2 / N * float(np.cov(a, b, ddof=1)[0, 1])
+
+
+def gamma_shape(means: Array) -> tuple[float, float]:
+    """log of the most likely shape and its standard error, from the curvature of the likelihood by differences."""
+
+    def minus_log_likelihood(log_a: float) -> float:
+        a = float(np.exp(log_a))
+        return -float(stats.gamma.logpdf(means, a, scale=means.mean() / a).sum())
+
+    best = optimize.minimize_scalar(
+        minus_log_likelihood, bounds=(-8.0, 14.0), method="bounded", options={"xatol": 1e-10}
+    )
+    h = 1e-3
+    curve = [minus_log_likelihood(best.x + d) for d in (-h, 0.0, h)]
+    return float(best.x), float(1.0 / np.sqrt((curve[0] - 2.0 * curve[1] + curve[2]) / h**2))
+
+
+@dataclass(frozen=True)
+class Oracle:
+    nu: float
+    spread: float
+    by_spread: float  # log nu, one standard error to the safe side, at a mean of 1
+    by_likelihood: float
+    shift: float  # to the mean of 1, before the limit at 0
+    clipped: bool  # the mean is farther from 1 than chance carries it
+    floored: bool  # the variance is below 2 / N
+
+
+def oracle(means: Array, dof: int, steps: int, gaussian: bool = True) -> Oracle:
+    N = len(means)
+    without = [np.delete(means, i) for i in range(N)]
+    left_out, log_mean = [log_nu_of_spread(m) for m in without], [float(np.log(m.mean())) for m in without]
+    of_mean, both = covariance_of_left_out(log_mean, log_mean), covariance_of_left_out(left_out, log_mean)
+    slope, reach = both / of_mean, 4.0 * np.sqrt(of_mean)
+    distance = float(np.log(means.mean()))
+    shift = -slope * min(max(distance, -reach), reach)
+    unfloored = covariance_of_left_out(left_out, left_out) - slope * both
+    variance = max(unfloored, 2.0 / N)
+    cv2 = means.var(ddof=1) / means.mean() ** 2
+    by_spread = log_nu_of_spread(means) - np.log1p(cv2 / N) + min(shift, 0.0) - np.sqrt(variance)
+    log_a, error = gamma_shape(means)
+    by_likelihood = np.log(2.0) + log_a - error
+    nu = min(np.exp(min(by_spread, by_likelihood)), dof * steps)
+    nu, spread = (dof, np.inf) if gaussian and nu <= dof else (nu, 2.0 / variance)
+    return Oracle(nu, spread, by_spread, by_likelihood, shift, abs(distance) > reach, unfloored < 2.0 / N)
+
+
+def tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
+    """p values above and below, with a normal quantile read as Student's t."""
+    above = stats.t.sf(stats.norm.isf(stats.chi2.sf(k * ratio, k)), spread)
+    return float(above), float(stats.t.cdf(stats.norm.ppf(stats.chi2.cdf(k * ratio, k)), spread))
+
+
+def gamma_means(rng: np.random.Generator, runs: int, nu: float, ratio: float = 1.0) -> Array:
+    return ratio * rng.chisquare(nu, runs) / nu
+
+
+def cases() -> dict[str, tuple[Array, int, int]]:
+    """Run means of many kinds: (runs,), dof, steps."""
+    rng = np.random.default_rng(1)
+    found = {
+        "gamma": (gamma_means(rng, 40, 9.0), 3, 50),
+        "few, near 1": (gamma_means(rng, 20, 30.0), 3, 50),
+        "too large": (gamma_means(rng, 60, 12.0, 1.3), 3, 50),
+        "far too large": (gamma_means(rng, 60, 12.0, 30.0), 3, 50),
+        "few, too large": (gamma_means(rng, 25, 12.0, 4.0), 3, 50),
+        "too small": (gamma_means(rng, 60, 12.0, 0.75), 3, 50),
+        "far too small": (gamma_means(rng, 45, 8.0, 0.01), 3, 50),
+        "fully dependent": (gamma_means(rng, 50, 3.0), 3, 50),
+        "more even than independent steps": (1.0 + 0.01 * rng.standard_normal(30), 2, 4),
+        "two kinds of runs": (np.concatenate([gamma_means(rng, 30, 2.0), gamma_means(rng, 30, 200.0)]), 1, 100),
+        "log-normal": (np.exp(0.5 * rng.standard_normal(80)), 1, 100),
+        "heavy": (np.exp(1.5 * rng.standard_normal(80)), 2, 100),
+        "one step": (gamma_means(rng, 30, 2.0), 2, 1),
+        "small values": (np.concatenate([gamma_means(rng, 40, 40.0), [0.002, 0.01]]), 1, 100),
+        "uniform": (rng.uniform(0.2, 1.8, 70), 1, 100),
+    }
+    return found
+
+
+CASES = cases()
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("gaussian", [True, False])
+def test_effective_dof_and_p_values(name: str, gaussian: bool) -> None:
+    means, dof, steps = CASES[name]
+    test, expected = scale_test(means, dof, steps, gaussian), oracle(means, dof, steps, gaussian)
+    if steps == 1 and gaussian:
+        expected = Oracle(dof, np.inf, 0.0, 0.0, 0.0, False, False)
+    assert test.runs == len(means)
+    assert test.ratio == pytest.approx(means.mean(), rel=1e-12)
+    assert test.effective_dof == pytest.approx(expected.nu, rel=2e-6)
+    assert test.spread == pytest.approx(expected.spread, rel=1e-8)
+    above, below = tails(means.mean(), len(means) * test.effective_dof, test.spread)
+    assert test.above == pytest.approx(above, rel=1e-6, abs=1e-300)
+    assert test.below == pytest.approx(below, rel=1e-6, abs=1e-300)
+    assert test.p_value == pytest.approx(min(1.0, 2.0 * min(above, below)), rel=1e-6)
+
+
+def test_the_cases_reach_every_branch() -> None:
+    """Otherwise a fault in one of them would not be seen above."""
+    all_ = {name: oracle(*case) for name, case in CASES.items()}
+    free = {name: o for name, o in all_.items() if np.isfinite(o.spread)}
+    several = {name: o for name, o in free.items() if o.nu < CASES[name][1] * CASES[name][2]}
+    assert any(o.by_spread < o.by_likelihood - 0.01 for o in several.values())
+    assert any(o.by_likelihood < o.by_spread - 0.01 for o in several.values())
+    first = {name: o for name, o in several.items() if o.by_spread < o.by_likelihood}
+    assert any(o.shift < -0.01 and not o.clipped for o in first.values())
+    assert any(o.shift < -0.01 and o.clipped for o in first.values())
+    assert any(o.shift > 0.01 for o in first.values())
+    assert any(o.floored for o in several.values())
+    assert any(not o.floored for o in several.values())
+    assert len(several) < len(free) < len(all_)  # limited above and below
+
+
+@pytest.mark.parametrize("runs", [1, 2, 19])
+def test_below_twenty_runs_the_worst_case_is_taken(runs: int) -> None:
+    """Chi-square of one step, exactly; the spread between the runs plays no part."""
+    means = 1.2 + 1e-3 * np.arange(runs)
+    test = scale_test(means, 3, 100)
+    assert (test.effective_dof, test.spread) == (3.0, np.inf)
+    assert test.above == pytest.approx(stats.chi2.sf(3 * means.sum(), 3 * runs), rel=1e-10)
+    assert test.below == pytest.approx(stats.chi2.cdf(3 * means.sum(), 3 * runs), rel=1e-10)
+    assert scale_test(1.2 + 1e-3 * np.arange(20), 3, 100).effective_dof > 100
+
+
+def test_a_run_without_any_error_leaves_the_worst_case() -> None:
+    means = np.append(np.full(40, 1.1) + 0.01 * np.arange(40), 0.0)
+    assert scale_test(means, 2, 100).effective_dof == 2.0
+
+
+def test_a_right_filter_has_p_values_near_uniform_at_full_dependence() -> None:
+    """1,000 draws at 2.5 %, with 19 runs (exact) and 21 and 60 (estimated, nu at its lower end more often than not)."""
+    rng = np.random.default_rng(2)
+    draws, level = 1000, 0.025
+    for runs, n in ((19, 1), (21, 1), (60, 3)):
+        p = np.array([scale_test(rng.chisquare(n, runs) / n, n, 100).p_value for _ in range(draws)])
+        count = int((p <= level).sum())
+        assert count <= stats.binom.isf(SURE, draws, level)
+        assert count >= (stats.binom.ppf(SURE, draws, level) if runs < 20 else 1)
+
+
+def test_steps_that_are_the_same_are_one_step() -> None:
+    """Whatever the number of steps, the run means of full dependence are those of one step."""
+    rng = np.random.default_rng(3)
+    error = fully_dependent(rng, 19, 30, 3)
+    nees = np.square(error).sum(axis=-1)
+    many, one = mean_test(nees, 3), mean_test(nees[:, :1], 3)
+    assert (many.above, many.below) == pytest.approx((one.above, one.below))
+
+
+def test_effective_dof_does_not_depend_on_the_unit_far_from_one() -> None:
+    """Where the mean is farther from 1 than chance carries it, on the same side."""
+    rng = np.random.default_rng(4)
+    means = gamma_means(rng, 50, 10.0)
+    for a, b in ((10.0, 1e6), (0.1, 1e-6)):
+        one, other = scale_test(means * a, 2, 100), scale_test(means * b, 2, 100)
+        assert one.effective_dof == pytest.approx(other.effective_dof, rel=1e-9)
+        assert one.spread == pytest.approx(other.spread, rel=1e-9)
+
+
+def test_effective_dof_of_known_worlds() -> None:
+    """(tr C)^2 / tr C^2, from below: C_kl = .9^|k - l| in each of 3 components; 2,000 runs."""
+    rng = np.random.default_rng(5)
+    T, n = 60, 3
+    C = 0.9 ** np.abs(np.subtract.outer(np.arange(T), np.arange(T)))
+    exact = n * T**2 / np.square(C).sum()
+    nees = np.square(autoregression(rng, 2000, T, n, 0.9)).sum(axis=-1)
+    assert 0.8 * exact < mean_test(nees, n).effective_dof < exact * 1.05
+
+
+def test_heavy_tails_may_have_less_than_one_step() -> None:
+    rng = np.random.default_rng(6)
+    means = np.exp(1.2 * rng.standard_normal(100))
+    assert scale_test(means, 3, 50).effective_dof == 3.0
+    test = scale_test(means, 3, 50, gaussian=False)
+    assert test.effective_dof < 2.0
+    assert np.isfinite(test.spread)
+    single = scale_test(means, 3, 1, gaussian=False)  # one step may have heavy tails too
+    assert single.effective_dof == pytest.approx(test.effective_dof)
+    assert scale_test(means, 3, 1).effective_dof == 3.0
+
+
+def test_nothing_to_judge() -> None:
+    test = scale_test(np.empty(0), 3, 0)
+    assert test.runs == 0
+    assert np.isnan([test.ratio, test.above, test.below, test.p_value]).all()
+    assert np.isnan(acceptance(test, 3, 0.05)).all()
+
+
+def test_run_means_count_the_steps_that_a_run_has() -> None:
+    nees = np.array([[1.0, 2.0, 6.0], [np.nan, 4.0, np.nan], [np.nan] * 3])
+    means, counts = run_means(nees)
+    assert means[:2] == pytest.approx([3.0, 4.0])
+    assert np.isnan(means[2])
+    assert counts.tolist() == [3, 1, 0]
+    test = mean_test(nees, 2)
+    assert (test.runs, test.ratio) == (2, pytest.approx(1.75))
+
+
+def test_ragged_runs_count_the_steps_of_the_longest() -> None:
+    """nu is at most dof times the steps of the longest run."""
+    nees = np.full((30, 8), np.nan)
+    for run in range(30):
+        nees[run, : 2 + run % 3] = 2.0 + 1e-4 * run
+    assert mean_test(nees, 2).effective_dof == pytest.approx(2 * 4)
+
+
+# --- what is accepted ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["gamma", "too large", "fully dependent", "two kinds of runs"])
+@pytest.mark.parametrize("allow", [None, "conservative"])
+def test_accepted_interval_is_where_the_p_value_crosses(name: str, allow: str | None) -> None:
+    means, dof, steps = CASES[name]
+    test = scale_test(means, dof, steps)
+    low, high = acceptance(test, dof, 0.04, allow)
+    k = len(means) * test.effective_dof
+    assert tails(high / dof, k, test.spread)[0] == pytest.approx(0.04 if allow else 0.02, rel=1e-6)
+    if allow:
+        assert low == 0.0
+    else:
+        assert tails(low / dof, k, test.spread)[1] == pytest.approx(0.02, rel=1e-6)
+    assert (low <= test.ratio * dof <= high) == ((test.above if allow else test.p_value) > 0.04)
+
+
+# --- the interval of the ratio ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("confidence", [0.95, 0.99])
+def test_ratio_interval_from_twenty_runs_on(confidence: float) -> None:
+    """Chi-square with nu from the spread as it is; what doubt remains, by the jackknife, in Student's t."""
+    rng = np.random.default_rng(7)
+    means = gamma_means(rng, 30, 6.0, 1.8)
+    N = len(means)
+    left_out = [log_nu_of_spread(np.delete(means, i)) for i in range(N)]
+    variance = max(covariance_of_left_out(left_out, left_out), 2.0 / N)
+    nu = np.exp(log_nu_of_spread(means)) / (1.0 + means.var(ddof=1) / means.mean() ** 2 / N)
+    tail = stats.norm.sf(stats.t.isf((1 - confidence) / 2, 2.0 / variance))
+    value, low, high = ratio_interval(means, 3, confidence)
+    assert value == pytest.approx(means.mean())
+    assert low == pytest.approx(value * N * nu / stats.chi2.isf(tail, N * nu), rel=1e-6)
+    assert high == pytest.approx(value * N * nu / stats.chi2.ppf(tail, N * nu), rel=1e-6)
+
+
+def test_ratio_interval_of_few_runs() -> None:
+    """As if all steps were one, or by the spread that is seen if that is larger."""
+    for means, dof in (
+        (np.array([1.0, 1.1, 0.9, 1.05]), 3),
+        (np.array([0.02, 5.0, 0.01, 0.1]), 3),
+        (np.array([2.0]), 2),
+    ):
+        nu = float(dof)
+        if len(means) > 1:
+            cv2 = means.var(ddof=1) / means.mean() ** 2
+            nu = min(nu, 2.0 / cv2 / (1.0 + cv2 / len(means)))
+        k = len(means) * nu
+        value, low, high = ratio_interval(means, dof)
+        assert low == pytest.approx(value * k / stats.chi2.isf(0.025, k), rel=1e-6)
+        assert high == pytest.approx(value * k / stats.chi2.ppf(0.025, k), rel=1e-6)
+    assert ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 6)[2] < ratio_interval(np.array([1.0, 1.1, 0.9, 1.05]), 1)[2]
+
+
+def test_ratio_interval_of_a_right_filter_says_something() -> None:
+    """20 runs of one component, fully dependent: none in 300 draws from practically 0 to practically infinity."""
+    rng = np.random.default_rng(10)
+    intervals = [ratio_interval(gamma_means(rng, 20, 1.0)) for _ in range(300)]
+    assert max(i.high / max(i.low, 1e-300) for i in intervals) < 1e4
+
+
+def test_ratio_interval_where_there_is_nothing_to_spread() -> None:
+    assert np.isnan(ratio_interval(np.empty(0))).all()
+    assert ratio_interval(np.zeros(5)) == (0.0, 0.0, 0.0)
+    assert ratio_interval(np.full(30, 1.5)) == pytest.approx((1.5, 1.5, 1.5))
+    value, low, high = ratio_interval(np.full(5, 1.5), 2)
+    assert low < 1.0 < value < 2.0 < high
+
+
+def test_ratio_interval_holds_the_ratio_of_gaussian_errors() -> None:
+    """500 draws each of 3, 12 and 40 runs of one step: misses of either side at most 5 % in all (limits 1e-5)."""
+    rng = np.random.default_rng(8)
+    draws = 500
+    for runs in (3, 12, 40):
+        misses = 0
+        for _ in range(draws):
+            _, low, high = ratio_interval(gamma_means(rng, runs, 3.0, 0.6), 3)
+            misses += not low <= 0.6 <= high
+        assert misses <= stats.binom.isf(SURE, draws, 0.05 if runs < 20 else 0.06)
+        assert misses >= stats.binom.ppf(SURE, draws, 0.02)
+
+
+# --- large and small numbers -------------------------------------------------------------------------------
+
+
+def test_hardly_any_spread() -> None:
+    """Runs that are all alike: nu is at its upper end, and nothing divides by zero."""
+    for means in (np.full(25, 1.01), 1.0 + 1e-9 * np.arange(25)):
+        assert scale_test(means, 3, 40).effective_dof == pytest.approx(120.0)
+
+
+def test_digamma_equation_holds() -> None:
+    """The shape solves log a - digamma(a) = log mean Y - mean log Y, from tiny shapes to huge ones."""
+    rng = np.random.default_rng(9)
+    for shape in (0.05, 0.5, 5.0, 500.0, 5e5):
+        means = rng.gamma(shape, 1.0 / shape, 400).clip(1e-300)
+        gap = np.log(means.mean()) - np.log(means).mean()
+        a = optimize.brentq(lambda x, gap=gap: np.log(x) - special.psi(x) - gap, 1e-4, 1e9)
+        error = (
+            1.0 / np.sqrt(len(means) * (a * a * special.polygamma(1, a) - a)) if a < 1e6 else np.sqrt(2 / len(means))
+        )
+        test = scale_test(means, 1, 10**9, gaussian=False)
+        assert test.effective_dof <= 2.0 * a * np.exp(-error) * (1 + 1e-6)
+        if oracle(means, 1, 10**9, gaussian=False).by_likelihood < oracle(means, 1, 10**9, False).by_spread:
+            assert test.effective_dof == pytest.approx(2.0 * a * np.exp(-error), rel=1e-5)

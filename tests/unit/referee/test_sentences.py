@@ -1,0 +1,234 @@
+"""What is shown, by how much and where: axes, opposite axes, correlations of the wrong sign, steps on both sides.
+
+Faults are so large that a verdict at a false-alarm rate of 1e-5 misses them less often than that; the seed is fixed
+and was not chosen.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from draws import fully_dependent, identities, independent, verdict_on
+
+from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
+from consistency.referee.diagnostics.export import text
+from consistency.referee.diagnostics.faults_in_words import bias_text, scale_text, shape_text
+from consistency.referee.diagnostics.records import Interval
+from consistency.referee.diagnostics.wording import reasons
+from consistency.referee.terminal.table import print_verdicts
+from consistency.referee.types import Array
+
+SURE = 1e-5
+AXES = ("x", "y", "heading")
+
+
+def judged(error: Array, stated: Array | None = None, **settings: object) -> Verdict:
+    P = identities(error) if stated is None else np.broadcast_to(stated, (*error.shape, error.shape[-1]))
+    axes = AXES[: error.shape[-1]]
+    return judge(Evidence("f", error, P, axes=axes), Settings(**{"false_alarm": SURE} | settings))  # type: ignore[arg-type]
+
+
+def correlated(
+    rng: np.random.Generator, true: float, stated: float, n: int = 2, runs: int = 100
+) -> tuple[Array, Array]:
+    """Errors of x and y with one correlation, and the covariance that states another."""
+    C, S = np.eye(n), np.eye(n)
+    C[0, 1] = C[1, 0] = true
+    S[0, 1] = S[1, 0] = stated
+    return independent(rng, runs, 30, n) @ np.linalg.cholesky(C).T, S
+
+
+# --- the worst axis ----------------------------------------------------------------------------------------
+
+
+def test_the_worst_axis_stands_beside_the_whole(rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
+    error = independent(rng, 50, 6, 3) * np.sqrt([1.0, 1.0, 1.3])
+    verdict = judged(error)
+    assert verdict.status == "consistent"
+    ratio = float(np.square(error[..., 2]).mean())
+    name, interval = verdict.worst_axis or ("", Interval(0.0, 0.0, 0.0))
+    assert name == "heading"
+    assert interval.value == pytest.approx(ratio)
+    beside = f"worst axis: heading, {ratio:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+    assert f"({beside})" in verdict.reasons[0]
+    assert re.search(rf"worst axis +heading, {ratio:.2f} \[", text(verdict))
+    assert verdict.statistics["worst_axis"] == "heading"
+    assert verdict.statistics["worst_axis_ratio"] == tuple(interval)
+    print_verdicts({"f": verdict})
+    assert f"ratio of the {beside.replace(':', ': f')}" in capsys.readouterr().out
+    few = judged(error[:5])
+    assert few.status == "undecided"
+    assert "(worst axis: " in few.reasons[0]
+
+
+def test_the_worst_axis_of_a_fault_is_to_its_side(rng: np.random.Generator) -> None:
+    for factor, status, name in ((4.0, "overconfident", "x"), (0.25, "conservative", "heading")):
+        verdict = judged(independent(rng, 60, 10, 3) * np.sqrt(factor * np.array([1.2, 1.0, 0.83])))
+        assert verdict.status == status
+        assert (verdict.worst_axis or ("",))[0] == name
+        assert any(line.startswith(f"covariance ratio of the worst axis: {name}, ") for line in verdict.reasons)
+
+
+def test_a_small_axis_may_be_the_worst(rng: np.random.Generator) -> None:
+    error = independent(rng, 50, 6, 3) * np.sqrt([1.05, 0.6, 1.2])
+    assert (judged(error).worst_axis or ("",))[0] == "y"
+    assert (judged(error, allow="conservative").worst_axis or ("",))[0] == "heading"
+    assert judged(error[..., :1]).worst_axis is None
+    assert judge(Evidence("f", nees=np.square(error).sum(axis=-1), dof=3)).worst_axis is None
+
+
+# --- opposite axes -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("factors", [(1.4, 0.7), (1.5, 0.6, 1.2), (0.33, 1.4), (0.5, 0.6, 1.4)])
+def test_opposite_axes_are_inconsistent(rng: np.random.Generator, factors: tuple[float, ...]) -> None:
+    verdict = judged(independent(rng, 200, 40, len(factors)) * np.sqrt(factors))
+    assert "scale of an axis" in verdict.faults
+    assert verdict.status == "inconsistent"
+    small, large = AXES[int(np.argmax(factors))], AXES[int(np.argmin(factors))]
+    sentence = verdict.reasons[0]
+    said = re.search(
+        rf"too small by x([\d.]+) \[[^]]+\] in {small}, (?:.*, )?too large by x([\d.]+) \[[^]]+\]", sentence
+    )
+    assert said is not None, sentence
+    assert float(said[1]) == pytest.approx(max(factors), rel=0.1)
+    assert float(said[2]) == pytest.approx(1.0 / min(factors), rel=0.1)
+    assert f"] in {large}" in sentence
+
+
+def test_an_axis_nearer_to_one_than_the_whole_leaves_it_overconfident(rng: np.random.Generator) -> None:
+    verdict = judged(independent(rng, 100, 60, 2) * np.sqrt([3.0, 0.7]))
+    assert verdict.status == "overconfident"
+    sentence = verdict.reasons[0]
+    assert re.search(r"too small by x1\.\d\d \[.*, mainly x.*, but too large by x1\.\d\d \[[^]]+\] in y", sentence)
+
+
+def test_both_sides_are_named_of_many_axes(rng: np.random.Generator) -> None:
+    verdict = verdict_on(independent(rng, 200, 20, 6) * np.sqrt([1.9, 1.8, 1.7, 1.6, 0.2, 0.2]), false_alarm=SURE)
+    assert verdict.status == "inconsistent"
+    assert verdict.reasons[0].count("too small by") == 2
+    assert verdict.reasons[0].count("too large by") == 1
+
+
+# --- correlations --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("stated", [-0.6, 0.6])
+def test_a_correlation_of_the_wrong_sign_is_called_that(rng: np.random.Generator, n: int, stated: float) -> None:
+    """With x, y and a heading the group of x and y is wrong, and no axis is."""
+    verdict = judged(*correlated(rng, -stated, stated, n))
+    assert "scale" in verdict.faults
+    assert verdict.status == "inconsistent"
+    sentence = verdict.reasons[0]
+    said = re.search(r"correlation of the wrong sign: ([+-][\d.]+), stated ([+-][\d.]+), of x and y; no axis", sentence)
+    assert said is not None, sentence
+    assert float(said[1]) == pytest.approx(-stated, abs=0.08)
+    assert float(said[2]) == stated
+    assert "too small" not in sentence
+    assert verdict.statistics["correlation_wrong_sign"]
+
+
+def test_a_correlation_of_the_right_sign_is_not(rng: np.random.Generator) -> None:
+    verdict = judged(*correlated(rng, 0.2, 0.8))
+    assert verdict.status == "overconfident"
+    assert "wrong sign" not in verdict.reasons[0]
+    assert "correlation +0." in verdict.reasons[0]
+    assert not verdict.statistics["correlation_wrong_sign"]
+    unstated = judged(*correlated(rng, 0.6, 0.0))
+    assert "wrong sign" not in unstated.reasons[0]
+
+
+def test_a_sign_that_chance_makes_is_none(rng: np.random.Generator) -> None:
+    """A true correlation of -0.05 in 40 runs of one step each: its sign is not known."""
+    verdict = judged(
+        np.repeat(correlated(rng, -0.05, 0.7, runs=40)[0][:, :1], 3, axis=1), np.array([[1, 0.7], [0.7, 1]])
+    )
+    assert not verdict.statistics["correlation_wrong_sign"]
+
+
+def test_a_wrong_scale_beside_a_wrong_sign_is_still_one(rng: np.random.Generator) -> None:
+    error, stated = correlated(rng, 0.6, -0.6)
+    verdict = judged(2.0 * error, stated)
+    assert verdict.status == "overconfident"
+    assert "covariance too small by x" in verdict.reasons[0]
+    assert "; correlation of the wrong sign: +0." in verdict.reasons[0]
+    assert "no axis by itself" not in verdict.reasons[0]
+
+
+# --- steps -----------------------------------------------------------------------------------------------------
+
+
+def test_steps_above_and_below_are_counted_apart(rng: np.random.Generator) -> None:
+    """Four steps from the 11th far below, one, the 41st, above by less."""
+    error = independent(rng, 100, 100, 2)
+    error[:, 10:14] *= 0.3
+    error[:, 40] *= 1.45
+    verdict = judged(error)
+    assert verdict.status == "conservative"
+    ratio = np.square(error).mean(axis=(0, 2))
+    assert verdict.reasons[0].startswith(
+        f"conservative: covariance too large by up to x{1.0 / ratio[10:14].min():.1f} in 4 of 100 steps, first in "
+        "step 11, and too small in 1, first in step 41"
+    )
+    assert "too small by" not in verdict.reasons[0]
+    turned = judged(error[:, :20])
+    assert "too small" not in turned.reasons[0]
+
+
+def test_the_larger_side_comes_first(rng: np.random.Generator) -> None:
+    error = independent(rng, 100, 100, 2)
+    error[:, 10] *= 0.68
+    error[:, 40:43] *= 2.2
+    verdict = judged(error)
+    assert verdict.location is not None
+    steps = replace(verdict, location=replace(verdict.location, lasting=False), status="overconfident")
+    said = scale_text(steps, {"scale in some step": steps.answers[0]})
+    worst = np.square(error).mean(axis=(0, 2)).max()
+    assert said.startswith(f"covariance too small by up to x{worst:.2f} in 3 of 100 steps, first in step 41")
+
+
+@pytest.mark.parametrize(
+    ("late", "status", "side"), [(3.0, "conservative", "too large"), (0.3, "overconfident", "too small")]
+)
+def test_no_factor_to_the_other_side(rng: np.random.Generator, late: float, status: str, side: str) -> None:
+    """A verdict on the whole whose late part errs to the other side: the factor is that of the whole."""
+    error = independent(rng, 60, 20, 3) * np.sqrt(0.5 if status == "conservative" else 2.0)
+    verdict = judged(error)
+    assert verdict.status == status
+    assert verdict.scale is not None
+    contrary = replace(verdict, scale=replace(verdict.scale, inflation=Interval(late, 0.9 * late, 1.1 * late)))
+    sentence = reasons(contrary)[0]
+    ratio = verdict.scale.mean_anees / 3
+    assert f"{side} by x{max(ratio, 1 / ratio):.2f} in the mean of all steps" in sentence
+
+
+# --- bias ------------------------------------------------------------------------------------------------------
+
+
+def test_a_bias_in_a_step_has_a_size(rng: np.random.Generator) -> None:
+    error = independent(rng, 100, 30, 3)
+    error[:, 11, 1] -= 2.0
+    verdict = judged(error)
+    assert verdict.bias is not None
+    assert verdict.bias.size == pytest.approx(float(error[:, 11, 1].mean()))
+    assert f"biased: mean error {verdict.bias.size:+.2f} sigma in y, in step 12" in verdict.reasons[0]
+    assert verdict.statistics["bias_in_step"] == verdict.bias.size
+
+
+def test_a_bias_of_no_axis_is_in_a_combination(rng: np.random.Generator) -> None:
+    verdict = judged(fully_dependent(rng, 60, 4, 2) + 2.0)
+    assert verdict.bias is not None
+    none = replace(verdict, bias=replace(verdict.bias, by_axis={}))
+    assert bias_text(none, False).startswith("mean error in a combination of axes; without the bias")
+
+
+def test_a_shape_in_a_step_says_which(rng: np.random.Generator) -> None:
+    error = independent(rng, 200, 12, 2)
+    error[:, 4, 1] = 0.95 * error[:, 4, 0] + np.sqrt(1 - 0.95**2) * error[:, 4, 1]
+    verdict = judged(error)
+    assert verdict.faults[0] == "shape in some step"
+    assert re.search(r"correlation \+0\.9\d, stated \+0\.00, of x and y in step 5$", shape_text(verdict, {}))

@@ -1,0 +1,301 @@
+"""Looks while runs come: what they cost together, what they are told, and that a decision stands.
+
+Seeds are fixed and were not chosen; counts have limits at 1e-5.
+"""
+
+from __future__ import annotations
+
+import itertools
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from draws import fully_dependent, identities, independent
+from scipy import stats
+
+from consistency.bench.runs import sequential
+from consistency.referee.diagnostics import (
+    Design,
+    Evidence,
+    Verdict,
+    e_process,
+    ever,
+    follow,
+    judge,
+    look,
+    sequential_design,
+)
+from consistency.referee.diagnostics.equivalence import equivalence_by_betting
+from consistency.referee.diagnostics.verdict import Look
+from consistency.referee.types import Array, Failure
+
+SURE = 1e-5
+
+
+def inspections(design: Design, count: int) -> list[tuple[int, float | None]]:
+    return list(itertools.islice(design.inspections(), count))
+
+
+def evidence_from(error: Array, **more: Any) -> Any:
+    """The first runs of a filter, as many as asked for."""
+    P = identities(error)
+    return lambda runs: Evidence("f", error[:runs], P[:runs], **more)
+
+
+# --- the grid -----------------------------------------------------------------------------------------
+
+
+def test_looks_double_and_the_scale_is_looked_at_in_between() -> None:
+    found = inspections(Design(3), 13)
+    assert [runs for runs, _ in found] == [12, 15, 18, 21, 24, 30, 36, 42, 48, 60, 72, 84, 96]
+    spent = dict(found)
+    assert [runs for runs, s in found if s is not None] == [12, 24, 48, 96]
+    assert [spent[n] for n in (12, 24, 48, 96)] == pytest.approx([1 / 2, 1 / 6, 1 / 12, 1 / 20])
+
+
+def test_all_looks_cost_the_rate_once() -> None:
+    costs = [s for _, s in inspections(Design(3), 400) if s is not None]
+    assert len(costs) == 100
+    assert 0.98 < sum(costs) < 1.0
+
+
+@pytest.mark.parametrize("max_runs", [1, 5, 11, 12, 13, 14, 15, 16, 20, 23, 24, 25, 30, 31, 47, 48, 49, 100, 1000])
+def test_a_limit_on_runs_ends_with_a_look(max_runs: int) -> None:
+    found = list(Design(3, max_runs=max_runs).inspections())
+    runs = [n for n, _ in found]
+    assert runs[-1] == max_runs
+    assert found[-1][1] is not None
+    assert all(a < b for a, b in itertools.pairwise(runs))
+    assert sum(s for _, s in found if s is not None) <= 1.0
+    free = inspections(Design(3), len(found))
+    assert found[:-1] == free[: len(found) - 1]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"max_runs": 0},
+        {"max_runs": -3},
+        {"dof": 0},
+        {"detect": 1.0},
+        {"detect": -1.0},
+        {"false_alarm": 0.0},
+        {"power": 1.0},
+    ],
+)
+def test_what_cannot_be_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        sequential_design(**{"dof": 3, **options})
+
+
+def test_settings_are_those_of_the_plan() -> None:
+    settings = sequential_design(2, 0.5, 0.01, 0.9, 40).settings
+    assert (settings.detect, settings.false_alarm, settings.power, settings.allow) == (0.5, 0.01, 0.9, None)
+
+
+# --- one look ------------------------------------------------------------------------------------------
+
+
+def test_the_scale_is_that_of_the_e_process_and_the_rest_pays_for_the_look() -> None:
+    rng = np.random.default_rng(71)
+    error = 1.1 * independent(rng, 24, 6, 3)
+    error[:20] *= 1.3  # earlier evidence counts though it has faded
+    evidence = evidence_from(error)(24)
+    means = np.square(error).sum(axis=-1).mean(axis=1) / 3
+    expected = ever(e_process(means, 3).both)
+    plain = {a.question: a.p_value for a in judge(evidence).answers}
+    at = {a.question: a.p_value for a in look(Design(3), evidence, 1 / 6).answers}
+    assert set(at) == set(plain)
+    assert at.pop("scale") == pytest.approx(expected)
+    assert at == pytest.approx({q: min(1.0, 6 * p) for q, p in plain.items() if q != "scale"})
+    between = {a.question: a.p_value for a in look(Design(3), evidence, None).answers}
+    assert between.pop("scale") == pytest.approx(expected)
+    assert set(between.values()) == {1.0}
+
+
+def test_the_share_of_the_scale_is_the_same_at_every_inspection() -> None:
+    evidence = evidence_from(independent(np.random.default_rng(72), 24, 6, 3))(24)
+    for spent in (None, 0.5, 1 / 6):
+        shares = {a.question: a.share for a in look(Design(3), evidence, spent).answers}
+        assert shares["scale"] == 0.5
+        assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_what_is_shown_is_shown_by_betting() -> None:
+    error = independent(np.random.default_rng(73), 96, 6, 3)
+    verdict = look(Design(3, detect=1.7), evidence_from(error)(96), 0.05)
+    means = np.square(error).sum(axis=-1).mean(axis=1) / 3
+    expected = equivalence_by_betting(means, 3, Design(3, detect=1.7).settings)
+    assert verdict.equivalence == expected
+
+
+def test_consistent_is_said_at_looks_only() -> None:
+    evidence = evidence_from(independent(np.random.default_rng(74), 200, 20, 3))(200)
+    design = Design(3, false_alarm=SURE)
+    assert look(design, evidence, 0.05).status == "consistent"
+    between = look(design, evidence, None)
+    assert between.status == "undecided"
+    assert between.reasons[0].startswith("undecided: no fault found in the scale; the other questions are asked at")
+    assert between.faults == ()
+
+
+def test_a_gross_fault_is_found_between_looks_too() -> None:
+    error = np.sqrt(20.0) * independent(np.random.default_rng(75), 15, 6, 3)
+    assert look(Design(3), evidence_from(error)(15), None).status == "overconfident"
+    assert look(Design(3), evidence_from(error / 40.0)(15), None).status == "conservative"
+
+
+def test_a_correlation_is_found_at_looks_only() -> None:
+    error = independent(np.random.default_rng(76), 48, 20, 2)
+    error[..., 1] = 0.9 * error[..., 0] + np.sqrt(0.19) * error[..., 1]
+    design, evidence = Design(2, false_alarm=1e-3), evidence_from(error)(48)
+    assert "shape" in look(design, evidence, 1 / 12).faults
+    assert look(design, evidence, None).faults == ()
+
+
+def test_failed_runs_decide_at_once() -> None:
+    error = independent(np.random.default_rng(77), 15, 6, 3)
+    failures = (Failure("f", 2, 1, "diverged"),)
+    assert look(Design(3, false_alarm=SURE), evidence_from(error, failures=failures)(15), None).status == "failed"
+
+
+def test_without_truth_looks_are_at_the_innovations() -> None:
+    rng = np.random.default_rng(78)
+    nis, dof = 2.0 * rng.chisquare(2, (48, 30)), np.full((48, 30), 2)
+    evidence = Evidence("f", nis=nis, nis_dof=dof, optimal_gain=True)
+    design = Design(3, false_alarm=1e-3)
+    assert look(design, evidence, None).status == "undecided"
+    at_look = look(design, evidence, 1 / 12)
+    assert at_look.status == "overconfident"
+    scale = next(a for a in at_look.answers if a.question == "innovation scale")
+    plain = next(a for a in judge(evidence).answers if a.question == "innovation scale")
+    assert scale.p_value == pytest.approx(12 * plain.p_value)
+
+
+def test_a_look_inside_judge() -> None:
+    """A scale just below and just above its half of the rate."""
+    evidence = evidence_from(independent(np.random.default_rng(79), 24, 6, 3))(24)
+    design = Design(3, false_alarm=0.01)
+    found = judge(evidence, design.settings, Look(None, 0.00499))
+    assert found.faults == ("scale",)
+    assert judge(evidence, design.settings, Look(None, 0.00501)).faults == ()
+
+
+# --- until decided -------------------------------------------------------------------------------------
+
+
+def test_a_gross_fault_stops_at_the_first_look() -> None:
+    error = np.sqrt(20.0) * independent(np.random.default_rng(80), 200, 6, 3)
+    verdict, used = follow(Design(3), evidence_from(error), 200)
+    assert (verdict.status, used) == ("overconfident", 12)
+    assert verdict.runs == 12
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_decision_stands_however_many_runs_follow(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ratio = [1.0, 1.0, 1.6, 1.6, 0.5, 4.0][seed]
+    error = np.sqrt(ratio) * independent(rng, 400, 5, 3)
+    verdict, used = follow(Design(3), evidence_from(error), 400)
+    assert verdict.status != "undecided"
+    for limit in (used, used + 1, 2 * used, None):
+        assert follow(Design(3), evidence_from(error), limit)[0].answers == verdict.answers
+    spoiled = error.copy()
+    spoiled[used:] *= 100.0  # what comes later is not looked at
+    later, again = follow(Design(3), evidence_from(spoiled), 400)
+    assert (later.status, later.reasons, again) == (verdict.status, verdict.reasons, used)
+
+
+def test_a_verdict_is_that_of_the_first_inspection_that_decides() -> None:
+    error = np.sqrt(1.7) * independent(np.random.default_rng(81), 400, 5, 3)
+    design, evidence = Design(3), evidence_from(error)
+    verdict, used = follow(design, evidence, 400)
+    for runs, spent in design.inspections():
+        at = look(design, evidence(runs), spent)
+        if runs == used:
+            assert at.reasons == verdict.reasons
+            break
+        assert at.status == "undecided"
+
+
+def test_a_limit_is_not_exceeded() -> None:
+    error = independent(np.random.default_rng(82), 400, 2, 3)
+    asked: list[int] = []
+
+    def evidence(runs: int) -> Evidence:
+        asked.append(runs)
+        return evidence_from(error)(runs)
+
+    design = Design(3, detect=1.0001)  # never shown
+    for limit, expected in (
+        (5, [5]),
+        (12, [12]),
+        (16, [12, 15]),
+        (24, [12, 15, 18, 21, 24]),
+        (29, [12, 15, 18, 21, 24]),
+    ):
+        asked.clear()
+        verdict, used = follow(design, evidence, limit)
+        assert asked == expected
+        assert used == expected[-1]
+        assert verdict.runs == used
+    asked.clear()
+    verdict, used = follow(Design(3, detect=1.0001, max_runs=20), evidence)
+    assert asked == [12, 15, 18, 20]
+    assert (verdict.status, used) == ("undecided", 20)
+
+
+def test_a_right_filter_is_shown_in_the_end() -> None:
+    verdict, used = follow(
+        Design(3, false_alarm=SURE), evidence_from(independent(np.random.default_rng(83), 800, 4, 3))
+    )
+    assert verdict.status == "consistent"
+    assert used in (24, 48, 96, 192)
+
+
+def test_right_filters_are_seldom_found_at_fault() -> None:
+    """40 filters at 5 %, fully dependent, looked at until decided or 30 runs."""
+    rng, found = np.random.default_rng(84), 0
+    for _ in range(40):
+        verdict, _ = follow(Design(2), evidence_from(fully_dependent(rng, 30, 2, 2)), 30)
+        found += bool(verdict.faults)
+    assert found <= stats.binom.isf(SURE, 40, 0.05)
+
+
+def test_a_gaussian_fault_found_early_has_its_name() -> None:
+    """x1.7 until decided, 25 filters: the name of the fault is that of the scale in all but chance cases."""
+    rng = np.random.default_rng(85)
+    names = [
+        follow(Design(3), evidence_from(np.sqrt(1.7) * fully_dependent(rng, 200, 3, 3)), 200)[0].status
+        for _ in range(25)
+    ]
+    assert names.count("overconfident") >= 18
+
+
+# --- the same for several filters at a time -----------------------------------------------------------------
+
+
+def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPatch) -> None:
+    """'early' is decided at the first look, and would be found consistent later; 'late' keeps the runs coming."""
+    calls: list[tuple[str, int]] = []
+    script = {("early", 12): "overconfident", ("late", 24): "conservative"}
+
+    def verdict_at(design: Design, evidence: Evidence, spent: float | None) -> Verdict:
+        runs = evidence.run_numbers[0]  # type: ignore[index]
+        calls.append((evidence.name, runs))
+        status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
+        return Verdict(evidence.name, status, (f"{status}: at {runs}",), runs, 1, design.settings)
+
+    monkeypatch.setattr(sequential, "look", verdict_at)
+    monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)
+    bare = {"own": None, "landmarks": None, "rejections": None}
+    monkeypatch.setattr(sequential, "evidence_of", lambda c, runs: Evidence(c.name, runs=[runs]))
+    verdicts: dict[str, Verdict] = {}
+    read = lambda runs, name: SimpleNamespace(name=name, **bare)  # noqa: E731
+    counts = list(sequential.looks(sequential_design(3), ["early", "late"], read, verdicts))  # type: ignore[arg-type]
+    assert counts == [12, 15, 18, 21, 24]
+    assert {name: v.status for name, v in verdicts.items()} == {"early": "overconfident", "late": "conservative"}
+    assert [call for call in calls if call[0] == "early"] == [("early", 12)]
+    assert [runs for name, runs in calls if name == "late"] == [12, 24]
+    assert list(verdicts) == ["early", "late"]

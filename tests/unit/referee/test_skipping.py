@@ -1,0 +1,312 @@
+"""First steps left out of the statistics, and the hint that a fault is in them alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import first_steps
+import numpy as np
+import pytest
+from draws import autoregression, fully_dependent, identities, independent, verdict_on
+from recorded import read_recordings
+
+import consistency as cs
+from consistency.bench.store.curves import Curves, Errors
+from consistency.referee.cli import main as command
+from consistency.referee.diagnostics.skipping import Skip, skip_of
+from consistency.referee.diagnostics.symmetric import Symmetric
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+from consistency.referee.verdicts.baselines import baseline_of_files, read_baseline, write_baseline
+from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse
+
+RUNS, STEPS, FIRST = 30, 40, 6
+SURE = 1e-5
+VOID = "a number that was chosen on these data voids the false-alarm rate"
+
+
+@pytest.fixture
+def errors(rng: np.random.Generator) -> Array:
+    """Too large in the first 6 of 40 steps, right afterwards."""
+    error = independent(rng, RUNS, STEPS, 3)
+    error[:, :FIRST] *= 4.0
+    return error
+
+
+@pytest.fixture
+def archive(tmp_path: Path, errors: Array) -> Path:
+    path = tmp_path / "mine.npz"
+    np.savez(path, errors=errors, covariances=identities(errors), t=100.0 + 0.5 * np.arange(STEPS))
+    return path
+
+
+# --- what is asked ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "size", "unit"), [("20", 20, "step"), (20, 20, "step"), ("2s", 2, "s"), (" 0.5 s", 0.5, "s")]
+)
+def test_steps_or_seconds(given: str | int, size: float, unit: str) -> None:
+    assert skip_of(given) == Skip(size, unit)
+
+
+@pytest.mark.parametrize("given", [None, 0, "0", "0s"])
+def test_nothing_is_left_out(given: Any) -> None:
+    assert skip_of(given) is None
+
+
+@pytest.mark.parametrize("given", [-1, "2.5", 2.5, True, "x", "2m", "s", ""])
+def test_neither_steps_nor_seconds(given: Any) -> None:
+    with pytest.raises(ValueError, match="must be a whole number of steps"):
+        skip_of(given)
+
+
+def test_seconds_count_from_the_first_time_of_each_run() -> None:
+    """The step at the end of the seconds is kept; a run that begins later loses later steps."""
+    t = np.array([[0.0, 0.5, 1.0, 1.5], [np.nan, 7.0, 7.5, 8.0]])
+    np.testing.assert_array_equal(Skip(1.0, "s").mask((2, 4), t), [[1, 1, 0, 0], [0, 1, 1, 0]])
+    np.testing.assert_array_equal(Skip(1.0, "s").mask((2, 4), t[0]), [[1, 1, 0, 0]] * 2)
+    with pytest.raises(ValueError, match="there are no times; give a number of steps"):
+        Skip(1.0, "s").mask((2, 4), np.array([[0.0, 1.0, 2.0, 3.0], [np.nan] * 4]))
+
+
+# --- verdicts ---------------------------------------------------------------------------------------
+
+
+def test_the_rest_is_judged_by_its_own_steps(archive: Path, errors: Array) -> None:
+    """As the errors without those steps, whose numbers it keeps; one right log in 1e5 is found at fault."""
+    record = cs.read(archive)
+    assert cs.judge(record).status == "overconfident"
+    errors[:, 22] *= 5.0
+    verdict = cs.judge(record, skip=FIRST, false_alarm=SURE)
+    cut = verdict_on(np.delete(errors, 22, axis=1)[:, FIRST:], false_alarm=SURE)
+    assert verdict.status == cut.status == "consistent"
+    assert verdict.reasons[0].endswith("; without the first 6 steps of each run")
+    assert any(VOID in reason for reason in verdict.reasons)
+    assert (verdict.steps, verdict.scale.judged_steps) == (STEPS, STEPS - FIRST)  # type: ignore[union-attr]
+    assert verdict.statistics["skip"] == "6"
+    assert (verdict.statistics["skipped_steps"], verdict.statistics["skipped_runs"]) == (FIRST, 0)
+    assert verdict.statistics["left_out_steps"] == []
+    assert np.isfinite(record.nees).all()  # type: ignore[arg-type]
+
+
+def test_steps_keep_their_numbers(errors: Array) -> None:
+    errors[:, 22] *= 5.0
+    with pytest.raises(ConsistencyError, match="without the first 6 steps of each run") as fault:
+        assert_consistent(errors, np.array(identities(errors)), skip=FIRST, false_alarm=0.01)
+    assert fault.value.verdict is not None
+    assert fault.value.verdict.first_step == 23
+
+
+@pytest.mark.parametrize("given", ["2.5s", "5"])
+def test_files_by_seconds_or_steps(given: str, archive: Path) -> None:
+    """Steps are half a second apart."""
+    verdict = cs.judge(cs.read(archive), skip=given)
+    assert verdict.statistics["skipped_steps"] == 5
+    assert np.isnan(verdict.statistics["anees"][:5]).all()
+    assert np.isfinite(verdict.statistics["anees"][5:]).all()
+
+
+def test_tables_have_times_of_each_run(tmp_path: Path) -> None:
+    """Two days, which share no clock: seconds count from the first estimate of each."""
+    head = "run,t,a,P_a_a\n"
+    rows = [f"{run},{5000.0 * run + 0.1 * k:.1f},{{}},1\n" for run in range(3) for k in range(10 + run)]
+    noise = np.random.default_rng(3).normal(size=len(rows))
+    (tmp_path / "est.csv").write_text(
+        head + "".join(row.format(f"{e:.6f}") for row, e in zip(rows, noise, strict=True))
+    )
+    (tmp_path / "truth.csv").write_text(head + "".join(row.format(0) for row in rows))
+    (record,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv", state=["a"])
+    assert np.isnan(record.t).all()
+    rest = record.without_first(Skip(0.35, "s"))
+    np.testing.assert_array_equal(np.isfinite(rest.nees).sum(axis=1), [6, 7, 8])  # type: ignore[arg-type]
+    assert record.without_first(None).skipped is None
+
+
+def test_windows_count_as_steps_and_by_their_beginning(tmp_path: Path, rng: np.random.Generator) -> None:
+    D = np.tile([1.0, 0.0, 0.0], (40, 1))
+    np.savez(
+        tmp_path / "m.npz", estimates=D + 0.01 * rng.normal(size=D.shape), truth=np.cumsum(D, axis=0),
+        covariances=np.tile(1e-4 * np.eye(3), (40, 1, 1)), t=0.5 * np.arange(40),
+    )  # fmt: skip
+    (record,) = read_recordings(tmp_path / "m.npz", relative=3, motions=True)
+    windows = int(np.isfinite(record.nees).sum())  # type: ignore[arg-type]
+    for skip, lost in ((Skip(2), 2), (Skip(3.0, "s"), 2), (Skip(3.1, "s"), 3)):
+        rest = record.without_first(skip)
+        assert int(np.isfinite(rest.nees).sum()) == windows - lost  # type: ignore[arg-type]
+    verdict = cs.judge(cs.read(tmp_path / "m.npz", relative=3, motions=True), skip=2)
+    assert verdict.runs == windows - 2
+    assert "without the first 2 steps of each log" in verdict.reasons[0]
+
+
+def test_a_run_of_which_nothing_is_left_is_named(errors: Array, tmp_path: Path) -> None:
+    lengths = np.full(RUNS, STEPS)
+    lengths[3] = 4
+    np.savez(tmp_path / "short.npz", errors=errors, covariances=identities(errors), lengths=lengths)
+    verdict = cs.judge(cs.read(tmp_path / "short.npz"), skip=FIRST)
+    assert verdict.statistics["skipped_runs"] == 1
+    assert any("nothing is left of 1 run;" in reason for reason in verdict.reasons)
+
+
+def test_refusals(archive: Path, tmp_path: Path, errors: Array) -> None:
+    record = cs.read(archive)
+    with pytest.raises(InputError, match="--skip 40: nothing of mine is left, whose last step is 40"):
+        cs.judge(record, skip=STEPS)
+    np.savez(tmp_path / "bare.npz", errors=errors, covariances=identities(errors))
+    with pytest.raises(InputError, match="--skip 2s: there are no times; give a number of steps"):
+        cs.judge(cs.read(tmp_path / "bare.npz"), skip="2s")
+    with pytest.raises(InputError, match=r"--skip 2\.5: must be a whole number of steps"):
+        cs.judge(record, skip=2.5)
+
+
+def test_innovations_without_the_first_steps(rng: np.random.Generator) -> None:
+    """NIS of the left-out steps count no more, nor do their degrees of freedom; one right case in 1e5 fails."""
+    nis = rng.chisquare(2, (RUNS, STEPS))
+    nis[:, :FIRST] *= 9.0
+    given: Any = {"nis": nis, "nis_dof": 2, "optimal_gain": True, "false_alarm": SURE}
+    with pytest.raises(ConsistencyError):
+        assert_consistent(**given)
+    verdict = assert_consistent(**given, skip=FIRST)
+    assert verdict.innovations is not None
+    assert verdict.innovations.dof == 2 * RUNS * (STEPS - FIRST)
+    assert verdict.innovations.ratio == pytest.approx(nis[:, FIRST:].mean() / 2)
+
+
+def test_gates_with_nees_alone(errors: Array) -> None:
+    nees = np.square(errors).sum(axis=-1)
+    assert assert_consistent(nees=nees, dof=3, skip=FIRST, false_alarm=SURE).statistics["skipped_steps"] == FIRST
+    with pytest.raises(ConsistencyError, match="skip=8 in a gate"):
+        assert_consistent(nees=nees, dof=3, false_alarm=0.01)
+
+
+def test_a_comparison_without_the_first_steps(errors: Array, rng: np.random.Generator) -> None:
+    """Both filters are right afterwards; one pair in 1e5 is said to differ."""
+    P, other = np.array(identities(errors)), independent(rng, RUNS, STEPS, 3)
+    with pytest.raises(ConsistencyError):
+        assert_not_worse(errors, P, other, P, false_alarm=SURE)
+    assert_not_worse(errors, P, other, P, false_alarm=SURE, skip=FIRST, detect=3.0)
+
+
+def test_a_baseline_holds_what_it_was_written_with(archive: Path, tmp_path: Path) -> None:
+    records = read_recordings(archive)
+    write_baseline(baseline_of_files(records, "mine", skip=FIRST), tmp_path / "base.json")
+    assert read_baseline(tmp_path / "base.json", skip="6").skip == "6"
+    for skip, wanted in ((None, "without --skip"), (7, "with --skip 7")):
+        with pytest.raises(InputError, match=f"was written with --skip 6; write it again {wanted}"):
+            read_baseline(tmp_path / "base.json", skip=skip)
+    means = baseline_of_files(records, "mine").filters["mine"].nees
+    rest = baseline_of_files(records, "mine", skip=FIRST).filters["mine"].nees
+    assert (rest < means).all()
+
+
+def test_curves_of_results() -> None:
+    """Errors stay, and so does the error of the filter's own; what they are held against is left out."""
+    shape = (2, 4)
+    P, own = Symmetric.filled(shape, 3, 1.0), Symmetric.filled(shape, 3, 2.0)
+    numbers = np.ones(shape)
+    error = np.ones((*shape, 3))
+    c = Curves(
+        "f", np.arange(2), np.arange(1.0, 5.0), P, error, numbers, numbers, numbers.astype(np.int64), (),
+        convention="left", own=Errors(error, own, numbers),
+    )  # fmt: skip
+    rest = c.without_first(Skip(2.0, "s"))
+    assert rest.own is not None
+    for values in (rest.nees, rest.nis, rest.covariance.entry(0, 1), rest.own.nees, rest.own.covariance.entry(2, 2)):
+        np.testing.assert_array_equal(np.isnan(values), [[True, True, False, False]] * 2)
+    np.testing.assert_array_equal(rest.nis_dof, [[0, 0, 1, 1]] * 2)
+    assert rest.nis_dof.dtype == np.int64
+    assert rest.error is error
+    assert np.isfinite(P.entry(0, 0)).all()
+    with pytest.raises(InputError, match="--skip 4: nothing of f is left"):
+        c.without_first(Skip(4))
+
+
+def main(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as end:
+        command(arguments)
+    return int(end.value.code or 0)
+
+
+def test_the_command(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["analyse", str(archive), "--skip", "3s", "--fail-on", "inconsistent", "--json"]) == 0
+    (verdict,) = json.loads(capsys.readouterr().out).values()
+    assert verdict["statistics"]["skip"] == "3s"
+    assert main(["analyse", str(archive), "--fail-on", "inconsistent"]) == 1
+    assert "the fault is in the first 8 steps only" in capsys.readouterr().out.replace("\n", " ")
+    assert main(["analyse", str(archive), "--skip", "99"]) == 2
+    assert main(["compare", str(archive), str(archive), "--skip", "x"]) == 2
+    assert main(["compare", str(archive), str(archive), "--skip", "6"]) == 0
+    assert main(["baseline", str(archive), "--skip", "6", "--out", str(tmp_path / "b.json")]) == 0
+    capsys.readouterr()
+    assert main(["compare", str(archive), str(tmp_path / "b.json")]) == 2
+    assert "was written with --skip 6; write it again without --skip" in capsys.readouterr().err
+
+
+# --- the hint ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ratio", [6.0, 1.0 / 6.0])
+@pytest.mark.parametrize("steps", [1, 5, 16])
+def test_a_fault_of_the_first_steps_is_named(steps: int, ratio: float, rng: np.random.Generator) -> None:
+    """50 standard errors from being missed, and the ratio afterwards is outside its interval in one case of 20."""
+    error = independent(rng, 200, 60, 3)
+    error[:, :steps] *= np.sqrt(ratio)
+    verdict = verdict_on(error, false_alarm=SURE)
+    assert verdict.location is not None
+    until = verdict.location.until
+    assert until is not None
+    assert until.step in (steps, 1 << (steps - 1).bit_length())
+    assert until.early == pytest.approx(1.0 + (ratio - 1.0) * steps / until.step, rel=0.3)
+    assert until.late.value == pytest.approx(1.0, abs=0.05)
+    where = "the first step" if until.step == 1 else f"the first {until.step} steps"
+    (said,) = (reason for reason in verdict.reasons if "the fault is in" in reason)
+    assert said.startswith(f"the fault is in {where} only, where the covariance ratio is ")
+    assert f"state --skip {until.step} (skip={until.step} in a gate)" in said
+    assert verdict.statistics["until"] == until.step
+
+
+def test_a_bias_of_the_first_steps_is_named(rng: np.random.Generator) -> None:
+    error = autoregression(rng, 100, 64, 3)
+    error[:, :8, 0] += 4.0
+    verdict = verdict_on(error, false_alarm=SURE)
+    assert verdict.location is not None
+    assert verdict.location.until is not None
+    assert verdict.location.until.step == 8
+
+
+def test_no_hint_where_a_fault_remains(rng: np.random.Generator) -> None:
+    """Half of the fault is left, or a later step has one too, or the fault is in the later steps."""
+    for scale in (np.r_[np.full(8, 9.0), np.full(56, 2.5)], np.r_[9.0, np.ones(40), 9.0, np.ones(22)],
+                  np.r_[np.ones(32), np.full(32, 9.0)], np.r_[np.full(40, 9.0), np.ones(24)]):  # fmt: skip
+        error = independent(rng, 100, 64, 3) * np.sqrt(scale)[:, None]
+        verdict = verdict_on(error, false_alarm=SURE)
+        assert verdict.faults
+        assert verdict.location is not None
+        assert verdict.location.until is None
+
+
+def test_no_hint_of_few_runs_or_a_single_step(rng: np.random.Generator) -> None:
+    for shape in ((7, 60), (50, 1)):
+        error = 3.0 * independent(rng, *shape, 3)
+        if shape[1] > 1:
+            error[:, 8:] /= 3.0
+        verdict = verdict_on(error)
+        assert verdict.location is not None
+        assert verdict.location.until is None
+
+
+def test_uniform_faults_get_no_hint() -> None:
+    """At most 4 % of right ones; 29 of 250 or more come once in 1e5."""
+    rng, hints = np.random.default_rng(27), 0
+    for i in range(250):
+        rho = (0.0, 0.9, 1.0)[i % 3]
+        hints += first_steps.hinted(np.sqrt(1.6) * first_steps.errors(rng, rho, 20, 32, False))[1]
+    assert hints < 29
+
+
+def test_constant_errors_of_a_run_get_none(rng: np.random.Generator) -> None:
+    verdict = verdict_on(2.0 * fully_dependent(rng, 40, 32, 3))
+    assert verdict.location is not None
+    assert verdict.location.until is None

@@ -1,0 +1,368 @@
+"""Gates of ``consistency.testing`` without a session around them.
+
+Right filters are judged at a false-alarm rate of 1e-6 each, 2e-5 in this file; faults are far beyond what is found
+with a power of 1 - 1e-6.
+"""
+
+from __future__ import annotations
+
+import pickle
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import consistency as cs
+from consistency.referee.diagnostics import gate_runs
+from consistency.referee.types import Array
+from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
+
+RARE = 1e-6  # false-alarm rate of a gate here
+RUNS = gate_runs(3, 1.5, RARE, 0.95)
+OPTIMAL = {"optimal_gain": True}
+
+
+def sample(
+    rng: np.random.Generator, runs: int = RUNS, steps: int = 12, n: int = 3, true: float = 1.0
+) -> tuple[Array, Array]:
+    """Errors that follow each other (AR(1), 0.8), and covariances that are theirs over ``true``; of mixed units."""
+    A = rng.normal(size=(n, n)) + 2.0 * np.eye(n)
+    A[0] *= 1e-3
+    z = rng.normal(size=(runs, steps, n))
+    for k in range(1, steps):
+        z[:, k] = 0.8 * z[:, k - 1] + 0.6 * z[:, k]
+    P = np.broadcast_to(A @ A.T / true, (runs, steps, n, n))
+    return z @ A.T, 0.5 * (P + np.swapaxes(P, -1, -2))
+
+
+# --- what passes and what does not -----------------------------------------------------------------
+
+
+def test_a_right_filter_passes(rng: np.random.Generator) -> None:
+    verdict = assert_consistent(*sample(rng), false_alarm=RARE, axes=["x", "y", "heading"])
+    assert verdict.status == "consistent"
+    assert verdict.faults == ()
+    assert verdict.statistics["runs"] == RUNS
+
+
+@pytest.mark.parametrize(("true", "status"), [(3.0, "overconfident"), (1 / 3, "conservative")])
+def test_a_wrong_scale_does_not(rng: np.random.Generator, true: float, status: str) -> None:
+    with pytest.raises(ConsistencyError) as caught:
+        assert_consistent(*sample(rng, true=true), false_alarm=RARE, name="mine")
+    verdict = caught.value.verdict
+    assert verdict is not None
+    assert (verdict.status, verdict.filter) == (status, "mine")
+    assert verdict.p_value <= RARE
+    assert "scale" in verdict.faults
+    low, high = verdict.inflation_interval
+    assert low < verdict.inflation < high
+    assert abs(np.log(verdict.inflation / true)) < 0.5
+    lines = str(caught.value).splitlines()
+    assert lines[0] == f"assert_consistent: mine is {verdict.reasons[0]}"
+    assert lines[1:] == [f"  - {reason}" for reason in verdict.reasons[1:]]
+
+
+def test_a_bias_does_not(rng: np.random.Generator) -> None:
+    errors, covariances = sample(rng)
+    sigma = np.sqrt(covariances[0, 0, 1, 1])
+    with pytest.raises(ConsistencyError, match="biased") as caught:
+        assert_consistent(errors + np.array([0.0, 1.5 * sigma, 0.0]), covariances, false_alarm=RARE)
+    assert caught.value.verdict is not None
+    assert "bias" in caught.value.verdict.faults
+
+
+def test_a_covariance_too_large_can_be_allowed(rng: np.random.Generator) -> None:
+    errors, covariances = sample(rng, true=1 / 3)
+    assert assert_consistent(errors, covariances, allow="conservative", false_alarm=RARE).consistent
+    with pytest.raises(ConsistencyError):
+        assert_consistent(errors, covariances / 9.0, allow="conservative", false_alarm=RARE)
+
+
+def test_nees_alone(rng: np.random.Generator) -> None:
+    errors, covariances = sample(rng)
+    nees = cs.nees(errors, covariances)
+    assert assert_consistent(nees=nees, dof=3, false_alarm=RARE).consistent
+    with pytest.raises(ConsistencyError):
+        assert_consistent(nees=3.0 * nees, dof=3, false_alarm=RARE)
+
+
+def test_a_subset_is_looked_at(rng: np.random.Generator) -> None:
+    verdict = assert_consistent(*sample(rng), false_alarm=RARE, subsets={"first two": [0, 1]}, method="bonferroni")
+    assert "first two" in verdict.statistics["groups"]
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_as_many_runs_as_components(rng: np.random.Generator, n: int) -> None:
+    """(runs, n) beside (runs, n, n) with runs = n is one matrix of right-hand sides to ``solve``; not here."""
+    errors, covariances = sample(rng, runs=n, n=n)
+    verdict = assert_consistent(errors, covariances, false_alarm=RARE, detect=1e6)
+    expected = np.mean(
+        [[e @ np.linalg.inv(P) @ e for e, P in zip(*run, strict=True)] for run in zip(errors, covariances, strict=True)]
+    )
+    assert verdict.statistic == pytest.approx(expected, rel=1e-9)
+
+
+# --- innovations -----------------------------------------------------------------------------------
+
+
+def test_innovations_alone(rng: np.random.Generator) -> None:
+    S = np.broadcast_to(np.diag([4.0, 0.25]), (40, 50, 2, 2))
+    v = rng.normal(size=(40, 50, 2)) * [2.0, 0.5]
+    v[:, 7] = np.nan  # no measurement in step 8
+    assert assert_consistent(innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL).consistent
+    nis, dof = np.where(np.isnan(v[..., 0]), np.nan, np.square(v / [2.0, 0.5]).sum(-1)), np.full((40, 50), 2)
+    dof[:, 7] = 0
+    assert assert_consistent(nis=nis, nis_dof=dof, false_alarm=RARE, **OPTIMAL).consistent
+    with pytest.raises(ConsistencyError, match="larger than stated"):
+        assert_consistent(innovations=v, innovation_covariances=S / 2.0, false_alarm=RARE, **OPTIMAL)
+    slow = np.repeat(rng.normal(size=(40, 25, 2)), 2, axis=1) * [2.0, 0.5]
+    with pytest.raises(ConsistencyError, match="correlated over steps"):
+        assert_consistent(innovations=slow, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
+
+
+def test_innovations_beside_errors(rng: np.random.Generator) -> None:
+    """Right errors, innovations twice as wide as stated."""
+    S, v = np.ones((RUNS, 12, 1, 1)), 2.0 * rng.normal(size=(RUNS, 12, 1))
+    with pytest.raises(ConsistencyError) as caught:
+        assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
+    assert caught.value.verdict is not None
+    assert caught.value.verdict.faults == ("innovation scale",)
+    verdict = assert_consistent(*sample(rng), innovations=v, innovation_covariances=S, false_alarm=RARE)
+    assert verdict.innovations is not None
+    assert not verdict.innovations.judged
+    assert verdict.innovations.ratio > 3.0
+
+
+def test_innovations_of_any_gain_decide_nothing(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="only with optimal_gain=True"):
+        assert_consistent(nis=rng.chisquare(2, (40, 50)), nis_dof=2)
+
+
+# --- enough runs -----------------------------------------------------------------------------------
+
+
+def test_too_few_runs_do_not_pass(rng: np.random.Generator) -> None:
+    """Five runs have 15 degrees of freedom: no ratio shows that 1.5 and 1 / 1.5 are both too far off."""
+    errors, covariances = sample(rng, runs=5)
+    with pytest.raises(InsufficientTrials) as caught:
+        assert_consistent(errors, covariances, false_alarm=RARE)
+    assert (caught.value.needed, caught.value.runs) == (RUNS, 5)
+    assert caught.value.verdict is not None
+    assert caught.value.verdict.status == "undecided"
+    assert f"consistency plan --dof 3 --detect 1.5 --false-alarm {RARE} --power 0.95" in str(caught.value)
+    assert "5 runs do not show the covariance ratio" in str(caught.value)
+    with pytest.raises(InsufficientTrials, match="--allow conservative"):
+        assert_consistent(errors, covariances, false_alarm=RARE, detect=1.01, allow="conservative")
+
+
+def test_a_small_fault_can_be_tolerated(rng: np.random.Generator) -> None:
+    """x1.2 in 4,000 runs is found beyond all doubt, and shown to be below 1.5."""
+    errors, covariances = sample(rng, runs=4000, true=1.2)
+    with pytest.raises(ConsistencyError, match=r"covariance too small by x1\.2"):
+        assert_consistent(errors, covariances, false_alarm=RARE)
+    verdict = assert_consistent(errors, covariances, false_alarm=RARE, tolerance=1.4)
+    assert "within the tolerance of x1.4" in "".join(verdict.reasons)
+    with pytest.raises(ConsistencyError):
+        assert_consistent(errors, covariances, false_alarm=RARE, tolerance=1.1)
+    with pytest.raises(ValueError, match="tolerance must be"):
+        assert_consistent(errors, covariances, tolerance=-1.0)
+
+
+def test_a_fault_is_a_fault_in_few_runs_too(rng: np.random.Generator) -> None:
+    with pytest.raises(ConsistencyError):
+        assert_consistent(*sample(rng, runs=5, true=100.0), false_alarm=RARE)
+
+
+def test_the_defaults_are_those_of_the_documentation(rng: np.random.Generator) -> None:
+    with pytest.raises(InsufficientTrials) as caught:  # fixed values: no chance in it
+        assert_consistent(nees=[[3.0], [2.0]], dof=3)
+    assert caught.value.needed == gate_runs(3, 1.5, 1e-3, 0.95)
+
+
+@pytest.mark.parametrize("error", [ConsistencyError("text"), InsufficientTrials("text", 7, 3)])
+def test_errors_travel_between_processes(error: Any) -> None:
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), vars(again)) == (str(error), vars(error))
+
+
+# --- input that cannot be judged -------------------------------------------------------------------
+
+
+def spoilt(what: str) -> tuple[Array, Array]:
+    errors = np.random.default_rng(0).normal(size=(6, 8, 3))
+    covariances = np.broadcast_to(np.eye(3), (6, 8, 3, 3)).copy()
+    bad = covariances[4, 6]
+    if what == "error":
+        errors[4, 6, 1] = np.nan
+    elif what == "infinite":
+        errors[4, 6, 1] = np.inf
+    elif what == "covariance":
+        bad[0, 0] = np.nan
+    elif what == "asymmetric":
+        bad[0, 1] = 1e-7
+    elif what == "negative":
+        bad[2, 2] = -1.0
+    elif what == "indefinite":
+        bad[0, 1] = bad[1, 0] = 1.5
+    else:
+        bad[:2, :2] = 1.0
+    return errors, covariances
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("error", "errors: not finite"), ("infinite", "errors: not finite"), ("covariance", "covariances: not finite"),
+        ("asymmetric", "not symmetric"), ("negative", "not positive definite"),
+        ("indefinite", "not positive definite"), ("singular", "singular"),
+    ],
+)  # fmt: skip
+def test_unusable_input_is_named_by_run_and_step(what: str, said: str) -> None:
+    errors, covariances = spoilt(what)
+    with pytest.raises(ValueError, match=rf"{said}.* in run 4, step 7$"):
+        assert_consistent(errors, covariances)
+    with pytest.raises(ValueError, match=rf"reference b: .*{said}.* in run 4, step 7$"):
+        assert_not_worse(np.ones((6, 8, 3)), np.broadcast_to(np.eye(3), (6, 8, 3, 3)), errors, covariances)
+
+
+def test_nearly_symmetric_is_symmetric() -> None:
+    errors, covariances = spoilt("none of these")
+    covariances[4, 6] = np.eye(3)
+    covariances[4, 6, 0, 1] = 1e-9
+    with pytest.raises(InsufficientTrials):  # judged, that is; false-alarm rate 1e-6
+        assert_consistent(errors, covariances, false_alarm=RARE)
+
+
+E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3), (4, 2, 3, 3))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({}, "nothing to judge"),
+        ({"errors": E}, "errors without covariances"),
+        ({"covariances": P}, "covariances without errors"),
+        ({"errors": E[0], "covariances": P[0]}, "(runs, steps, n), got (2, 3); of a single step: errors[:, None, :]"),
+        ({"errors": E, "covariances": P[..., :2]}, "(4, 2, 3, 3) to fit errors (4, 2, 3), got (4, 2, 3, 2)"),
+        ({"errors": E[:0], "covariances": P[:0]}, "must have shape (runs, steps, n)"),
+        ({"errors": [[[1.0], [2.0]], [[1.0]]], "covariances": P}, "errors: not an array of numbers"),
+        ({"errors": E, "covariances": P, "dof": 2}, "dof is 2, but the errors have 3 components"),
+        ({"errors": E, "covariances": P, "nees": E[..., 0]}, "not both"),
+        ({"nees": E[..., 0]}, "nees without dof"),
+        ({"nees": E[..., 0], "dof": 0}, "dof must be at least 1"),
+        ({"nees": E[0, :, 0], "dof": 3}, "nees must have shape (runs, steps), got (2,)"),
+        ({"nees": np.abs(E[..., 0]) - 9.0, "dof": 3}, "nees: negative in run 0, step 1"),
+        ({"nees": E[..., 0] * np.nan, "dof": 3}, "nees: not finite in run 0, step 1"),
+        ({"nees": E[..., 0] ** 2, "dof": 3, "axes": ["a", "b", "c"]}, "axes needs errors and covariances"),
+        ({"nis": E[..., 0]}, "give nis and nis_dof together"),
+        ({"nis": E[..., 0] ** 2, "nis_dof": 1.5}, "whole numbers"),
+        ({"nis": E[..., 0] * np.nan, "nis_dof": 1}, "nis: not finite in run 0, step 1"),
+        ({"innovations": E}, "give innovations and innovation_covariances together"),
+        ({"innovations": E, "innovation_covariances": E}, "(runs, steps, m) and (runs, steps, m, m)"),
+        ({"errors": E, "covariances": P, "nis": E[:2, :, 0] ** 2, "nis_dof": 1}, "nis has (2, 2) runs and steps"),
+        ({"errors": E, "covariances": P, "allow": "optimistic"}, "allow must be 'conservative' or None"),
+        ({"errors": E, "covariances": P, "method": "pointwise"}, "method must be 'max' or 'bonferroni'"),
+        ({"errors": E, "covariances": P, "false_alarm": 0.0}, "false_alarm must lie between 0 and 1"),
+        ({"errors": E, "covariances": P, "power": 1.0}, "power must lie between 0 and 1"),
+        ({"errors": E, "covariances": P, "detect": 1.0}, "detect must be a positive ratio"),
+        ({"errors": E, "covariances": P, "detect": 0.5, "allow": "conservative"}, "which allow='conservative' accepts"),
+        ({"errors": E, "covariances": P, "axes": ["x"]}, "1 names of axes for 3 components"),
+        ({"errors": E, "covariances": P, "filter": "kf"}, "results"),
+    ],
+)
+def test_unusable_arguments_say_what_is_wrong(arguments: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)):
+        assert_consistent(**arguments)
+
+
+# --- two filters -----------------------------------------------------------------------------------
+
+
+def test_a_filter_is_not_worse_than_itself(rng: np.random.Generator) -> None:
+    data = sample(rng)
+    assert not assert_not_worse(*data, *data, false_alarm=RARE).worse  # p is 1: no chance in it
+
+
+@pytest.mark.parametrize("true", [2.0, 0.5])
+def test_a_less_consistent_filter_is_worse(rng: np.random.Generator, true: float) -> None:
+    errors, covariances = sample(rng)
+    with pytest.raises(ConsistencyError, match="worse than the reference: mean NEES") as caught:
+        assert_not_worse(errors, covariances / true, errors, covariances, false_alarm=RARE, name="new")
+    assert caught.value.comparison is not None
+    assert caught.value.comparison.worse
+    assert caught.value.verdict is not None
+    assert caught.value.verdict.filter == "new"
+    nees = cs.nees(errors, covariances)
+    with pytest.raises(ConsistencyError):
+        assert_not_worse(nees_a=true * nees, nees_b=nees, dof=3, false_alarm=RARE)
+    assert not assert_not_worse(
+        nees_a=nees, nees_b=true * nees, dof=3, false_alarm=RARE, detect=3.0
+    ).worse  # the better one
+
+
+def test_a_comparison_needs_runs(rng: np.random.Generator) -> None:
+    a, b = sample(rng, runs=9), sample(rng, runs=9)
+    with pytest.raises(InsufficientTrials, match="at the spread between these runs") as caught:
+        assert_not_worse(*a, *b, false_alarm=RARE, detect=1.01)
+    assert caught.value.needed > 9
+    with pytest.raises(InsufficientTrials, match="4 runs are too few for a standard error"):
+        assert_not_worse(a[0][:4], a[1][:4], b[0][:4], b[1][:4])
+
+
+def test_rows_of_a_comparison_are_the_same_trials(rng: np.random.Generator) -> None:
+    e, P = sample(rng, runs=20)
+    with pytest.raises(ValueError, match="20 runs and the reference 19"):
+        assert_not_worse(e, P, e[1:], P[1:])
+    with pytest.raises(ValueError, match="3 and 2 components"):
+        assert_not_worse(e, P, e[..., :2], P[..., :2, :2])
+    with pytest.raises(ValueError, match="need results"):
+        assert_not_worse(e, P, e, P, than="kf")
+    with pytest.raises(ValueError, match="reference b: nothing to judge"):
+        assert_not_worse(e, P)
+
+
+# --- the bench's own results -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stereo() -> cs.Results:
+    scenario = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=80)
+    return cs.run_trials(scenario, filters=["ekf-xyz", "ekf-uvd"], runs=12, seed=0)
+
+
+def test_results_are_judged_as_by_analyse(stereo: cs.Results) -> None:
+    with pytest.raises(ConsistencyError) as caught:
+        assert_consistent(stereo, filter="ekf-xyz", false_alarm=0.05)
+    assert caught.value.verdict is not None
+    assert caught.value.verdict.reasons == cs.analyse(stereo)["ekf-xyz"].reasons
+    assert caught.value.verdict.status == "overconfident"
+
+
+def test_a_failed_run_is_a_fault(stereo: cs.Results) -> None:
+    row = {"filter": ["ekf-uvd"], "run": [3], "step": [40], "reason": ["NaN"]}
+    failures = pd.DataFrame(row).astype(stereo.failures.dtypes)
+    broken = replace(stereo, failures=failures, estimates=stereo.estimates[stereo.estimates["run"] != 3])
+    with pytest.raises(ConsistencyError, match="1 of 12 runs failed"):
+        assert_consistent(broken, filter="ekf-uvd", detect=20.0, false_alarm=RARE)
+
+
+def test_results_compared(stereo: cs.Results) -> None:
+    with pytest.raises(ConsistencyError, match="worse than ekf-uvd"):
+        assert_not_worse(stereo, filter="ekf-xyz", than="ekf-uvd", false_alarm=0.01)
+    assert not assert_not_worse(stereo, filter="ekf-xyz", reference=stereo, false_alarm=RARE).worse
+    with pytest.raises(ValueError, match="name the filter to compare with"):
+        assert_not_worse(stereo, filter="ekf-xyz")
+    with pytest.raises(ValueError, match="'kf' is not in the reference"):
+        assert_not_worse(stereo, filter="ekf-xyz", than="kf")
+
+
+def test_results_need_a_filter_and_bring_the_rest(stereo: cs.Results) -> None:
+    with pytest.raises(ValueError, match="filter: name one of ekf-xyz, ekf-uvd"):
+        assert_consistent(stereo)
+    with pytest.raises(ValueError, match="'kf' is not in these results"):
+        assert_consistent(stereo, filter="kf")
+    with pytest.raises(ValueError, match="dof: results bring their own"):
+        assert_consistent(stereo, filter="ekf-xyz", dof=3)

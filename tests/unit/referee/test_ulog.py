@@ -1,0 +1,190 @@
+"""Flight logs of PX4 through the monitor: pairs, sensors, units, repeats, gaps, NaN, and every refusal."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from consistency.referee.cli import main
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array
+from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch
+
+pytest.importorskip("pyulog", reason="needs the extra 'ulog'")
+
+from flight import TOPICS, Flight
+
+STEP = 20_000  # us between messages
+NAN = float("nan")
+
+
+def flight(
+    innovations: Array, variances: Array, field: str = "gps_hpos", *, sample: bool = True, start: int = 10**7
+) -> Flight:
+    """Innovations (N, n) of one sensor with their variances (N, n)."""
+    log = Flight(sample=sample)
+    for k, (own, variance) in enumerate(zip(innovations, variances, strict=True)):
+        log.both(start + k * STEP, {field: (own, variance)})
+    return log
+
+
+def draws(ratio: float = 1.0, steps: int = 400, n: int = 2) -> tuple[Array, Array]:
+    """White innovations whose true variance is ``ratio`` times the one that is logged, which changes."""
+    rng = np.random.default_rng()
+    variance = np.exp(rng.normal(size=(steps, n)))
+    return np.sqrt(ratio * variance) * rng.normal(size=(steps, n)), variance
+
+
+def test_the_nis_of_a_sensor_is_the_sum_over_its_components(tmp_path: Path) -> None:
+    own, variance = draws()
+    path = flight(own, variance).write(tmp_path / "a.ulg")
+    log = read_innovations(path)
+    assert log.name == "gps_hpos"
+    np.testing.assert_allclose(log.nis, (own**2 / variance).sum(axis=1), rtol=1e-5)  # floats of four bytes
+    assert (log.dof == 2).all()
+    np.testing.assert_allclose(log.t, 10.0 + 0.02 * np.arange(len(own)), rtol=1e-12)
+    assert log.step.tolist() == list(range(1, len(own) + 1))
+    one = read_innovations(path, "gps_hpos[1]")
+    np.testing.assert_allclose(one.nis, own[:, 1] ** 2 / variance[:, 1], rtol=1e-5)
+    assert (one.dof == 1).all()
+
+
+def test_an_honest_filter_raises_no_alarm_and_one_that_is_not_does(tmp_path: Path) -> None:
+    """False-alarm rate 1e-5; a variance four times too small is found in 400 steps of 2 with certainty."""
+    for ratio, alarm in ((1.0, False), (4.0, True)):
+        path = flight(*draws(ratio)).write(tmp_path / "a.ulg")
+        watched = watch(read_innovations(path), make_monitor("optimal", false_alarm=1e-5))
+        assert (watched.alarm is not None) == alarm
+        assert watched.alarm is None or watched.alarm.direction == "overconfident"
+
+
+def test_repeats_nan_and_sensors_that_are_not_fused_are_no_measurements(tmp_path: Path) -> None:
+    own = np.array([[1.0, 2.0], [1.0, 2.0], [1.0, 3.0], [NAN, NAN], [NAN, 2.0], [3.0, 1.0], [0.0, 0.0], [0.0, 4.0]])
+    variance = np.array(
+        [[4.0, 1.0], [4.0, 1.0], [4.0, 1.0], [4.0, 1.0], [1.0, 1.0], [9.0, NAN], [0.0, 0.0], [1.0, 2.0]]
+    )
+    log = read_innovations(flight(own, variance).write(tmp_path / "a.ulg"))
+    np.testing.assert_allclose(log.nis, [4.25, NAN, 9.25, NAN, 4.0, 1.0, NAN, 8.0])
+    assert log.dof.tolist() == [2, 0, 2, 0, 1, 1, 0, 2]
+    assert "gps_hpos: 5 innovations in 8 messages; 1 message repeat" in log.notes[0]
+
+
+def test_what_has_no_partner_is_left_out_and_counted(tmp_path: Path) -> None:
+    own, variance = draws(steps=6)
+    log = Flight()
+    for k in range(6):
+        stamp = 5_000_000 + k * STEP
+        if k != 1:
+            log.log(TOPICS[0], stamp, {"gps_hpos": own[k]})
+        if k != 4:
+            log.log(TOPICS[1], stamp, {"gps_hpos": variance[k]})
+    found = read_innovations(log.write(tmp_path / "a.ulg"))
+    keep = [0, 2, 3, 5]
+    np.testing.assert_allclose(found.nis, (own**2 / variance).sum(axis=1)[keep], rtol=1e-5)
+    np.testing.assert_allclose(found.t, 5.0 + 0.02 * np.array(keep))
+    assert any("2 messages have no partner" in note for note in found.notes)
+
+
+def test_logs_without_the_time_of_the_sample_go_by_that_of_publication(tmp_path: Path) -> None:
+    own, variance = draws(steps=5)
+    found = read_innovations(flight(own, variance, sample=False).write(tmp_path / "a.ulg"))
+    np.testing.assert_allclose(found.nis, (own**2 / variance).sum(axis=1), rtol=1e-5)
+
+
+def test_gaps_and_losses_are_named(tmp_path: Path) -> None:
+    own, variance = draws(steps=20)
+    log = Flight()
+    for k in range(20):
+        log.both(10**6 + k * STEP + (k > 10) * 3 * 10**6, {"gps_hpos": (own[k], variance[k])})
+    log.lose(2900)
+    log.lose(60)
+    notes = "\n".join(read_innovations(log.write(tmp_path / "a.ulg")).notes)
+    assert "1 gap in the messages, the longest of 3.02 s" in notes
+    assert "the logger lost messages 2 times, 2.96 s in all" in notes
+    assert "damaged" not in notes
+
+
+def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    own, variance = draws(steps=50)
+    path = flight(own, variance).write(tmp_path / "a.ulg")
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 3 // 5])
+    log = read_innovations(path)
+    assert 20 < len(log.nis) < 40
+    np.testing.assert_allclose(log.nis, (own**2 / variance).sum(axis=1)[: len(log.nis)], rtol=1e-5)
+
+
+def test_sensors_and_instances_are_chosen(tmp_path: Path) -> None:
+    (gps, S), (baro, T) = draws(steps=9), draws(steps=9, n=1)
+    log = Flight()
+    for k in range(9):
+        log.both(10**6 + k * STEP, {"gps_hpos": (gps[k], S[k]), "baro_vpos": (baro[k], T[k])}, instance=0)
+        log.both(10**6 + k * STEP, {"baro_vpos": (2.0 * baro[k], T[k])}, instance=1)
+    path = log.write(tmp_path / "a.ulg")
+    with pytest.raises(InputError, match=r"holds more than one instance of the EKF2 \(0, 1\); choose with --run"):
+        read_innovations(path)
+    with pytest.raises(InputError, match=r"holds more than one sensor \(gps_hpos, baro_vpos\); choose with --filter"):
+        read_innovations(path, run=0)
+    first, second = (read_innovations(path, "baro_vpos", run) for run in (0, 1))
+    np.testing.assert_allclose(first.nis, baro[:, 0] ** 2 / T[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(second.nis, 4.0 * first.nis, rtol=1e-5)
+    with pytest.raises(InputError, match=r"--filter gps_hpos: is never fused in .*; there are: baro_vpos$"):
+        read_innovations(path, "gps_hpos", 1)
+    with pytest.raises(InputError, match=r"--filter sonar: is not in .*; there are: gps_hpos, baro_vpos$"):
+        read_innovations(path, "sonar", 0)
+    with pytest.raises(InputError, match="--run 3: is not in"):
+        read_innovations(path, "baro_vpos", 3)
+
+
+def test_what_cannot_be_judged_is_refused(tmp_path: Path) -> None:
+    own, variance = draws(steps=3)
+    path = tmp_path / "a.ulg"
+    with pytest.raises(InputError, match=r"a\.ulg: no such file"):
+        read_innovations(path)
+    path.write_bytes(b"ULog")
+    with pytest.raises(InputError, match=r"a\.ulg: cannot be read as a ULog, damaged or cut short"):
+        read_innovations(path)
+    Flight().write(path)
+    with pytest.raises(InputError, match="holds no message 'estimator_innovations'"):
+        read_innovations(path)
+    lone = Flight()
+    lone.log(TOPICS[0], 10**6, {"gps_hpos": own[0]})
+    with pytest.raises(InputError, match="holds no message 'estimator_innovation_variances'"):
+        read_innovations(lone.write(path))
+    lone.log(TOPICS[1], 10**6, {"gps_hpos": variance[0]}, instance=1)
+    with pytest.raises(InputError, match="no instance of the EKF2 has both"):
+        read_innovations(lone.write(path))
+    apart = Flight()
+    apart.log(TOPICS[0], 10**6, {"gps_hpos": own[0]})
+    apart.log(TOPICS[1], 2 * 10**6, {"gps_hpos": variance[0]})
+    with pytest.raises(InputError, match="no message of estimator_innovations has its partner"):
+        read_innovations(apart.write(path))
+    with pytest.raises(InputError, match=r"field 'gps_hpos\[1\]' at 10\.02 s: -2 is below 0"):
+        read_innovations(flight(own, np.array([[1.0, 1.0], [1.0, -2.0], [1.0, 1.0]])).write(path))
+    with pytest.raises(InputError, match="holds no innovation with a variance; nothing was fused"):
+        read_innovations(flight(own, 0.0 * variance).write(path))
+    back = flight(own, variance)
+    back.both(10**6, {"gps_hpos": (own[0], variance[0])})
+    with pytest.raises(InputError, match="message 4 of estimator_innovations is older than the one before"):
+        read_innovations(back.write(path))
+    with mock.patch.dict(sys.modules, {"pyulog": None}), pytest.raises(InputError, match="needs pyulog: pip install "):
+        read_innovations(path)
+
+
+def test_one_command_from_a_flight_to_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """False-alarm rate 1e-3 of the mission is the tool's; here the innovations are their own quantiles."""
+    values = np.sqrt(stats.chi2.ppf((np.arange(200) * 77 % 200 + 0.5) / 200, 1))[:, None]
+    path = flight(values, np.ones((200, 1)), "baro_vpos").write(tmp_path / "a.ulg")
+    with pytest.raises(SystemExit) as end:
+        main(["monitor", str(path), "--innovations", "optimal", "--plot", str(tmp_path / "a.png")])
+    assert not end.value.code
+    out, err = capsys.readouterr()
+    assert "baro_vpos" in out
+    assert "no alarm" in out
+    assert "200 innovations in 200 messages" in err
+    assert (tmp_path / "a.png").stat().st_size > 10_000

@@ -1,0 +1,323 @@
+"""The referee on cases whose answer is known: calibrated, overconfident, conservative, biased, broken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from referee import judge
+from scipy import stats
+
+import consistency as cs
+from consistency.referee.diagnostics import anees_interval
+from consistency.referee.types import Array, Failure
+
+RUNS, STEPS = 50, 40
+# a calibrated case is found at fault with probability 1e-5 at most; the other cases are so far off that they are
+# missed with less than 1e-5
+FALSE_ALARM = 1e-5
+BROKE = Failure("f", 3, 12, "LinAlgError: singular")
+
+
+@dataclass(frozen=True)
+class Case:
+    error: Array
+    covariance: Array
+    nees: Array
+    nis: Array
+    nis_dof: Array
+
+    def verdict(
+        self, failures: tuple[Failure, ...] = (), false_alarm: float = FALSE_ALARM, **options: Any
+    ) -> cs.Verdict:
+        return judge(
+            "f", self.error, self.covariance, nees=self.nees, nis=self.nis, nis_dof=self.nis_dof, failures=failures,
+            false_alarm=false_alarm, **{"optimal_gain": True, **options},
+        )  # fmt: skip
+
+
+def make(scale: float = 1.0, bias: float = 0.0, runs: int = RUNS, steps: int = STEPS) -> Case:
+    """Errors of covariance P (and mean ``bias`` standard deviations along x) that a filter calls P / scale.
+
+    Steps of a run are as dependent as those of a filter: an autoregression with coefficient 0.9.
+    """
+    rng = np.random.default_rng(5)
+    white, e = rng.normal(size=(runs, steps, 3)), np.empty((runs, steps, 3))
+    e[:, 0] = white[:, 0]
+    for k in range(1, steps):
+        e[:, k] = 0.9 * e[:, k - 1] + np.sqrt(1 - 0.81) * white[:, k]
+    P = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.003]])
+    error = e @ np.linalg.cholesky(P).T + [bias * 0.2, 0.0, 0.0]
+    covariance = np.broadcast_to(P / scale, (runs, steps, 3, 3)).copy()
+    nis_dof = rng.integers(0, 4, (runs, steps)) * 3
+    nis = np.where(nis_dof > 0, scale * rng.chisquare(np.maximum(nis_dof, 1)), np.nan)
+    return Case(error, covariance, cs.nees(error, covariance), nis, nis_dof)
+
+
+def broken(case: Case, run: int, step: int) -> Case:
+    """The case with nothing from ``step`` of ``run`` on."""
+    arrays = {name: value.copy() for name, value in vars(case).items()}
+    for name in ("error", "covariance", "nees", "nis"):
+        arrays[name][run, step - 1 :] = np.nan
+    arrays["nis_dof"][run, step - 1 :] = 0
+    return Case(**arrays)
+
+
+# --- with truth ----------------------------------------------------------------------------------
+
+
+def test_calibrated_is_consistent() -> None:
+    verdict = make().verdict()
+    assert verdict.status == "consistent"
+    assert verdict.consistent
+    assert verdict.faults == ()
+    assert verdict.reasons[0].startswith("consistent: no fault found in 50 runs, and the covariance ratio ")
+    assert "] is shown to be between 0.67 and 1.50 (worst axis: axis " in verdict.reasons[0]
+    assert verdict.reasons[0].endswith("; lost runs of up to 5.8 % cannot be excluded with 50 runs")
+    assert verdict.first_step is None
+    assert verdict.subset is None
+    assert verdict.statistics["first_outside"] is None
+    assert "steps outside the simultaneous band: none of 40" in verdict.reasons[1]
+    low, high = verdict.threshold
+    assert low < verdict.statistic < high
+
+
+def test_overconfident_is_caught() -> None:
+    verdict = make(scale=2.0).verdict()
+    assert verdict.status == "overconfident"
+    assert not verdict.consistent
+    assert "scale" in verdict.faults
+    assert verdict.statistics["steps_above"] > 0
+    assert verdict.statistics["steps_below"] == 0
+    assert verdict.statistics["mean_anees"] > 5
+    assert "covariance too small by x" in verdict.reasons[0]
+    assert " above of 40" in verdict.reasons[1]
+    assert verdict.inflation == pytest.approx(make(scale=2.0).nees.mean() / 3)
+    assert 1.0 < verdict.inflation_interval[0] < verdict.inflation < verdict.inflation_interval[1]
+    assert verdict.statistic > verdict.threshold[1]
+
+
+def test_conservative_is_caught() -> None:
+    verdict = make(scale=0.5).verdict()
+    assert verdict.status == "conservative"
+    assert "scale" in verdict.faults
+    assert verdict.statistics["steps_below"] > 0
+    assert verdict.statistics["steps_above"] == 0
+    assert verdict.statistics["mean_anees"] < 2
+    assert "covariance too large by x" in verdict.reasons[0]
+    assert " below of 40" in verdict.reasons[1]
+    assert verdict.statistic < verdict.threshold[0]
+
+
+def test_a_covariance_too_large_may_be_allowed() -> None:
+    assert make(scale=0.5).verdict(allow="conservative").status == "consistent"
+    assert make(scale=2.0).verdict(allow="conservative").status == "overconfident"
+
+
+def test_biased_is_caught() -> None:
+    """A bias of 1.5 standard deviations in x adds at least 2.25 to the NEES; less the bias the covariance is right."""
+    verdict = make(bias=1.5).verdict()
+    assert verdict.status == "biased"
+    assert {"scale", "bias"} <= set(verdict.faults)
+    assert verdict.reasons[0].startswith("biased: mean error +1.")
+    assert "too small" not in verdict.reasons[0]
+    assert verdict.bias is not None
+    assert verdict.bias.inflation_without is not None
+    assert 0.7 < verdict.bias.inflation_without.value < 1.4 < verdict.inflation
+
+
+def test_a_bias_does_not_hide_a_covariance_too_small() -> None:
+    verdict = make(scale=3.0, bias=1.5).verdict()
+    assert verdict.status == "overconfident"
+    assert "mean error +" in verdict.reasons[0]
+    assert "covariance about the mean too small by x" in verdict.reasons[0]
+
+
+def test_overconfident_in_a_single_step_is_caught() -> None:
+    case = make()
+    case.error[:, 17] *= np.sqrt(3.0)
+    verdict = case.verdict()
+    assert verdict.status == "overconfident"
+    assert "scale in some step" in verdict.faults
+    assert "scale" not in verdict.faults
+    assert verdict.first_step == 18
+    assert verdict.statistics["first_outside"] == 18
+    assert verdict.statistics["since"] is None
+    assert "in 1 of 40 steps, first in step 18" in verdict.reasons[0]
+
+
+def test_statistics_of_a_calibrated_filter() -> None:
+    case = make()
+    s = case.verdict(false_alarm=0.05).statistics
+    assert (s["runs"], s["steps"], s["dof"], s["judged_steps"], s["left_out_steps"]) == (RUNS, STEPS, 3, STEPS, [])
+    assert np.allclose(s["anees"], case.nees.mean(axis=0))
+    assert np.array_equal(s["alive"], np.full(STEPS, RUNS))
+    assert s["band"][0] == pytest.approx(anees_interval(3, RUNS))
+    assert s["mean_anees"] == pytest.approx(case.nees.mean())
+    inside = (s["anees"] >= s["band"][:, 0]) & (s["anees"] <= s["band"][:, 1])
+    assert s["share_inside"] == pytest.approx(inside.mean())
+    assert s["rmse_position"] != s["rmse_position"]  # the axes have no names
+    named = case.verdict(axes=("x", "y", "heading")).statistics
+    assert named["rmse_position"] == pytest.approx(np.sqrt(np.mean(np.sum(case.error[..., :2] ** 2, axis=-1))))
+    assert named["rmse_heading"] == pytest.approx(np.sqrt(np.mean(case.error[..., 2] ** 2)))
+    assert s["nis_ratio"] == pytest.approx(np.nansum(case.nis) / case.nis_dof.sum())
+    assert s["nis_dof"] == case.nis_dof.sum()
+    assert s["ratio"] == pytest.approx(case.nees.mean() / 3)
+
+
+def test_nees_is_worked_out_from_error_and_covariance() -> None:
+    case = make(scale=2.0)
+    alone = judge("f", case.error, case.covariance, false_alarm=FALSE_ALARM)
+    lied = judge("f", case.error, case.covariance, nees=case.nees / 2, false_alarm=FALSE_ALARM)
+    for verdict in (alone, lied):
+        assert verdict.statistic == pytest.approx(case.nees.mean())
+        assert verdict.status == "overconfident"
+
+
+def test_nees_alone_needs_its_dof() -> None:
+    case = make(scale=2.0)
+    assert judge("f", nees=case.nees, dof=3, false_alarm=FALSE_ALARM).status == "overconfident"
+    with pytest.raises(ValueError, match="nees needs dof"):
+        judge("f", nees=case.nees)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "nothing to judge"),
+        ({"nees": np.ones((2, 2)), "dof": 1, "allow": "overconfident"}, "allow must be"),
+        ({"nees": np.ones((2, 2)), "dof": 1, "false_alarm": 1.0}, "false_alarm must lie between 0 and 1"),
+        ({"nees": np.ones((2, 2)), "dof": 1, "method": "sidak"}, "method must be 'max' or 'bonferroni'"),
+    ],
+)
+def test_what_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        judge("f", **options)
+
+
+def test_names_and_subsets_that_do_not_fit_are_refused() -> None:
+    case = make()
+    with pytest.raises(ValueError, match="2 names of axes for 3 components"):
+        case.verdict(axes=("x", "y"))
+    with pytest.raises(ValueError, match="subset 'far'"):
+        case.verdict(subsets={"far": [3]})
+
+
+def test_bonferroni_band_over_all_steps() -> None:
+    """Its share of the false-alarm rate, as Holm's first step gives it, over the steps and two sides."""
+    s = make().verdict(false_alarm=0.1, method="bonferroni").statistics
+    share = next(a["share"] for a in s["answers"] if a["question"] == "scale in some step")
+    tail = stats.chi2.sf(s["simultaneous"][0, 1] * RUNS, 3 * RUNS)
+    assert tail == pytest.approx(0.1 * share / STEPS / 2, rel=1e-6)
+    assert np.all(s["simultaneous"][:, 0] < s["band"][:, 0])
+    assert np.all(s["simultaneous"][:, 1] > s["band"][:, 1])
+
+
+def test_band_over_all_steps_counts_neighbours_that_move_together_once() -> None:
+    wide, narrow = (make().verdict(method=m).statistics["simultaneous"] for m in ("bonferroni", "max"))
+    assert np.all(narrow[:, 1] < wide[:, 1])
+    assert np.all(narrow[:, 0] > wide[:, 0])
+
+
+def test_false_alarms_stay_below_the_stated_rate() -> None:
+    """A verdict at 10 % over 200 calibrated filters: more than 40 alarms have probability below 1e-5."""
+    assert stats.binom.sf(40, 200, 0.1) < 1e-5
+    rng = np.random.default_rng(11)
+    P = np.broadcast_to(np.eye(3), (20, 10, 3, 3))
+    alarms = 0
+    for _ in range(200):
+        error = rng.normal(size=(20, 10, 3))
+        nis = np.full((20, 10), np.nan)
+        verdict = judge(
+            "f", error, P, nees=cs.nees(error, P), nis=nis, nis_dof=np.zeros((20, 10), int), false_alarm=0.1
+        )
+        alarms += bool(verdict.faults)
+    assert 0 < alarms <= 40  # none in 200 has probability below 1e-5 if the rate is above 6 %
+
+
+# --- steps and runs left out -----------------------------------------------------------------------
+
+
+def test_rank_deficient_steps_are_left_out_by_name() -> None:
+    case = make()
+    case.nees[:, :3] = np.nan
+    verdict = case.verdict()
+    assert verdict.status == "consistent"
+    assert verdict.statistics["left_out_steps"] == [1, 2, 3]
+    assert verdict.statistics["judged_steps"] == STEPS - 3
+    assert np.isnan(verdict.statistics["band"][:3]).all()
+    assert np.isnan(verdict.statistics["anees"][:3]).all()
+
+
+def test_nothing_to_judge_is_failed() -> None:
+    case = replace(make(), nees=np.full((RUNS, STEPS), np.nan))
+    verdict = case.verdict()
+    assert verdict.status == "failed"
+    assert "full rank" in verdict.reasons[0]
+
+
+def test_one_failed_run_makes_a_consistent_filter_failed() -> None:
+    case = broken(make(), run=3, step=12)
+    verdict = case.verdict((BROKE,))
+    assert case.verdict().status == "consistent"
+    assert verdict.status == "failed"
+    assert not verdict.consistent
+    assert verdict.reasons[0] == "failed: 1 of 50 runs failed, first run 3 in step 12: LinAlgError: singular"
+    assert verdict.statistics["failures"] == [[3, 12, "LinAlgError: singular"]]
+
+
+def test_a_run_that_fails_midway_counts_only_before() -> None:
+    s = broken(make(), run=3, step=12).verdict((BROKE,)).statistics
+    assert np.array_equal(s["alive"], [RUNS] * 11 + [RUNS - 1] * (STEPS - 11))
+    assert s["left_out_steps"] == []
+    # fewer runs, wider band
+    assert s["band"][11, 1] > s["band"][10, 1]
+    assert s["band"][11] == pytest.approx(anees_interval(3, RUNS - 1))
+
+
+def test_a_failing_overconfident_filter_stays_overconfident_and_names_the_failure() -> None:
+    verdict = broken(make(scale=2.0), 3, 12).verdict((BROKE,))
+    assert verdict.status == "overconfident"
+    assert any("1 of 50 runs failed" in reason for reason in verdict.reasons)
+
+
+def test_all_runs_failed_at_once() -> None:
+    case = make()
+    for run in range(RUNS):
+        case = broken(case, run, 1)
+    verdict = case.verdict(tuple(Failure("f", run, 1, "NaN") for run in range(RUNS)))
+    assert verdict.status == "failed"
+    assert any("50 of 50 runs failed" in reason for reason in verdict.reasons)
+
+
+# --- without truth ---------------------------------------------------------------------------------
+
+
+def blind(case: Case, **options: Any) -> cs.Verdict:
+    arrays = {"nis": case.nis, "nis_dof": case.nis_dof}
+    return judge("f", None, case.covariance, **arrays, **{"optimal_gain": True, "false_alarm": FALSE_ALARM, **options})
+
+
+@pytest.mark.parametrize(("scale", "status"), [(1.0, "consistent"), (1.3, "overconfident"), (0.7, "conservative")])
+def test_without_truth_the_nis_is_judged(scale: float, status: str) -> None:
+    verdict = blind(make(scale=scale))
+    assert verdict.status == status
+    assert "no truth" in verdict.reasons[0]
+    assert "mean_anees" not in verdict.statistics
+    assert verdict.statistics["nis_ratio"] == pytest.approx(scale, rel=0.06)
+    assert verdict.statistic == verdict.statistics["nis_ratio"]
+
+
+def test_without_truth_a_failed_run_counts_too() -> None:
+    verdict = blind(broken(make(), 3, 12), failures=(BROKE,))
+    assert verdict.status == "failed"
+    assert verdict.reasons[0] == "failed: 1 of 50 runs failed, first run 3 in step 12: LinAlgError: singular"
+
+
+def test_without_truth_and_innovations_there_is_no_verdict() -> None:
+    case = make()
+    verdict = blind(replace(case, nis=np.full_like(case.nis, np.nan)))
+    assert verdict.status == "failed"
+    assert "neither truth nor innovations" in verdict.reasons[0]

@@ -1,0 +1,146 @@
+"""Exhibits of the experiments on the sensor: every finding has one, with its rule, its tables and its figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scripts import experiment
+
+import consistency as cs
+from consistency.bench.pages.blocks import Block, Column, Heading, Stack, Status, Table
+from consistency.bench.pages.build import build_report
+from consistency.bench.pages.drawing import Figure, Line, Points, Rule
+from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, section
+from consistency.bench.pages.section import Part
+from consistency.stereo.pages import biases, image_tracks, images, sensor_issues
+
+SECTIONS = (biases, sensor_issues, images, image_tracks)
+SCRIPTS = ("e20_bias_or_noise", "e21_sensor_issues", "e24_image_noise", "e25_image_tracks", "e26_lens_models")
+TEXT = dict.fromkeys(("source", "claim", "statistic", "published", "measured"), "")
+
+
+def written(folder: Path, tables: dict[str, pd.DataFrame], ids: tuple[str, ...] = ()) -> Path:
+    """A folder of findings that are reproduced, with these tables."""
+    study = cs.Study(jobs=1)
+    study.tables |= tables
+    findings = [study.finding(True, "none", id=name, **TEXT, accept=f"rule of {name}") for name in ids]
+    study.write(folder, findings, 0.0)
+    return folder
+
+
+def rows_of(table: Table) -> tuple[tuple[Any, ...], ...]:
+    [(_, rows)] = table.groups
+    return rows
+
+
+def figures_of(blocks: tuple[Block, ...]) -> dict[str, Figure]:
+    return {block.title: block for block in blocks if isinstance(block, Figure)}
+
+
+def test_every_finding_on_the_sensor_has_one_exhibit_with_its_name_as_title() -> None:
+    exhibits = [exhibit for module in SECTIONS for exhibit in module.EXHIBITS]
+    shown = [name for exhibit in exhibits for name in exhibit.findings]
+    wanted = [name for script in SCRIPTS for name in experiment(script).FINDINGS]
+    assert sorted(shown) == sorted(wanted)
+    for exhibit in exhibits:
+        assert exhibit.title.startswith(", ".join(exhibit.findings) + ": ")
+
+
+def test_an_exhibit_has_its_own_findings_and_none_without_a_table(tmp_path: Path) -> None:
+    def shown(data: pd.DataFrame) -> Table:
+        return listing(data, {"x": ("X", ".1f")}, "numbers")
+
+    part = Part("test", "Test", "Test")
+    exhibits = (Exhibit(("a", "b"), "a, b: two", (Source("first", ("x",), (), shown),)),
+                Exhibit(("c",), "c: one", (Source("second", ("x",), (), shown),)))  # fmt: skip
+    of = section(part, exhibits)
+    folder = written(tmp_path / "out", {"first": pd.DataFrame({"x": [1.25]})}, ("c", "b", "a"))
+    heading, findings, table = of.blocks(build_report(folder))
+    assert heading == Heading("a, b: two", paper="a, b: two")
+    assert [row[0] for row in rows_of(findings)] == [Stack("b", (), bold=True), Stack("a", (), bold=True)]
+    assert "Accepted if: rule of b" in [line.text for line in rows_of(findings)[0][1].below]
+    assert rows_of(findings)[0][-1] == Status("reproduced")
+    assert rows_of(table) == (("1.2",),)
+    (folder / "first.parquet").unlink()
+    assert of.read(build_report(folder)) is None
+
+
+def test_a_listing_writes_text_numbers_and_verdicts() -> None:
+    data = pd.DataFrame({"name": ["a"], "x": [2.0 / 3.0], "status": ["biased"], "y": [np.nan], "p": [1e-9]})
+    heads = {"status": ("Verdict", STATUS), "name": ("Name", ""), "x": ("X", ".2f"), "y": ("Y", ".1f"),
+             "p": ("p", P_VALUE)}  # fmt: skip
+    table = listing(data, heads, "label", "caption")
+    assert rows_of(table) == ((Status("biased"), "a", "0.67", "–", "< 1e-6"),)
+    numbers = tuple(Column(head, number=True) for head in ("X", "Y", "p"))
+    assert table.columns == (Column("Verdict"), Column("Name"), *numbers)
+
+
+OUTCOME = {"status": "biased", "anees": 4.0, "precision": np.nan, "recall": np.nan}
+
+
+def test_spurious_features_are_shown_with_their_bounds(tmp_path: Path) -> None:
+    steps = pd.DataFrame({"step": [1, 2], "x": [0.1, np.nan], "y": [0.2, 0.3], "heading": [4.0, 5.0],
+                          "sigma_x": [1.0, np.nan], "sigma_y": [0.5, 0.6], "sigma_heading": [7.0, 8.0]})  # fmt: skip
+    rows = pd.DataFrame([OUTCOME | {"case": "plain", "rmse_position_m": 0.1, "rmse_heading_deg": 2.0}])
+    guarded = rows.assign(precision=0.9, recall=0.8)
+    tables = {"fig10a": rows, "fig10a_errors": steps, "fig10b": guarded, "fig10b_errors": steps}
+    blocks = sensor_issues.SECTION.blocks(build_report(written(tmp_path / "out", tables)))
+    plain, behind = (block for block in blocks if isinstance(block, Table))
+    assert rows_of(plain) == (("plain", Status("biased"), "4.00", "0.100", "2.00"),)
+    assert rows_of(behind) == (("plain", Status("biased"), "4.00", "0.100", "2.00", "0.900", "0.800"),)
+    lines = [panel.marks[0] for panel in figures_of(blocks)["Errors and bounds"].panels]
+    np.testing.assert_allclose(lines[1].y, [0.2, 0.3])
+    np.testing.assert_allclose(lines[1].bound, [1.0, 1.2])
+    np.testing.assert_allclose(lines[2].bound, [14.0, 16.0])
+
+
+def test_lenses_and_features_are_drawn(tmp_path: Path) -> None:
+    cases = [(d, k1, name) for name in ("one", "two") for k1 in (0.0, 0.1) for d in (20.0, 90.0)]
+    lenses = pd.DataFrame(cases, columns=["degrees", "k1", "filter"]).assign(
+        status="biased", anees=np.arange(8.0) + 3.0, rmse_position_m=0.1, rmse_heading_deg=np.arange(8.0) + 1.0
+    )
+    mix = pd.DataFrame([OUTCOME | {"case": case, "rmse_position_m": m, "rmse_heading_deg": deg}
+                        for case, m, deg in (("near", 0.1, 2.0), ("far", 0.2, 1.0))])  # fmt: skip
+    counts = mix.assign(count=[2, 8], p=[np.nan, 1e-3])
+    tables = {"field_of_view": lenses, "near_far_mix": mix, "feature_count": counts}
+    blocks = sensor_issues.SECTION.blocks(build_report(written(tmp_path / "out", tables)))
+    figures = figures_of(blocks)
+    heading, nees = figures["Field of view"].panels
+    np.testing.assert_allclose([mark.y for mark in heading.marks if isinstance(mark, Line)][1], [3.0, 4.0])
+    np.testing.assert_allclose([mark.y for mark in nees.marks if isinstance(mark, Points)][3], [9.0, 10.0])
+    assert [mark.at for mark in nees.marks if isinstance(mark, Rule)] == [3.0]
+    assert [key.text for key in figures["Field of view"].keys][1] == "one, k1 left over 0.1"
+    position, turn = (panel.marks[0] for panel in figures["Errors over the number of features"].panels)
+    np.testing.assert_allclose([position.x, position.y, turn.y], [[2, 8], [0.1, 0.2], [2.0, 1.0]])
+    tables_of = {block.label: rows_of(block) for block in blocks if isinstance(block, Table)}
+    assert [row[-1] for row in tables_of["Counts of features"]] == ["–", "0.001"]
+    assert tables_of["Outcomes"][1] == ("far", Status("biased"), "4.00", "0.200", "1.00")
+
+
+def test_a_bias_map_is_drawn_row_by_row(tmp_path: Path) -> None:
+    u, v = np.meshgrid([-1.0, 0.0, 1.0], np.linspace(-60.0, 60.0, 13))
+    many = pd.DataFrame({"u": u.ravel(), "v": v.ravel(), "bias_d": (u * v).ravel()}).sample(frac=1.0, random_state=1)
+    few = many[many["v"].isin([-60.0, 0.0, 10.0])].assign(model="none")
+    curves = pd.DataFrame({"belief": ["a", "a", "b"], "step": [1, 2, 2], "nees": [3.0, 4.0, 9.0]})
+    tables = {"bias_or_noise_map": many, "lens_models_bias": few, "bias_or_noise_nees": curves}
+    figures = figures_of(biases.SECTION.blocks(build_report(written(tmp_path / "out", tables))))
+    lines = [mark for mark in figures["Bias of disparity"].panels[0].marks if isinstance(mark, Line)]
+    np.testing.assert_allclose([line.y[2] for line in lines], [0.0, 20.0, 40.0, 60.0])
+    np.testing.assert_allclose(lines[1].x, [-1.0, 0.0, 1.0])
+    (panel,) = figures["Bias of disparity by lens model"].panels
+    np.testing.assert_allclose([mark.y[0] for mark in panel.marks if isinstance(mark, Line)], [60.0, 0.0, -10.0])
+    assert panel.title == "lens model: none"
+    assert panel.y.window == pytest.approx((-69.0, 69.0))
+    rule, first, second = figures["ANEES by belief"].panels[0].marks
+    assert (rule.at, first.y.tolist(), second.x.tolist()) == (3.0, [3.0, 4.0], [2])
+
+
+@pytest.mark.parametrize(("name", "module"), [("bias_survivors", biases), ("guarded", sensor_issues)])
+def test_a_table_that_lacks_a_column_is_refused(tmp_path: Path, name: str, module: Any) -> None:
+    folder = written(tmp_path / "out", {name: pd.DataFrame({"filter": ["x"]})})
+    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: column '\w+' is missing"):
+        module.SECTION.read(build_report(folder))

@@ -1,0 +1,134 @@
+"""Matching on descriptors made by hand: mutual, ratio, epipolar gate, and the circle."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+import consistency as cs
+from consistency.referee.geometry import rotation
+from consistency.referee.types import Array
+from consistency.stereo.vision import StereoRig
+from consistency.stereo.vision.features import Features, grey, opencv
+from consistency.stereo.vision.matching import (
+    StereoFeatures,
+    circular_matches,
+    epipolar_gate,
+    is_rectified,
+    mutual_matches,
+    stereo_matches,
+)
+
+K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+RECTIFIED = StereoRig(K, K, np.eye(3), np.array([0.5, 0.0, 0.0]), (1200, 360))
+TURNED = StereoRig(
+    K, 1.1 * K + np.diag([0, 0, -0.1]), rotation(0.04, 0.016, 0.014), np.array([0.4, 0.01, 0.02]), (1200, 360)
+)
+
+
+def unit(rng: np.random.Generator, count: int) -> Array:
+    values = rng.normal(size=(count, 128)).astype(np.float32)
+    return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+def features(uv: Array, descriptors: Array) -> Features:
+    return Features(uv, np.ones(len(uv)), descriptors)
+
+
+def points(rng: np.random.Generator, count: int) -> Array:
+    return np.column_stack([rng.uniform(-3, 3, count), rng.uniform(-1, 1, count), rng.uniform(6, 40, count)])
+
+
+def test_matches_are_each_others_nearest_and_unambiguous(rng: np.random.Generator) -> None:
+    first = unit(rng, 6)
+    order = rng.permutation(6)
+    second = first[order]
+    np.testing.assert_array_equal(mutual_matches(first, second), np.column_stack([np.arange(6), np.argsort(order)]))
+    twice = np.concatenate([second, second[:1]])  # the nearest has an equal rival: ratio test
+    assert order[0] not in mutual_matches(first, twice)[:, 0]
+    both = np.concatenate([first, first[:1]])  # two of the first would take the same one
+    assert not {0, 6} & set(mutual_matches(both, second)[:, 0])
+    assert mutual_matches(first, second[:0]).shape == (0, 2)
+
+
+def test_what_is_not_allowed_is_no_match_and_no_rival(rng: np.random.Generator) -> None:
+    first = unit(rng, 3)
+    second = np.concatenate([first, first])
+    allowed = np.tile(np.eye(3, dtype=bool), 2)
+    assert len(mutual_matches(first, second)) == 0
+    assert len(mutual_matches(first, second, allowed)) == 0  # the copies are allowed too
+    allowed[:, 3:] = False
+    np.testing.assert_array_equal(mutual_matches(first, second, allowed), [[0, 0], [1, 1], [2, 2]])
+    assert len(mutual_matches(first, second, np.zeros_like(allowed))) == 0
+
+
+@pytest.mark.parametrize("rig", [RECTIFIED, TURNED])
+def test_a_point_lies_on_its_epipolar_line_and_another_one_does_not(rig: StereoRig, rng: np.random.Generator) -> None:
+    uv = rig.project(points(rng, 50))
+    assert np.diag(epipolar_gate(rig, uv[:, :2], uv[:, 2:], 1e-2)).all()
+    below = uv[:, 2:] + [0.0, 5.0]
+    assert not np.diag(epipolar_gate(rig, uv[:, :2], below, 2.0)).any()
+
+
+def test_in_rectified_images_the_right_column_is_not_greater() -> None:
+    left = np.array([[100.0, 50.0]])
+    right = np.array([[90.0, 50.0], [101.0, 50.0], [103.0, 50.0]])
+    np.testing.assert_array_equal(epipolar_gate(RECTIFIED, left, right, 2.0), [[True, True, False]])
+
+
+def test_what_counts_as_rectified() -> None:
+    assert is_rectified(RECTIFIED)
+    assert not is_rectified(TURNED)
+    tilted = StereoRig(K, K, np.eye(3), np.array([0.5, 0.01, 0.0]), (1200, 360))
+    assert not is_rectified(tilted)
+    assert is_rectified(
+        StereoRig(K, K, np.eye(3), np.array([0.54, 0.003, 0.001]), (1200, 360))
+    )  # KITTI's colour cameras
+
+
+def test_bands_of_rows_change_nothing(rng: np.random.Generator) -> None:
+    uv = RECTIFIED.project(points(rng, 800)) + rng.normal(0, 0.4, (800, 4))
+    one = unit(rng, 800)
+    other = one + rng.normal(0, 0.1, one.shape).astype(np.float32)
+    other /= np.linalg.norm(other, axis=1, keepdims=True)
+    left, right = features(uv[:, :2], one), features(uv[:, 2:], other)
+    whole = mutual_matches(one, other, epipolar_gate(RECTIFIED, left.uv, right.uv))
+    assert len(whole) > 500
+    np.testing.assert_array_equal(stereo_matches(RECTIFIED, left, right).pairs, whole)
+
+
+def test_a_circle_must_close(rng: np.random.Generator) -> None:
+    descriptors = unit(rng, 20)
+    uv = np.zeros((20, 2))
+    same = features(uv, descriptors)
+    pairs = np.column_stack([np.arange(20)] * 2)
+    before = StereoFeatures(same, same, pairs)
+    order = rng.permutation(20)
+    after = StereoFeatures(features(uv, descriptors[order]), features(uv, descriptors[order]), pairs)
+    closed = circular_matches(before, after)
+    np.testing.assert_array_equal(closed, np.column_stack([np.arange(20), np.argsort(order)]))
+    crossed = StereoFeatures(after.left, after.right, np.column_stack([np.arange(20), np.roll(np.arange(20), 1)]))
+    assert len(circular_matches(before, crossed)) == 0
+    none = StereoFeatures(same, same, pairs[:0])
+    assert circular_matches(before, none).shape == circular_matches(none, before).shape == (0, 2)
+
+
+def test_images_of_any_kind_become_grey() -> None:
+    colour = np.zeros((4, 5, 3), np.uint8)
+    colour[..., 1] = 200
+    assert grey(colour).dtype == np.uint8
+    assert grey(colour)[0, 0] == round(0.587 * 200)
+    assert grey(np.full((4, 5), 65535, np.uint16))[0, 0] == 255
+    assert grey(np.full((4, 5), 300.0))[0, 0] == 255
+    for wrong, said in ((np.zeros((2, 2, 2)), "shape"), (np.zeros((0, 3)), "no image"), (np.array([["a"]]), "no image"),
+                        (np.full((2, 2), np.nan), "finite")):  # fmt: skip
+        with pytest.raises(cs.InputError, match=said):
+            grey(wrong, "my image")
+
+
+def test_without_opencv_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(cs.InputError, match="an image needs opencv-python-headless: pip install "):
+        opencv()

@@ -1,0 +1,103 @@
+"""The experiments on synthetic matches, cut to a few repetitions: all findings come, and their rules can fail."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scipy import stats
+from scripts import experiment
+
+import consistency as cs
+from consistency.bench.pages.build import build_report
+from consistency.bench.pages.sections import first_order as first_order_section
+from consistency.bench.pages.sections import shares
+from consistency.stereo.pages import scenes
+from consistency.stereo.vision import RelativePose
+from consistency.stereo.vision.synthetic import MOTION, SIZE, common_points, disparity_noise, published_rig
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = experiment("e10_front_end_synthetic")
+    for name, value in {"REPETITIONS": 4, "FEWER": 1, "OTHERS": ((3.0, 1.0),), "SAMPLES_23": 100}.items():
+        monkeypatch.setattr(module, name, value)
+    return module
+
+
+@pytest.fixture
+def first_order(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = experiment("e12_first_order")
+    for name, value in {"DEPTHS": (3.0,), "BASELINES": (1.0,), "NOISES": (0.25,), "RUNS": 12, "POINTS": 8}.items():
+        monkeypatch.setattr(module, name, value)
+    return module
+
+
+def test_figures(figures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = cs.Study(seed=3)
+    assert figures.interval(study).verdict == "reproduced"
+    found = {finding.id: finding for finding in (figures.figure_22(study), *figures.figure_23(study))}
+    assert set(found) < set(figures.FINDINGS)
+    assert {"frontend_fig22", "frontend_fig23"} <= set(study.tables)
+    scenes = study.tables["frontend_fig23"]
+    np.testing.assert_allclose(scenes["ratio"], scenes["mean"] / 600)
+    assert (scenes["ratio_least"] <= scenes["ratio"]).all()
+    assert (scenes["ratio"] <= scenes["ratio_most"]).all()
+    again = cs.Study(seed=3)
+    assert figures.figure_22(again).measured == found["frontend-fig2.2"].measured
+    monkeypatch.setattr(figures, "INTERVAL_22", (818.8, 985.0))
+    assert figures.interval(study).verdict == "not reproduced"
+
+
+def test_a_deep_scene_is_not_reproduced(figures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 30 m and 2 px the disparity's noise is a third of it: the rule of fig. 2.2 must fail."""
+    monkeypatch.setattr(figures, "POINT", np.array([2.0, -1.0, 24.0]))
+    monkeypatch.setattr(figures, "DEPTHS_22", (24.0,))
+    monkeypatch.setattr(figures, "REPETITIONS", 20)
+    monkeypatch.setattr(figures, "NOISE", 1.0)
+    assert figures.figure_22(cs.Study(seed=3)).verdict == "not reproduced"
+
+
+def test_map(first_order: ModuleType) -> None:
+    study = cs.Study(seed=3)
+    findings = first_order.main(study)
+    assert [finding.id for finding in findings] == list(first_order.FINDINGS)
+    assert study.tables["first_order"]["estimator"].nunique() == 5
+    assert study.tables["first_order"]["mean_nees"].between(0.5, 30).all()
+    assert study.tables["first_order"]["nees_ratio"].between(0.2, 5).all()
+    assert study.tables["first_order"].groupby("estimator")["dof"].first().to_dict() == {
+        "triangulation": 3, "svd": 6, "horn": 6, "weighted": 6, "reprojection": 6,
+    }  # fmt: skip
+
+
+def test_the_drawn_band_is_the_rule(figures: ModuleType) -> None:
+    """Counts at its ends are accepted by the binomial test, those beside them are not."""
+    low, high = figures.accepted_counts(200)
+    p = [stats.binomtest(count, 200, figures.REGION).pvalue for count in (low - 1, low, high, high + 1)]
+    assert [value > figures.LEVEL for value in p] == [False, True, True, False]
+
+
+@pytest.mark.parametrize("name", ["e10", "e12"])
+def test_the_report_shows_the_tables(name: str, figures: ModuleType, first_order: ModuleType, tmp_path: Path) -> None:
+    study = cs.Study(seed=3)
+    found = figures.main(study) if name == "e10" else first_order.main(study)
+    study.write(tmp_path / "out", found, 1.0)
+    report = build_report(tmp_path / "out")
+    assert (shares.read(report) is not None) == (scenes.read(report) is not None) == (name == "e10")
+    assert (first_order_section.read(report) is not None) == (name == "e12")
+
+
+def test_points_that_all_images_see(rng: np.random.Generator) -> None:
+    rig = published_rig(0.2)
+    assert rig.baseline == pytest.approx(0.2)
+    p = common_points(rng, rig, MOTION, 200, 2.0, 6.0)
+    assert p.shape == (200, 3)
+    assert rig.inside(rig.project(p)).all()
+    assert rig.inside(rig.project(MOTION.inverse().apply(p))).all()
+    assert (p[:, 2] >= 2.0).all()
+    assert (p[:, 2] <= 6.0).all()
+    assert not rig.inside(rig.project(RelativePose(np.eye(3), np.array([6.0, 0, 0])).apply(p))).all()
+    assert disparity_noise(rig, 5.0, 1.0) == pytest.approx(np.sqrt(2) * 5 / (500 * 0.2))
+    assert rig.image_size == SIZE

@@ -1,0 +1,309 @@
+"""Registrations: exact recovery, the misprints of Horn's method, consensus among outliers, refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rigs import MOTION
+from scipy.spatial.transform import Rotation
+
+from consistency.referee.errors import InputError
+from consistency.stereo.vision import (
+    ConsensusError,
+    ConvergenceError,
+    DegenerateError,
+    RelativePose,
+    consensus,
+    register_horn,
+    register_ransac,
+    register_svd,
+    register_weighted,
+    registration_covariance,
+)
+from consistency.stereo.vision.consensus import squared_distances
+
+Array = np.ndarray[Any, Any]
+BOTH = pytest.mark.parametrize("register", [register_svd, register_horn])
+
+
+def scene(rng: np.random.Generator, n: int) -> Array:
+    return rng.uniform([-2, -1.5, 4], [2, 1.5, 10], (n, 3))
+
+
+def apart(a: RelativePose, b: RelativePose) -> float:
+    return float(max(np.abs(a.R - b.R).max(), np.abs(a.t - b.t).max()))
+
+
+@BOTH
+@given(seed=st.integers(0, 2**32), n=st.integers(3, 12), flat=st.booleans())
+def test_exact_points_give_the_motion(register: Any, seed: int, n: int, flat: bool) -> None:
+    """Any rotation, also of three points or of a plane, where half of all singular vectors make a reflection."""
+    rng = np.random.default_rng(seed)
+    truth = RelativePose(Rotation.random(rng=rng).as_matrix(), rng.normal(0, 10, 3))
+    p2 = rng.normal(size=(n, 3)) * [1, 1, 0 if flat else 1]
+    assert apart(register(truth.apply(p2), p2), truth) < 1e-5
+
+
+def test_a_reflection_is_repaired(rng: np.random.Generator) -> None:
+    """Noise on a nearly flat cloud: eq. 2.20 itself is a reflection, and the rotation is still the best one."""
+    p2 = scene(rng, 6) * [1, 1, 0.001]
+    p1 = MOTION.apply(p2 * [1, 1, -1])
+    U, _, Vt = np.linalg.svd((p1 - p1.mean(0)).T @ (p2 - p2.mean(0)))
+    assert np.linalg.det(U @ Vt) < 0
+    pose = register_svd(p1, p2)
+    assert np.linalg.det(pose.R) == pytest.approx(1.0)
+    assert apart(pose, register_horn(p1, p2)) < 1e-9
+
+
+def test_both_registrations_are_one(rng: np.random.Generator) -> None:
+    p2 = scene(rng, 30)
+    p1 = MOTION.apply(p2) + rng.normal(0, 0.3, (30, 3))
+    assert apart(register_svd(p1, p2), register_horn(p1, p2)) < 1e-9
+
+
+def test_directions_as_printed_are_wrong_under_translation(rng: np.random.Generator) -> None:
+    """Eq. 2.5 and 2.6 on noise-free points: right without translation, degrees off with 0.97 m of it."""
+    p2 = scene(rng, 100)
+    turned = RelativePose(MOTION.R, np.zeros(3))
+    assert apart(register_horn(turned.apply(p2), p2, directions=True), turned) < 1e-9
+    printed = register_horn(MOTION.apply(p2), p2, directions=True)
+    assert Rotation.from_matrix(printed.R.T @ MOTION.R).magnitude() > np.radians(1.0)
+    assert apart(register_horn(MOTION.apply(p2), p2), MOTION) < 1e-9
+
+
+def test_the_quaternions_scalar_is_first(rng: np.random.Generator) -> None:
+    """Eq. 2.9 maps (1, 0, 0, 0) to (0, c): for a motion without rotation c = 0, so that this is its quaternion, and
+    by eq. 2.11, which takes the last component as the cosine, it would be half a turn."""
+    v = rng.normal(size=3)
+    b = 2 * v
+    B_i = np.array([[0, 0, 0, 0], [0, 0, b[2], -b[1]], [0, -b[2], 0, b[0]], [0, b[1], -b[0], 0]])
+    assert np.abs(B_i @ [1, 0, 0, 0]).max() == 0.0
+    assert 2 * np.arccos(np.array([1, 0, 0, 0])[3]) == pytest.approx(np.pi)
+
+
+DEGENERATE = {
+    "two points": (np.eye(3)[:2], "2 points"),
+    "no points": (np.zeros((0, 3)), "0 points"),
+    "one line": (np.outer(np.arange(8.0), [1, 2, 3]) + 5, "lie on one line"),
+    "identical": (np.ones((8, 3)), "identical"),
+    "at the origin": (np.zeros((8, 3)), "identical"),
+}
+
+
+@pytest.mark.parametrize(("points", "message"), DEGENERATE.values(), ids=DEGENERATE.keys())
+def test_points_that_fix_no_motion(points: Array, message: str, rng: np.random.Generator) -> None:
+    moved = MOTION.apply(points)
+    calls = [
+        lambda: register_svd(moved, points),
+        lambda: register_horn(moved, points),
+        lambda: register_ransac(moved, points, threshold=0.1, rng=rng),
+        lambda: register_weighted(moved, points, np.eye(3), np.eye(3)),
+        lambda: registration_covariance(moved, points, np.eye(3), np.eye(3), MOTION),
+    ]
+    for call in calls:
+        with pytest.raises(DegenerateError, match=message):
+            call()
+
+
+@BOTH
+def test_shapes_and_values_are_checked(register: Any, rng: np.random.Generator) -> None:
+    p = scene(rng, 5)
+    with pytest.raises(InputError, match="p1, p2: 5, 4 rows"):
+        register(p, p[:4])
+    with pytest.raises(InputError, match=r"p2: shape \(5, 2\)"):
+        register(p, p[:, :2])
+    with pytest.raises(InputError, match=r"p1: not finite at index \(2, 1\)"):
+        register(np.where(np.arange(15).reshape(5, 3) == 7, np.nan, p), p)
+
+
+@BOTH
+def test_a_mirrored_cloud_has_no_best_rotation(register: Any) -> None:
+    cube = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    with pytest.raises(DegenerateError, match="more than one rotation"):
+        register(-cube, cube)
+
+
+# --- consensus -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
+def test_outliers_are_found(share: float, rng: np.random.Generator) -> None:
+    p2 = scene(rng, 100)
+    p1 = MOTION.apply(p2)
+    bad = np.arange(100) < 100 * share
+    p1[bad] = scene(rng, int(bad.sum()))
+    pose, inliers = register_ransac(p1, p2, threshold=1e-3, rng=rng)
+    assert (inliers == ~bad).all()
+    assert apart(pose, MOTION) < 1e-9
+    if share:
+        assert apart(register_svd(p1, p2), MOTION) > 0.01  # negative control
+
+
+def test_the_generator_decides(rng: np.random.Generator) -> None:
+    p2 = scene(rng, 60)
+    p1 = np.where(np.arange(60)[:, None] < 30, scene(rng, 60), MOTION.apply(p2) + rng.normal(0, 0.05, (60, 3)))
+    a, b = (register_ransac(p1, p2, threshold=0.1, rng=np.random.default_rng(7)) for _ in range(2))
+    assert (a[0].R == b[0].R).all()
+    assert (a[1] == b[1]).all()
+
+
+def test_covariances_let_far_points_in(rng: np.random.Generator) -> None:
+    p2 = scene(rng, 80)
+    S = ((p2[:, 2] / 10) ** 4 * 0.05**2)[:, None, None] * np.eye(3)
+    p1 = MOTION.apply(p2) + np.sqrt(S[:, 0, :1]) * rng.normal(size=(80, 3))
+    p1[:20] += 0.4
+    _, inliers = register_ransac(p1, p2, threshold=4.0, rng=rng, S1=S, S2=np.zeros((3, 3)))
+    assert not inliers[:20].any()
+    assert inliers[20:].mean() > 0.95
+
+
+def long_covariances(rng: np.random.Generator, n: int) -> Array:
+    """Noise of 1 m along one direction and 0.01 m across it, another direction for each point."""
+    along = Rotation.random(n, rng=rng).as_matrix()
+    return along @ np.diag([1.0, 1e-4, 1e-4]) @ np.swapaxes(along, 1, 2)
+
+
+def test_distances_by_hand(rng: np.random.Generator) -> None:
+    """e' (S1 + R S2 R')^-1 e, point by point, for one motion and for many; the covariances are long and thin."""
+    p1, p2 = scene(rng, 6), scene(rng, 6)
+    S1, S2 = long_covariances(rng, 6), long_covariances(rng, 6)
+    turns, shifts = Rotation.random(4, rng=rng).as_matrix(), rng.normal(size=(4, 3))
+    wanted, plain = np.empty((4, 6)), np.empty((4, 6))
+    for k, (R, t) in enumerate(zip(turns, shifts, strict=True)):
+        for i in range(6):
+            e = p1[i] - (R @ p2[i] + t)
+            plain[k, i] = e @ e
+            wanted[k, i] = e @ np.linalg.inv(S1[i] + R @ S2[i] @ R.T) @ e
+    np.testing.assert_allclose(squared_distances(p1, p2, turns, shifts, S1, S2), wanted, rtol=1e-9)
+    np.testing.assert_allclose(squared_distances(p1, p2, turns, shifts), plain, rtol=1e-12)
+    np.testing.assert_allclose(squared_distances(p1, p2, turns[0], shifts[0], S1, S2), wanted[0], rtol=1e-9)
+
+
+def test_noise_of_the_second_frame_is_turned(rng: np.random.Generator) -> None:
+    """Noise of frame 2 that is long in x is long in y after a quarter turn.
+
+    Of 40 points one is farther off than 6 sigma with a probability of 3e-6.
+    """
+    quarter = RelativePose(Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.array([0.3, -0.2, 0.5]))
+    p2 = scene(rng, 40)
+    S2 = np.diag([0.25, 1e-6, 1e-6])
+    noisy = p2 + rng.normal(size=(40, 3)) * np.sqrt(np.diag(S2))
+    p1 = quarter.apply(p2)
+    S1 = 1e-6 * np.eye(3)
+    distances = squared_distances(p1, noisy, quarter.R, quarter.t, np.tile(S1, (40, 1, 1)), np.tile(S2, (40, 1, 1)))
+    assert (distances < 36.0).all()
+    p1[:5, 0] += 1.0  # across the noise
+    again = squared_distances(p1, noisy, quarter.R, quarter.t, np.tile(S1, (40, 1, 1)), np.tile(S2, (40, 1, 1)))
+    assert (again[:5] > 1e4).all()
+
+
+def test_points_that_are_off_across_their_noise_are_no_inliers(rng: np.random.Generator) -> None:
+    """The long noise of frame 2 would let them in along it."""
+    turned = RelativePose(Rotation.from_euler("z", 50, degrees=True).as_matrix(), np.array([0.3, -0.2, 0.5]))
+    p2 = scene(rng, 80)
+    S2 = np.diag([0.04**2, 1e-8, 1e-8])
+    p1 = turned.apply(p2)
+    p1[:20] += turned.R @ [0.0, 0.03, 0.0]
+    noisy = p2 + rng.normal(size=(80, 3)) * np.sqrt(np.diag(S2)) * 1e-3
+    _, inliers = register_ransac(p1, noisy, threshold=4.0, rng=rng, S1=1e-8 * np.eye(3), S2=S2)
+    assert not inliers[:20].any()
+    assert inliers[20:].all()
+
+
+def test_all_inliers_know_more_than_three(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A threshold in the middle of the noise: the motion of all inliers of the best draw has more of them than this.
+
+    Of single clouds 3 % gain nothing, of ten together 1e-15.
+    """
+    gained = []
+    for _ in range(10):
+        p2 = scene(rng, 300)
+        p1 = MOTION.apply(p2) + rng.normal(0, 0.05, (300, 3))
+        counts = []
+        for refits in (consensus.REFITS, 0):
+            with monkeypatch.context() as patch:
+                patch.setattr(consensus, "REFITS", refits)
+                same = np.random.default_rng(7)
+                counts.append(int(register_ransac(p1, p2, threshold=0.08, rng=same)[1].sum()))
+        gained.append(counts[0] - counts[1])
+    assert min(gained) >= 0 < max(gained)
+
+
+def test_few_inliers_take_many_draws(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """20 % inliers: one draw in 125 has three, and log(0.001) / log(1 - 0.2^3) = 861 draws are 14 rounds of 64."""
+    rounds = []
+    motions = consensus.rigid_motions
+
+    def counted(*points: Array) -> Any:
+        rounds.append(len(points[0]))
+        return motions(*points)
+
+    monkeypatch.setattr(consensus, "rigid_motions", counted)
+    p2 = scene(rng, 100)
+    p1 = np.where(np.arange(100)[:, None] < 20, MOTION.apply(p2), scene(rng, 100))
+    register_ransac(p1, p2, threshold=1e-3, rng=rng)
+    assert rounds.count(consensus.ROUND) >= 14
+
+
+def test_points_of_a_line_agree_on_no_motion(rng: np.random.Generator) -> None:
+    """Three of them fit any turn about the line, and would take all the others of the line with them."""
+    p2 = scene(rng, 60)
+    p2[:30] = np.array([0.0, 0.0, 6.0]) + rng.uniform(-2, 2, (30, 1)) * [1.0, 0.5, 0.2]
+    p1 = scene(rng, 60)
+    p1[:30] = MOTION.apply(p2[:30])
+    with pytest.raises(ConsensusError):
+        register_ransac(p1, p2, threshold=1e-3, rng=rng)
+
+
+def test_all_outliers(rng: np.random.Generator) -> None:
+    with pytest.raises(ConsensusError, match=r"of 100 points agree on a motion within 0\.05, at least 10 must"):
+        register_ransac(scene(rng, 100), scene(rng, 100), threshold=0.05, rng=rng)
+    with pytest.raises(ConsensusError, match="at least 4"):
+        register_ransac(MOTION.apply(np.eye(3)), np.eye(3), threshold=0.05, rng=rng)
+
+
+def test_arguments_of_the_search(rng: np.random.Generator) -> None:
+    p = scene(rng, 9)
+    for threshold in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="threshold"):
+            register_ransac(p, p, threshold=threshold, rng=rng)
+    with pytest.raises(InputError, match="S1, S2: give both"):
+        register_ransac(p, p, threshold=1.0, rng=rng, S1=np.eye(3))
+    with pytest.raises(InputError, match="S1, S2: singular together"):
+        register_ransac(p, p, threshold=1.0, rng=rng, S1=np.zeros((3, 3)), S2=np.zeros((3, 3)))
+    with pytest.raises(InputError, match="p1: too large at index"):
+        register_ransac(1e200 * p, p, threshold=1.0, rng=rng)
+
+
+# --- covariance of the registration --------------------------------------------------------------
+
+
+def test_covariance_of_a_pure_translation() -> None:
+    """Centred points with equal isotropic noise: the translation's is (s1^2 + s2^2) / N."""
+    p = np.concatenate([np.eye(3), -np.eye(3)])
+    S = registration_covariance(p, p, 0.09 * np.eye(3), 0.16 * np.eye(3), register_svd(p, p))
+    assert S[:3, :3] == pytest.approx(0.25 / 6 * np.eye(3))
+    assert S[3:, 3:] == pytest.approx(0.25 / 4 * np.eye(3))  # sum of squared distances from each axis is 4
+
+
+def test_a_pose_of_other_points_is_refused(rng: np.random.Generator) -> None:
+    p2 = scene(rng, 30)
+    p1 = MOTION.apply(p2) + rng.normal(0, 0.1, (30, 3))
+    with pytest.raises(ConvergenceError, match="not the minimum"):
+        registration_covariance(p1, p2, 0.01 * np.eye(3), 0.01 * np.eye(3), register_svd(p1[:20], p2[:20]))
+
+
+def test_covariances_of_points_are_checked(rng: np.random.Generator) -> None:
+    p = scene(rng, 5)
+    for S, message in [
+        (np.eye(4), "S1: shape"),
+        (-np.eye(3), "S1: not positive"),
+        (np.ones((4, 3, 3)), "S1: shape"),
+        (np.full((3, 3), np.inf), "S1: not finite"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            registration_covariance(p, p, S, np.eye(3), register_svd(p, p))

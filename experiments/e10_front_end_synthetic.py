@@ -1,7 +1,8 @@
 """Is the stereo front-end's first-order covariance right, as simulations of points and of poses say it is?
 
 Valencia & Andrade-Cetto (2018) sec. 2.3.3.1 print the rig's pose, the pixel noise and how many points and samples there
-are. Camera matrices and motion are not, and are those of ``consistency.stereo.vision.synthetic``; where points are is below.
+are. Camera matrices and motion are not, and are those of ``consistency.stereo.vision.synthetic``; where points are is
+below.
 """
 
 from __future__ import annotations

@@ -1,15 +1,12 @@
-"""Frozen records shared by all packages, with the shape of each field."""
+"""Frozen records that worlds, filters and runs share, with the shape of each field."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]  # of floats, shape in the comment or docstring
-Indices = NDArray[np.int64]
+from consistency.referee.types import Array, Failure, Indices
 
 
 @dataclass(frozen=True)
@@ -117,16 +114,6 @@ class Trial:
         """Observation of step 1..T."""
         rows = slice(self.first[step - 1], self.first[step])
         return Observation(self.landmark[rows], self.z[rows])
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A failed run, with the step of its failure."""
-
-    filter: str
-    run: int
-    step: int
-    reason: str
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ Also names of a package that are loaded on first use, since that is where a miss
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -141,11 +141,13 @@ def _from_origin(extras: tuple[str, ...]) -> list[str]:
 # --- names loaded on first use ---------------------------------------------------------------------
 
 
-def lazy_names(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+def lazy_names(
+    package: str, file: str, packages: Collection[str] = ()
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names stand in the ``.pyi`` beside its file.
 
-    Each name is loaded when it is first used. One that needs a package that is not installed raises
-    :class:`MissingPackageError`.
+    Each name is loaded when it is first used, as are the ``packages`` below it. One that needs a package that is not
+    installed raises :class:`MissingPackageError`.
     """
     import ast
 
@@ -158,6 +160,8 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], Any], Callable[
     }
 
     def load(name: str) -> Any:
+        if name in packages:
+            return import_module(f"{package}.{name}")
         if name not in modules:
             raise AttributeError(f"No {package} attribute {name}")
         try:

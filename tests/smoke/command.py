@@ -35,7 +35,8 @@ def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.Compl
 
 STARTER = """
 import gc, json, os, sys
-import consistency.referee.cli, consistency.bench.pages.html, consistency.bench.pages.paper, consistency.bench.runs.montecarlo
+import consistency.referee.cli, consistency.bench.pages.html, consistency.bench.pages.paper
+import consistency.bench.runs.montecarlo
 import consistency.bench.pages.pdf, consistency.referee.verdicts.comparison
 from consistency.__main__ import main
 

@@ -27,13 +27,16 @@ from consistency.referee.system.provenance import manifest_of
 KIND, CELL_KIND = "sweep", "cell"
 CELLS = "cells"  # folder of the cells in that of the sweep
 # rooms whose code the numbers of a cell depend on
-CODE = ("diagnostics", "filters", "geometry", "models", "scenario", "simulation", "verdicts", "runs/sequential.py")
+CODE = (
+    "referee/diagnostics", "referee/geometry", "referee/verdicts", "bench/filters", "bench/models",
+    "bench/runs/sequential.py", "bench/scenario", "bench/simulation", "bench/store",
+)  # fmt: skip
 
 
 @functools.cache
 def code_digest() -> str:
     """Hash of the sources that the numbers of a cell depend on."""
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     paths = (
         path for name in CODE for path in ((root / name).rglob("*.py") if (root / name).is_dir() else (root / name,))
     )

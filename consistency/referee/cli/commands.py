@@ -1,6 +1,6 @@
 """The table of commands: where each is, which extras it needs, and examples; and the group that loads the called one.
 
-A command is a function of Typer in a module of this folder, and a row here.
+A command is a function of Typer in a module of a root's ``cli``, and a row here.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ HELP = ["-h", "--help"]
 
 
 class Row:
-    """A command: module of this folder and function in it, extras needed whatever its arguments are, examples."""
+    """A command: module and function, extras needed whatever its arguments are, examples."""
 
     def __init__(self, name: str, target: str, extras: str = "", *examples: str) -> None:
         self.name, self.target, self.extras, self.examples = name, target, tuple(extras.split()), examples
@@ -28,49 +28,51 @@ class Row:
 # fmt: off
 ROWS = (
     # for any estimator
-    Row("analyse", "judging:analyse", "",
+    Row("analyse", "referee.cli.judging:analyse", "",
         "analyse mine.npz --report look",
         "analyse est.txt --truth truth.txt --covariance P.txt --error so3",
         "analyse est --truth truth --align posyaw",
         "analyse results --skip 2s --fail-on inconsistent"),
-    Row("report", "judging:report", "report", "report est.txt --truth truth.txt --covariance P.txt", "report results"),
-    Row("compare", "comparing:compare", "",
+    Row("report", "referee.cli.judging:report", "report",
+        "report est.txt --truth truth.txt --covariance P.txt",
+        "report results"),
+    Row("compare", "referee.cli.comparing:compare", "",
         "compare new.csv old.csv --truth truth.csv --fail-on worse",
         "compare results --filter ukf-uvd --filter ekf-uvd"),
-    Row("baseline", "comparing:baseline", "", "baseline results --out baseline.json"),
-    Row("plan", "judging:plan", "",
+    Row("baseline", "referee.cli.comparing:baseline", "", "baseline results --out baseline.json"),
+    Row("plan", "referee.cli.judging:plan", "",
         "plan --dof 3 --detect 1.2",
         "plan --like results",
         "plan herath2007-stereo --filter ekf-uvd --detect 1.2"),
-    Row("monitor", "monitoring:monitor", "",
+    Row("monitor", "referee.cli.monitoring:monitor", "",
         "monitor innovations.csv --innovations optimal --plot alarm.png",
         "monitor flight.ulg"),
     # the laboratory
-    Row("list", "listing:list_"),
-    Row("simulate", "running:simulate", "bench", "simulate herath2007-stereo --runs 10 --out log"),
-    Row("frontend", "frontend:frontend", "vision",
+    Row("list", "referee.cli.listing:list_"),
+    Row("simulate", "bench.cli.running:simulate", "bench", "simulate herath2007-stereo --runs 10 --out log"),
+    Row("frontend", "stereo.cli.frontend:frontend", "vision",
         "frontend IMAGES --out drive",
         "frontend IMAGES --calibration stereo.yml --rate 20 --out drive"),
-    Row("run", "running:run", "bench",
+    Row("run", "bench.cli.running:run", "bench",
         "run herath2007-stereo --filter ekf-uvd --filter ukf-uvd --out results",
         "run world.toml --filter ekf-uvd --until-decided --out results",
         "run --log log --filter ekf-uvd --out results",
         "run --log log --screen 2,2,1 --filter ekf-uvd --out results"),
-    Row("reproduce", "running:reproduce", "bench report",
+    Row("reproduce", "bench.cli.running:reproduce", "bench report",
         "reproduce --out findings",
         "reproduce --only fig3-chain --runs 20 --out findings"),
-    Row("challenge", "challenging:challenge", "bench", "challenge ukf-uvd --minutes 5 --out worst.toml"),
-    Row("characterise", "characterising:characterise", "bench",
+    Row("challenge", "bench.cli.challenging:challenge", "bench", "challenge ukf-uvd --minutes 5 --out worst.toml"),
+    Row("characterise", "stereo.cli.characterising:characterise", "bench",
         "characterise log --out sensor.toml",
         "characterise IMAGES --board 9x6 --square 0.024 --out s.toml"),
-    Row("compile", "compiling:compile_", "bench",
+    Row("compile", "bench.cli.compiling:compile_", "bench",
         "compile ekf-uvd ukf-uvd --scenario herath2007-stereo",
         "compile ekf-uvd --into /opt/kernels --cpu x86-64-v3"),
-    Row("sweep", "sweeping:sweep", "bench report",
+    Row("sweep", "bench.cli.sweeping:sweep", "bench report",
         "sweep regime --out regime",
         "sweep grid.toml --share 1/4 --out cells"),
-    Row("recommend", "sweeping:recommend", "bench", "recommend herath2007-stereo --range 6"),
-    Row("tune", "tuning:tune", "bench",
+    Row("recommend", "bench.cli.sweeping:recommend", "bench", "recommend herath2007-stereo --range 6"),
+    Row("tune", "bench.cli.tuning:tune", "bench",
         "tune herath2007-optimistic --filter oc-ekf-xyz",
         "tune --log log --filter ekf-uvd"),
 )
@@ -99,7 +101,7 @@ class Loaded(Mapping[str, Any]):
         info = CommandInfo(
             name,
             cls=Command,
-            callback=getattr(import_module(f"consistency.referee.cli.{module}"), function),
+            callback=getattr(import_module(f"consistency.{module}"), function),
             epilog=epilog if row.examples else None,
         )
         made: Any = typer.main.get_command_from_info(info, pretty_exceptions_short=True, rich_markup_mode=None)

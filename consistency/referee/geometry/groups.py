@@ -72,8 +72,8 @@ def adjoint(T: Array) -> Array:
 def to_left(T: Array, convention: str) -> Array:
     """J (N, n, n) with e_left = J e to first order, e the error of T (N, d + 1, d + 1) in a ``convention``.
 
-    The conventions are those of :mod:`consistency.referee.geometry.conventions`. T_true = T Exp(e_left), so that the position
-    is off by R rho and the rotation by phi about the axes of the body.
+    The conventions are those of :mod:`consistency.referee.geometry.conventions`. T_true = T Exp(e_left), so that the
+    position is off by R rho and the rotation by phi about the axes of the body.
     """
     if convention == "right":
         return adjoint(inverse(T))

@@ -56,7 +56,7 @@ def _git_commit() -> str | None:
 
     Asked once a process, as its modules are read once.
     """
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     if not (root / ".git").exists():  # installed, perhaps inside somebody else's repository
         return None
     command = ["git", "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]

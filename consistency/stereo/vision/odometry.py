@@ -58,8 +58,8 @@ def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
     R : (T + 1, 3, 3)
     t : (T + 1, 3), m
     P : (T + 1, 6, 6), of the position and of the rotation vector of R_true R' about the first frame's axes (error
-        convention so3 of :mod:`consistency.referee.geometry.conventions`), m and rad; 0 for the first pose. Rotation vectors
-        have no gimbal lock, which Euler angles in camera axes have where a car turns by 90 degrees.
+        convention so3 of :mod:`consistency.referee.geometry.conventions`), m and rad; 0 for the first pose. Rotation
+        vectors have no gimbal lock, which Euler angles in camera axes have where a car turns by 90 degrees.
     """
     R, t, P = [np.eye(3)], [np.zeros(3)], [np.zeros((6, 6))]
     for motion in motions:

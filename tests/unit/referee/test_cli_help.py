@@ -62,8 +62,6 @@ def test_help_of_no_command_is_refused() -> None:
 
 
 def test_help_imports_nothing_that_checks_values() -> None:
-    code = (
-        "import sys; sys.argv[1:] = ['run', '-h']; from consistency.referee.cli.app import _show_help; import consistency.referee.cli; \
+    code = "import sys; sys.argv[1:] = ['run', '-h']; from consistency.referee.cli.app import _show_help; \
 _show_help(None) or sys.exit(3); sys.exit('pydantic' in sys.modules or 'numpy' in sys.modules)"
-    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

@@ -25,9 +25,15 @@ from consistency.bench.store.results import Outcome
 from consistency.referee.errors import InputError
 from consistency.referee.system.machine import this_machine
 
-PACKAGE = Path(__file__).parents[2]
+PACKAGE = Path(__file__).parents[3]
 DECIDING = ("numpy", "scipy", "numba")  # packages whose versions the bits depend on
-ROOMS = ("geometry", "models", "scenario", "simulation", "filters")  # and our own sources
+ROOMS = (
+    "referee/geometry",
+    "bench/models",
+    "bench/scenario",
+    "bench/simulation",
+    "bench/filters",
+)  # and our own sources
 
 
 @dataclass(frozen=True)

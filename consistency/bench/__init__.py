@@ -1,0 +1,1 @@
+"""The bench: worlds, filters and Monte Carlo studies, judged by the referee. It does not know the stereo laboratory."""

@@ -1,0 +1,1 @@
+"""Pages on the verdicts and records of any estimator: what a document of them holds, in which order."""

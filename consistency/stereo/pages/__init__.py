@@ -1,0 +1,1 @@
+"""Sections and documents of reports on images and stereo sensors."""

@@ -56,7 +56,8 @@ bench: .venv/.done
 
 # what the core is, whose types are also checked for Python 3.10
 CORE := $(addprefix consistency/,defaults.py errors.py extras.py types.py testing.py pytest_plugin.py reading geometry diagnostics recording gating \
-	notebook terminal reporting/static.py \
+	notebook terminal document reporting/plain.py \
+	$(addprefix show/,__init__.py json.py junit.py markdown.py static.py terminal.py text.py) \
 	$(addprefix cli/,app.py commands.py comparing.py files.py judging.py listing.py monitoring.py options.py) \
 	$(addprefix verdicts/,files.py options.py baselines.py comparison.py monitoring.py))
 lint: .venv/.done

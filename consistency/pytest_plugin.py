@@ -15,8 +15,8 @@ import pytest
 from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
 from consistency.referee.gating.budget import in_place_rate
-from consistency.referee.gating.report import refusal, write
-from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, lines, to_property
+from consistency.referee.gating.report import lines, refusal, write
+from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, to_property
 from consistency.referee.gating.watch import DEFAULTS, Entry, Watch, current, watching
 
 NAME = "consistency-gates"
@@ -31,7 +31,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--consistency-runs", type=int, metavar="N", help="runs to simulate, in place of the number planned for a test"
     )
-    group.addoption("--consistency-report", metavar="FILE", help="write all gates to FILE.json or FILE.html")
+    group.addoption("--consistency-report", metavar="FILE", help="write all gates to FILE: .json, .html, .xml, .md")
     rate = "false-alarm rate of the whole session, split over the gates that state none of their own"
     group.addoption("--consistency-false-alarm", type=float, metavar="RATE", help=rate)
     parser.addini("consistency_false_alarm", rate)
@@ -133,7 +133,7 @@ class Gates:
     def _keep(self, item: pytest.Item, entry: Entry) -> None:
         item.user_properties.append(to_property(entry))
         if self.path is not None and self.path.suffix.lower() == ".json":
-            from consistency.referee.system.provenance import plain
+            from consistency.referee.diagnostics.export import plain
 
             self.statistics.append(plain(entry.statistics))
 

@@ -26,6 +26,7 @@ import pandas as pd
 import consistency as cs
 from consistency.bench.models import point, stereo
 from consistency.bench.models.motion import dead_reckoning
+from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.store.curves import curves
@@ -34,8 +35,8 @@ from consistency.bench.store.results import Results, joined
 from consistency.bench.store.storage import require_free
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import anees_interval, chi2_mean_interval, coverage
+from consistency.referee.show.terminal import show
 from consistency.referee.system.provenance import manifest_of
-from consistency.referee.terminal.table import print_findings
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
@@ -301,7 +302,7 @@ def command(arguments: Sequence[str] | None = None) -> None:
     study.write(given.out, findings, time.monotonic() - started, given.overwrite)
     view = (data.size, (float(data.centre[0]), float(data.centre[1])))
     write_log(given.out / "log", logs[MAIN].trials, logs[MAIN].belief, None, manifest, view=view)
-    print_findings(findings)
+    show(findings_table(findings))
     print(f"results in {given.out}, the log in its folder log; next: consistency report {given.out}")
 
 

@@ -21,12 +21,13 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
+from consistency.bench.pages.finding import findings_table
 from consistency.bench.pages.front_end import matches_png, samples_png
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.bench.store.storage import require_free
 from consistency.referee.diagnostics import Evidence, Verdict, judge, nees
+from consistency.referee.show.terminal import show
 from consistency.referee.system.atomic import write_whole
-from consistency.referee.terminal.table import print_findings
 from consistency.referee.types import Array
 from consistency.stereo.vision import (
     RelativePose,
@@ -345,7 +346,7 @@ def command(arguments: Sequence[str] | None = None) -> None:
     study.write(given.out, findings, time.monotonic() - started, given.overwrite)
     for name, content in pictures.items():
         write_whole(given.out / name, content)
-    print_findings(findings)
+    show(findings_table(findings))
     print(f"results in {given.out}, figures beside them")
 
 

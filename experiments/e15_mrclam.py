@@ -21,13 +21,14 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
+from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.store.curves import Curves, curves
 from consistency.bench.store.log import Log, write_log
 from consistency.bench.store.storage import require_free
+from consistency.referee.show.terminal import show
 from consistency.referee.system.provenance import manifest_of
-from consistency.referee.terminal.table import print_findings
 
 if TYPE_CHECKING:
     import mrclam_log as conversion
@@ -158,7 +159,7 @@ def command(arguments: Sequence[str] | None = None) -> None:
     study.write(given.out, findings, time.monotonic() - started, given.overwrite)
     for name, drive in logs.items():
         write_log(given.out / "logs" / name, drive.log.trials, drive.log.belief, drive.log.landmarks, manifest)
-    print_findings(findings)
+    show(findings_table(findings))
     print(f"results in {given.out}, the logs in its folder logs; next: consistency report {given.out}")
 
 

@@ -23,10 +23,11 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
+from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.bench.store.storage import require_free
+from consistency.referee.show.terminal import show
 from consistency.referee.terminal.progress import each
-from consistency.referee.terminal.table import print_findings
 from consistency.referee.types import Array
 from consistency.stereo.vision import RelativePose, StereoRig, triangulate
 from consistency.stereo.vision.errors import ConsensusError
@@ -199,7 +200,7 @@ def command(arguments: Sequence[str] | None = None) -> None:
     study, started = cs.Study(runs=1, seed=31), time.monotonic()
     findings = measure(study, given.data)
     study.write(given.out, findings, time.monotonic() - started, given.overwrite)
-    print_findings(findings)
+    show(findings_table(findings))
     print(f"results in {given.out}")
 
 

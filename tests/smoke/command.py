@@ -35,9 +35,8 @@ def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.Compl
 
 STARTER = """
 import gc, json, os, sys
-import consistency.referee.cli, consistency.bench.pages.html, consistency.bench.pages.paper
-import consistency.bench.runs.montecarlo
-import consistency.bench.pages.pdf, consistency.referee.verdicts.comparison
+import consistency.referee.cli, consistency.referee.show.html, consistency.referee.show.paper
+import consistency.referee.show.pdf, consistency.referee.verdicts.comparison, consistency.bench.runs.montecarlo
 from consistency.__main__ import main
 
 consistency.get_filter("ekf-uvd")

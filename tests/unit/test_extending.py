@@ -65,6 +65,68 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     assert done.stdout == "est: run 7, mean NEES 49\n", done.stderr
 
 
+def changed(path: Path, old: str, new: str) -> None:
+    """Replace the one place where ``old`` stands."""
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def test_the_question_of_the_document_is_asked(copy: Path) -> None:
+    """Three files; runs whose errors grow are found at fault, the same runs in random order are not."""
+    statistic, table, line = code("Add a question of the verdict")
+    folder = copy / "consistency/referee/diagnostics"
+    (folder / "trend.py").write_text(statistic, encoding="utf-8")
+    changed(folder / "questions.py", "\n\ndef answers(", f"{table}\n\ndef answers(")
+    first = "    distribution = pit(sample.nees, sample.dof)\n"
+    changed(folder / "hypothesis_tests.py", first, f"    {line.strip()}\n{first}")
+    changed(
+        folder / "hypothesis_tests.py", "from consistency.referee.diagnostics.whitening",
+        "from consistency.referee.diagnostics.trend import trend\nfrom consistency.referee.diagnostics.whitening",
+    )  # fmt: skip
+    done = python(
+        copy,
+        """
+import numpy as np
+from scipy import stats
+from consistency.referee.diagnostics import Evidence, judge
+
+n = 200
+size = np.sqrt(stats.chi2.ppf((np.arange(n) + 0.5) / n, 1))  # errors of a right estimator by their size
+for order in (np.arange(n), np.arange(n) * 37 % n):
+    error = (size * np.resize([1, -1, -1, 1], n))[order].reshape(n, 1, 1)
+    v = judge(Evidence("f", error=error, covariance=np.ones((n, 1, 1, 1)), nees=error[..., 0] ** 2, dof=1))
+    print(v.faults, v.reasons[0], "trend" in [a["question"] for a in v.statistics["answers"]])
+""",
+    )
+    assert done.returncode == 0, done.stderr
+    grows, mixed = done.stdout.splitlines()
+    assert "trend" in grows
+    assert "the NEES depends on the order of the runs" in grows
+    assert "the NEES depends" not in mixed
+    assert grows.endswith("True")
+    assert mixed.endswith("True")
+
+
+def test_the_renderer_of_the_document_works(copy: Path) -> None:
+    """One file and a row; the command line and the gates have the format at once."""
+    module, row = code("Add a renderer")
+    (copy / "consistency/referee/show/csv.py").write_text(module, encoding="utf-8")
+    changed(copy / "consistency/referee/show/__init__.py", "FORMATS = {", f"FORMATS = {row.strip()[:-1]}, ")
+    (copy / "est.csv").write_text("run,step,a,P_a_a\n" + "".join(f"{r},{k},{r},1\n" for r in (3, 7) for k in (1, 2)))
+    (copy / "truth.csv").write_text("step,a\n1,0\n2,0\n")
+    words = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a", "--report", "out.csv"]
+    done = python(copy, f"from consistency.referee.cli import main\nmain({words})")
+    assert done.stdout.endswith("out.csv\n"), done.stderr
+    heads, cells = (copy / "out.csv").read_text().splitlines()
+    assert heads == "filter,verdict,ANEES,ratio,RMSE m,RMSE deg,NIS/dof,failed"
+    assert cells.startswith("est,overconfident,29.00,")
+    refusal = (
+        "from pathlib import Path\nfrom consistency.referee.gating.report import refusal\nprint(refusal(Path('a.b')))"
+    )
+    assert ".csv" in python(copy, refusal).stdout
+
+
 def test_the_bias_of_the_document_works(copy: Path) -> None:
     """One new file, one line elsewhere, a key in a scenario; and the document's own test passes."""
     effect, line, key, test = code("Add a sensor effect")

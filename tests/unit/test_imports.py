@@ -24,8 +24,8 @@ RANKS = {
         "types": 0, "errors": 0, "defaults": 0, "system.atomic": 0, "system.machine": 0, "system.stopping": 0,
         "terminal": 0,
         "extras": 1, "system.ending": 1, "system.provenance": 1, "geometry": 1, "reading": 1,
-        "diagnostics": 2, "sources": 3, "verdicts": 4, "document": 5, "show": 6, "pages": 7, "gating": 8, "notebook": 8,
-        "cli": 9,
+        "diagnostics": 2, "sources": 3, "verdicts": 4, "document": 3, "show": 4, "pages": 5, "gating": 6, "notebook": 6,
+        "cli": 7,
     },
     "bench": {
         "types": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,
@@ -39,9 +39,15 @@ RANKS = {
     "stereo": {"vision": 0, "imaging": 1, "frontend": 2, "characterising": 2, "pages": 3, "cli": 4},
     "": {"doors": 0, "testing": 1, "pytest_plugin": 1, "__main__": 1},
 }  # fmt: skip
-DIAGNOSTICS = {"types", "geometry", "errors", "defaults", "diagnostics"}
+ONLY = {  # all that these may import of ours
+    "diagnostics": {"types", "geometry", "errors", "defaults", "diagnostics"},
+    "document": {"types", "geometry", "errors", "diagnostics", "document"},
+    "show": {"types", "diagnostics", "document", "show"},
+}
+ARRAYS = {"diagnostics", "document"}  # rooms that need these alone
+OF_ARRAYS = {"numpy", "scipy"} | sys.stdlib_module_names
 DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}
-PAINTERS = {("referee", "show")}  # alone draw
+PAINTERS = {"show"}
 IN_EXPERIMENTS = {"consistency", "numpy", "pandas", "scipy"}
 PEERS = {"bench_peers": {"filterpy"}, "bench_stonesoup": {"stonesoup"}}  # what the bench sets beside ours
 
@@ -76,16 +82,14 @@ def below(other: tuple[str, str], mine: tuple[str, str]) -> bool:
 def complaints(at: str, source: str) -> list[str]:
     """What a module at ``at`` ("referee.cli") imports and may not."""
     found, mine = set(), place(at.split("."))
-    arrays_only = mine == ("referee", "diagnostics")
+    room = mine[1] if mine[0] == "referee" else ""
     for name in imported(source):
         top, *rest = name.split(".")
         if top == "consistency":
             other = place(rest) if rest else ("", "__init__")
-            if not below(other, mine) or (arrays_only and other[1] not in DIAGNOSTICS):
+            if not below(other, mine) or (room in ONLY and other[1] not in ONLY[room]):
                 found.add(f"{at} imports {name}")
-        elif arrays_only and top not in {"numpy", "scipy"} | sys.stdlib_module_names:
-            found.add(f"{at} imports {top}")
-        elif top in DRAWING and mine not in PAINTERS:
+        elif top in (DRAWING if room not in PAINTERS else ()) or (room in ARRAYS and top not in OF_ARRAYS):
             found.add(f"{at} imports {top}")
     return sorted(found)
 
@@ -156,6 +160,11 @@ FORBIDDEN = [
     ("bench.store", "from consistency.bench.store.storage import read_manifest"),
     ("stereo.imaging", "from consistency.stereo.frontend.build import front_end"),
     ("stereo.vision", "from consistency.stereo.imaging.chain import Chain"),
+    ("referee.document", "from consistency.referee.show.text import fragment"),
+    ("referee.document", "from consistency.referee.verdicts.options import settings_of"),
+    ("referee.document", "from rich.console import Console"),
+    ("referee.show", "from consistency.referee.system.provenance import manifest_of"),
+    ("stereo.vision", "from consistency.stereo.pages.images import IMAGES"),
 ]
 
 

@@ -176,18 +176,11 @@ def compare(given: Inputs, estimates: str) -> tuple[bool, list[Row]]:
 
 def markdown(verdict: str, rows: list[Row], why: str = "") -> str:
     """The summary of the job."""
+    from consistency.referee.document.blocks import Column, Document, table
+    from consistency.referee.show.markdown import render
 
-    def cell(text: str) -> str:
-        text = plain(text)
-        for char, escaped in (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("`", "\\`")):
-            text = text.replace(char, escaped)
-        return text
-
-    lines = [f"## Consistency: {verdict}", "", *([cell(why), ""] if why else [])]
-    if rows:
-        lines += ["| what | verdict | ratio of covariances | runs | why |", "| --- | --- | --- | --- | --- |"]
-        lines += ["| " + " | ".join(map(cell, row)) + " |" for row in rows]
-    return "\n".join(lines) + "\n\n"
+    heads = tuple(map(Column, ("what", "verdict", "ratio of covariances", "runs", "why")))
+    return render(Document(f"Consistency: {verdict}", why, (), (table(heads, rows, "Verdicts"),) if rows else ()))
 
 
 def append(variable: str, text: str) -> None:

@@ -9,10 +9,10 @@ import numpy as np
 
 from consistency.bench.challenging.challenge import Challenge
 from consistency.bench.scenario import scenario_text
+from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.wording import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
-from consistency.referee.system.provenance import plain
 
 
 def lines(outcome: Challenge, out: Path) -> list[str]:

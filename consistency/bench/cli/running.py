@@ -92,8 +92,9 @@ def run(
     from consistency.bench.store.judge import analyse
     from consistency.bench.store.log import read_log
     from consistency.bench.store.results import Results, StoredResults
+    from consistency.referee.document.verdict import document
+    from consistency.referee.show import terminal
     from consistency.referee.terminal.progress import say
-    from consistency.referee.terminal.table import print_verdicts
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
@@ -146,7 +147,7 @@ def run(
         kept = f"{done} finished runs are in {out}; add --resume to the same command to go on"
         say(f"stopped: {kept}" if done else "stopped before a run was finished; nothing written")
         sys.exit(stop.status)
-    print_verdicts(verdicts or analyse(results))
+    terminal.show(*document(verdicts or analyse(results), reasons=False).opening)
     print(f"results in {out}; next: consistency report {out}")
 
 
@@ -164,12 +165,13 @@ def reproduce(
 ) -> None:
     """Set each published finding beside what is measured here; exit 1 if a published one is not reproduced."""
     from consistency.bench.pages import write_reports
+    from consistency.bench.pages.finding import findings_table
     from consistency.bench.runs.findings import reproduce as reproduce_findings
     from consistency.bench.types import OURS
-    from consistency.referee.terminal.table import print_findings
+    from consistency.referee.show import terminal
 
     findings = reproduce_findings(only, runs, seed, jobs, out, overwrite, long)
-    print_findings(findings)
+    terminal.show(findings_table(findings))
     for path in (out / "findings.json", *write_reports(out, out / "report.html", out / "report.pdf", overwrite=True)):
         print(path)
     missed = [finding.id for finding in findings if finding.verdict != "reproduced"]

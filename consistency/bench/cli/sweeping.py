@@ -69,10 +69,11 @@ def sweep(
             print(f"this share is done; {missing} of the whole sweep are missing in {out}")
             return
     from consistency.bench.pages import write_regime_reports
-    from consistency.bench.sweeps.printing import print_regime
+    from consistency.bench.sweeps.printing import regime_blocks
+    from consistency.referee.show import terminal
 
     regime = regime_of(folder)
-    print_regime(regime)
+    terminal.show(*regime_blocks(regime))
     for path in (*write_regime(regime, folder.path), *write_regime_reports(regime, folder.path)):
         print(path)
 
@@ -104,14 +105,15 @@ def recommend(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """Which filters to trust on one rig: looked up in a map, and confirmed by a few runs of that rig."""
-    from consistency.bench.sweeps.printing import advice_json, print_advice
+    from consistency.bench.sweeps.printing import advice_blocks, advice_json
     from consistency.bench.sweeps.recommend import recommend_for
     from consistency.bench.sweeps.regime import read_regime
     from consistency.bench.sweeps.rig import Request
+    from consistency.referee.show import terminal
 
     request = Request(rig, range_, speed, density)
     advice = recommend_for(request, read_regime(map_), runs, confirm, seed, jobs)
     if as_json:
         print(json.dumps(advice_json(advice), indent=2, allow_nan=False))
     else:
-        print_advice(advice)
+        terminal.show(*advice_blocks(advice))

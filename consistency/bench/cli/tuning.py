@@ -51,7 +51,8 @@ def tune(
     from consistency.bench.store.storage import require_free
     from consistency.bench.tuning.tune import tune as tune_filter
     from consistency.bench.tuning.wording import KIND, as_data, lines, verdicts, write
-    from consistency.referee.terminal.table import print_verdicts
+    from consistency.referee.document.verdict import document
+    from consistency.referee.show import terminal
     from consistency.referee.verdicts.options import settings_of
 
     if fail_on not in (None, "inconsistent"):
@@ -73,7 +74,7 @@ def tune(
     if as_json:
         print(json.dumps(as_data(tuning, out), indent=2, allow_nan=False))
     else:
-        print_verdicts(verdicts(tuning))
+        terminal.show(*document(verdicts(tuning), reasons=False).opening)
         print("\n" + "\n".join(lines(tuning, out)))
     if fail_on and not tuning.consistent:
         raise typer.Exit(1)

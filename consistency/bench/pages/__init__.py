@@ -1,8 +1,8 @@
-"""Results as one offline HTML file and as a PDF; both show the same document.
+"""Pages: results to documents, and documents to files.
 
 ``build`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each of which
-is described once. ``html`` and ``pdf`` show the blocks; ``screen`` and ``paper`` draw the figures. No statistic is
-computed here that the diagnostics do not already have.
+is described once. Renderers of ``show`` write them. No statistic is computed here that the diagnostics do not already
+have.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
+from consistency.referee.show import rendered
 from consistency.referee.system.atomic import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from consistency.bench.pages.blocks import Document
     from consistency.bench.sweeps.regime import Regime
     from consistency.referee.diagnostics import Evidence, Verdict
+    from consistency.referee.document.blocks import Document
     from consistency.referee.terminal.progress import Advance
     from consistency.referee.verdicts.monitoring import Watched
     from consistency.stereo.characterising.characterise import Characterisation
@@ -35,6 +36,7 @@ __all__ = [
     "write_regime_reports",
     "write_reports",
     "write_sensor_reports",
+    "write_text_file",
 ]
 
 KINDS = (".png", ".pdf", ".svg")  # of a plot
@@ -186,10 +188,24 @@ def _pages(
     return lambda at: _write_document(document, at / "report.html", at / "report.pdf")
 
 
-def _static_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
-    from consistency.bench.pages.static import verdicts_page
+def write_text_file(document: Document, path: Path, overwrite: bool) -> Path:
+    """One file, in the format of its suffix.
 
-    text = verdicts_page(records, judged, title)
+    Raises
+    ------
+    InputError
+        The file exists or cannot be written.
+    """
+    _require_writable(path, overwrite)
+    _write(path, rendered(document, path).encode("utf-8"))
+    return path
+
+
+def _static_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
+    from consistency.referee.pages.plain import compose_plain
+    from consistency.referee.show.static import render
+
+    text = render(compose_plain(records, judged, title))
     return lambda at: _write(at / "report.html", text.encode("utf-8"))
 
 
@@ -197,8 +213,8 @@ def _write_document(
     document: Document, html: Path | None, pdf: Path | None, *, advance: Advance = lambda _: None
 ) -> None:
     """The document in both formats, each file whole or not at all; None leaves one out."""
-    from consistency.bench.pages.html import render_html
-    from consistency.bench.pages.pdf import pdf_beside
+    from consistency.referee.show.html import render_html
+    from consistency.referee.show.pdf import pdf_beside
 
     contents: list[tuple[Path, bytes]] = []
     with pdf_beside(document) if pdf is not None else nullcontext(bytes) as finished:

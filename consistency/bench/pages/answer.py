@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from consistency.bench.pages.model import Study, Track
-from consistency.bench.pages.wording import listed
 from consistency.bench.types import outcome
 from consistency.referee.diagnostics.records import STATUSES
 from consistency.referee.diagnostics.wording import plural
+from consistency.referee.document.wording import listed
 
 LISTED = 6  # filters that the first paragraph names one by one
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.pages.answer import answer
-from consistency.bench.pages.blocks import Block, Chapter, Document
 from consistency.bench.pages.contents import SECTIONS
 from consistency.bench.pages.model import Report, Study, Track
 from consistency.bench.pages.section import OPENING, STUDY, Section
@@ -19,6 +18,7 @@ from consistency.bench.store.judge import design_of, verdict_by, with_map
 from consistency.bench.store.results import open_results
 from consistency.bench.store.storage import read_manifest
 from consistency.referee.diagnostics import Settings
+from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.errors import InputError
 from consistency.referee.pages.clock import clock_of
 from consistency.referee.terminal.progress import Advance

@@ -6,9 +6,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from consistency.bench.pages import paper
-from consistency.bench.pages.drawing import Axis, Line, Panel, Points, Sheet, xy
-from consistency.bench.pages.looks import COLOURS, DASHES, TRUTH, Look
+from consistency.referee.document.drawing import Axis, Line, Panel, Points, Sheet, xy
+from consistency.referee.document.looks import COLOURS, DASHES, TRUTH, Look
+from consistency.referee.show import paper
 from consistency.referee.types import Array
 
 FEATURES = 3.0  # standard deviations of the ellipses, fig. 2.4

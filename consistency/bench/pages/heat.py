@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.bench.pages.drawing import Axis, Figure, Key, Panel, Sheet, Tiles, Tips
-from consistency.bench.pages.looks import COLOURS, Look
-from consistency.bench.pages.wording import brief
 from consistency.bench.sweeps.axes import Axis as GridAxis
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell
 from consistency.bench.sweeps.regime import Regime
+from consistency.referee.document.drawing import Axis, Figure, Key, Panel, Sheet, Tiles, Tips
+from consistency.referee.document.looks import COLOURS, Look
+from consistency.referee.document.wording import brief
 
 SMALL, LARGE = COLOURS[0], COLOURS[1]  # of a ratio below and above 1: blue and vermilion, told apart by everybody
 NOTHING, PAPER = "#e3e3e3", "#ffffff"

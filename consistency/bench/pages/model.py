@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.bench.pages.drawing import Key, Owner
-from consistency.bench.pages.looks import Look, style
 from consistency.referee.diagnostics import Verdict
+from consistency.referee.document.drawing import Key, Owner
+from consistency.referee.document.looks import Look, style
 from consistency.referee.pages.clock import Clock
 from consistency.referee.types import Array, Failure, Indices
 

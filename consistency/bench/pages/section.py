@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from consistency.bench.pages.blocks import Block
+from consistency.referee.document.blocks import Block
 
 Source = TypeVar("Source")
 Record = TypeVar("Record")

@@ -16,6 +16,7 @@ import pandas as pd
 from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.bench.filters import get_filter
+from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
@@ -29,9 +30,9 @@ from consistency.bench.types import Finding
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.reading import read_json, reading
+from consistency.referee.show.terminal import show
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.terminal.progress import quiet, say
-from consistency.referee.terminal.table import print_findings
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 WAITING = 30.0  # seconds between lines on a process that is waited for
@@ -292,7 +293,7 @@ def script(main: Callable[[Study], list[Finding]], arguments: Sequence[str] | No
     """Main function of an experiment that is run alone: ``python experiments/eNN_….py [RUNS] [SEED]``."""
     try:
         values = [int(value) for value in (sys.argv[1:] if arguments is None else arguments)]
-        print_findings(main(Study(*values)))
+        show(findings_table(main(Study(*values))))
     except (InputError, ValueError) as error:
         print(f"{Path(sys.argv[0]).name} [RUNS] [SEED]: {error}", file=sys.stderr)
         sys.exit(2)

@@ -6,106 +6,90 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Table as RichTable
 
 from consistency.bench.sweeps.cell import CellResult, plain_numbers
 from consistency.bench.sweeps.recommend import OPEN, Advice, Candidate
 from consistency.bench.sweeps.regime import Regime
+from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.records import STATUSES
 from consistency.referee.diagnostics.wording import plural, short
-from consistency.referee.system.provenance import plain
-from consistency.referee.terminal.table import COLOURS, open_console
+from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Status, Table, Text, table
 
 MOST_CELLS = 48  # for a table of all cells on a terminal; map.csv has any number
+WIDEST = 36  # characters of a value in it
+OF_ADVICE = (
+    *map(Column, ("filter", "there")),
+    *(Column(head, number=True) for head in ("cells around", "RMSE m", "RMSE deg", "cost")),
+    Column("runs here"),
+)
 
 
-def print_regime(regime: Regime) -> None:
-    """Print a row for each filter: number of cells by verdict, and the cost of a step."""
+def regime_blocks(regime: Regime) -> tuple[Block, ...]:
+    """A row for each filter, number of cells by verdict and the cost of a step; then the cells, if they are few."""
     counts = {
         name: Counter(r.status for (_, n), r in regime.results.items() if n == name) for name in regime.sweep.filters
     }
     statuses = [status for status in STATUSES if any(count[status] for count in counts.values())]
-    table = RichTable(box=None, pad_edge=False)
-    for column in ("filter", *statuses, "cost"):
-        table.add_column(column, justify="left" if column == "filter" else "right")
+    rows = []
     for name, count in counts.items():
         costs = [r.cost for (_, n), r in regime.results.items() if n == name and np.isfinite(r.cost)]
         cost = f"×{np.median(costs):.2g}" if costs else "-"
-        table.add_row(escape(name), *(str(count[status]) for status in statuses), cost)
-    out = open_console()
-    out.print(table)
+        rows.append((name, *(str(count[status]) for status in statuses), cost))
+    heads = (Column("filter"), *(Column(head, number=True) for head in (*statuses, "cost")))
+    blocks: list[Block] = [table(heads, rows, "Cells by verdict")]
     cells = regime.sweep.cells
     if len(cells) <= MOST_CELLS:
-        out.print()
-        out.print(_cells_table(regime))
-        out.print("verdict, and ratio of true to stated covariance", markup=False, soft_wrap=not out.is_terminal)
+        blocks += [Text(""), _cells_table(regime), Text("verdict, and ratio of true to stated covariance")]
     lines = [f"{len(cells)} cells; cost: CPU time of a step against {regime.sweep.reference}, median over the cells"]
     if alone := sum(bool(regime.trusted(cell)) for cell in cells):
         lines.append(f"in {alone} of {len(cells)} cells some filter is consistent")
     if regime.missing:
         lines.append(f"{regime.missing} of {len(cells) * len(regime.sweep.filters)} are not there yet")
-    for line in lines:
-        out.print(line, markup=False, soft_wrap=not out.is_terminal)
+    return *blocks, *map(Text, lines)
 
 
-def _cells_table(regime: Regime) -> RichTable:
-    """Print a row for each cell: its values, and the verdict and covariance ratio of each filter."""
-    table = RichTable(box=None, pad_edge=False)
+def _cells_table(regime: Regime) -> Table:
+    """A row for each cell: its values, and the verdict and covariance ratio of each filter."""
     axes = [axis for axis in regime.sweep.axes if len(axis.values) > 1] or list(regime.sweep.axes)
-    for axis in axes:
-        table.add_column(escape(axis.key.rpartition(".")[2]), justify="right" if axis.numeric else "left", max_width=36)
-    for name in regime.sweep.filters:
-        table.add_column(escape(name))
+    columns = (
+        *(Column(axis.key.rpartition(".")[2], number=axis.numeric, most=WIDEST) for axis in axes),
+        *map(Column, regime.sweep.filters),
+    )
+    rows: list[tuple[Cell, ...]] = []
     for cell in regime.sweep.cells:
-        values = [escape(axis.say(cell.indices[regime.sweep.axes.index(axis)])) for axis in axes]
+        values = (axis.say(cell.indices[regime.sweep.axes.index(axis)]) for axis in axes)
         found = regime.at(cell)
-        table.add_row(*values, *(_verdict_text(found.get(name)) for name in regime.sweep.filters))
-    return table
+        rows.append((*values, *(_verdict(found.get(name)) for name in regime.sweep.filters)))
+    return table(columns, rows, "Cells")
 
 
-def _verdict_text(result: CellResult | None) -> str:
+def _verdict(result: CellResult | None) -> Cell:
     if result is None:
         return "-"
-    colour = COLOURS[result.status]
     ratio = "" if np.isnan(result.ratio) else f" {'∞' if np.isinf(result.ratio) else short(result.ratio)}"
-    return f"[{colour}]{result.status}[/{colour}]{ratio}"
+    return Status(result.status, ratio)
 
 
 # --- advice -----------------------------------------------------------------------------------------
 
 
-def print_advice(advice: Advice) -> None:
+def advice_blocks(advice: Advice) -> tuple[Block, ...]:
     """Where the rig lies, a row a filter, and the answer in sentences."""
-    out = open_console()
-
-    def line(text: str) -> None:
-        out.print(text, markup=False, soft_wrap=not out.is_terminal)
-
-    line(f"{advice.rig.name}: {'; '.join(place.text for place in advice.places)}")
-    for note in notes_of(advice):
-        line(f"  {note}")
-    line(f"nearest cell of the map: {advice.nearest.text}")
-    table = RichTable(box=None, pad_edge=False)
-    for column in ("filter", "there", "cells around", "RMSE m", "RMSE deg", "cost", "runs here"):
-        table.add_column(column, justify="left" if column in ("filter", "there", "runs here") else "right")
-    for candidate in advice.candidates:
-        table.add_row(*_row(candidate))
-    out.print(table)
-    line("")
-    for sentence in sentences_of(advice):
-        line(sentence)
+    first = [f"{advice.rig.name}: {'; '.join(place.text for place in advice.places)}"]
+    first += [f"  {note}" for note in notes_of(advice)]
+    first.append(f"nearest cell of the map: {advice.nearest.text}")
+    rows = [_row(candidate) for candidate in advice.candidates]
+    return *map(Text, first), table(OF_ADVICE, rows, "Filters"), Text(""), *map(Text, sentences_of(advice))
 
 
-def _row(c: Candidate) -> list[str]:
-    near, colour = c.nearest, COLOURS[c.nearest.status]
+def _row(c: Candidate) -> tuple[Cell, ...]:
+    near = c.nearest
     said = "-" if c.verdict is None else f"{'no fault found' if c.verdict.status in OPEN else c.verdict.status}"
-    heading = f"{np.rad2deg(near.rmse_heading):.2f}" if np.isfinite(near.rmse_heading) else "-"
-    return [
-        escape(c.filter), f"[{colour}]{near.status}[/{colour}]", f"{c.agreeing} of {c.around}",
-        f"{near.rmse_position:.3f}" if np.isfinite(near.rmse_position) else "-", heading,
-        f"×{near.cost:.2g}" if np.isfinite(near.cost) else "-", said,
-    ]  # fmt: skip
+    return (
+        c.filter, Status(near.status), f"{c.agreeing} of {c.around}", Quantity(near.rmse_position, digits=".3f"),
+        Quantity(np.rad2deg(near.rmse_heading), digits=".2f"), f"×{near.cost:.2g}" if np.isfinite(near.cost) else "-",
+        said,
+    )  # fmt: skip
 
 
 def notes_of(advice: Advice) -> list[str]:

@@ -19,8 +19,9 @@ from consistency.bench.tuning.parts import with_belief
 from consistency.bench.tuning.tune import Factor, Setting, Tuning
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.wording import short
-from consistency.referee.system.provenance import manifest_of, plain
+from consistency.referee.system.provenance import manifest_of
 
 TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}
 KIND = "tuning"

@@ -33,9 +33,9 @@ def compare(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
-    from consistency.referee.terminal.table import comparisons_json, print_comparisons
+    from consistency.referee.show import json, terminal
     from consistency.referee.verdicts.baselines import baseline_of_files, is_baseline, read_baseline
-    from consistency.referee.verdicts.comparison import compare_filters, compare_with
+    from consistency.referee.verdicts.comparison import compare_filters, compare_with, document
     from consistency.referee.verdicts.options import skip_asked
 
     if fail_on not in (None, "worse"):
@@ -62,9 +62,9 @@ def compare(
         compared = compare_filters(new, filters or [], false_alarm)
     tell_notes(*read.values())
     if as_json:
-        print(comparisons_json(compared))
+        print(json.render(document(compared)))
     else:
-        print_comparisons(compared)
+        terminal.show(*document(compared).opening)
     if fail_on and any(each.worse for each in compared):
         raise typer.Exit(1)
 

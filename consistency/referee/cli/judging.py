@@ -61,14 +61,16 @@ def analyse(
     ] = None,
     skip: Skip = None,
     report: Annotated[
-        Path | None, typer.Option("--report", help="Folder for an HTML and a PDF page on files of another estimator.")
+        Path | None,
+        typer.Option("--report", help="Folder for an HTML and a PDF page on files, or FILE.xml (JUnit) or FILE.md."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
 ) -> None:
     """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
-    from consistency.referee.terminal.table import print_verdicts, verdicts_json
+    from consistency.referee.document.verdict import document
+    from consistency.referee.show import FORMATS, json, terminal
     from consistency.referee.verdicts.files import analyse_recordings
     from consistency.referee.verdicts.options import settings_of, skip_asked
 
@@ -80,19 +82,20 @@ def analyse(
     settings, first = settings_of(**changes) if changes else None, skip_asked(skip)
     written: list[Path] = []
     refused: InputError | None = None  # of a report, said below the verdict
+    is_file = report is not None and report.suffix.lower() in FORMATS.keys() - {".html", ".json"}  # a folder has both
     if overwrite and report is None:
         raise InputError("--overwrite goes with --report: nothing else is written")
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
-        if report is not None:
+        if report is not None and not is_file:
             from consistency.bench.pages import write_file_reports
             from consistency.bench.store.storage import require_free
 
             try:
                 require_free(report, overwrite, "verdict", "--report")
-                data = verdicts_json(verdicts)
+                data = json.render(document(verdicts))
                 written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
                 if missing("report"):
                     print(f"consistency: the interactive page and the PDF need {remedy('report')}", file=sys.stderr)
@@ -103,7 +106,7 @@ def analyse(
         from consistency.bench.store.results import open_results
 
         results = open_results(path)
-        if report is not None:
+        if report is not None and not is_file:
             raise InputError(f"--report: is for files of another estimator; for {path} use 'consistency report {path}'")
         if innovations is not None:
             raise InputError(
@@ -116,10 +119,18 @@ def analyse(
             if fail_on:
                 raise InputError(f"--fail-on: {text}")
             print(f"consistency: {text}", file=sys.stderr)
+    shown = document(verdicts, path.name)
+    if report is not None and is_file:
+        from consistency.bench.pages import write_text_file
+
+        try:
+            written = [write_text_file(shown, report, overwrite)]
+        except InputError as error:
+            refused = error
     if as_json:
-        print(verdicts_json(verdicts))
+        print(json.render(shown))
     else:
-        print_verdicts(verdicts, reasons=True)
+        terminal.show(*shown.opening)
         for file in written:
             print(file)
     is_failed = fail_on is not None and not all(verdict.consistent for verdict in verdicts.values())
@@ -187,7 +198,7 @@ def plan(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
-    from consistency.referee.terminal.table import print_plan
+    from consistency.referee.document.plan import plan_lines
     from consistency.referee.verdicts.options import plan as plan_runs
 
     if scenario is not None and like is not None:
@@ -213,4 +224,4 @@ def plan(
     if as_json:
         print(json.dumps(planned, indent=2))
     else:
-        print_plan(planned)
+        print("\n".join(plan_lines(planned)))

@@ -50,8 +50,9 @@ def monitor(
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
     from consistency.bench.pages import require_plot, write_monitor_plot
+    from consistency.referee.document.monitor import monitor_document
     from consistency.referee.reading import one_line
-    from consistency.referee.terminal.table import print_watched, watched_json
+    from consistency.referee.show import json, terminal
     from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
 
     if fail_on not in (None, "alarm"):
@@ -71,9 +72,10 @@ def monitor(
         watched = watch(log, watcher)
     if plot is not None:
         write_monitor_plot(plot, watched)
+    document = monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t)
     if as_json:
-        print(watched_json(watched))
+        print(json.render(document))
     else:
-        print_watched(watched)
+        terminal.show(*document.opening)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)

@@ -1,18 +1,13 @@
-"""A verdict for programs, terminals and notebooks: one flat dictionary, a short text, a short table."""
+"""A verdict for programs: one flat dictionary, and what JSON can hold."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.wording import p_text, percent, plain, plural, question_text, short
-from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
-
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records import Equivalence, Interval, MapScore, RejectionScore, Verdict, Within
+    from consistency.referee.diagnostics.records import Equivalence, Verdict, Within
 
 
 def flat(v: Verdict) -> dict[str, Any]:
@@ -180,101 +175,14 @@ def _joint(v: Verdict) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# --- for people --------------------------------------------------------------------------------------
-
-
-def figures(v: Verdict) -> list[tuple[str, str]]:
-    """The numbers that matter, with their names."""
-    size = f" of {plural(v.steps, v.places[:-1])}" if v.unit == "run" else ""
-    rows = [("evidence", f"{plural(v.runs, v.unit)}{size}")]
-    if v.scale is not None and v.scale.judged_steps:
-        s, shown = v.scale, v.scale.equivalence
-        low, high = s.accepted
-        rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {short(low)} to {short(high)} accepted)"))
-        value, low, high = s.inflation
-        rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], truth over stated"))
-        if (worst := v.worst_axis) is not None:
-            rows.append(("worst axis", f"{worst[0]}, {plain(worst[1])}"))
-        if s.within is not None:
-            rows.append(("within the log", f"{plain(s.within.ratio)}, if errors decorrelate as within it"))
-        ends = f"[{short(1 / shown.factor)}, {short(shown.factor)}]"
-        rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)})"))
-        if v.lost is not None:
-            rows.append((f"lost {v.unit}s", f"{v.lost.count} of {v.lost.runs}, at most {percent(v.lost.upper)} of all"))
-    if v.accuracy is not None and v.axes is not None:
-        inside = (f"{axis} {100 * c:.1f} %" for axis, c in zip(v.axes.names, v.accuracy.coverage, strict=True))
-        rows.append(("2-sigma coverage", ", ".join(inside)))
-    if v.innovations is not None and np.isfinite(v.innovations.ratio):
-        judged = "" if v.innovations.judged else ", not judged"
-        rows.append(("NIS / dof", f"{v.innovations.ratio:.3f}{judged}"))
-    if v.joint is not None and v.joint.runs:
-        value, low, high = v.joint.both
-        rows.append(("pose and map", f"NEES / dof {short(value)} [{short(low)}, {short(high)}]"))
-    if v.world is not None:
-        rows.insert(0, ("error", f"{v.convention}: {PLANAR[v.convention or ADDITIVE]}"))
-        rows.append(("in the world", _in_world(v.world)))
-    if v.map is not None:
-        rows.append(("map NEES / 3", f"{map_text(v.map)}, after the last step{_map_status(v.map)}"))
-    if v.rejection is not None:
-        rows.append(("rejected", rejection_text(v.rejection)))
-    rows.append((f"failed {v.unit}s", f"{len({f.run for f in v.failures})} of {v.runs}"))
-    faults = [
-        f"{question_text(v, a.question)} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated
-    ]
-    rows.append(("faults", f"{', '.join(faults) or 'none'} of {plural(len(v.answers), 'question')}"))
-    return rows
-
-
-def _in_world(v: Verdict) -> str:
-    mean = f", mean NEES {short(v.scale.mean_anees)}" if v.scale is not None and v.scale.judged_steps else ""
-    return f"{v.status}{mean} (additive error, '{ADDITIVE}')"
-
-
-def _map_status(m: MapScore) -> str:
-    return "; not judged" if m.verdict is None else f"; the map is {m.verdict.reasons[0]}"
-
-
-def map_text(m: MapScore) -> str:
-    """Mean NEES over 3 of the landmarks in maps, with its interval."""
-    left_out = f" ({m.left_out} of {m.left_out + m.landmarks} landmarks left out)" if m.left_out else ""
-    if not m.landmarks:
-        return f"-{left_out}"
-    value, low, high = m.ratio
-    return f"{short(value)} [{short(low)}, {short(high)}]{left_out}"
-
-
-def rejection_text(r: RejectionScore) -> str:
-    """What a guard rejected, and where spurious observations are known precision and recall."""
-    rejected = f"{r.rejected} of {r.offered} observations"
-    if not r.spurious:
-        return f"{rejected} ({_percent(r.false_alarms)})"
-    return (
-        f"{rejected}, {r.spurious} of them spurious: precision {_percent(r.precision)}, recall {_percent(r.recall)}, "
-        f"right ones rejected {_percent(r.false_alarms)}"
-    )
-
-
-def _percent(share: Interval) -> str:
-    value, low, high = (f"{100 * end:.3g}" for end in share)
-    return f"{value if value != 'nan' else '-'} [{low}, {high}] %"
-
-
-def text(v: Verdict) -> str:
-    """The sentence and a short table."""
-    rows = figures(v)
-    width = max(len(name) for name, _ in rows)
-    return "\n".join([f"{v.filter} is {v.reasons[0]}", *(f"  {name:<{width}}  {value}" for name, value in rows)])
-
-
-def html(v: Verdict) -> str:
-    """Summary of a verdict as an HTML table, for a notebook."""
-    return f"<div><p><strong>{escape(v.filter)}</strong> is {escape(v.reasons[0])}</p>{html_table(figures(v))}</div>"
-
-
-def html_table(rows: Sequence[tuple[str, str]]) -> str:
-    """Names and values as an HTML table, for a notebook."""
-    cells = "".join(
-        f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
-        for name, value in rows
-    )
-    return f"<table>{cells}</table>"
+def plain(value: Any) -> Any:
+    """Arrays as lists, not finite numbers as None: what JSON can hold."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -51,6 +51,11 @@ ABOUT = {
     JOINT: "NEES of pose and all landmarks together against its degrees of freedom",
     JOINT_DISTRIBUTION: "Kolmogorov's distance of that NEES from chi-square, one value a run",
 }
+# what is wrong, where the answer to one of these questions is the only fault
+ALONE = {
+    JOINT_DISTRIBUTION: "the NEES of pose and map together does not follow the chi-square distribution",
+    "distribution": "the NEES does not follow the chi-square distribution",
+}
 
 
 def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answer]:

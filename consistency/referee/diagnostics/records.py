@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -525,14 +526,17 @@ class Verdict:
         return flat(self)
 
     def __str__(self) -> str:
-        from consistency.referee.diagnostics.export import text
-
-        return text(self)
+        return _shown(self, "text")
 
     def __repr__(self) -> str:
         return f"<Verdict {self.filter}: {self.status}, {self.runs} runs x {self.steps} steps; print() shows it>"
 
     def _repr_html_(self) -> str:
-        from consistency.referee.diagnostics.export import html
+        return _shown(self, "static")
 
-        return html(self)
+
+def _shown(verdict: Verdict, renderer: str) -> str:
+    """Summary by a renderer; both stand above the diagnostics, which find them by name and work without them."""
+    blocks = import_module("consistency.referee.document.verdict").summary(verdict)
+    text: str = import_module(f"consistency.referee.show.{renderer}").fragment(*blocks)
+    return text

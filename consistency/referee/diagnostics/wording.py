@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.faults_in_words import (
     tails_text,
 )
 from consistency.referee.diagnostics.numbers_in_words import UNCERTAIN, off_by, p_text, percent, plain, plural, short
-from consistency.referee.diagnostics.questions import BIAS, JOINT, JOINT_DISTRIBUTION, SCALE, SHAPE
+from consistency.referee.diagnostics.questions import ALONE, BIAS, JOINT, SCALE, SHAPE
 from consistency.referee.diagnostics.records import Equivalence, Verdict
 
 __all__ = ["UNCERTAIN", "off_by", "p_text", "percent", "plain", "plural", "question_text", "reasons", "short"]
@@ -117,10 +117,7 @@ def _sentence(v: Verdict, faults: Faults) -> str:
         parts.insert(0 if v.status == "heavy-tailed" else len(parts), tails_text(v, faults))
     if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
         parts.append(joint_text(v, v.joint))
-    if JOINT_DISTRIBUTION in faults and len(faults) == 1:
-        parts.append("the NEES of pose and map together does not follow the chi-square distribution")
-    if "distribution" in faults and len(faults) == 1:
-        parts.append("the NEES does not follow the chi-square distribution")
+    parts += [ALONE[q] for q in faults if q in ALONE and len(faults) == 1]
     if "innovation scale" in faults and v.innovations is not None:
         parts.append(f"innovations {'larger' if v.innovations.ratio > 1 else 'smaller'} than stated")
     if "innovation whiteness" in faults:

@@ -1,70 +1,98 @@
-"""The gates of a session as a file: JSON for programs, one HTML page for people."""
+"""The gates of a session in rows and columns: on the terminal and in a file."""
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
-from html import escape
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
-from consistency.bench.pages.static import page
-from consistency.referee.gating.session import Ledger, ending, interval, named, number, outcome
+from consistency.referee.gating.session import Ledger, ending, outcome, wanted
 from consistency.referee.gating.watch import Entry
+from consistency.referee.show import FORMATS, rendered
 from consistency.referee.system.atomic import write_whole
 
-SUFFIXES = (".json", ".html")
-
-HEAD = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "planned", "inflation", "why")
-NUMBERS = {"p", "false-alarm rate", "runs", "planned", "inflation"}
+if TYPE_CHECKING:
+    from consistency.referee.document.blocks import Cell, Document, Table
 
 
-def as_json(ledger: Ledger) -> str:
-    """All gates with the statistics of their verdicts; not finite numbers are null."""
+class Field(NamedTuple):
+    """A column of the gates."""
+
+    head: str
+    cell: Callable[[Entry], Cell]
+    is_number: bool = False
+    is_brief: bool = True  # also on the terminal
+
+
+def _fields() -> tuple[Field, ...]:
+    from consistency.referee.document.blocks import Quantity, Reason, Status
+
+    def inflation(e: Entry) -> Quantity:
+        low, high = (float("inf") if end is None else end for end in e.inflation_interval or (None, None))
+        return Quantity(e.inflation, (low, high), digits=".3g", is_factor=True)
+
+    def why(e: Entry) -> Reason:
+        first, *rest = e.reasons
+        return Reason(f"{e.gate} {e.name}", first, tuple(rest), None, e.outcome == "passed" or wanted(e), e.test)
+
+    return (
+        Field("test", lambda e: e.test),
+        Field("gate", lambda e: e.gate),
+        Field("filter", lambda e: e.name, is_brief=False),
+        Field("outcome", outcome),
+        Field("verdict", lambda e: Status(e.status), is_brief=False),
+        Field("p", lambda e: _p(e.p_value), is_number=True),
+        Field("false-alarm rate", lambda e: f"{e.false_alarm:.3g}", is_number=True, is_brief=False),
+        Field("runs", lambda e: str(e.runs), is_number=True),
+        Field("planned", lambda e: str(e.needed), is_number=True),
+        Field("inflation", inflation, is_number=True),
+        Field("why", why, is_brief=False),
+    )
+
+
+def _p(value: float | None) -> str:
+    """A p value, or a dash."""
+    return "-" if value is None else f"{min(value, 1.0):.2g}" if value >= 1e-6 else "<1e-6"
+
+
+def _table(ledger: Ledger, fields: tuple[Field, ...]) -> Table:
+    from consistency.referee.document.blocks import Column, table
+
+    columns = tuple(Column(field.head, number=field.is_number) for field in fields)
+    return table(columns, [tuple(field.cell(e) for field in fields) for e in ledger.entries()], "Gates")
+
+
+def lines(ledger: Ledger) -> list[str]:
+    """The summary for a terminal: a row a gate, and under it why it did not pass."""
+    from consistency.referee.document.blocks import Reason
+    from consistency.referee.show.text import fragment
+
+    fault = Field("", lambda e: Reason(e.name, e.reasons[0], has_passed=e.outcome != "fault found"))
+    brief = tuple(field for field in _fields() if field.is_brief)
+    return [*fragment(_table(ledger, (*brief, fault))).split("\n"), ending(ledger)]
+
+
+def document(ledger: Ledger) -> Document:
+    """All gates in one table, and the statistics of their verdicts as data."""
+    from consistency.referee.document.blocks import Document
+
     data = {
         "schema_version": 1,
         "kind": "gates",
         "budget": ledger.budget,
         "false_alarm_each": ledger.rate,
         "false_alarm_bound": ledger.bound(),
-        "gates": named(ledger.entries()),
+        "gates": [vars(entry) for entry in ledger.entries()],
     }
-    return json.dumps(data, indent=2, allow_nan=False) + "\n"
-
-
-def as_html(ledger: Ledger) -> str:
-    """One page that needs nothing else."""
-    head = "".join(f'<th scope="col"{_number(name)}>{name}</th>' for name in HEAD)
-    rows = "\n".join(_row(entry) for entry in ledger.entries())
-    table = f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
-    return page(
-        "Consistency gates",
-        f"<p>{escape(ending(ledger))}.</p>",
-        f'<div class="scroll" tabindex="0" role="region" aria-label="Gates">\n{table}\n</div>',
-    )
-
-
-def _row(e: Entry) -> str:
-    first, *rest = e.reasons
-    colour = e.status.replace(" ", "-")
-    more = "".join(f"<li>{escape(reason)}</li>" for reason in rest)
-    cells = [
-        escape(e.gate), escape(e.name), escape(outcome(e)), f'<span class="verdict {colour}">{escape(e.status)}</span>',
-        escape(number(e.p_value)), f"{e.false_alarm:.3g}", str(e.runs), str(e.needed), escape(interval(e)),
-        f"<details><summary>{escape(first)}</summary><ul>{more}</ul></details>",
-    ]  # fmt: skip
-    body = "".join(f"<td{_number(name)}>{cell}</td>" for name, cell in zip(HEAD[1:], cells, strict=True))
-    return f'<tr><th scope="row">{escape(e.test)}</th>{body}</tr>'
-
-
-def _number(name: str) -> str:
-    return ' class="number"' if name in NUMBERS else ""
+    return Document("Consistency gates", f"{ending(ledger)}.", (), (_table(ledger, _fields()),), data)
 
 
 def refusal(path: Path) -> str:
     """Why a report cannot be written there, and what to do; '' if it can."""
-    if path.suffix.lower() not in SUFFIXES:
-        return f"--consistency-report {path}: must end in {' or '.join(SUFFIXES)}"
+    if path.suffix.lower() not in FORMATS:
+        return f"--consistency-report {path}: must end in {' or '.join(FORMATS)}"
     if path.is_dir():
         return f"--consistency-report {path}: is a folder; name a file in it"
     if not path.parent.is_dir():
@@ -81,5 +109,4 @@ def refusal(path: Path) -> str:
 
 def write(ledger: Ledger, path: Path) -> None:
     """The whole file or none: written beside its place and renamed."""
-    text = as_json(ledger) if path.suffix.lower() == ".json" else as_html(ledger)
-    write_whole(path, text.encode("utf-8"))
+    write_whole(path, rendered(document(ledger), path).encode("utf-8"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -116,20 +115,6 @@ def needed_at(entry: Entry, rate: float) -> int:
     return comparison.needed_runs(entry.detect, entry.power)
 
 
-def lines(ledger: Ledger) -> Iterator[str]:
-    """The summary for a terminal: a row a gate, and under it why it did not pass."""
-    entries = ledger.entries()
-    rows = [("test", "gate", "outcome", "p", "runs", "planned", "inflation")]
-    for e in entries:
-        rows.append((e.test, e.gate, outcome(e), number(e.p_value), str(e.runs), str(e.needed), interval(e)))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for i, row in enumerate(rows):
-        yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        if i and entries[i - 1].outcome == "fault found":
-            yield f"    {entries[i - 1].name} is {entries[i - 1].reasons[0]}"
-    yield ending(ledger)
-
-
 def ending(ledger: Ledger) -> str:
     """How many gates, and the chance that any of them fails a test without a fault."""
     entries = ledger.entries()
@@ -150,21 +135,3 @@ def outcome(e: Entry) -> str:
 def wanted(e: Entry) -> bool:
     """The gate did not pass, and its test did."""
     return e.outcome != "passed" and e.test_outcome == "passed"
-
-
-def number(value: float | None) -> str:
-    """A p value, or a dash."""
-    return "-" if value is None else f"{min(value, 1.0):.2g}" if value >= 1e-6 else "<1e-6"
-
-
-def interval(e: Entry) -> str:
-    """Covariance inflation and its 95 % interval."""
-    if e.inflation is None:
-        return "-"
-    low, high = (f"{x:.3g}" if x is not None else "inf" for x in e.inflation_interval)
-    return f"x{e.inflation:.3g} [{low}, {high}]"
-
-
-def named(entries: Iterable[Entry]) -> list[dict[str, Any]]:
-    """Entries as dictionaries, in the order of their fields."""
-    return [dict(vars(entry)) for entry in entries]

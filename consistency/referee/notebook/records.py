@@ -9,19 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from consistency.referee.diagnostics import Evidence, Verdict
-from consistency.referee.diagnostics.export import html_table
 from consistency.referee.diagnostics.wording import plural
+from consistency.referee.document.blocks import Bullets, Facts
 from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.reading.options import Reading
+from consistency.referee.show.static import block
 from consistency.referee.sources import read_recordings
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.verdicts.files import analyse_recordings
 from consistency.referee.verdicts.options import settings_of, skip_asked
 
 if TYPE_CHECKING:
-    from consistency.bench.pages.drawing import Sheet
-    from consistency.bench.pages.paper import Drawn
+    from consistency.referee.document.drawing import Sheet
+    from consistency.referee.show.paper import Drawn
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,12 +55,11 @@ class Record(Evidence):
         return f"<Record {self.name}: {size}, error {self.convention or '-'} of {', '.join(self.axes)}>"
 
     def _repr_html_(self) -> str:
-        rows = [
+        rows = (
             ("runs", str(len(self.run_numbers))), ("steps", str(len(self.t))), ("error", self.convention or "-"),
             ("components", ", ".join(self.axes)), ("failed runs", str(len(self.failures))),
-        ]  # fmt: skip
-        notes = "".join(f"<li>{escape(note)}</li>" for note in self.notes)
-        return f"<div><strong>{escape(self.name)}</strong>{html_table(rows)}<ul>{notes}</ul></div>"
+        )  # fmt: skip
+        return f"<div><strong>{escape(self.name)}</strong>{block(Facts(rows))}{block(Bullets(self.notes))}</div>"
 
 
 @dataclass(frozen=True, repr=False)
@@ -76,11 +76,10 @@ class Judgement(Verdict):
         return _drawn(record_sheet(self.record, self), path)
 
     def _repr_html_(self) -> str:
-        from consistency.bench.pages.static import picture
+        from consistency.referee.pages.plain import picture
 
         assert self.record is not None
-        text, figure = super()._repr_html_(), picture(self.record, self)
-        return text if figure is None else f'{text}<img alt="errors, NEES, coverage" src="{figure}">'
+        return super()._repr_html_() + "".join(map(block, picture(self.record, self)))
 
 
 def read(
@@ -170,7 +169,7 @@ def _parts(of: Any) -> dict[str, Any]:
 
 def _drawn(sheet: Sheet, path: str | Path | None) -> Drawn:
     require("a plot", "plot")
-    from consistency.bench.pages.paper import drawn, picture
+    from consistency.referee.show.paper import drawn, picture
 
     figure = drawn(sheet)
     if path is not None:

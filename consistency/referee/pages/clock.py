@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from consistency.bench.pages.drawing import Axis
+from consistency.referee.document.drawing import Axis
 from consistency.referee.types import Array
 
 EPOCH = 1e6  # s; times beyond are shown from the first on

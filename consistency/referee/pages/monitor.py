@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.bench.pages import paper
-from consistency.bench.pages.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
-from consistency.bench.pages.looks import EXPECTED, LIMIT, style
+from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
+from consistency.referee.document.looks import EXPECTED, LIMIT, style
+from consistency.referee.show import paper
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitoring import Watched
 

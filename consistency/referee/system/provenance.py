@@ -1,4 +1,4 @@
-"""Where a file came from, and what JSON can hold."""
+"""Where a file came from."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import sys
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from consistency.referee.system.machine import this_machine
 
@@ -67,16 +65,3 @@ def _git_commit() -> str | None:
     commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid ")), "(initial)")
     dirty = any(not line.startswith("#") for line in lines)
     return None if commit == "(initial)" else commit + ("-dirty" if dirty else "")
-
-
-def plain(value: Any) -> Any:
-    """Arrays as lists, not finite numbers as None: what JSON can hold."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,5 +1,1 @@
-"""What a terminal shows: the progress of long work, and tables of verdicts, comparisons and findings.
-
-Here belongs text for people who wait or read on a terminal, and its JSON for programs. Commands and their options are
-in ``cli``; reports as files are in ``reporting``.
-"""
+"""Progress of long work on a terminal; what is said there of results is rendered by ``show``."""

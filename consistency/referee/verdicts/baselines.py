@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence, RunSummary, summary
+from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.skipping import Skip
 from consistency.referee.errors import InputError
 from consistency.referee.reading import HUGE, read_json, reading
 from consistency.referee.reading.columns import POSE
 from consistency.referee.system.atomic import write_whole
-from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of, plain
+from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 from consistency.referee.verdicts.files import evidence_of_windows
 from consistency.referee.verdicts.options import skip_asked
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Comparison, compare
 from consistency.referee.diagnostics.comparison import FailedRuns
+from consistency.referee.document.blocks import Block, Document, Text
+from consistency.referee.document.comparison import comparison_table
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.baselines import Baseline
 
@@ -107,3 +109,16 @@ def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, 
     except ValueError as error:
         raise InputError(f"{of_a} against {of_b}: {error}") from None
     return Compared(of_a, of_b, comparison, FailedRuns(a.failures[of_a], b.failures[of_b]))
+
+
+def document(compared: Sequence[Compared]) -> Document:
+    """A table and a sentence for each pair, and the numbers of all as data."""
+    blocks: list[Block] = []
+    for each in compared:
+        blocks += [comparison_table(each.a, each.b, each.comparison), Text(each.sentence), Text("")]
+    data = [
+        {"a": each.a, "b": each.b, "worse": each.worse, "sentence": each.sentence, "failures": each.failures}
+        | asdict(each.comparison)
+        for each in compared
+    ]
+    return Document("", "", (), tuple(blocks), data)

@@ -44,7 +44,8 @@ def characterise(
     """Measure a stereo sensor: noise, growth with disparity, bias map, tails, whiteness, each with an interval."""
     from consistency.bench.pages import write_sensor_reports
     from consistency.bench.store.storage import require_free
-    from consistency.stereo.characterising.printing import print_characterisation
+    from consistency.referee.show import terminal
+    from consistency.stereo.characterising.printing import blocks
     from consistency.stereo.characterising.sources import CORNERS, NODES, Options, characterise_source, counts
     from consistency.stereo.characterising.writing import as_json as json_of
     from consistency.stereo.characterising.writing import require_free_file, sensor_text, write_sensor
@@ -64,7 +65,7 @@ def characterise(
     if as_json:
         print(json_of(measured.of))
         return
-    print_characterisation(measured.of)
+    terminal.show(*blocks(measured.of))
     for path in written:
         print(path)
     print(f"sensor in {out}; next: consistency recommend {out}")

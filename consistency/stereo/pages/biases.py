@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.blocks import Table
-from consistency.bench.pages.drawing import Axis, Figure, Key, Line, Panel, Points, Rule
 from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, groups, listing, section, several, single
-from consistency.bench.pages.looks import EXPECTED, style
 from consistency.bench.pages.section import Part
+from consistency.referee.document.blocks import Table
+from consistency.referee.document.drawing import Axis, Figure, Key, Line, Panel, Points, Rule
+from consistency.referee.document.looks import EXPECTED, style
 
 SENSOR = Part("sensor-issues", "The stereo sensor: biases and practical issues", "Sensor issues")
 DOF = 3.0

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span
-from consistency.bench.pages.looks import EXPECTED, SHADE, style
 from consistency.bench.pages.model import Report
 from consistency.bench.pages.section import FRONT_END, Section
 from consistency.bench.pages.tables import extra_table
+from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span
+from consistency.referee.document.looks import EXPECTED, SHADE, style
 
 FILE = "frontend_fig23.parquet"
 COLUMNS = [

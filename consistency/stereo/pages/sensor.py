@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from consistency.bench.pages.blocks import Cell, Chapter, Column, Document, Facts, Table, Text, table
-from consistency.bench.pages.drawing import (
+from consistency.bench.pages.sections.provenance import facts
+from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Table, Text, table
+from consistency.referee.document.drawing import (
     Axis,
     Band,
     Bars,
@@ -25,8 +26,7 @@ from consistency.bench.pages.drawing import (
     Span,
     Stems,
 )
-from consistency.bench.pages.looks import COLOURS, EXPECTED, SHADE, Look, style
-from consistency.bench.pages.sections.provenance import facts
+from consistency.referee.document.looks import COLOURS, EXPECTED, SHADE, Look, style
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
 from consistency.stereo.characterising.wording import counted, interval, sentences

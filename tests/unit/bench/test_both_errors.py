@@ -20,11 +20,13 @@ from consistency.bench.store.judge import analyse, evidence_of, until_decided
 from consistency.bench.store.results import open_results
 from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, Interval, Settings, judge, map_score
-from consistency.referee.diagnostics.export import map_text
 from consistency.referee.diagnostics.records import MapScore
 from consistency.referee.diagnostics.scale import ratio_interval
+from consistency.referee.document.map import map_text
+from consistency.referee.document.verdict import document
 from consistency.referee.reading.columns import OWN_COVARIANCE
-from consistency.referee.terminal.table import print_verdicts, verdicts_json
+from consistency.referee.show.json import render
+from consistency.referee.show.terminal import show
 from consistency.referee.verdicts.baselines import baseline_of
 from consistency.referee.verdicts.files import analyse_recordings
 
@@ -244,7 +246,7 @@ def test_the_map_is_no_part_of_the_verdict(results: cs.Results) -> None:
 
 
 def printed(capsys: pytest.CaptureFixture[str], *names: str, results: cs.Results) -> list[str]:
-    print_verdicts(analyse(results, list(names)))
+    show(*document(analyse(results, list(names)), reasons=False).opening)
     return capsys.readouterr().out.splitlines()
 
 
@@ -296,7 +298,7 @@ def test_a_score_in_words(score: MapScore, text: str) -> None:
 
 
 def test_json_holds_both(results: cs.Results) -> None:
-    said = json.loads(verdicts_json(analyse(results)))
+    said = json.loads(render(document(analyse(results))))
     own = said["right"]["statistics"]
     v = analyse(results)["right"]
     assert (own["convention"], own["mean_anees"]) == ("right", v.scale.mean_anees)

@@ -22,7 +22,8 @@ from consistency.referee.diagnostics import Evidence, Settings, blocks, judge, s
 from consistency.referee.diagnostics.sample import sample_of
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.whitening import all_finite, squared_length
-from consistency.referee.terminal.table import verdicts_json
+from consistency.referee.document.verdict import document
+from consistency.referee.show.json import render
 
 STEPS = 200
 RUNS = 4000
@@ -168,7 +169,7 @@ def test_a_filter_read_in_parts_is_judged_as_in_whole(folders: tuple[Path, Path]
     results = open_results(folders[0])
     whole = {name: verdict_of(curves(results, name), Settings()) for name in results.filters}
     assert whole["ekf-uvd"].map is not None
-    assert verdicts_json(analyse(results)) == verdicts_json(whole)
+    assert render(document(analyse(results))) == render(document(whole))
 
 
 MEASURE = """

@@ -12,10 +12,11 @@ import pytest
 from documents import blocks
 
 import consistency as cs
-from consistency.bench.pages import build, pdf, write_reports
+from consistency.bench.pages import build, write_reports
 from consistency.bench.pages.build import build_report
 from consistency.bench.pages.contents import SECTIONS
 from consistency.bench.pages.sections import pose_errors
+from consistency.referee.show import pdf
 
 
 def example(path: str) -> str:

@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.bench.pages.blocks import Status
 from consistency.bench.pages.sections import filters
 from consistency.bench.runs.findings import Study, experiments
+from consistency.referee.document.blocks import Status
 
 ROW = {
     "filter": "a", "realisable": "yes", "error": "so2", "status": "consistent",

@@ -28,7 +28,8 @@ from consistency.bench.simulation import World
 from consistency.bench.store import parquet
 from consistency.bench.store.results import Outcome, StoredResults, open_results, outcome_of
 from consistency.bench.types import Trial
-from consistency.referee.terminal.table import verdicts_json
+from consistency.referee.document.verdict import document
+from consistency.referee.show.json import render
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 FILTERS = ["ekf-uvd", "ekf-xyz"]
@@ -198,7 +199,7 @@ def test_a_filter_is_read_without_the_others(uvd: cs.Scenario, written: Path, mo
 
 def test_verdicts_from_a_folder_are_those_from_memory(written: Path) -> None:
     stored, memory = open_results(written), cs.read_results(written)
-    assert verdicts_json(cs.analyse(stored)) == verdicts_json(cs.analyse(memory))
+    assert render(document(cs.analyse(stored))) == render(document(cs.analyse(memory)))
     assert stored.finished_runs(FILTERS) == set(range(9))
     assert stored.scenario == memory.scenario
 
@@ -211,7 +212,7 @@ def test_a_folder_that_another_program_wrote(written: Path, tmp_path: Path) -> N
     mixed = memory.estimates.sort_values(["run", "step"], kind="stable")
     mixed.to_parquet(tmp_path / "out" / "estimates.parquet", index=False)
     accept_changes(tmp_path / "out")
-    assert verdicts_json(cs.analyse(open_results(tmp_path / "out"))) == verdicts_json(cs.analyse(memory))
+    assert render(document(cs.analyse(open_results(tmp_path / "out")))) == render(document(cs.analyse(memory)))
     mixed.sample(frac=1.0, random_state=1).to_parquet(tmp_path / "out" / "estimates.parquet", index=False)
     with pytest.raises(cs.InputError, match=r"estimates\.parquet: step \d+ of run \d+ .* is not what comes next"):
         open_results(tmp_path / "out")

@@ -18,10 +18,8 @@ import consistency as cs
 from consistency.bench.filters.guard.guarded import Guarded
 from consistency.bench.filters.stepping import optimal_gain, run_filter, step_through
 from consistency.bench.pages import write_reports
-from consistency.bench.pages.blocks import Name, Table
 from consistency.bench.pages.build import build_report
 from consistency.bench.pages.sections import rejections
-from consistency.bench.pages.wording import brief
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.scenario.effects import EFFECTS
@@ -30,7 +28,10 @@ from consistency.bench.store.results import open_results
 from consistency.bench.types import Info, Observation
 from consistency.referee.cli.app import app
 from consistency.referee.diagnostics import clustered_share, rejection_score
-from consistency.referee.terminal.table import verdicts_json
+from consistency.referee.document.blocks import Name, Table
+from consistency.referee.document.verdict import document
+from consistency.referee.document.wording import brief, written
+from consistency.referee.show.json import render
 
 WRONG = [{"kind": "wrong-match", "rate": 0.05}]
 
@@ -407,7 +408,7 @@ def test_verdicts_tell_precision_and_recall(
     score = verdicts["ekf-uvd+gate"].rejection
     assert score is not None
     assert score.precision != score.recall
-    statistics = json.loads(verdicts_json(verdicts))["ekf-uvd+gate"]["statistics"]
+    statistics = json.loads(render(document(verdicts)))["ekf-uvd+gate"]["statistics"]
     assert statistics["rejection_recall"] == list(score.recall)
     assert statistics["rejection_precision"] == list(score.precision)
     app(["analyse", str(tmp_path / "out")], standalone_mode=False)
@@ -428,7 +429,7 @@ def test_a_report_has_a_row_for_each_guard(wrong: cs.Scenario, tmp_path: Path) -
         Name("ekf-uvd+gate", study.tracks[1].look), str(score.offered), str(score.spurious), str(score.rejected)
     )  # fmt: skip
     shares = (score.precision, score.recall, score.false_alarms)
-    assert [str(cell).partition(" ")[0] for cell in row[4:]] == [brief(100 * share.value) for share in shares]
+    assert [written(cell).partition(" ")[0] for cell in row[4:]] == [brief(100 * share.value) for share in shares]
     write_reports(tmp_path / "out", tmp_path / "r.html", None, False)
     assert "Rejected observations" in (tmp_path / "r.html").read_text(encoding="utf-8")
     assert rejections.SECTION.blocks(replace(study, tracks=study.tracks[:1])) == ()

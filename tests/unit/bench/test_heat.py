@@ -12,14 +12,15 @@ import pytest
 
 import consistency as cs
 from consistency.bench.pages import heat, write_regime_reports
-from consistency.bench.pages.drawing import Figure, Tiles
 from consistency.bench.pages.heat import colour_of, heat_figure, ink_on
-from consistency.bench.pages.paper import render
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.plan import Sweep, load_sweep
-from consistency.bench.sweeps.printing import print_regime
+from consistency.bench.sweeps.printing import regime_blocks
 from consistency.bench.sweeps.regime import Regime
+from consistency.referee.document.drawing import Figure, Tiles
+from consistency.referee.show.paper import render
+from consistency.referee.show.terminal import show
 
 LONG = [{"kind": "mismatch", "rate": 0.05}]
 
@@ -127,7 +128,7 @@ def _words(svg: bytes) -> str:
 @pytest.mark.parametrize("name", GRIDS)
 def test_a_terminal_has_a_row_a_cell(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     regime = regime_of(sweep_over(**GRIDS[name]))
-    print_regime(regime)
+    show(*regime_blocks(regime))
     lines = [line for line in capsys.readouterr().out.splitlines() if line]
     rows = [line for line in lines if "overconfident " in line and "cost" not in line]
     assert len(rows) == len(regime.sweep.cells)
@@ -137,7 +138,7 @@ def test_a_terminal_has_a_row_a_cell(name: str, capsys: pytest.CaptureFixture[st
 
 
 def test_many_cells_are_counted_only(capsys: pytest.CaptureFixture[str]) -> None:
-    print_regime(regime_of(replace(load_sweep("regime"), filters=("a", "b"))))
+    show(*regime_blocks(regime_of(replace(load_sweep("regime"), filters=("a", "b")))))
     assert len(capsys.readouterr().out.splitlines()) < 10
 
 

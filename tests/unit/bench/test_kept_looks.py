@@ -21,7 +21,8 @@ from consistency.bench.store.curves import Curves
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import Outcome, StoredResults, open_results
 from consistency.bench.types import Trial
-from consistency.referee.terminal.table import verdicts_json
+from consistency.referee.document.verdict import document
+from consistency.referee.show.json import render
 
 OPEN: dict[str, Any] = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "seed": 3, "jobs": 1}  # looks at 12 to 20
 
@@ -74,7 +75,7 @@ def test_the_folder_is_that_of_a_plain_run_with_the_plan(world: cs.Scenario, who
     cs.run_trials(world, ["kf"], runs=20, seed=3, jobs=1, out=tmp_path / "plain")
     assert content(whole) == content(tmp_path / "plain")
     stored = open_results(whole)
-    assert verdicts_json(cs.analyse(stored)) == verdicts_json(verdicts)
+    assert render(document(cs.analyse(stored))) == render(document(verdicts))
     assert plan_in(whole) == results.manifest["until_decided"]
     assert (stored.manifest["runs"], stored.manifest["complete"]) == (20, True)
     assert [path.name for path in whole.parent.iterdir()] == ["whole"]
@@ -95,7 +96,7 @@ def test_what_ends_the_process_takes_no_finished_run(
     _, verdicts = run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
     assert done == list(range(run, 20))
     assert content(tmp_path / "out") == content(whole)
-    assert verdicts_json(verdicts) == verdicts_json(cs.analyse(open_results(whole)))
+    assert render(document(verdicts)) == render(document(cs.analyse(open_results(whole))))
     assert plan_in(tmp_path / "out") == plan_in(whole)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -198,7 +199,7 @@ def test_two_filters_on_disk_are_those_in_memory(world: cs.Scenario, uvd: cs.Sce
     assert isinstance(stored, StoredResults)
     memory.write(tmp_path / "memory")
     assert content(tmp_path / "out") == content(tmp_path / "memory")
-    assert verdicts_json(verdicts) == verdicts_json(said)
+    assert render(document(verdicts)) == render(document(said))
 
 
 def test_a_look_holds_one_filter_and_no_outcome(

@@ -15,11 +15,15 @@ import pytest
 from matplotlib import image
 
 import consistency as cs
-from consistency.bench.pages import paper, require_plot, write_monitor_plot
+from consistency.bench.pages import require_plot, write_monitor_plot
+from consistency.referee.document.blocks import Document
+from consistency.referee.document.monitor import monitor_document
 from consistency.referee.errors import InputError
 from consistency.referee.pages.monitor import POINTS, averaged, monitor_plot, sheet
+from consistency.referee.show import paper
+from consistency.referee.show.json import render
+from consistency.referee.show.terminal import show
 from consistency.referee.sources.nis import NisLog
-from consistency.referee.terminal.table import print_watched, watched_json
 from consistency.referee.verdicts.monitoring import Watched, make_monitor, read_innovations, watch, watch_lines
 
 NIS = [1.0, 2.5, math.nan, 0.25, 7.0]
@@ -255,14 +259,18 @@ def test_empty_fields_of_a_line_are_a_step_without_an_innovation() -> None:
 # --- showing -------------------------------------------------------------------------------------------
 
 
+def document_of(w: Watched) -> Document:
+    return monitor_document(w.name, w.monitor, w.alarm, w.alarm_t, w.since_t)
+
+
 def test_the_terminal_shows_numbers_and_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
-    print_watched(changed(gate=0.99, tolerance=1.0))  # a NIS of 12 is above the gate
+    show(*document_of(changed(gate=0.99, tolerance=1.0)).opening)  # a NIS of 12 is above the gate
     out = capsys.readouterr().out
     assert "rejected" in out
     assert "$odd$" in out
     assert "no alarm" in out
     assert "rejected 50 % of the measurements (designed for 1 %), which is not judged" in out
-    print_watched(changed())
+    show(*document_of(changed()).opening)
     out = capsys.readouterr().out
     assert "rejected" not in out
     assert "overconfident since step 211" in out
@@ -271,15 +279,15 @@ def test_the_terminal_shows_numbers_and_a_sentence(capsys: pytest.CaptureFixture
     none = NisLog(
         "f", np.arange(1.0, 5), np.full(4, np.nan), np.array([50.0, 2.0, 3.0, np.nan]), np.array([2.0, 2, 2, 0])
     )
-    print_watched(watch(none, make_monitor("optimal", gate=0.99)))
+    show(*document_of(watch(none, make_monitor("optimal", gate=0.99))).opening)
     assert "rejected 33 % of the measurements" in capsys.readouterr().out  # a step without one does not count
-    print_watched(changed(1.0))
+    show(*document_of(changed(1.0)).opening)
     assert "no alarm" in capsys.readouterr().out
 
 
 def test_json_has_every_number() -> None:
     watched = changed()
-    data = json.loads(watched_json(watched))
+    data = json.loads(render(document_of(watched)))
     assert data["alarm"]["since"] == 211
     assert data["alarm"]["since_t"] == 20.0
     assert data["alarm"]["scale"] == pytest.approx(4.0)
@@ -288,7 +296,7 @@ def test_json_has_every_number() -> None:
     assert data["largest_evidence"] == data["evidence"] == watched.monitor.evidence
     assert data["nis_ratio"] == 2.5
     assert "pose" in data["note"]
-    assert json.loads(watched_json(changed(1.0)))["alarm"] is None
+    assert json.loads(render(document_of(changed(1.0))))["alarm"] is None
 
 
 def test_many_innovations_are_averaged_before_they_are_drawn() -> None:

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.pages import pdf
 from consistency.bench.pages.answer import answer
-from consistency.bench.pages.blocks import Document, Name, Status, Table
 from consistency.bench.pages.build import build_report, compose
-from consistency.bench.pages.drawing import Figure, Intervals, Span
-from consistency.bench.pages.html import render_html
 from consistency.bench.pages.model import Report
 from consistency.bench.pages.sections import overview
+from consistency.referee.document.blocks import Document, Name, Status, Table
+from consistency.referee.document.drawing import Figure, Intervals, Span
+from consistency.referee.document.wording import written
+from consistency.referee.show import pdf
+from consistency.referee.show.html import render_html
 
 FILTERS = ("ekf-uvd", "ekf-xyz")
 
@@ -47,7 +48,7 @@ def test_every_verdict_is_in_the_table(report: Report) -> None:
         for study in report.studies
         for track in study.tracks
     ]
-    found = [(world, name.text, status.text, anees) for world, name, status, anees, _ in rows]
+    found = [(world, name.text, status.text, written(anees)) for world, name, status, anees, _ in rows]
     assert [row[:3] for row in found] == [row[:3] for row in expected]
     assert [float(row[3]) for row in found] == pytest.approx([float(row[3]) for row in expected], rel=1e-2)
     assert all(isinstance(row[1], Name) and isinstance(row[2], Status) for row in rows)
@@ -85,7 +86,7 @@ def test_a_filter_without_a_ratio_stays_in_the_table(report: Report) -> None:
     changed = replace(report, studies=(report.studies[0], replace(study, tracks=(blind,))))
     picture, verdicts = opening(changed)
     assert "second" not in [w for m in picture.panels[0].marks if isinstance(m, Intervals) for w in m.columns["world"]]
-    assert verdicts.groups[0][1][-1][3:] == ("–", "–")
+    assert tuple(map(written, verdicts.groups[0][1][-1][3:])) == ("–", "–")
 
 
 def test_one_study_opens_with_its_answer_alone(report: Report) -> None:

@@ -18,11 +18,12 @@ from consistency.bench.sweeps import regime as maps
 from consistency.bench.sweeps.axes import Axis, equivalent_baseline
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import load_sweep
-from consistency.bench.sweeps.printing import advice_json, notes_of, print_advice, sentences_of
+from consistency.bench.sweeps.printing import advice_blocks, advice_json, notes_of, sentences_of
 from consistency.bench.sweeps.recommend import recommend_for
 from consistency.bench.sweeps.regime import Regime, read_regime
 from consistency.bench.sweeps.rig import Request, differences, place_on, read_rig, told_otherwise
 from consistency.referee.errors import InputError
+from consistency.referee.show.terminal import show
 
 BASE = "herath2007-stereo"
 SENSOR = """
@@ -210,7 +211,7 @@ def test_runs_of_the_rig_confirm_or_contradict(short: str, capsys: pytest.Captur
     said = " ".join(sentences_of(advice))
     assert f"a covariance too small by ×{best.detectable:.2f} would have been found with probability 0.95" in said
     assert "a right filter would fail in 1 %" in said
-    print_advice(advice)
+    show(*advice_blocks(advice))
     assert "no fault found" in capsys.readouterr().out
     data = advice_json(advice)
     assert (data["take"], data["sure"], data["filters"][0]["confirmed"]["status"]) == (

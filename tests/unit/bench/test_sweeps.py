@@ -386,9 +386,9 @@ def test_only_consistent_filters_are_trusted() -> None:
 
 
 def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
-    from consistency.bench.pages.html import render_html
-    from consistency.bench.pages.pdf import render_pdf
     from consistency.bench.pages.regime import LOOKS, compose_regime
+    from consistency.referee.show.html import render_html
+    from consistency.referee.show.pdf import render_pdf
 
     sweep = load_sweep("small")
     statuses = list(LOOKS)
@@ -411,8 +411,8 @@ def test_a_report_shows_every_filter_and_cell(at: Path) -> None:
 
 
 def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at: Path) -> None:
-    from consistency.bench.pages.html import render_html
     from consistency.bench.pages.regime import compose_regime
+    from consistency.referee.show.html import render_html
 
     path = edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "truth.sensor.range = [[0.5, 3.0], [0.5, 4.0]]")
     sweep: Sweep = load_sweep(path)

@@ -12,8 +12,7 @@ from bokeh.models.annotations import BoxAnnotation
 from bokeh.models.annotations import Span as Across
 from matplotlib.colors import to_hex
 
-from consistency.bench.pages import paper
-from consistency.bench.pages.drawing import (
+from consistency.referee.document.drawing import (
     Axis,
     Band,
     Bars,
@@ -32,8 +31,9 @@ from consistency.bench.pages.drawing import (
     kept,
     numbers,
 )
-from consistency.bench.pages.looks import BAND, EXPECTED, LIMIT, SHADE, style
-from consistency.bench.pages.screen import MARKERS, Screen
+from consistency.referee.document.looks import BAND, EXPECTED, LIMIT, SHADE, style
+from consistency.referee.show import paper
+from consistency.referee.show.screen import MARKERS, Screen
 
 ODD = ("$x^2$ and \\frac", "_hidden", "<script>", "#*@", "$$y$$")
 STEPS = np.arange(1, 6)

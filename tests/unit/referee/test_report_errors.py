@@ -10,12 +10,13 @@ from invariant import Invariant
 
 import consistency as cs
 from consistency.bench.pages import write_reports
-from consistency.bench.pages.blocks import Name, Status, Table
 from consistency.bench.pages.build import build_report
 from consistency.bench.pages.model import Study
 from consistency.bench.pages.sections import anees, maps, own_errors, verdicts
-from consistency.bench.pages.wording import brief
 from consistency.referee.diagnostics import Interval, MapScore
+from consistency.referee.document.blocks import Cell, Name, Quantity, Status, Table
+from consistency.referee.document.figures import rmse_position
+from consistency.referee.document.wording import brief, written
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def study(folder: Path) -> Study:
     return build_report(folder).studies[0]
 
 
-def rows_of(blocks: tuple[object, ...]) -> tuple[tuple[object, ...], ...]:
+def rows_of(blocks: tuple[object, ...]) -> tuple[tuple[Cell, ...], ...]:
     [found] = [block for block in blocks if isinstance(block, Table)]
     [(_, rows)] = found.groups
     return rows
@@ -46,9 +47,9 @@ def test_both_errors_stand_below_each_other(study: Study) -> None:
     v = track.verdict
     own, world = rows_of(own_errors.SECTION.blocks(study))
     name = Name("right", track.look)
-    assert own[:4] == (name, "right, its own", Status(v.status), brief(v.scale.mean_anees))
-    assert world[:4] == ("", "so2, additive", Status(v.world.status), brief(v.world.scale.mean_anees))
-    assert brief(v.scale.inflation.low) in own[4]
+    assert own[:4] == (name, "right, its own", Status(v.status), Quantity(v.scale.mean_anees))
+    assert world[:4] == ("", "so2, additive", Status(v.world.status), Quantity(v.world.scale.mean_anees))
+    assert brief(v.scale.inflation.low) in written(own[4])
     caption = own_errors.caption(study)
     assert caption.startswith("right: Log(truth estimate^-1) of SE(2), in the world frame; so2: position difference")
 
@@ -64,8 +65,7 @@ def test_captions_name_the_filters_with_an_error_of_their_own(study: Study) -> N
 
 def test_the_rmse_is_that_of_the_pose_in_the_world(study: Study) -> None:
     track = study.tracks[1]
-    heads = [column.head for column in verdicts.columns(study)]
-    cell = verdicts.row(track)[heads.index("RMSE position (m)")]
+    cell = written(rmse_position(track.verdict))
     assert cell == f"{track.verdict.world.accuracy.rmse_position:.3f}"
     assert cell != f"{track.verdict.accuracy.rmse_position:.3f}", "negative control"
 
@@ -80,7 +80,7 @@ def test_maps_of_all_filters(study: Study) -> None:
     ends = [f"{brief(i.value)} [{brief(i.low)}, {brief(i.high)}]" for i in _of_map(score)]
     count = len(study.results.map) // 2
     assert rows[0][0] == Name("ekf-uvd", study.tracks[0].look)
-    assert rows[0][1:] == (score.verdict.status, *ends, "6", str(count), "0")
+    assert tuple(map(written, rows[0][1:])) == (score.verdict.status, *ends, "6", str(count), "0")
     assert len(rows) == 2
     sentences = [getattr(block, "text", "") for block in maps.SECTION.blocks(study)]
     assert f"Map of ekf-uvd: {score.verdict.reasons[0]}." in sentences

@@ -14,9 +14,9 @@ from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.pages.blocks import Table, Text
-from consistency.bench.pages.drawing import Band, Figure, Line, Points
 from consistency.referee import cli
+from consistency.referee.document.blocks import Table, Text
+from consistency.referee.document.drawing import Band, Figure, Line, Points
 from consistency.referee.pages.files import (
     clock_of,
     compose_files,

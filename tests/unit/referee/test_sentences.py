@@ -14,11 +14,11 @@ import pytest
 from draws import fully_dependent, identities, independent, verdict_on
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.export import text
 from consistency.referee.diagnostics.faults_in_words import bias_text, scale_text, shape_text
 from consistency.referee.diagnostics.records import Interval
 from consistency.referee.diagnostics.wording import reasons
-from consistency.referee.terminal.table import print_verdicts
+from consistency.referee.document.verdict import document
+from consistency.referee.show.terminal import show
 from consistency.referee.types import Array
 
 SURE = 1e-5
@@ -54,10 +54,10 @@ def test_the_worst_axis_stands_beside_the_whole(rng: np.random.Generator, capsys
     assert interval.value == pytest.approx(ratio)
     beside = f"worst axis: heading, {ratio:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
     assert f"({beside})" in verdict.reasons[0]
-    assert re.search(rf"worst axis +heading, {ratio:.2f} \[", text(verdict))
+    assert re.search(rf"worst axis +heading, {ratio:.2f} \[", str(verdict))
     assert verdict.statistics["worst_axis"] == "heading"
     assert verdict.statistics["worst_axis_ratio"] == tuple(interval)
-    print_verdicts({"f": verdict})
+    show(*document({"f": verdict}, reasons=False).opening)
     assert f"ratio of the {beside.replace(':', ': f')}" in capsys.readouterr().out
     few = judged(error[:5])
     assert few.status == "undecided"

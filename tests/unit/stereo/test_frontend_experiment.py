@@ -11,7 +11,7 @@ import scripts
 
 import consistency as cs
 from consistency.bench.pages.front_end import ellipse, matches_png, samples_png
-from consistency.bench.pages.looks import style
+from consistency.referee.document.looks import style
 from consistency.stereo.vision import RelativePose
 
 ROOT = Path(__file__).parents[3]

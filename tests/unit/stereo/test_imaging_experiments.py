@@ -12,9 +12,9 @@ import pytest
 from scripts import experiment
 
 import consistency as cs
-from consistency.bench.pages.blocks import Heading, Table
 from consistency.bench.pages.build import build_report
-from consistency.bench.pages.drawing import Bars, Figure, Line, Points, Stems
+from consistency.referee.document.blocks import Heading, Table
+from consistency.referee.document.drawing import Bars, Figure, Line, Points, Stems
 from consistency.stereo.imaging.chain import MISMATCH, POINT, Tracks
 from consistency.stereo.imaging.protocols import Stops, wall_texture
 from consistency.stereo.imaging.scene import Layer, Scene

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from consistency.bench.pages.blocks import Table
 from consistency.bench.pages.exhibits import findings_table
 from consistency.bench.pages.model import Report
 from consistency.bench.pages.section import Part, Section
+from consistency.referee.document.blocks import Table
 
 FINDINGS = Part("findings", "Findings: published beside measured", "Findings")
 CAPTION = "Rules of acceptance are constants of the scripts, fixed before this run"

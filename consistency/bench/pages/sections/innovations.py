@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.drawing import (
+from consistency.bench.pages.model import Study, Track, wide
+from consistency.bench.pages.section import STUDY, Section
+from consistency.referee.document.drawing import (
     Axis,
     Band,
     Figure,
@@ -21,10 +23,8 @@ from consistency.bench.pages.drawing import (
     Stems,
     dodge,
 )
-from consistency.bench.pages.looks import EXPECTED, SHADE, Look
-from consistency.bench.pages.model import Study, Track, wide
-from consistency.bench.pages.section import STUDY, Section
-from consistency.bench.pages.wording import listed
+from consistency.referee.document.looks import EXPECTED, SHADE, Look
+from consistency.referee.document.wording import listed
 from consistency.referee.types import Array
 
 LEAST = 0.1  # correlation drawn on either side of zero, so that noise does not look large

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from consistency.bench.pages.blocks import Text
 from consistency.bench.pages.model import Study
 from consistency.bench.pages.section import STUDY, Section
+from consistency.referee.document.blocks import Text
 
 
 def read(study: Study) -> Study | None:

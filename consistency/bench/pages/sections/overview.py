@@ -6,24 +6,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.blocks import Block, Cell, Column, Name, Status, Table, table
-from consistency.bench.pages.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span, dodge
-from consistency.bench.pages.looks import EXPECTED, SHADE, solid
 from consistency.bench.pages.model import Report, Track
 from consistency.bench.pages.section import OPENING, Section
-from consistency.bench.pages.sections.verdicts import inflation
-from consistency.bench.pages.wording import brief
 from consistency.referee.diagnostics import Interval
+from consistency.referee.document.blocks import Block, Column, Name, Table, table
+from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span, dodge
+from consistency.referee.document.figures import factor
+from consistency.referee.document.looks import EXPECTED, SHADE, solid
+from consistency.referee.document.verdict import BRIEF, cells, columns
+from consistency.referee.document.wording import written
 
 TITLE = "Which filter tells the truth about its uncertainty, and where?"
 LABEL = "covariance ratio (truth / stated)"
 ROOM = 1.5  # factor between the outermost values and the edges of the picture
+WIDTHS = ("0.9fr", "auto", "auto")
 COLUMNS = (
     Column("World", width="1.6fr"),
     Column("Filter", width="1fr"),
-    Column("Verdict", width="0.9fr"),
-    Column("Mean ANEES", number=True),
-    Column("Covariance to multiply by", number=True),
+    *(replace(column, paper="", width=width) for column, width in zip(columns(BRIEF), WIDTHS, strict=True)),
 )
 
 
@@ -48,14 +48,11 @@ def show(report: Report) -> tuple[Block, ...]:
 
 
 def _table(report: Report) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for study in report.studies:
-        for track in study.tracks:
-            scale = track.verdict.scale
-            anees = "–" if scale is None else brief(scale.mean_anees)
-            rows.append(
-                (study.name, Name(track.name, track.look), Status(track.verdict.status), anees, inflation(track))
-            )
+    rows = [
+        (study.name, Name(track.name, track.look), *cells(BRIEF, track.verdict))
+        for study in report.studies
+        for track in study.tracks
+    ]
     caption = "Every verdict of this report; a right filter has a mean ANEES of 3 for a pose in the plane."
     return table(COLUMNS, rows, "Verdicts of all studies", caption=caption, paper=caption, style="narrow", apart=True)
 
@@ -106,7 +103,7 @@ def _intervals(places: list[Place]) -> list[Intervals]:
             "world": [place.world for place in own],
             "filter": [name] * len(own),
             "verdict": [place.track.verdict.status for place in own],
-            "text": [inflation(place.track) for place in own],
+            "text": [written(factor(place.track.verdict)) for place in own],
         }
         tips = (("world", "@world"), ("filter", "@filter"), ("verdict", "@verdict"), ("covariance", "@text"))
         look = replace(own[0].track.look, size=5.0, width=1.3)

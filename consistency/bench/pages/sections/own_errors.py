@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from consistency.bench.pages.blocks import Block, Cell, Column, Heading, Name, Status, table
 from consistency.bench.pages.model import Study, Track
 from consistency.bench.pages.section import STUDY, Section
-from consistency.bench.pages.sections.verdicts import inflation
-from consistency.bench.pages.wording import brief
+from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, table
+from consistency.referee.document.verdict import BRIEF, FILTER, cells, columns
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 
-COLUMNS = (
-    Column("Filter", width="1.3fr"),
-    Column("Error", width="2.4fr"),
-    Column("Verdict"),
-    Column("Mean ANEES", "Mean\nANEES", number=True),
-    Column("Covariance to multiply by", "Covariance to\nmultiply by", number=True),
-)
+COLUMNS = (FILTER, Column("Error", width="2.4fr"), *columns(BRIEF))
 
 
 def read(study: Study) -> Study | None:
@@ -39,14 +30,9 @@ def _rows(track: Track) -> list[tuple[Cell, ...]]:
     if world is None:
         return []
     return [
-        (Name(track.name, track.look), f"{own.convention}, its own", *_cells(track)),
-        ("", f"{ADDITIVE}, additive", *_cells(replace(track, verdict=world))),
+        (Name(track.name, track.look), f"{own.convention}, its own", *cells(BRIEF, own)),
+        ("", f"{ADDITIVE}, additive", *cells(BRIEF, world)),
     ]
-
-
-def _cells(track: Track) -> tuple[Cell, ...]:
-    scale = track.verdict.scale
-    return Status(track.verdict.status), "–" if scale is None else brief(scale.mean_anees), inflation(track)
 
 
 def caption(study: Study) -> str:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.drawing import Axis, Figure, Key, Line, Panel, Rule, Sheet
-from consistency.bench.pages.looks import Look, solid
 from consistency.bench.pages.model import Study, Track
 from consistency.bench.pages.section import STUDY, Section
+from consistency.referee.document.drawing import Axis, Figure, Key, Line, Panel, Rule, Sheet
+from consistency.referee.document.looks import Look, solid
 from consistency.referee.types import Array
 
 COMPONENTS = (("x", "m"), ("y", "m"), ("heading", "deg"))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from consistency.bench.pages.blocks import Block, Details, Facts, Settings
 from consistency.bench.pages.model import Report, Study
 from consistency.bench.pages.section import Part, Section
-from consistency.bench.pages.wording import number
+from consistency.referee.document.blocks import Block, Details, Facts, Settings
+from consistency.referee.document.wording import number
 
 PROVENANCE = Part("provenance", "Provenance", "Provenance")
 SHORT = 4000  # characters of settings that surely fit on one page

@@ -4,25 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from consistency.bench.pages.blocks import (
-    Block,
-    Cell,
-    Column,
-    Heading,
-    Name,
-    Reason,
-    Reasons,
-    Status,
-    Table,
-    Text,
-    table,
-)
 from consistency.bench.pages.model import Estimator, Judged, Report
 from consistency.bench.pages.section import Part, Section
-from consistency.bench.pages.wording import brief, listed, number, p_cell
-from consistency.referee.diagnostics.wording import UNCERTAIN, plain, plural, short
+from consistency.referee.diagnostics.wording import plural, short
+from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, Table, Text, table
+from consistency.referee.document.verdict import FILTER, cells, columns, page, reason, with_values
+from consistency.referee.document.wording import listed
 
 VERDICTS = Part("verdicts", "Verdicts", "Verdicts")
 FAILURES = (
@@ -48,7 +35,8 @@ def show(report: Report) -> tuple[Block, ...]:
 
 def judgement(study: Judged) -> list[Block]:
     """Table and sentences of one study, and its failed runs."""
-    blocks: list[Block] = [Heading(study.name), _table(study), Reasons(tuple(_reason(t) for t in study.tracks))]
+    reasons = Reasons(tuple(reason(track.verdict, track.name, track.look) for track in study.tracks))
+    blocks: list[Block] = [Heading(study.name), _table(study), reasons]
     if study.failures:
         rows: list[tuple[Cell, ...]] = [(name, str(run), str(step), why) for name, run, step, why in study.failures]
         caption = f"Failed runs of {study.name}: {len(rows)}"
@@ -57,62 +45,11 @@ def judgement(study: Judged) -> list[Block]:
 
 
 def _table(study: Judged) -> Table:
-    every = [_cells(track) for track in study.tracks]
-    shown = [i for i in range(len(every[0])) if any(cells[i] != "–" for cells in every)] if every else []
-    heads = tuple(columns(study)[i] for i in shown)
-    rows = [tuple(cells[i] for i in shown) for cells in every]
+    view = with_values(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
+    rows = [(Name(track.name, track.look), *cells(view, track.verdict)) for track in study.tracks]
     text = caption(study)
     label, paper = f"Verdicts of {study.name}", f"{study.name}: {text}"
-    return table(heads, rows, label, caption=text, paper=paper, style="narrow", apart=True)
-
-
-def _cells(track: Estimator) -> tuple[Cell, ...]:
-    name, status, *others = row(track)
-    return Name(name, track.look), Status(status), *others
-
-
-def _reason(track: Estimator) -> Reason:
-    sentence, *others = track.verdict.reasons
-    return Reason(track.name, track.look, sentence, tuple(others))
-
-
-def columns(study: Judged) -> tuple[Column, ...]:
-    """Heads of the verdict table."""
-    inside = equivalence_interval(study)
-    return (
-        Column("Filter", width="1.3fr"),
-        Column("Verdict"),
-        Column("Mean ANEES", "Mean\nANEES", number=True),
-        Column("Covariance to multiply by", "Covariance to\nmultiply by", number=True),
-        Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True),
-        Column("Worst axis", "Worst\naxis", number=True),
-        Column("Mainly", number=True),
-        Column("Since step", "Since\nstep", number=True),
-        Column("RMSE position (m)", "RMSE\n(m)", number=True),
-        Column("RMSE heading (deg)", "RMSE\n(deg)", number=True),
-        Column("NIS / dof", "NIS\n/ dof", number=True),
-        Column("Failed runs", "Failed\nruns", number=True),
-    )
-
-
-def row(track: Estimator) -> tuple[str, ...]:
-    """Cells of the verdict table, as :func:`columns`."""
-    v, location, accuracy = track.verdict, track.verdict.location, track.verdict.in_world.accuracy
-    since = None if location is None else location.since
-    return (
-        track.name,
-        v.status,
-        "–" if v.scale is None else brief(v.scale.mean_anees),
-        inflation(track),
-        shown_inside(track),
-        worst_axis(track),
-        (location.subset if location is not None else None) or "–",
-        "–" if since is None else str(since),
-        number(None if accuracy is None else accuracy.rmse_position, ".3f"),
-        number(None if accuracy is None else np.rad2deg(accuracy.rmse_heading), ".2f"),
-        nis(track),
-        f"{len(v.failures)} of {v.runs}",
-    )
+    return table((FILTER, *columns(view)), rows, label, caption=text, paper=paper, style="narrow", apart=True)
 
 
 def equivalence_interval(study: Judged) -> str:
@@ -124,37 +61,6 @@ def equivalence_interval(study: Judged) -> str:
     factor = verdict.settings.factor if shown is None else shown.factor
     low = "(0" if (verdict.settings if shown is None else shown).one_sided else f"[{short(1.0 / factor)}"
     return f"{low},\u00a0{short(factor)}]"
-
-
-def inflation(track: Estimator) -> str:
-    """Factor that makes the stated covariance that of the errors, with its interval."""
-    scale = track.verdict.scale
-    if scale is None or not np.isfinite(scale.inflation.value):
-        return "–"
-    ratio, low, high = scale.inflation
-    known = np.isfinite(high) and high < UNCERTAIN * low
-    return f"×{brief(ratio)} [{f'{brief(low)}, {brief(high)}' if known else 'unknown'}]"
-
-
-def worst_axis(track: Estimator) -> str:
-    """Axis whose ratio of true to stated covariance is farthest from 1, and that ratio."""
-    worst = track.verdict.worst_axis
-    return "–" if worst is None else f"{worst[0]}, {plain(worst[1])}"
-
-
-def shown_inside(track: Estimator) -> str:
-    """Whether the ratio of true to stated covariance was shown to lie where it should, and the p value."""
-    shown = track.verdict.equivalence
-    if shown is None or not np.isfinite(shown.p_value):
-        return "–"
-    return f"{'yes' if shown.shown else 'no'}, p {p_cell(shown.p_value)}"
-
-
-def nis(track: Estimator) -> str:
-    """NIS per degree of freedom, in parentheses where it is not judged."""
-    found = track.verdict.innovations
-    ratio = number(None if found is None else found.ratio, ".3f")
-    return ratio if track.innovations_judged or ratio == "–" else f"({ratio})"
 
 
 def caption(study: Judged) -> str:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from consistency.bench.pages.drawing import (
+from consistency.referee.document.drawing import (
     Axis,
     Band,
     Bars,
@@ -32,7 +32,8 @@ from consistency.bench.pages.drawing import (
     Tiles,
     kept,
 )
-from consistency.bench.pages.frames import (
+from consistency.referee.document.thin import LIMIT
+from consistency.referee.show.frames import (
     SMALL,
     dots,
     frame,
@@ -44,7 +45,6 @@ from consistency.bench.pages.frames import (
     title,
     wrapped,
 )
-from consistency.bench.pages.thin import LIMIT
 
 Drawn: TypeAlias = Figure  # for rooms that do not draw themselves
 WIDTH = 6.7  # inches, the text width of the page

@@ -1,12 +1,15 @@
-"""What a section of a report is made of, beside figures: text, tables, lists of facts."""
+"""What a document is made of, beside figures: text, tables, lists of facts."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
-from consistency.bench.pages.drawing import Figure, Key
-from consistency.bench.pages.looks import Look
+import numpy as np
+
+from consistency.referee.document.drawing import Figure, Key
+from consistency.referee.document.looks import Look
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,41 @@ class Status:
     """Cell with the word of a verdict."""
 
     text: str
+    note: str = ""  # words after it, without its colour
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Cell with a number and, where it has one, its interval; how both are written is up to a renderer."""
+
+    value: float | None  # None or NaN where there is none
+    interval: tuple[float, float] | None = None
+    unit: str = ""  # stands after it
+    digits: str = ""  # as a format says them, ".3f"; empty: three, as in a sentence
+    limit: float = np.inf  # upper over lower end from which on the interval says nothing
+    is_factor: bool = False  # something to multiply by
+    is_aside: bool = False  # reported and not judged
+
+    @property
+    def is_empty(self) -> bool:
+        return self.value is None or np.isnan(self.value) or (np.isinf(self.value) and not self.is_open)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether an infinite value is one: only without an interval and without digits of its own."""
+        return not self.digits and self.interval is None
+
+
+@dataclass(frozen=True)
+class Reason:
+    """The sentence of a verdict, and the figures behind it; also a cell."""
+
+    name: str
+    sentence: str
+    others: tuple[str, ...] = ()
+    look: Look | None = None
+    has_passed: bool = True
+    group: str = ""  # what it belongs to, such as a test
 
 
 @dataclass(frozen=True)
@@ -70,7 +108,7 @@ class Stack:
     bold: bool = False
 
 
-Cell: TypeAlias = str | Name | Status | Answer | Stack
+Cell: TypeAlias = str | Name | Status | Answer | Stack | Quantity | Reason
 
 
 @dataclass(frozen=True)
@@ -81,6 +119,7 @@ class Column:
     paper: str = ""  # another head on paper, where a line break is one
     width: str = "auto"  # on paper, as Typst writes it
     number: bool = False  # set at the right
+    most: int | None = None  # characters of it on a terminal
 
     @property
     def short(self) -> str:
@@ -100,15 +139,9 @@ class Table:
     apart: bool = False  # on a screen the caption stands above the table, not in it
     whole: bool = False  # not broken between pages
 
-
-@dataclass(frozen=True)
-class Reason:
-    """The sentence of a verdict, and the figures behind it."""
-
-    name: str
-    look: Look
-    sentence: str
-    others: tuple[str, ...]
+    @property
+    def rows(self) -> Iterator[tuple[Cell, ...]]:
+        return (row for _, rows in self.groups for row in rows)
 
 
 @dataclass(frozen=True)
@@ -144,7 +177,14 @@ class Details:
     whole: bool = False  # not broken between pages
 
 
-Block: TypeAlias = Figure | Heading | Text | Table | Reasons | Facts | Settings | Details
+@dataclass(frozen=True)
+class Bullets:
+    """Short texts below each other."""
+
+    texts: tuple[str, ...]
+
+
+Block: TypeAlias = Figure | Heading | Text | Table | Reasons | Facts | Bullets | Settings | Details
 
 
 @dataclass(frozen=True)
@@ -161,12 +201,13 @@ class Chapter:
 
 @dataclass(frozen=True)
 class Document:
-    """A whole report, ready to be shown."""
+    """All that is said, ready to be shown."""
 
     title: str
     answer: str
     chapters: tuple[Chapter, ...]
     opening: tuple[Block, ...] = ()  # below the answer, before the contents
+    data: Any = None  # the same for programs: names, numbers, texts and arrays
 
     @property
     def parts(self) -> tuple[tuple[Block, ...], ...]:
@@ -177,7 +218,16 @@ class Document:
     def figures(self) -> tuple[Figure, ...]:
         return tuple(block for part in self.parts for block in part if isinstance(block, Figure))
 
+    @property
+    def reasons(self) -> Iterator[Reason]:
+        """What was judged, wherever it stands: in lists of reasons and in the cells of tables."""
+        for block in (block for part in self.parts for block in part):
+            if isinstance(block, Reasons):
+                yield from block.entries
+            elif isinstance(block, Table):
+                yield from (cell for row in block.rows for cell in row if isinstance(cell, Reason))
 
-def table(columns: tuple[Column, ...], rows: list[tuple[Cell, ...]], label: str, **options: str | bool) -> Table:
+
+def table(columns: tuple[Column, ...], rows: Sequence[tuple[Cell, ...]], label: str, **options: str | bool) -> Table:
     """Table of rows without groups."""
     return Table(columns, (("", tuple(rows)),), label, **options)  # type: ignore[arg-type]

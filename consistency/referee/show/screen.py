@@ -11,7 +11,7 @@ from bokeh.models.annotations import BoxAnnotation
 from bokeh.models.annotations import Span as Across
 from bokeh.plotting import figure
 
-from consistency.bench.pages.drawing import (
+from consistency.referee.document.drawing import (
     Axis,
     Band,
     Bars,
@@ -28,7 +28,7 @@ from consistency.bench.pages.drawing import (
     Tiles,
     kept,
 )
-from consistency.bench.pages.looks import Look, solid
+from consistency.referee.document.looks import Look, solid
 from consistency.referee.types import Array
 
 # Bokeh's names of the marker shapes in looks.MARKERS

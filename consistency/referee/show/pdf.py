@@ -19,8 +19,10 @@ from typing import Any
 
 import typst
 
-from consistency.bench.pages import blocks, paper
-from consistency.bench.pages.drawing import Figure
+from consistency.referee.document import blocks
+from consistency.referee.document.drawing import Figure
+from consistency.referee.document.wording import written
+from consistency.referee.show import paper
 
 TEMPLATE = "report.typ"
 MANY = 24  # sheets that take longer to draw than a process to start
@@ -38,7 +40,7 @@ def render_pdf(document: blocks.Document) -> bytes:
             "chapters": [_chapter(chapter, folder) for chapter in document.chapters],
         }
         (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
-        template = resources.files("consistency.bench.pages").joinpath("templates", TEMPLATE)
+        template = resources.files("consistency.referee.show").joinpath("templates", TEMPLATE)
         (folder / TEMPLATE).write_text(template.read_text(encoding="utf-8"), encoding="utf-8")
         pdf: bytes = typst.compile(str(folder / TEMPLATE), root=str(folder), ignore_system_fonts=True)
         return pdf
@@ -93,6 +95,8 @@ def _block(block: blocks.Block, name: str, folder: Path) -> dict[str, Any]:
         case blocks.Facts():
             rows = [[soft(key), soft(value)] for key, value in block.rows]
             content = {"rows": rows, "heads": block.heads, "width": block.width}
+        case blocks.Bullets():
+            content = {"texts": [soft(text) for text in block.texts]}
         case blocks.Settings():
             content = {"cells": _settings(json.loads(block.text))}
         case blocks.Details():
@@ -122,18 +126,16 @@ def _table(table: blocks.Table) -> dict[str, Any]:
 
 def _cell(cell: blocks.Cell) -> Any:
     match cell:
-        case str():
-            return soft(cell)
-        case blocks.Name():
-            return soft(cell.text)
         case blocks.Answer():
             return {"kind": "Answer", "mark": cell.mark, "text": soft(cell.text), "emphasis": cell.emphasis}
         case blocks.Stack():
             lines = [(line.text if line.paper is None else line.paper, line.italic) for line in cell.below]
             below = [{"text": soft(text), "italic": italic} for text, italic in lines if text]
             return {"kind": "Stack", "text": soft(cell.text), "bold": cell.bold, "below": below}
+        case blocks.Status():
+            return {"kind": "Status", "text": soft(cell.text), "note": soft(cell.note)}
         case _:
-            return {"kind": "Status", "text": soft(cell.text)}
+            return soft(written(cell))
 
 
 def _reason(reason: blocks.Reason) -> dict[str, Any]:

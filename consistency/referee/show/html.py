@@ -14,10 +14,11 @@ from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from consistency.bench.pages.blocks import Block, Document
-from consistency.bench.pages.drawing import Figure, Panel, numbers
-from consistency.bench.pages.screen import Screen
-from consistency.bench.pages.thin import LIMIT
+from consistency.referee.document.blocks import Block, Document
+from consistency.referee.document.drawing import Figure, Panel, numbers
+from consistency.referee.document.thin import LIMIT
+from consistency.referee.document.wording import written
+from consistency.referee.show.screen import Screen
 
 MAXIMUM = 6_000_000  # bytes of the whole file
 SCRIPT = 1_400_000  # bytes of Bokeh itself, style and words
@@ -36,10 +37,10 @@ def render_html(document: Document) -> str:
     scripts = [script for script, found in drawn if found]
     longest = max((row[0] for row in _rows(document)), default=0)
     environment = Environment(
-        loader=PackageLoader("consistency.bench.pages"), autoescape=True, undefined=StrictUndefined,
+        loader=PackageLoader("consistency.referee.show"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters["kind"] = lambda block: type(block).__name__
+    environment.filters |= {"kind": lambda block: type(block).__name__, "written": written}
     page = environment.get_template("report.html.j2").render(
         document=document,
         chart=lambda panel: charts[id(panel)],

@@ -1,0 +1,66 @@
+"""The score of a map in rows and columns, as :mod:`consistency.referee.document.verdict` has those of a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from consistency.referee.diagnostics import Interval, MapScore
+from consistency.referee.diagnostics.wording import short
+from consistency.referee.document.blocks import Cell, Column, Quantity
+from consistency.referee.document.wording import PLAIN, written
+
+NONE = Quantity(None)
+COLUMNS = (
+    Column("Verdict on the map", "Verdict on\nthe map", width="1.2fr"),
+    Column("Mean NEES / 3 of landmarks", "Mean NEES / 3\nof landmarks", number=True),
+    Column("Pose and map together, NEES / dof", "Pose and map\ntogether", number=True),
+    Column("Map given the pose, NEES / dof", "Map given\nthe pose", number=True),
+    Column("Runs", number=True),
+    Column("Landmarks", number=True),
+    Column("Landmarks left out", "Landmarks\nleft out", number=True),
+)
+
+
+def map_cells(m: MapScore) -> tuple[Cell, ...]:
+    """Cells of a page, as COLUMNS."""
+    joint = None if m.verdict is None else m.verdict.joint
+    together = (NONE, NONE) if joint is None or not joint.runs else (_ratio(joint.both), _ratio(joint.map))
+    return (
+        "not judged" if m.verdict is None else m.verdict.status, _ratio(m.ratio) if m.landmarks else NONE, *together,
+        str(m.runs), str(m.landmarks), str(m.left_out),
+    )  # fmt: skip
+
+
+def _ratio(interval: Interval) -> Quantity:
+    return Quantity(interval.value, interval[1:])
+
+
+def map_text(m: MapScore) -> str:
+    """Mean NEES over 3 of the landmarks in maps, with its interval."""
+    left_out = f" ({m.left_out} of {m.left_out + m.landmarks} landmarks left out)" if m.left_out else ""
+    return f"{written(_ratio(m.ratio) if m.landmarks else NONE, PLAIN)}{left_out}"
+
+
+def map_summary(m: MapScore) -> str:
+    """Also the sentence of the verdict on the map."""
+    verdict = "not judged" if m.verdict is None else f"the map is {m.verdict.reasons[0]}"
+    return f"{map_text(m)}, after the last step; {verdict}"
+
+
+def map_lines(scores: Mapping[str, MapScore]) -> list[str]:
+    """One line on the maps of several filters; none where there is no map."""
+    known = {name: m for name, m in scores.items() if m.landmarks}
+    if not known:
+        return []
+    judged = "" if any(m.verdict is not None for m in known.values()) else ", not judged"
+    texts = "; ".join(f"{name} {_with_verdict(m)}" for name, m in known.items())
+    return [f"map after the last step, mean NEES / 3{judged}: {texts}"]
+
+
+def _with_verdict(m: MapScore) -> str:
+    """NEES of landmarks over 3, and the verdict on the map with the ratio of pose and map together."""
+    if m.verdict is None:
+        return map_text(m)
+    joint = m.verdict.joint
+    together = "" if joint is None or not joint.runs else f" (together with the pose {short(joint.both.value)})"
+    return f"{m.verdict.status}, {map_text(m)}{together}"

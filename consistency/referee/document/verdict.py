@@ -1,0 +1,212 @@
+"""A verdict in rows and columns: which figures stand where, in which order, and what they are called.
+
+Every place that shows verdicts takes them from here: terminal, reports, notebooks, static pages. What a view shows is a
+tuple of :class:`Measure`; to show another figure, write its function in ``figures`` and put it into the views that have
+room for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics.export import flat
+from consistency.referee.diagnostics.wording import p_text, percent, plain, plural, question_text, short
+from consistency.referee.document import figures
+from consistency.referee.document.blocks import (
+    Block,
+    Cell,
+    Column,
+    Document,
+    Facts,
+    Quantity,
+    Reason,
+    Reasons,
+    Table,
+    Text,
+    table,
+)
+from consistency.referee.document.guard import rejection_text
+from consistency.referee.document.looks import Look
+from consistency.referee.document.map import map_lines, map_summary
+from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+
+
+class Measure(NamedTuple):
+    """A figure of a verdict: its column, and its cell."""
+
+    column: Column
+    cell: Callable[[Verdict], Cell]
+
+
+def cells(view: Iterable[Measure], verdict: Verdict) -> tuple[Cell, ...]:
+    """Cells of a row."""
+    return tuple(measure.cell(verdict) for measure in view)
+
+
+def columns(view: Iterable[Measure]) -> tuple[Column, ...]:
+    """Heads of the columns."""
+    return tuple(measure.column for measure in view)
+
+
+def with_values(view: Sequence[Measure], verdicts: Sequence[Verdict]) -> tuple[Measure, ...]:
+    """The measures that any of the verdicts has a value of."""
+    return tuple(m for m in view if any(not _is_empty(m.cell(v)) for v in verdicts))
+
+
+def _is_empty(cell: Cell) -> bool:
+    return isinstance(cell, Quantity) and cell.is_empty
+
+
+# --- views ------------------------------------------------------------------------------------------
+
+FILTER = Column("Filter", width="1.3fr")
+STATUS = Measure(Column("Verdict"), figures.status)
+ANEES = Measure(Column("Mean ANEES", "Mean\nANEES", number=True), figures.mean_anees)
+FACTOR = Measure(Column("Covariance to multiply by", "Covariance to\nmultiply by", number=True), figures.factor)
+BRIEF = (STATUS, ANEES, FACTOR)
+TERMINAL = (
+    Measure(Column("verdict"), figures.status_and_source),
+    Measure(Column("ANEES", number=True), lambda v: figures.mean_anees(v, ".2f")),
+    Measure(Column("ratio", number=True), figures.ratio),
+    Measure(Column("RMSE m", number=True), figures.rmse_position),
+    Measure(Column("RMSE deg", number=True), figures.rmse_heading),
+    Measure(Column("NIS/dof", number=True), figures.nis),
+    Measure(Column("failed", number=True), figures.failed),
+)
+IN_WORLD = 3  # of these are shown of the additive error, too
+FURTHER = (
+    Measure(Column("Mean ANEES accepted", "Mean ANEES\naccepted", number=True), figures.accepted),
+    Measure(
+        Column("Covariance ratio that would be found", "Ratio that\nwould be found", number=True), figures.detectable
+    ),
+    Measure(Column("2-sigma coverage, all steps (%)", "Coverage 2σ (%)\nall steps", number=True), figures.coverage),
+    Measure(Column("Noncredibility (dB)", "Noncredi-\nbility (dB)", number=True), figures.noncredibility),
+    Measure(Column("Inclination (dB)", "Incli-\nnation (dB)", number=True), figures.inclination),
+    Measure(Column("NIS / dof (95 % expected)", "NIS / dof\n(95 % expected)", number=True), figures.nis_expected),
+)
+
+
+def page(inside: str) -> tuple[Measure, ...]:
+    """Of a report; ``inside`` is where the ratio of consistent filters is shown to be."""
+    return (
+        *BRIEF,
+        Measure(Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True), figures.shown_inside),
+        Measure(Column("Worst axis", "Worst\naxis", number=True), figures.worst_axis),
+        Measure(Column("Mainly", number=True), figures.mainly),
+        Measure(Column("Since step", "Since\nstep", number=True), figures.since),
+        Measure(Column("RMSE position (m)", "RMSE\n(m)", number=True), figures.rmse_position),
+        Measure(Column("RMSE heading (deg)", "RMSE\n(deg)", number=True), figures.rmse_heading),
+        Measure(Column("NIS / dof", "NIS\n/ dof", number=True), figures.nis_aside),
+        Measure(Column("Failed runs", "Failed\nruns", number=True), figures.failed),
+    )
+
+
+def reason(v: Verdict, name: str = "", look: Look | None = None) -> Reason:
+    """The sentence, and the figures behind it."""
+    sentence, *others = v.reasons
+    return Reason(name or v.filter, sentence, tuple(others), look, v.consistent)
+
+
+# --- one verdict ------------------------------------------------------------------------------------
+
+
+def summary(v: Verdict) -> tuple[Block, ...]:
+    """The sentence and the figures that matter."""
+    return Reasons((replace(reason(v), others=()),)), Facts(tuple(rows(v)))
+
+
+def rows(v: Verdict) -> list[tuple[str, str]]:
+    """The numbers that matter, with their names."""
+    size = f" of {plural(v.steps, v.places[:-1])}" if v.unit == "run" else ""
+    rows = [("evidence", f"{plural(v.runs, v.unit)}{size}")]
+    if v.scale is not None and v.scale.judged_steps:
+        s, shown = v.scale, v.scale.equivalence
+        low, high = s.accepted
+        rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {short(low)} to {short(high)} accepted)"))
+        value, low, high = s.inflation
+        rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], truth over stated"))
+        if (worst := v.worst_axis) is not None:
+            rows.append(("worst axis", f"{worst[0]}, {plain(worst[1])}"))
+        if s.within is not None:
+            rows.append(("within the log", f"{plain(s.within.ratio)}, if errors decorrelate as within it"))
+        ends = f"[{short(1 / shown.factor)}, {short(shown.factor)}]"
+        rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)})"))
+        if v.lost is not None:
+            rows.append((f"lost {v.unit}s", f"{v.lost.count} of {v.lost.runs}, at most {percent(v.lost.upper)} of all"))
+    if v.accuracy is not None and v.axes is not None:
+        inside = (f"{axis} {100 * c:.1f} %" for axis, c in zip(v.axes.names, v.accuracy.coverage, strict=True))
+        rows.append(("2-sigma coverage", ", ".join(inside)))
+    if v.innovations is not None and np.isfinite(v.innovations.ratio):
+        judged = "" if v.innovations.judged else ", not judged"
+        rows.append(("NIS / dof", f"{v.innovations.ratio:.3f}{judged}"))
+    if v.joint is not None and v.joint.runs:
+        value, low, high = v.joint.both
+        rows.append(("pose and map", f"NEES / dof {short(value)} [{short(low)}, {short(high)}]"))
+    if v.world is not None:
+        rows.insert(0, ("error", f"{v.convention}: {PLANAR[v.convention or ADDITIVE]}"))
+        rows.append(("in the world", _in_world(v.world)))
+    if v.map is not None:
+        rows.append(("map NEES / 3", f"{map_summary(v.map)}"))
+    if v.rejection is not None:
+        rows.append(("rejected", rejection_text(v.rejection)))
+    rows.append((f"failed {v.unit}s", f"{len({f.run for f in v.failures})} of {v.runs}"))
+    faults = [
+        f"{question_text(v, a.question)} (p {p_text(a.adjusted)})" for a in v.answers if a.found and not a.tolerated
+    ]
+    rows.append(("faults", f"{', '.join(faults) or 'none'} of {plural(len(v.answers), 'question')}"))
+    return rows
+
+
+def _in_world(v: Verdict) -> str:
+    mean = f", mean NEES {short(v.scale.mean_anees)}" if v.scale is not None and v.scale.judged_steps else ""
+    return f"{v.status}{mean} (additive error, '{ADDITIVE}')"
+
+
+# --- several verdicts -------------------------------------------------------------------------------
+
+
+def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = True) -> Document:
+    """A row for each filter, what goes for all of them below, and with ``reasons`` also why; the data are all numbers.
+
+    ``ratio``: true over stated covariance, 95 % interval. A filter that is judged in an error of its own has a second
+    row, in the additive error of the world.
+    """
+    blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
+    if reasons:
+        blocks.append(Reasons(tuple(reason(v, name) for name, v in verdicts.items())))
+    return Document(title, "", (), tuple(blocks), data(verdicts))
+
+
+def data(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
+    """Status, reasons and statistics by filter."""
+    return {name: {"status": v.status, "reasons": v.reasons, "statistics": flat(v)} for name, v in verdicts.items()}
+
+
+def _overview(verdicts: Mapping[str, Verdict]) -> Table:
+    own = any(v.world is not None for v in verdicts.values())
+    rows: list[tuple[Cell, ...]] = []
+    for name, v in verdicts.items():
+        error = (v.convention or ADDITIVE) if v.world is not None else ADDITIVE
+        rows.append((name, *[error] * own, *cells(TERMINAL, v)))
+        if v.world is not None:
+            rows.append(("", f"{ADDITIVE}, beside it", *cells(TERMINAL[:IN_WORLD], v.world)))
+    return table((Column("filter"), *[Column("error")] * own, *columns(TERMINAL)), rows, "Verdicts")
+
+
+def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
+    """What the errors are, where filters have some of their own; then the maps, and what guards rejected."""
+    lines = []
+    if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
+        texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
+        lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
+    if worst := [(name, *v.worst_axis) for name, v in verdicts.items() if v.worst_axis is not None]:
+        texts = "; ".join(f"{name} {axis}, {plain(ratio)}" for name, axis, ratio in worst)
+        lines.append(f"ratio of the worst axis: {texts}")
+    lines += map_lines({name: v.map for name, v in verdicts.items() if v.map is not None})
+    guarded = {name: v.rejection for name, v in verdicts.items() if v.rejection is not None}
+    return lines + [f"{name} rejected {rejection_text(score)}" for name, score in guarded.items()]

@@ -1,0 +1,49 @@
+"""A document as Markdown of GitHub, such as the summary of a job."""
+
+from __future__ import annotations
+
+from consistency.referee.document.blocks import Block, Bullets, Cell, Document, Facts, Heading, Reasons, Table, Text
+from consistency.referee.document.wording import PLAIN, written
+
+ESCAPED = (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("`", "\\`"))
+
+
+def render(document: Document) -> str:
+    """Title and answer, then all blocks; figures and settings are left out."""
+    parts = [f"## {_line(document.title)}", _line(document.answer), *map(_block, document.opening)]
+    for chapter in document.chapters:
+        parts += [f"### {_line(chapter.title)}", _line(chapter.summary), *map(_block, chapter.blocks)]
+    return "\n\n".join(part for part in parts if part) + "\n\n"
+
+
+def _block(block: Block) -> str:
+    match block:
+        case Table():
+            rows = (map(_cell, cells) for cells in block.rows)
+            lines = [[_line(column.head) for column in block.columns], ["---"] * len(block.columns), *rows]
+            return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        case Reasons():
+            entries = (f"**{_line(e.name)}** is {_line(e.sentence)}" for e in block.entries)
+            return "\n\n".join(entries)
+        case Facts():
+            return "\n".join(f"- {_line(name)}: {_line(value)}" for name, value in block.rows)
+        case Bullets():
+            return "\n".join(f"- {_line(text)}" for text in block.texts)
+        case Heading():
+            return f"#### {_line(block.text)}"
+        case Text():
+            return _line(f"{block.lead} {block.text}")
+        case _:
+            return ""
+
+
+def _cell(cell: Cell) -> str:
+    return _line(written(cell, PLAIN))
+
+
+def _line(text: str) -> str:
+    """Text on one line, without control characters and with nothing that is markup."""
+    text = " ".join("".join(char if char.isprintable() else " " for char in text).split())
+    for char, escaped in ESCAPED:
+        text = text.replace(char, escaped)
+    return text

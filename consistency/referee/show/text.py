@@ -1,0 +1,46 @@
+"""Blocks as plain text: ``print`` of a verdict, and the summary of a test session."""
+
+from __future__ import annotations
+
+from consistency.referee.document.blocks import Block, Bullets, Facts, Heading, Reason, Reasons, Table, Text
+from consistency.referee.document.wording import PLAIN, written
+
+
+def fragment(*blocks: Block) -> str:
+    """Lines of all blocks; figures and settings are left out."""
+    return "\n".join(line for block in blocks for line in _lines(block))
+
+
+def _lines(block: Block) -> list[str]:
+    match block:
+        case Reasons():
+            return [line for entry in block.entries for line in _reason(entry)]
+        case Facts():
+            width = max(len(name) for name, _ in block.rows)
+            return [f"  {name:<{width}}  {value}" for name, value in block.rows]
+        case Table():
+            return _table(block)
+        case Bullets():
+            return [f"  - {text}" for text in block.texts]
+        case Text() | Heading():
+            return [block.text]
+        case _:
+            return []
+
+
+def _reason(entry: Reason) -> list[str]:
+    return [f"{entry.name} is {entry.sentence}", *(f"  - {other}" for other in entry.others)]
+
+
+def _table(table: Table) -> list[str]:
+    """Rows in columns; what did not pass is said below its row."""
+    rows = [[column.head for column in table.columns]]
+    below: list[list[str]] = [[]]
+    for cells in table.rows:
+        rows.append([written(cell, PLAIN) for cell in cells if not isinstance(cell, Reason)])
+        below.append([f"    {c.name} is {c.sentence}" for c in cells if isinstance(c, Reason) and not c.has_passed])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=False)]
+    lines = []
+    for row, more in zip(rows, below, strict=True):
+        lines += ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip(), *more]
+    return lines

@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 from bench_trials import SEED, Work, interleaved
 
+from consistency.bench.runs.findings import sibling
 from consistency.referee.errors import InputError
+from consistency.referee.reading.shipped import data_folder
 from consistency.stereo.vision import register_svd, registration_covariance, triangulate, triangulation_covariance
 from consistency.stereo.vision.odometry import visual_odometry
 from consistency.stereo.vision.registration import rigid_motions
 from consistency.stereo.vision.sequence import Sequence, read_sequence
-from consistency.stereo.vision.synthetic import MOTION, common_points, published_rig
+
+rigs = sibling(str(data_folder("experiments") / "README.md"), "published_rig")
 
 NOISE, NEAR, FAR = 2.0, 1.5, 3.0  # px, m, m: of e10's fig. 2.3
 OFTEN = 20  # covariances in a measurement
@@ -26,9 +29,9 @@ IMAGES = "CONSISTENCY_BENCH_IMAGES"  # environment variable with the folder of a
 
 def covariance_and_simulation(points: int, samples: int, repeats: int) -> dict[str, float]:
     """Seconds of a covariance from the pixels on, and of Monte Carlo sample by sample and of all samples at once."""
-    rig, rng = published_rig(), np.random.default_rng(SEED)
-    p1 = common_points(rng, rig, MOTION, points, NEAR, FAR)
-    uv = [rig.project(p) for p in (p1, MOTION.inverse().apply(p1))]
+    rig, rng = rigs.published_rig(), np.random.default_rng(SEED)
+    p1 = rigs.common_points(rng, rig, rigs.MOTION, points, NEAR, FAR)
+    uv = [rig.project(p) for p in (p1, rigs.MOTION.inverse().apply(p1))]
     clouds = [triangulate(rig, z) for z in uv]
     pose, S_uv = register_svd(*clouds), NOISE**2 * np.eye(4)
 

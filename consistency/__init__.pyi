@@ -2,7 +2,7 @@
 
 from .bench.filters import filter_names as filter_names
 from .bench.filters import get_filter as get_filter
-from .bench.filters.guard.guarded import guarded as guarded
+from .bench.filters.compiled import guarded as guarded
 from .bench.runs.findings import Study as Study
 from .bench.runs.montecarlo import run_trials as run_trials
 from .bench.scenario import Scenario as Scenario
@@ -14,7 +14,7 @@ from .bench.store.log import Log as Log
 from .bench.store.log import read_log as read_log
 from .bench.store.results import Results as Results
 from .bench.store.results import read_results as read_results
-from .bench.tuning.tune import Tuning as Tuning
+from .bench.tuning.result import Tuning as Tuning
 from .bench.tuning.tune import tune as tune
 from .bench.types import Control as Control
 from .bench.types import Finding as Finding

@@ -1,8 +1,7 @@
 """Is the stereo front-end's first-order covariance right, as simulations of points and of poses say it is?
 
 Valencia & Andrade-Cetto (2018) sec. 2.3.3.1 print the rig's pose, the pixel noise and how many points and samples there
-are. Camera matrices and motion are not, and are those of ``consistency.stereo.vision.synthetic``; where points are is
-below.
+are. Camera matrices and motion are not, and are those of ``published_rig.py``; where points are is below.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, script
+from consistency.bench.runs.findings import OURS, script, sibling
 from consistency.referee.diagnostics import chi2_mean_interval
 from consistency.referee.types import Array
 from consistency.stereo.vision import (
@@ -25,7 +24,8 @@ from consistency.stereo.vision import (
 )
 from consistency.stereo.vision.pose import euler_angles
 from consistency.stereo.vision.registration import rigid_motions
-from consistency.stereo.vision.synthetic import MOTION, common_points, disparity_noise, published_rig
+
+rigs = sibling(__file__, "published_rig")
 
 FINDINGS = ("frontend-interval", "frontend-fig2.2", "frontend-fig2.3", "frontend-rate")
 OWN_PROCESS = True  # runs no filter
@@ -74,7 +74,7 @@ def interval(study: cs.Study) -> cs.Finding:
 
 def figure_22(study: cs.Study) -> cs.Finding:
     """One point, 300 noisy matches a repetition; and the same along the point's ray."""
-    rig, rng = published_rig(), generator(study, 22)
+    rig, rng = rigs.published_rig(), generator(study, 22)
     S_uv = NOISE**2 * np.eye(4)
     rows = []
     for depth in DEPTHS_22:
@@ -83,7 +83,7 @@ def figure_22(study: cs.Study) -> cs.Finding:
         noisy = uv + rng.normal(0.0, NOISE, (REPETITIONS, SAMPLES_22, 4))
         points = triangulate(rig, noisy.reshape(-1, 4)).reshape(REPETITIONS, SAMPLES_22, 3)
         total = cs.nees(points - p, triangulation_covariance(rig, uv, S_uv)[0]).sum(axis=1)
-        rows.append((depth, disparity_noise(rig, depth, NOISE), *shares(total, 3 * SAMPLES_22)))
+        rows.append((depth, rigs.disparity_noise(rig, depth, NOISE), *shares(total, 3 * SAMPLES_22)))
     table = pd.DataFrame(rows, columns=["depth", "ratio", "mean", "inside", "p_value"])
     low, high = accepted_counts(REPETITIONS)
     study.tables["frontend_fig22"] = table.assign(
@@ -153,9 +153,9 @@ def poses_nees(rng: np.random.Generator, far: float, noise: float, repetitions: 
 
 
 def pose_nees(rng: np.random.Generator, far: float, noise: float, chunk: int = 100) -> float:
-    rig, S_uv = published_rig(), noise**2 * np.eye(4)
-    p1 = common_points(rng, rig, MOTION, POINTS_23, NEAR, far)
-    p2 = MOTION.inverse().apply(p1)
+    rig, S_uv = rigs.published_rig(), noise**2 * np.eye(4)
+    p1 = rigs.common_points(rng, rig, rigs.MOTION, POINTS_23, NEAR, far)
+    p2 = rigs.MOTION.inverse().apply(p1)
     true = [rig.project(p) for p in (p1, p2)]
     S1, S2 = (triangulation_covariance(rig, uv, S_uv) for uv in true)
     S = registration_covariance(p1, p2, S1, S2, register_svd(p1, p2))
@@ -163,7 +163,7 @@ def pose_nees(rng: np.random.Generator, far: float, noise: float, chunk: int = 1
     for _ in range(SAMPLES_23 // chunk):
         noisy = (uv + rng.normal(0.0, noise, (chunk, POINTS_23, 4)) for uv in true)
         R, t, _ = rigid_motions(*(triangulate(rig, uv.reshape(-1, 4)).reshape(chunk, POINTS_23, 3) for uv in noisy))
-        total += cs.nees(MOTION.vector - np.concatenate([t, euler_angles(R)], axis=1), S).sum()
+        total += cs.nees(rigs.MOTION.vector - np.concatenate([t, euler_angles(R)], axis=1), S).sum()
     return total
 
 

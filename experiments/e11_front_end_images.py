@@ -22,7 +22,6 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.pages.finding import findings_table
-from consistency.bench.pages.front_end import matches_png, samples_png
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.bench.store.storage import require_free
 from consistency.referee.diagnostics import Evidence, Verdict, judge, nees
@@ -43,9 +42,11 @@ from consistency.stereo.vision.shared import SHARED, fit_shared, sensitivities
 
 if TYPE_CHECKING:
     import front_end_data as data
+    import front_end_figures as drawings
     from front_end_data import Case
 else:
     data = sibling(__file__, "front_end_data")
+    drawings = sibling(__file__, "front_end_figures")
     Case = data.Case
 
 FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
@@ -133,9 +134,11 @@ def figures(cases: dict[str, Case], shown: dict[str, Simulated]) -> dict[str, by
     out = {}
     for name, case in cases.items():
         m = case.motions[0]
-        out[f"fig24-{name}.png"] = matches_png(case.image, m.uv0[m.inliers, :2], diagonal(m.sigma0[m.inliers, :2]))
+        out[f"fig24-{name}.png"] = drawings.matches_png(
+            case.image, m.uv0[m.inliers, :2], diagonal(m.sigma0[m.inliers, :2])
+        )
         sim = shown[name]
-        out[f"fig25-{name}.png"] = samples_png(sim.samples, sim.centre, sim.S)
+        out[f"fig25-{name}.png"] = drawings.samples_png(sim.samples, sim.centre, sim.S)
     return out
 
 

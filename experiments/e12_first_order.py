@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, script
+from consistency.bench.runs.findings import OURS, script, sibling
 from consistency.referee.diagnostics import Evidence, Settings, detectable_ratio, judge
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure
@@ -29,7 +29,8 @@ from consistency.stereo.vision import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.vision.synthetic import MOTION, common_points, disparity_noise, published_rig
+
+rigs = sibling(__file__, "published_rig")
 
 ROUTES = ("svd", "horn", "weighted", "reprojection")
 FINDINGS = tuple(f"first-order-{name}" for name in ("triangulation", *ROUTES))
@@ -47,9 +48,9 @@ def main(study: cs.Study) -> list[cs.Finding]:
     rows = []
     cells = [(z, b, s) for z in DEPTHS for b in BASELINES for s in NOISES]
     for number, (depth, baseline, noise) in enumerate(cells):
-        rig = published_rig(baseline)
+        rig = rigs.published_rig(baseline)
         rng = np.random.default_rng(np.random.SeedSequence(study.seed, spawn_key=(12, number)))
-        place = {"depth": depth, "baseline": baseline, "noise": noise, "ratio": disparity_noise(rig, depth, noise)}
+        place = {"depth": depth, "baseline": baseline, "noise": noise, "ratio": rigs.disparity_noise(rig, depth, noise)}
         measured = [triangulated(rng, rig, depth, noise), *registered(rng, rig, place)]
         rows += [place | errors.row() for errors in measured]
     table = pd.DataFrame(rows)
@@ -96,15 +97,15 @@ def registered(rng: np.random.Generator, rig: StereoRig, place: dict[str, float]
     error, S = np.full((*shape, 6), np.nan), np.full((*shape, 6, 6), np.nan)
     lost: list[list[Failure]] = [[] for _ in ROUTES]
     for run in range(RUNS):
-        p1 = common_points(rng, rig, MOTION, POINTS, 0.75 * place["depth"], 1.25 * place["depth"])
-        true = [rig.project(p) for p in (p1, MOTION.inverse().apply(p1))]
+        p1 = rigs.common_points(rng, rig, rigs.MOTION, POINTS, 0.75 * place["depth"], 1.25 * place["depth"])
+        true = [rig.project(p) for p in (p1, rigs.MOTION.inverse().apply(p1))]
         noisy = [uv + rng.normal(0.0, place["noise"], uv.shape) for uv in true]
         good = np.logical_and(*(triangulable(rig, uv) for uv in noisy))
         matches = Matches(rig, noisy[0][good], noisy[1][good], place["noise"] ** 2 * np.eye(4))
         for k, route in enumerate(ROUTES):
             try:
                 pose, S[k, run] = matches.estimate(route)
-                error[k, run] = MOTION.vector - pose.vector
+                error[k, run] = rigs.MOTION.vector - pose.vector
             except InputError as failure:
                 lost[k].append(Failure(route, run, 1, str(failure)))
     return [Errors(route, error[k], S[k], tuple(lost[k])) for k, route in enumerate(ROUTES)]
@@ -121,10 +122,10 @@ class Matches:
     def estimate(self, route: str) -> tuple[RelativePose, Array]:
         (p1, p2), (S1, S2) = self.clouds, self.S
         if route == "weighted":
-            found = register_weighted(p1, p2, S1, S2, MOTION)
+            found = register_weighted(p1, p2, S1, S2, rigs.MOTION)
             return found.pose, found.covariance
         if route == "reprojection":
-            found = refine_reprojection(self.rig, *self.uv, MOTION, self.S_uv)
+            found = refine_reprojection(self.rig, *self.uv, rigs.MOTION, self.S_uv)
             return found.pose, found.covariance
         pose = {"svd": register_svd, "horn": register_horn}[route](p1, p2)
         return pose, registration_covariance(p1, p2, S1, S2, pose)

@@ -10,8 +10,9 @@ import pandas as pd
 from scipy.stats import fisher_exact, ttest_rel
 
 import consistency as cs
-from consistency.bench.filters.centred import Corrections
-from consistency.bench.filters.methods.robocentric import PARKED, RobotCentredKalman, compiled
+from consistency.bench.filters.methods.robocentric import PARKED, compiled
+from consistency.bench.filters.textbook.inverse_range import Corrections
+from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
 from consistency.bench.runs.findings import script, sibling
 from consistency.bench.scenario import UniformLandmarks
 from consistency.bench.store.curves import curves, log_rmse

@@ -15,7 +15,7 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, script
+from consistency.bench.runs.findings import OURS, script, sibling
 from consistency.referee.errors import InputError
 from consistency.referee.terminal.progress import each
 from consistency.referee.types import Array
@@ -23,19 +23,12 @@ from consistency.stereo.imaging.camera import Camera, Lens, StereoCamera
 from consistency.stereo.imaging.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, joined
 from consistency.stereo.imaging.correspondence import KnownDisparity
 from consistency.stereo.imaging.filtering import LeftRightCheck, TrackResidual
-from consistency.stereo.imaging.protocols import (
-    Stops,
-    drive,
-    office,
-    partition,
-    pose_at,
-    retreat,
-    rigid_residual,
-    stand,
-)
+from consistency.stereo.imaging.protocols import Stops, pose_at, stand
 from consistency.stereo.imaging.selection import Spread
 from consistency.stereo.imaging.tracking import KnownProjection
 from consistency.stereo.vision.features import opencv
+
+drives = sibling(__file__, "image_drives")
 
 FINDINGS = ("fig6", "fig6-shake", "fig9", "fig9-dissimilarity", "exp1-tracks", "static-vs-dynamic", "fig3-chain")
 LONG = True
@@ -97,7 +90,7 @@ def figure_6(study: cs.Study) -> list[cs.Finding]:
     chain, camera = Chain(selection=Spread(FEATURES_6, 4, 4), stereo_first=False), wrong_camera()
     found = {}
     for number, shake in enumerate((0.0, SHAKE)):
-        parts = repeated(study, WALLS, 60 + number, partial(retreat, chain, camera, Stops(), shake=shake))
+        parts = repeated(study, WALLS, 60 + number, partial(drives.retreat, chain, camera, Stops(), shake=shake))
         found[number] = [part.take(part.frame > 0).errors[:, :2] for part in parts]
     study.tables["images_fig6"] = pd.concat(
         [
@@ -142,9 +135,9 @@ def figure_9(study: cs.Study) -> list[cs.Finding]:
     poses = np.stack([pose_at(STEP * k) for k in range(VIEWS)])
     rows = []
     for number, rng in enumerate(each(generator(study, 9).spawn(SCENES), SCENES, "junctions", "scenes")):
-        scene = partition(rng)
-        tracks = drive(chain, camera, scene, rng, VIEWS, STEP)
-        names, residual = rigid_residual(tracks, poses, camera)
+        scene = drives.partition(rng)
+        tracks = drives.drive(chain, camera, scene, rng, VIEWS, STEP)
+        names, residual = drives.rigid_residual(tracks, poses, camera)
         for name, value in zip(names, residual, strict=True):
             last = tracks.take(np.flatnonzero(tracks.track == name)[-1:])
             junction = bool(last.label[0] == JUNCTION)
@@ -199,7 +192,7 @@ def experiment_1(study: cs.Study) -> list[cs.Finding]:
     chain, camera = Chain(selection=Spread(FEATURES_1, 6, 5)), wrong_camera()
 
     def once(step: float) -> Callable[[np.random.Generator], Tracks]:
-        return lambda rng: drive(chain, camera, office(rng), rng, IMAGES, step)
+        return lambda rng: drives.drive(chain, camera, drives.office(rng), rng, IMAGES, step)
 
     moving, still = (joined(repeated(study, ROBOTS, 10, once(step))) for step in (STEP, 0.0))
     study.tables["images_exp1"] = pd.concat(
@@ -320,7 +313,7 @@ def budget(study: cs.Study) -> list[cs.Finding]:
         tracks = {
             "standing": stand(chain, camera, stops, generator(study, 30, number), study.workers),
             "moving": joined(
-                repeated(study, WALLS // 2, 300 + number, partial(retreat, chain, camera, Stops(), shake=shake))
+                repeated(study, WALLS // 2, 300 + number, partial(drives.retreat, chain, camera, Stops(), shake=shake))
             ),
         }
         for motion, own in tracks.items():

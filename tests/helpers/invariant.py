@@ -17,20 +17,20 @@ class Invariant:
     error = "right"
 
     def __init__(self) -> None:
-        self.twin = cs.get_filter("ekf-uvd").twin
+        self.textbook = cs.get_filter("ekf-uvd").textbook
 
     def init(self, problem: Any) -> Any:
-        return self.twin.init(problem)
+        return self.textbook.init(problem)
 
     def predict(self, state: Any, control: cs.Control) -> Any:
-        return self.twin.predict(state, control)
+        return self.textbook.predict(state, control)
 
     def update(self, state: Any, observation: cs.Observation) -> tuple[Any, Any]:
-        updated: tuple[Any, Any] = self.twin.update(state, observation)
+        updated: tuple[Any, Any] = self.textbook.update(state, observation)
         return updated
 
     def pose(self, state: Any) -> cs.Gaussian:
-        pose: cs.Gaussian = self.twin.pose(state)
+        pose: cs.Gaussian = self.textbook.pose(state)
         return pose
 
     def own_covariance(self, state: Any) -> Array:
@@ -41,5 +41,5 @@ class Invariant:
         return np.asarray(M @ pose.covariance @ M.T)
 
     def map(self, state: Any) -> dict[int, cs.Gaussian]:
-        landmarks: dict[int, cs.Gaussian] = self.twin.map(state)
+        landmarks: dict[int, cs.Gaussian] = self.textbook.map(state)
         return landmarks

@@ -15,7 +15,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters import MODULES, usable_names
-from consistency.bench.filters.plain_sensors import sensor_noise
+from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.stepping import run_filter, step_through
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import BelievedSensor, BiasMap
@@ -49,7 +49,7 @@ def filter_of(name: str, kernel: bool) -> Any:
     if name not in usable_names():
         pytest.skip(f"the library of {name} is not installed")
     filter_ = cs.get_filter(name)
-    return filter_ if kernel else getattr(filter_, "twin", filter_)
+    return filter_ if kernel else getattr(filter_, "textbook", filter_)
 
 
 def same(a: Estimates, b: Estimates, tolerance: float) -> bool:
@@ -138,7 +138,7 @@ def test_kernels_equal_their_twins_with_both(small: Small, name: str) -> None:
         truth__sensor__disparity_growth=GROWTH, belief__sensor__disparity_growth=GROWTH,
     )  # fmt: skip
     trial, filter_ = cs.simulate(scenario, run=1), cs.get_filter(name)
-    assert same(filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief), 1e-7)
+    assert same(filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief), 1e-7)
 
 
 def test_the_noise_of_a_point_is_that_of_its_own_pixels() -> None:

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.filters import plain, usable_names
+from consistency.bench.filters import usable_names
+from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.compiled import Compiled, problem_for
 from consistency.bench.filters.kernel.dispatch import require_fitting
 from consistency.bench.filters.kernel.gain import linearise_seen
@@ -32,10 +33,11 @@ from consistency.bench.filters.kernel.slam import (
 )
 from consistency.bench.filters.kernel.work import make_work
 from consistency.bench.filters.motion.unicycle import Unicycle
-from consistency.bench.filters.plain import SlamState
-from consistency.bench.filters.plain_sensors import sensor_noise, view
 from consistency.bench.filters.point.truth import AtTruth
 from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Estimates, Gaussian, Info, Observation, Trial
 from consistency.referee.types import Array
@@ -220,10 +222,10 @@ class TrueKalman:
         assert trial.truth is not None
         assert trial.landmarks is not None
         self.path, self.landmarks, self.uvd = trial.truth, trial.landmarks, uvd
-        self.robot = plain.Unicycle()
+        self.robot = basics.Unicycle()
 
     def init(self, problem: Problem) -> TrueState:
-        return TrueState(plain.start(problem), 0)
+        return TrueState(basics.start(problem), 0)
 
     def predict(self, state: TrueState, control: Control) -> TrueState:
         before, x, P = self.path[state.step], state.slam.x.copy(), state.slam.P.copy()
@@ -231,7 +233,7 @@ class TrueKalman:
         x[:3] = self.robot.move(before, control) + F @ (x[:3] - before)
         P[:3] = F @ P[:3]
         P[:, :3] = P[:, :3] @ F.T
-        P[:3, :3] += plain.process_noise(G, state.slam.problem.belief)
+        P[:3, :3] += basics.process_noise(G, state.slam.problem.belief)
         return TrueState(replace(state.slam, x=x, P=P), state.step + 1)
 
     def update(self, state: TrueState, observation: Observation) -> tuple[TrueState, Info]:
@@ -240,9 +242,9 @@ class TrueKalman:
 
         def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
             known = np.concatenate([pose, *(landmarks[label] for label in slam.landmarks)])
-            zhat, H = plain.expect(replace(slam, x=known), seen, self.uvd)
-            innovation = plain.innovation_of(slam, z, zhat, self.uvd) - H @ (slam.x - known)
-            S, W = plain.gain(slam.P, H, plain.block_diagonal(R))
+            zhat, H = basics.expect(replace(slam, x=known), seen, self.uvd)
+            innovation = basics.innovation_of(slam, z, zhat, self.uvd) - H @ (slam.x - known)
+            S, W = basics.gain(slam.P, H, basics.block_diagonal(R))
             return replace(slam, x=slam.x + W @ innovation, P=slam.P - W @ S @ W.T), Info(innovation, S, W)
 
         def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
@@ -251,11 +253,11 @@ class TrueKalman:
             error = sensor.less(z, sensor.measure(pose, landmarks[label])) - Hp @ (slam.x[:3] - pose)
             return landmarks[label] + Jz @ error, -Jz @ Hp, Jz
 
-        slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
+        slam, info = basics.update_jointly(state.slam, observation, self.uvd, correct, locate)
         return TrueState(slam, state.step), info
 
     def pose(self, state: TrueState) -> Gaussian:
-        return plain.pose_of(state.slam)
+        return basics.pose_of(state.slam)
 
 
 def scaled(scenario: cs.Scenario, scale: float) -> cs.Scenario:
@@ -307,7 +309,7 @@ def test_kernel_equals_its_twin_over_a_trial(small: Small, name: str, tilted: di
     mount = mounted(name, tilted)
     scenario = small(world_of(name), truth__steps=200, truth__sensor__mount=mount, belief__sensor__mount=mount)
     trial, filter_ = cs.simulate(scenario, run=2), cs.get_filter(name)
-    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
     assert difference(ours, twin) < 1e-10
     straight = small(world_of(name), truth__steps=200, truth__sensor__mount=mount)  # negative control
     assert difference(filter_.run(trial, straight.belief), twin) > 1e-6
@@ -325,7 +327,7 @@ def test_the_map_is_that_of_the_twin(small: Small, name: str) -> None:
     for label, mean, P in zip(ours.landmarks, ours.mean, ours.covariance, strict=True):
         assert close(mean, twin[label].mean, 1e-10)
         assert np.abs(P - twin[label].covariance).max() <= 1e-10 * np.abs(P).max()
-    joint, rows = filter_.twin.joint(state), np.append(0, 1 + np.argsort(list(twin)))
+    joint, rows = filter_.textbook.joint(state), np.append(0, 1 + np.argsort(list(twin)))
     rows = (3 * rows[:, None] + np.arange(3)).ravel()
     assert close(joint.mean[rows], np.append(filter_.pose(state).mean, ours.mean), 1e-10)
     assert np.abs(ours.joint - joint.covariance[np.ix_(rows, rows)]).max() <= 1e-10 * np.abs(ours.joint).max()

@@ -14,9 +14,10 @@ import pytest
 from scipy.stats import truncnorm
 
 import consistency as cs
-from consistency.bench.filters import EXTRAS, SMOOTHERS, filter_names, plain, usable_names
-from consistency.bench.filters.plain_sensors import PointSensor
+from consistency.bench.filters import EXTRAS, SMOOTHERS, filter_names, usable_names
 from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.sensors import PointSensor, heading_matrix
 from consistency.bench.models import motion, point, stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Estimates, Gaussian, Observation, Trial
@@ -199,14 +200,14 @@ class LinearWorld:
     def moved(self, pose: Array, control: Control) -> Array:
         step = len(self.reference)
         at = self.reference.setdefault(0, self.problem.start) if step == 0 else self.reference[step - 1]
-        self.reference[max(step, 1)] = plain.Unicycle().move(at, control)
-        F, _ = plain.Unicycle().jacobians(at, control)
+        self.reference[max(step, 1)] = basics.Unicycle().move(at, control)
+        F, _ = basics.Unicycle().jacobians(at, control)
         return self.reference[max(step, 1)] + F @ (pose - at)
 
     def motion(self, step: int, control: Control) -> Any:
         at, belief = self.reference[step - 1], self.problem.belief.motion
-        F, _ = plain.Unicycle().jacobians(at, control)
-        turn, ahead = plain.heading_matrix(at[2]).T, self.reference[step]
+        F, _ = basics.Unicycle().jacobians(at, control)
+        turn, ahead = heading_matrix(at[2]).T, self.reference[step]
         sigmas = control.dt * np.array([belief.sigma_v, 1e-7 * belief.sigma_v, belief.sigma_omega])
 
         def error(poses: list[Array]) -> tuple[Array, list[Array]]:

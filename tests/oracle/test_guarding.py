@@ -183,7 +183,7 @@ def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
     trial, filter_ = corrupted(cs.simulate(scenario, run=2), rng), cs.get_filter(name)
     wrong = np.concatenate([2.0 * trial.z[:1], trial.z[1:]])  # a landmark begins anew with the first row of all, too
     trial = replace(trial, z=wrong)
-    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
     assert ours.filter == twin.filter == name
     assert ours.rejected is not None
     assert twin.rejected is not None
@@ -256,7 +256,7 @@ def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None
     first = np.append(0, np.cumsum(np.bincount(step[keep], minlength=whole.steps)))
     trial = replace(whole, first=first, landmark=whole.landmark[keep], z=z[keep])
     filter_ = cs.get_filter(name)
-    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
     wrong = first_sightings(trial)[np.isin(np.unique(trial.landmark), [*AGAIN])]
     assert ours.rejected is not None
     assert twin.rejected is not None
@@ -274,7 +274,7 @@ def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None
 def test_a_parked_landmark_that_is_forgotten_takes_its_clone_along(small: Small) -> None:
     scenario = small("herath2007-stereo", truth__steps=120)
     trial = cs.simulate(scenario, run=2)
-    twin = cs.get_filter("parked-ekf-uvd").twin
+    twin = cs.get_filter("parked-ekf-uvd").textbook
     state = twin.init(problem_of(trial, scenario.belief))
     for step in range(1, 121):
         seen = trial.observation(step)

@@ -33,7 +33,7 @@ def gap(a: Estimates, b: Estimates) -> float:
 
 def both(name: str, scenario: cs.Scenario) -> tuple[Estimates, Estimates]:
     trial, filter_ = cs.simulate(scenario, run=3), cs.get_filter(name)
-    return filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    return filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_first_estimates_are_kept_while_updating_is_local(monkeypatch: pytest.Mo
 def test_the_textbook_twin_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     case = growing(80, 3)
     local = run("ekf-xyz", case.trial, case.belief, 10, monkeypatch)
-    assert gap(local, step_through(cs.get_filter("ekf-xyz").twin, case.trial, case.belief)) < 1e-9
+    assert gap(local, step_through(cs.get_filter("ekf-xyz").textbook, case.trial, case.belief)) < 1e-9
 
 
 @pytest.mark.parametrize("local_from", [4, 60, 150])

@@ -16,7 +16,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters.compiled import problem_for
-from consistency.bench.filters.plain import SlamState
+from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.types import Control, Observation, Trial
 from consistency.referee.types import Array
 
@@ -79,7 +79,7 @@ def observability_matrix(twin: Any, trial: Trial, belief: Any) -> Array:
 
 def unobserved(name: str, scenario: cs.Scenario) -> int:
     """How many directions of robot and map M leaves at zero; all others are clearly not."""
-    M = observability_matrix(cs.get_filter(name).twin, cs.simulate(scenario, run=3), scenario.belief)
+    M = observability_matrix(cs.get_filter(name).textbook, cs.simulate(scenario, run=3), scenario.belief)
     assert M.shape[0] > M.shape[1] > 30
     values = np.linalg.svd(M, compute_uv=False)
     zero = values < ZERO * values[0]

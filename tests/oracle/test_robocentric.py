@@ -11,7 +11,6 @@ import pytest
 from scipy.stats import truncnorm
 
 import consistency as cs
-from consistency.bench.filters import centred, plain
 from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.covariance_update.parking import Parking, _is_worth_it, make_clones, unpark
 from consistency.bench.filters.kernel.slam import State
@@ -19,6 +18,9 @@ from consistency.bench.filters.methods import robocentric as rc
 from consistency.bench.filters.sensor.conversion import Pixels
 from consistency.bench.filters.sensor.growth import Growth
 from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.textbook import centred, inverse_range
+from consistency.bench.filters.textbook import robocentric as textbook
+from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.filters.update.converting import Converting, converting_room
 from consistency.bench.filters.update.retraction_chain import aim_chained, cast_columns, cast_rows, unchain
 from consistency.referee.types import Array
@@ -48,16 +50,16 @@ def sensor(small: Small, tilted: dict[str, Any]) -> Any:
 
 @pytest.mark.parametrize("i", range(len(Y)))
 def test_carrying_a_landmark_has_the_derivatives_it_says(sensor: Any, i: int) -> None:
-    R, t = plain.heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
-    _, J, _, _ = centred.carried(Y, R, t, sensor)
-    assert close(J[i], along(lambda y: centred.carried(y[None], R, t, sensor)[0][0], Y[i]))
-    assert not close(1.001 * J[i], along(lambda y: centred.carried(y[None], R, t, sensor)[0][0], Y[i]))
+    R, t = heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
+    _, J, _, _ = inverse_range.carried(Y, R, t, sensor)
+    assert close(J[i], along(lambda y: inverse_range.carried(y[None], R, t, sensor)[0][0], Y[i]))
+    assert not close(1.001 * J[i], along(lambda y: inverse_range.carried(y[None], R, t, sensor)[0][0], Y[i]))
 
 
 def test_carrying_there_and_back_changes_nothing(sensor: Any) -> None:
-    R, t = plain.heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
-    there = centred.carried(Y, R, t, sensor)[0]
-    assert close(centred.carried(there, R.T, -R.T @ t, sensor)[0], Y, 1e-12)
+    R, t = heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
+    there = inverse_range.carried(Y, R, t, sensor)[0]
+    assert close(inverse_range.carried(there, R.T, -R.T @ t, sensor)[0], Y, 1e-12)
 
 
 @pytest.mark.parametrize("y", Y)
@@ -67,13 +69,13 @@ def test_a_parked_landmark_has_the_derivatives_it_says(small: Small, tilted: dic
     clone, pose = np.array([1.0, -0.5, 0.4]), np.array([1.6, 0.3, -0.7])
 
     def seen(y: Array, clone: Array, pose: Array) -> tuple[Array, Array, Array]:
-        state = rc.CentredState(pose, np.zeros((3, 3)), problem_of(trial, scenario.belief))
-        return rc._seen_from(state, clone, y)
+        state = centred.CentredState(pose, np.zeros((3, 3)), problem_of(trial, scenario.belief))
+        return centred.seen_from(state, clone, y)
 
     _, J, by_shift = seen(y, clone, pose)
     assert close(J, along(lambda y: seen(y, clone, pose)[0], y))
-    assert close(by_shift, along(lambda xi: seen(y, centred.moved(clone, xi), pose)[0], np.zeros(3)))
-    assert close(-by_shift, along(lambda xi: seen(y, clone, centred.moved(pose, xi))[0], np.zeros(3)))
+    assert close(by_shift, along(lambda xi: seen(y, inverse_range.moved(clone, xi), pose)[0], np.zeros(3)))
+    assert close(-by_shift, along(lambda xi: seen(y, clone, inverse_range.moved(pose, xi))[0], np.zeros(3)))
     assert not close(by_shift, 0.0 * by_shift, 1e-3)
 
 
@@ -82,13 +84,15 @@ def test_the_left_jacobian_is_that_of_exp_up_to_the_third_order() -> None:
     gaps = []
     for size in (0.2, 0.1):
         xi = size * np.array([0.8, -0.6, 0.5])
-        ahead = along(lambda error, xi=xi: centred.moved(pose, xi + error), np.zeros(3))
-        left = along(lambda error, xi=xi: centred.moved(centred.moved(pose, xi), error), np.zeros(3))
-        gaps.append(np.abs(ahead - left @ centred.left_jacobian(xi)).max())
+        ahead = along(lambda error, xi=xi: inverse_range.moved(pose, xi + error), np.zeros(3))
+        left = along(lambda error, xi=xi: inverse_range.moved(inverse_range.moved(pose, xi), error), np.zeros(3))
+        gaps.append(np.abs(ahead - left @ inverse_range.left_jacobian(xi)).max())
     assert gaps[0] < 1e-3
     assert gaps[1] < gaps[0] / 6.0
     assert close(
-        along(lambda error: centred.moved(pose, error), np.zeros(3)), np.linalg.inv(centred.shift_matrix(pose)), 1e-7
+        along(lambda error: inverse_range.moved(pose, error), np.zeros(3)),
+        np.linalg.inv(inverse_range.shift_matrix(pose)),
+        1e-7,
     )
 
 
@@ -98,10 +102,10 @@ Z = np.array([[20.0, -35.0, 4.0], [-110.0, 60.0, 1.7], [5.0, 90.0, 12.0]])
 
 
 def test_the_conversion_is_the_inverse_of_the_image_and_has_the_derivatives_it_says(sensor: Any) -> None:
-    y, J = centred.converted(Z, sensor)
-    assert close(centred.imaged(y, sensor), Z, 1e-9)
+    y, J = inverse_range.converted(Z, sensor)
+    assert close(inverse_range.imaged(y, sensor), Z, 1e-9)
     for i in range(len(Z)):
-        assert close(J[i], along(lambda z: centred.converted(z[None], sensor)[0][0], Z[i]))
+        assert close(J[i], along(lambda z: inverse_range.converted(z[None], sensor)[0][0], Z[i]))
         x = np.array([sensor.f * sensor.B / Z[i, 2]])
         point = np.array([x[0], -x[0] * Z[i, 0] / sensor.f, -x[0] * Z[i, 1] / sensor.f])
         assert y[i, 2] == pytest.approx(1.0 / np.linalg.norm(point))
@@ -112,10 +116,10 @@ def test_the_bias_is_that_of_quadrature(sensor: Any) -> None:
     u, v = np.meshgrid(nodes * sensor.sigma[0], nodes * sensor.sigma[1], indexing="ij")
     weight = np.outer(weights, weights).ravel() / (2.0 * np.pi)
     steps = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=1)
-    said = centred.bias(Z, sensor)
+    said = inverse_range.bias(Z, sensor)
     for i in range(len(Z)):
-        values = centred.converted(Z[i] + steps, sensor)[0]
-        exact = weight @ values - centred.converted(Z[i][None], sensor)[0][0]
+        values = inverse_range.converted(Z[i] + steps, sensor)[0]
+        exact = weight @ values - inverse_range.converted(Z[i][None], sensor)[0][0]
         assert np.abs(said[i] - exact).max() < 0.01 * np.abs(exact).max()
         assert np.abs(exact).max() > 1e-6
 
@@ -125,9 +129,9 @@ def test_a_disparity_freed_of_its_range_has_the_expected_mean_and_the_variance_i
     low, high, sigma = 1.0, 32.0, 0.65
     inside = truncnorm((low - expected) / sigma, (high - expected) / sigma, loc=expected, scale=sigma)
     d = np.array([inside.mean()])
-    mean, variance = centred.untruncated(d, np.array([expected]), sigma, (low, high))
+    mean, variance = inverse_range.untruncated(d, np.array([expected]), sigma, (low, high))
     assert mean[0] == pytest.approx(expected)
-    slope = centred.untruncated(d + 1.0, np.array([expected]), sigma, (low, high))[0] - mean
+    slope = inverse_range.untruncated(d + 1.0, np.array([expected]), sigma, (low, high))[0] - mean
     assert variance[0] == pytest.approx(slope[0] ** 2 * inside.var())
 
 
@@ -143,7 +147,7 @@ def charted(rng: np.random.Generator, size: float) -> tuple[Array, Array]:
 def test_a_chart_has_the_derivatives_it_says(rng: np.random.Generator, chart: str, on: int) -> None:
     """Errors about the moved poses are those on the left; J_l is that of SE(2) to second order."""
     poses, xi = charted(rng, 0.01)
-    function = centred.apart if chart == "apart" else partial(centred.chained, on=on)
+    function = inverse_range.apart if chart == "apart" else partial(inverse_range.chained, on=on)
     moved, C = function(poses, xi)
 
     def error(flat: Array) -> Array:
@@ -163,12 +167,12 @@ def test_the_motion_between_two_poses_of_a_chain_hangs_on_its_own_error(rng: np.
     other = xi + rng.normal(size=3)  # another error before the first pose; the same from each to the next
 
     def between(errors: Array) -> Array:
-        moved, _ = centred.chained(poses, errors, on=3)
-        turn = plain.heading_matrix(-moved[3, 2])[:2, :2]
+        moved, _ = inverse_range.chained(poses, errors, on=3)
+        turn = heading_matrix(-moved[3, 2])[:2, :2]
         return np.append(turn @ (moved[4, :2] - moved[3, :2]), moved[4, 2] - moved[3, 2])
 
     assert close(between(xi), between(other), 1e-12)
-    apart = [centred.apart(poses, errors)[0] for errors in (xi, other)]
+    apart = [inverse_range.apart(poses, errors)[0] for errors in (xi, other)]
     gaps = [np.hypot(*(moved[4, :2] - moved[3, :2])) for moved in apart]
     assert abs(gaps[0] - gaps[1]) > 1e-3
 
@@ -177,7 +181,7 @@ def test_the_motion_between_two_poses_of_a_chain_hangs_on_its_own_error(rng: np.
 def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, on: int) -> None:
     m, clones, number = 2, 3, np.array([2, 0, 1])
     poses, xi = rng.normal(size=(4, 3)), 0.3 * rng.normal(size=(4, 3))
-    moved, C = centred.chained(poses, xi, on=on)
+    moved, C = inverse_range.chained(poses, xi, on=on)
     pixels = Pixels(1.0, 1.0, 1.0, Growth(np.ones(1), np.ones(1)), 0.0, 0.0, False, False, False)
     update = Converting(pixels, 0.03, 20, 12, clones)
     room = converting_room(update, 3, 3, 3, m, 30)
@@ -209,14 +213,14 @@ CLOSING = {  # a lap in 150 steps: what was parked is seen again
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("left_out", ["nothing", *centred.Corrections._fields])
+@pytest.mark.parametrize("left_out", ["nothing", *inverse_range.Corrections._fields])
 def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any], left_out: str) -> None:
     changes = {"truth__sensor__mount": tilted, "belief__sensor__mount": tilted}
     scenario = small("herath2007-stereo", **CLOSING, **changes)
     trial = cs.simulate(scenario, run=3)
-    which = centred.Corrections()._replace(**({} if left_out == "nothing" else {left_out: False}))
-    filter_ = rc.compiled(rc.RobotCentredKalman("trial", which))
-    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    which = inverse_range.Corrections()._replace(**({} if left_out == "nothing" else {left_out: False}))
+    filter_ = rc.compiled(textbook.RobotCentredKalman("trial", which))
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
     assert ours.failure is None
     assert twin.failure is None
     size = np.abs(twin.covariance).max(axis=(1, 2), keepdims=True)
@@ -230,7 +234,7 @@ def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any
     assert ours.map.joint is not None
     assert twin.map.joint is not None
     assert np.abs(ours.map.joint - twin.map.joint).max() < 1e-8 * np.abs(twin.map.joint).max()
-    whole = rc.compiled(rc.RobotCentredKalman("trial", centred.Corrections())).run(trial, scenario.belief)
+    whole = rc.compiled(textbook.RobotCentredKalman("trial", inverse_range.Corrections())).run(trial, scenario.belief)
     assert (left_out == "nothing") == bool(np.array_equal(ours.pose, whole.pose))  # each correction does something
 
 
@@ -240,7 +244,7 @@ def test_updating_locally_changes_no_number_round_a_loop(
 ) -> None:
     """Clones are called back, freed and taken again while the rest is passive."""
     scenario = small("herath2007-stereo", **CLOSING)
-    filter_ = rc.compiled(rc.RobotCentredKalman("trial", centred.Corrections()))
+    filter_ = rc.compiled(textbook.RobotCentredKalman("trial", inverse_range.Corrections()))
     for run in range(3):
         trial = cs.simulate(scenario, run=run)
         said = []
@@ -291,10 +295,11 @@ def test_worlds_in_which_it_was_overconfident_are_mended() -> None:
 def test_a_chain_that_does_not_settle_is_given_up(monkeypatch: pytest.MonkeyPatch, small: Small) -> None:
     scenario = small("herath2007-stereo", **CLOSING)
     trial = cs.simulate(scenario, run=3)
-    filter_ = rc.compiled(rc.RobotCentredKalman("trial", centred.Corrections()))
+    filter_ = rc.compiled(textbook.RobotCentredKalman("trial", inverse_range.Corrections()))
     whole = filter_.run(trial, scenario.belief)
-    monkeypatch.setattr(rc, "PASSES_CHAINED", 2)  # too few for one whose noise is raised
-    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    for module in (rc, textbook):
+        monkeypatch.setattr(module, "PASSES_CHAINED", 2)  # too few for one whose noise is raised
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
     assert ours.failure is None
     assert not np.array_equal(ours.pose, whole.pose)
     assert np.abs(ours.pose - twin.pose).max() < 1e-9
@@ -303,7 +308,7 @@ def test_a_chain_that_does_not_settle_is_given_up(monkeypatch: pytest.MonkeyPatc
 def test_alone_and_in_doubt_a_landmark_waits(small: Small) -> None:
     """Seen beside what is in use it is called back at once, and alone once the turn since its clone is known."""
     scenario = small("herath2007-stereo", **CLOSING | {"truth__landmarks__count": 6})
-    filter_, waited, joined = rc.RobotCentredKalman("trial", centred.Corrections()), 0, 0
+    filter_, waited, joined = textbook.RobotCentredKalman("trial", inverse_range.Corrections()), 0, 0
     for run in range(4):
         trial = cs.simulate(scenario, run=run)
         state = filter_.init(problem_of(trial, scenario.belief))
@@ -325,7 +330,7 @@ def test_alone_and_in_doubt_a_landmark_waits(small: Small) -> None:
 
 def test_landmarks_are_parked_and_come_back(small: Small) -> None:
     scenario = small("herath2007-stereo", **CLOSING)
-    trial, filter_ = cs.simulate(scenario, run=3), rc.RobotCentredKalman("trial", centred.Corrections())
+    trial, filter_ = cs.simulate(scenario, run=3), textbook.RobotCentredKalman("trial", inverse_range.Corrections())
     state = filter_.init(problem_of(trial, scenario.belief))
     parked, back = set(), set()
     for k in range(1, trial.steps + 1):

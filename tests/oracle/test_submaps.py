@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.filters.methods.submaps import SubmapKalman, joined
 from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.textbook.submaps import SubmapKalman, joined
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
@@ -33,7 +33,7 @@ def compared(scenario: cs.Scenario, uvd: bool) -> tuple[Array, Array]:
     """Of each step: distance from the EKF's pose in standard deviations, and the ratio of the traces of P."""
     trial = cs.simulate(scenario, run=1)
     ours = step_through(SubmapKalman("submaps", uvd, STEPS), trial, scenario.belief)
-    one = step_through(cs.get_filter("ekf-uvd" if uvd else "ekf-xyz").twin, trial, scenario.belief)
+    one = step_through(cs.get_filter("ekf-uvd" if uvd else "ekf-xyz").textbook, trial, scenario.belief)
     assert ours.failure is None
     sigma = np.sqrt(np.einsum("kii->ki", one.covariance))
     with np.errstate(invalid="ignore", divide="ignore"):

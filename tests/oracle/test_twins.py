@@ -11,9 +11,9 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters.kernel.loop import trial_kernel
-from consistency.bench.filters.methods.ckf import CUBATURE
-from consistency.bench.filters.methods.ukf import sigma_points
 from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.textbook.ckf import CUBATURE
+from consistency.bench.filters.textbook.ukf import sigma_points
 from consistency.bench.scenario import Belief
 from consistency.bench.simulation import planned_path
 from consistency.bench.types import Estimates, Trial
@@ -71,7 +71,9 @@ CASES: list[tuple[str, str, int, dict[str, Any]]] = [
 def test_kernel_equals_its_twin(small: Small, name: str, world: str, steps: int, changes: dict[str, Any]) -> None:
     scenario = small(world, truth__steps=steps, **changes)
     trial = cs.simulate(scenario, run=1)
-    assert agree(compiled(name, trial, scenario.belief), step_through(cs.get_filter(name).twin, trial, scenario.belief))
+    assert agree(
+        compiled(name, trial, scenario.belief), step_through(cs.get_filter(name).textbook, trial, scenario.belief)
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,7 +93,7 @@ def test_kernel_equals_its_twin_with_a_tilted_camera(
     scenario = small(world, truth__sensor__mount=tilted, belief__sensor__mount=tilted)
     trial = cs.simulate(scenario)
     ours = compiled(name, trial, scenario.belief)
-    assert agree(ours, step_through(cs.get_filter(name).twin, trial, scenario.belief))
+    assert agree(ours, step_through(cs.get_filter(name).textbook, trial, scenario.belief))
     # negative control: a filter that takes the camera to look straight ahead says something else
     straight = small(world, truth__sensor__mount=tilted)
     assert not max(differences(compiled(name, trial, straight.belief), ours)) < 1e-6
@@ -100,7 +102,7 @@ def test_kernel_equals_its_twin_with_a_tilted_camera(
 def test_the_four_steps_of_a_compiled_filter_are_its_twin(uvd: cs.Scenario) -> None:
     trial, filter_ = cs.simulate(uvd), cs.get_filter("ekf-uvd")
     stepped = step_through(filter_, trial, uvd.belief)
-    assert np.array_equal(stepped.pose, step_through(filter_.twin, trial, uvd.belief).pose)
+    assert np.array_equal(stepped.pose, step_through(filter_.textbook, trial, uvd.belief).pose)
 
 
 def test_one_compiled_signature_serves_every_caller(uvd: cs.Scenario) -> None:
@@ -129,7 +131,7 @@ def test_the_cubature_filter_has_its_points_whatever_the_belief_says(small: Smal
     default, merwe = (small("herath2007-stereo", **changes).belief for changes in ({}, MERWE))
     ckf = compiled("ckf-uvd", trial, merwe)
     assert np.array_equal(ckf.pose, compiled("ukf-uvd", trial, default).pose)
-    assert agree(ckf, step_through(cs.get_filter("ckf-uvd").twin, trial, merwe))
+    assert agree(ckf, step_through(cs.get_filter("ckf-uvd").textbook, trial, merwe))
     assert not agree(ckf, compiled("ukf-uvd", trial, merwe), 1e-6)
 
 
@@ -249,7 +251,7 @@ def test_every_filter_is_the_kalman_filter_where_the_heading_is_known(small: Sma
     largest = kf.covariance.max(axis=(1, 2), keepdims=True)  # some variances are zero
     for name in ("ekf-xyz", "ukf-xyz", "iekf-xyz", "ri-ekf-xyz", "fej-ekf-xyz", "oc-ekf-xyz"):
         filter_, belief = cs.get_filter(name), with_xyz(scenario.belief)
-        for other in (filter_.run(trial, belief), step_through(filter_.twin, trial, belief)):
+        for other in (filter_.run(trial, belief), step_through(filter_.textbook, trial, belief)):
             pose, _, nis = differences(other, kf)
             assert max(pose, nis) < 1e-10
             assert (np.abs(other.covariance - kf.covariance) / largest).max() < 1e-10

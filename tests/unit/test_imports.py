@@ -49,7 +49,8 @@ OF_ARRAYS = {"numpy", "scipy"} | sys.stdlib_module_names
 DRAWING = {"matplotlib", "bokeh", "typst", "jinja2"}
 PAINTERS = {"show"}
 IN_EXPERIMENTS = {"consistency", "numpy", "pandas", "scipy"}
-PEERS = {"bench_peers": {"filterpy"}, "bench_stonesoup": {"stonesoup"}}  # what the bench sets beside ours
+# what the bench sets beside ours, and an experiment on images, which draws them
+OTHERS = {"bench_peers": {"filterpy"}, "bench_stonesoup": {"stonesoup"}, "front_end_figures": {"matplotlib"}}
 
 
 def imported(source: str) -> Iterator[str]:
@@ -62,6 +63,18 @@ def imported(source: str) -> Iterator[str]:
             assert node.module is not None
             room = node.module.split(".")[0] == "consistency" and node.module.count(".") < 3  # or a module in one
             yield from {f"{node.module}.{alias.name}" if room else node.module for alias in node.names}
+
+
+def imported_modules(source: str, known: Set[str]) -> set[str]:
+    """Those of the ``known`` modules that a source imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            inside = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= inside & known or {str(node.module)}
+    return found & known
 
 
 def place(parts: Sequence[str]) -> tuple[str, str]:
@@ -132,9 +145,32 @@ def test_no_two_rooms_import_each_other() -> None:
     assert not acyclic(graph | {"bench.store": {"bench.runs"}})  # negative control
 
 
+def test_no_two_modules_import_each_other() -> None:
+    """Wherever in them, for the type checker too; but a verdict shows itself by the module that shows verdicts."""
+    paths = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")}
+    paths = {name.removesuffix(".__init__"): path for name, path in paths.items()}
+    graph = {name: imported_modules(path.read_text(encoding="utf-8"), paths.keys()) for name, path in paths.items()}
+    graph["consistency.referee.diagnostics.records"].remove("consistency.referee.diagnostics.export")
+    assert acyclic(graph)
+    assert not acyclic(graph | {"consistency.bench.types": {"consistency.bench.scenario.view"}})  # negative control
+
+
 @pytest.mark.parametrize(("module", "path"), modules(), ids=[name for name, _ in modules()])
 def test_a_room_imports_only_rooms_below_it(module: str, path: Path) -> None:
     assert complaints(module.removesuffix(".__init__"), path.read_text(encoding="utf-8")) == []
+
+
+def not_of_the_textbook(source: str) -> list[str]:
+    """What a reference implementation imports of the filters beside others and the noise that all are told of."""
+    filters = "consistency.bench.filters"
+    found = [name for name in imported(source) if name.startswith(filters)]
+    return [name for name in found if not name.startswith((f"{filters}.textbook", f"{filters}.believed_noise"))]
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "bench/filters/textbook").glob("*.py")), ids=lambda path: path.stem)
+def test_the_textbook_knows_no_kernel(path: Path) -> None:
+    assert not_of_the_textbook(path.read_text(encoding="utf-8")) == []
+    assert not_of_the_textbook("from consistency.bench.filters.methods.ekf import xyz_parts") != []  # negative control
 
 
 FORBIDDEN = [
@@ -187,7 +223,7 @@ def strangers(source: str, known: Set[str] = frozenset()) -> set[str]:
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_a_script_only_uses_the_package(path: Path) -> None:
-    assert strangers(path.read_text(encoding="utf-8"), siblings(path)) == PEERS.get(path.stem, set())
+    assert strangers(path.read_text(encoding="utf-8"), siblings(path)) == OTHERS.get(path.stem, set())
 
 
 def mentioned(path: Path) -> set[str]:

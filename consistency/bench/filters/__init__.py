@@ -1,7 +1,8 @@
 """What the filter believes: SLAM filters by name.
 
-A method is one file in ``methods``: the parts that its kernel is made of, and its plain twin. Parts that several
-methods use have a folder for each role; ``kernel`` is what all share. Nothing here knows the simulation.
+A method is two files of one name: in ``textbook`` as a textbook writes it, in ``methods`` the parts that its kernel is
+made of. Parts that several methods use have a folder for each role; ``kernel`` is what all share. Nothing here knows
+the simulation.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ MODULES: dict[str, tuple[str, str, str]] = {
         "robot-centred map, with landmarks out of sight parked at clones of the pose",
     ),
     "eqf-uvd": ("methods.equivariant", "FILTER", "Equivariant filter: robot-centred map with polar errors, on pixels"),
-    "submap-ekf-xyz": ("methods.submaps", "XYZ", "EKF in small maps that are joined, on points"),
-    "submap-ekf-uvd": ("methods.submaps", "UVD", "EKF in small maps that are joined, on pixels"),
+    "submap-ekf-xyz": ("textbook.submaps", "XYZ", "EKF in small maps that are joined, on points"),
+    "submap-ekf-uvd": ("textbook.submaps", "UVD", "EKF in small maps that are joined, on pixels"),
     "filterpy-ekf-xyz": ("external.filterpy", "EKF_XYZ", "EKF of the library filterpy, on points"),
     "filterpy-ekf-uvd": ("external.filterpy", "EKF_UVD", "EKF of the library filterpy, on pixels"),
     "filterpy-ukf-xyz": ("external.filterpy", "UKF_XYZ", "UKF of the library filterpy, on points"),
@@ -113,7 +114,7 @@ def get_filter(name: str) -> Any:
     """
     inner, plus, kind = name.partition("+")
     if plus:
-        from consistency.bench.filters.guard.guarded import guarded
+        from consistency.bench.filters.compiled import guarded
 
         return guarded(get_filter(inner), kind)
     if name not in MODULES:

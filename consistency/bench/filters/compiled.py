@@ -12,17 +12,18 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from consistency.bench.filters.believed_noise import bias_at, sensor_noise
 from consistency.bench.filters.covariance_update.local import LOCAL_FROM, Local
 from consistency.bench.filters.covariance_update.parking import Parking
 from consistency.bench.filters.guard.guarded import Guarded
 from consistency.bench.filters.guard.parts import guard_part
+from consistency.bench.filters.guard.settings import KINDS
 from consistency.bench.filters.kernel.dispatch import fits, require_fitting
 from consistency.bench.filters.kernel.gain import HALTED, REASONS
 from consistency.bench.filters.kernel.jit import Outlook
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.slam import Data, Slam, landmark_width, robot_width
-from consistency.bench.filters.plain_sensors import bias_at, sensor_noise
-from consistency.bench.protocols import Problem, Truth
+from consistency.bench.protocols import Filter, Problem, Truth
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Control, Estimates, Gaussian, Info, Map, Observation, Trial
 from consistency.referee.errors import InputError
@@ -57,11 +58,11 @@ class Halted(Exception):
 
 
 class Compiled:
-    """``init``, ``predict``, ``update``, ``pose`` of the twin, and ``run`` of the kernels.
+    """``init``, ``predict``, ``update``, ``pose`` of the textbook's filter, and ``run`` of the kernels.
 
     Parameters
     ----------
-    twin : the filter in plain NumPy, with ``name`` and the optional ``map``
+    textbook : the filter in plain NumPy, with ``name`` and the optional ``map``
     parts : gives the parts of the filter for a problem and the controls (T, 3) of a trial
     sensors : models of sensors whose data it takes
     uvd : whether it works on (u, v, d); if not, such data are turned into points by eq. 21
@@ -69,18 +70,18 @@ class Compiled:
         :class:`consistency.protocols.Filter`
     error : convention of the error in which its covariance is meant, see
         :mod:`consistency.referee.geometry.conventions`
-    guard : kind of the guard that the twin has, if it has one
+    guard : kind of the guard that ``textbook`` has, if it has one
 
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
-    allow it; the numbers are the same. ``realisable`` is that of the twin: False for a bound that is told the truth.
-    ``needs``, of the twin too, are the keys of ``belief.sensor`` that it cannot do without and others can.
+    allow it; the numbers are the same. ``realisable`` and ``needs`` are those of ``textbook``: False for a bound
+    that is told the truth, and the keys of ``belief.sensor`` that it cannot do without and others can.
     """
 
     local_from = LOCAL_FROM
 
     def __init__(
         self,
-        twin: Any,
+        textbook: Any,
         parts: Callable[[Problem, Array], Slam],
         *,
         sensors: tuple[str, ...],
@@ -89,40 +90,40 @@ class Compiled:
         error: str = ADDITIVE,
         guard: str | None = None,
     ) -> None:
-        self.twin, self.parts, self.sensors, self.uvd = twin, parts, sensors, uvd
+        self.textbook, self.parts, self.sensors, self.uvd = textbook, parts, sensors, uvd
         self.innovations, self.error = innovations, error
-        self.name: str = twin.name
-        self.realisable: bool = is_realisable(twin)
-        self.needs: tuple[str, ...] = getattr(twin, "needs", ())
+        self.name: str = textbook.name
+        self.realisable: bool = is_realisable(textbook)
+        self.needs: tuple[str, ...] = getattr(textbook, "needs", ())
         self.guard = guard
 
     def guarded(self, kind: str) -> Compiled:
-        """This filter behind a guard, with the twin behind the same guard in plain Python."""
+        """This filter behind a guard, with the textbook's behind the same guard in plain Python."""
         return Compiled(
-            Guarded(self.twin, kind), self.parts, sensors=self.sensors, uvd=self.uvd, error=self.error, guard=kind
+            Guarded(self.textbook, kind), self.parts, sensors=self.sensors, uvd=self.uvd, error=self.error, guard=kind
         )
 
     def init(self, problem: Problem) -> Any:
-        return self.twin.init(problem)
+        return self.textbook.init(problem)
 
     def predict(self, state: Any, control: Control) -> Any:
-        return self.twin.predict(state, control)
+        return self.textbook.predict(state, control)
 
     def update(self, state: Any, observation: Observation) -> tuple[Any, Info | None]:
-        updated: tuple[Any, Info | None] = self.twin.update(state, observation)
+        updated: tuple[Any, Info | None] = self.textbook.update(state, observation)
         return updated
 
     def pose(self, state: Any) -> Gaussian:
-        pose: Gaussian = self.twin.pose(state)
+        pose: Gaussian = self.textbook.pose(state)
         return pose
 
     def map(self, state: Any) -> dict[int, Gaussian]:
-        landmarks: dict[int, Gaussian] = self.twin.map(state)
+        landmarks: dict[int, Gaussian] = self.textbook.map(state)
         return landmarks
 
     def own_covariance(self, state: Any) -> Array:
         """Covariance (3, 3) of the error that the filter declares."""
-        own: Array = self.pose(state).covariance if self.error == ADDITIVE else self.twin.own_covariance(state)
+        own: Array = self.pose(state).covariance if self.error == ADDITIVE else self.textbook.own_covariance(state)
         return own
 
     def is_ready(self, trial: Trial, belief: Belief) -> bool:
@@ -193,15 +194,41 @@ class Compiled:
         return slam
 
 
+def guarded(filter_: Filter, kind: str) -> Any:
+    """A filter behind a guard, under its name with ``+kind``; one of the bench stays compiled.
+
+    Parameters
+    ----------
+    filter_ : object with ``init``, ``predict``, ``update`` and ``pose`` whose ``update`` returns :class:`Info`
+    kind : "gate", "joint" or "ransac"
+
+    Raises
+    ------
+    InputError
+        There is no such guard, or this filter cannot be guarded.
+
+    >>> guarded(get_filter("ekf-uvd"), "gate").name  # doctest: +SKIP
+    'ekf-uvd+gate'
+    """
+    name = getattr(filter_, "name", type(filter_).__name__)
+    if kind not in KINDS:
+        raise InputError(f"filter '{name}': unknown guard '{kind}'; known: {', '.join(KINDS)}")
+    if isinstance(filter_, Guarded) or isinstance(getattr(filter_, "textbook", None), Guarded):
+        raise InputError(f"filter '{name}' has a guard already; it may have one")
+    if getattr(filter_, "innovates", True) is False:
+        raise InputError(f"filter '{name}' cannot be guarded: it gives no innovations to judge observations by")
+    return filter_.guarded(kind) if isinstance(filter_, Compiled) else Guarded(filter_, kind)
+
+
 def planar(
-    twin: Callable[..., Any], method: str, parts: Callable[[Problem, Array], Slam], **options: str
+    textbook: Callable[..., Any], method: str, parts: Callable[[Problem, Array], Slam], **options: str
 ) -> tuple[Compiled, Compiled]:
     """A method on landmarks in the plane, by relative positions (``METHOD-xy``) or range and bearing (``METHOD-rb``).
 
-    ``twin`` makes its plain twin of a name and ``uvd``, ``parts`` take sensor and landmark from the belief, and
+    ``textbook`` makes the plain filter of a name and ``uvd``, ``parts`` take sensor and landmark from the belief, and
     ``options`` are those of :class:`Compiled`.
     """
-    xy, rb = (twin(f"{method}-{suffix}", uvd=False) for suffix in ("xy", "rb"))
+    xy, rb = (textbook(f"{method}-{suffix}", uvd=False) for suffix in ("xy", "rb"))
     return (
         Compiled(xy, parts, sensors=("relative-xy",), uvd=False, **options),
         Compiled(rb, parts, sensors=("range-bearing",), uvd=False, **options),

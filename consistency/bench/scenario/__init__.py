@@ -1,8 +1,9 @@
 """Scenarios: a TOML file becomes a frozen record of what is true and what the filter believes.
 
-``tables`` reads files, ``sensor`` has the one definition of a sensor, ``truth`` and ``belief`` the two halves of a
-scenario, ``record`` puts them together, ``writing`` makes a file of one. ``effects`` holds what a sensor does to an
-ideal observation, one effect a file: its keys and its ``apply``. Nothing here draws a trial; that is the simulation's.
+``tables`` reads files, ``view`` and ``sensor`` have the one definition of a sensor, ``truth`` and ``belief`` the two
+halves of a scenario, ``record`` puts them together, ``writing`` makes a file of one. ``effects`` holds what a sensor
+does to an ideal observation, one effect a file: its keys and its ``apply``. Nothing here draws a trial; that is the
+simulation's.
 """
 
 from consistency.bench.scenario.agreement import misbelief
@@ -10,10 +11,8 @@ from consistency.bench.scenario.belief import Belief, BelievedMotion, GuardSetti
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
 from consistency.bench.scenario.record import Scenario, load_scenario, scenario_names
 from consistency.bench.scenario.sensor import (
-    PLANAR_SENSORS,
     BelievedSensor,
     LinearSensor,
-    Mount,
     PicturedSensor,
     RangeBearingSensor,
     RelativeXySensor,
@@ -47,6 +46,7 @@ from consistency.bench.scenario.truth import (
     UniformLandmarks,
     Waypoints,
 )
+from consistency.bench.scenario.view import PLANAR_SENSORS, Mount
 from consistency.bench.scenario.writing import scenario_text, toml_text
 from consistency.referee.reading.shipped import data_folder
 

@@ -2,5 +2,6 @@
 
 ``groups`` says what a factor scales, ``scores`` scores the steps of a run, ``bench`` all runs at one setting, ``fit``
 finds the best setting with its intervals and knows no filter. ``parts`` divides a scenario or a log into what is fitted
-and what is judged, ``why`` asks what no setting can mend, ``tune`` puts them together, ``wording`` says what came out.
+and what is judged, ``why`` asks what no setting can mend, ``tune`` puts them together, ``result`` says
+in words what comes of it, and ``writing`` in files.
 """

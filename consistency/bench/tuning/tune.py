@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from consistency.bench.tuning.bench import Bench
 from consistency.bench.tuning.fit import Fit, maximise
 from consistency.bench.tuning.groups import Group, groups_of, rounded, scaled
 from consistency.bench.tuning.parts import Judging, Parts, parts_of
+from consistency.bench.tuning.result import Factor, Setting, Tuning
 from consistency.bench.tuning.scores import require_scorable
 from consistency.bench.tuning.why import Probe, is_at_fault, reasons_of
 from consistency.referee.diagnostics import Settings, Verdict
@@ -34,77 +35,8 @@ OTHER_STARTS = (10.0, 0.1, 100.0)  # common factors to begin with where a run fa
 MOST_TOLERATED = 1.1  # ratio of true to stated covariance: what a verdict may excuse as the uncertainty of a fit
 
 
-@dataclass(frozen=True)
-class Factor:
-    """Factor on the variances of a group of noises, with a 95 % interval, NaN without one.
-
-    The interval is open, with an end of 0 or infinity, on a side on which the data do not bound the factor.
-    ``edge`` is -1 or 1 where the factor lies at the lower or upper limit of what is tried, which is then no estimate.
-    """
-
-    group: Group
-    value: float
-    interval: Interval
-    edge: int = 0
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A fit, the belief that it leads to, and the verdict on it."""
-
-    by: str  # "innovations", "nees", or "size": nearest to consistent where errors are as large as stated
-    factors: tuple[Factor, ...]
-    belief: Belief
-    verdict: Verdict
-    settings: int  # that were tried
-
-
 # another setting, how many were tried, whether none is consistent, and why
 Explanation = tuple[Setting | None, int, bool, tuple[str, ...]]
-
-
-@dataclass(frozen=True)
-class Tuning:
-    """Result of a fit, with the verdicts before and after it.
-
-    ``chosen`` is the fitted setting. If a fault is found in it and the truth is known, ``other`` is the setting nearest
-    to consistent on the runs of the fit, among settings whose errors have the stated size; ``tried`` is the number of
-    those settings. ``no_setting`` is true if a fault is found in both, and also in other runs of a scenario with its
-    true noises believed.
-    """
-
-    filter: str
-    parts: Parts
-    before: Verdict  # with the belief as it was, on the runs that are judged
-    chosen: Setting
-    other: Setting | None
-    tried: int
-    no_setting: bool  # no setting is consistent, as far as they were tried
-    why: tuple[str, ...]  # what the referee finds, and the cause
-    seconds: float
-
-    @property
-    def verdict(self) -> Verdict:
-        """After the fit, on runs that it has not seen."""
-        return self.chosen.verdict
-
-    @property
-    def consistent(self) -> bool:
-        return self.verdict.consistent
-
-    @property
-    def factors(self) -> tuple[Factor, ...]:
-        return self.chosen.factors
-
-    @property
-    def belief(self) -> Belief:
-        """With the noises of the chosen setting."""
-        return self.chosen.belief
-
-    def __str__(self) -> str:
-        from consistency.bench.tuning.wording import lines
-
-        return "\n".join(lines(self))
 
 
 def tune(

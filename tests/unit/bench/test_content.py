@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -13,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+import kernel_keys
 import numba
 import pytest
 from numba.core import config
@@ -236,6 +238,24 @@ real = Something()
 def with_something(x: complex) -> float:
     """Reads an attribute; to a key it might be the global of that name."""
     return x.real
+
+
+# --- textbook -----------------------------------------------------------------------------------------------
+
+
+def keys_with_other_numbers(folder: str) -> dict[str, str]:
+    """Keys of the kernels of built-in filters, with every number in a folder of ``consistency.bench.filters`` doubled."""
+    command = [sys.executable, kernel_keys.__file__, folder]
+    out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240).stdout
+    keys: dict[str, str] = json.loads(out)
+    return keys
+
+
+def test_the_textbook_is_no_content() -> None:
+    before, after = kernel_keys.keys(), keys_with_other_numbers("update")
+    assert len(before) > 30
+    assert keys_with_other_numbers("textbook") == before
+    assert {name for name in before if after[name] != before[name]} >= {"parked-ekf-uvd", "ukf-xyz"}  # negative control
 
 
 # --- processes --------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ class Declares:
     name = "mine"
 
     def __init__(self, **attributes: Any) -> None:
-        self.inner = cs.get_filter("kf").twin
+        self.inner = cs.get_filter("kf").textbook
         vars(self).update(attributes)
 
     def init(self, problem: Any) -> Any:

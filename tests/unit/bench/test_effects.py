@@ -344,7 +344,7 @@ def test_things_that_are_never_found_leave_no_label(small: Small) -> None:
 def test_a_filter_takes_a_thing_for_a_landmark(small: Small, name: str) -> None:
     scenario = with_effects(small, GHOSTS, truth__steps=80)
     trial, filter_ = cs.simulate(scenario, run=1), cs.get_filter(name)
-    kernel, twin = filter_.run(trial, scenario.belief), step_through(filter_.twin, trial, scenario.belief)
+    kernel, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
     assert kernel.failure is None
     assert np.abs(kernel.pose - twin.pose).max() < 1e-9
     assert np.array_equal(kernel.nis_dof, twin.nis_dof)

@@ -261,7 +261,7 @@ def test_a_filter_without_innovations_ends_as_a_failed_run(uvd: cs.Scenario) -> 
 
 
 def test_a_filter_of_ones_own_is_guarded_like_one_of_the_bench(wrong: cs.Scenario) -> None:
-    mine = cs.guarded(cs.get_filter("ekf-uvd").twin, "gate")
+    mine = cs.guarded(cs.get_filter("ekf-uvd").textbook, "gate")
     assert pickle.loads(pickle.dumps(mine)).name == "ekf-uvd+gate"  # workers are sent it
     trial = cs.simulate(wrong)
     ours, compiled = (
@@ -278,7 +278,7 @@ def test_small_maps_are_guarded_too(wrong: cs.Scenario) -> None:
     """The first small map is the EKF's; to a new one a landmark is new, and its observation cannot be judged."""
     trial = cs.simulate(wrong, run=1)
     small, whole = (
-        step_through(cs.guarded(getattr(filter_, "twin", filter_), "gate"), trial, wrong.belief)
+        step_through(cs.guarded(getattr(filter_, "textbook", filter_), "gate"), trial, wrong.belief)
         for filter_ in map(cs.get_filter, ("submap-ekf-uvd", "ekf-uvd"))
     )
     assert small.failure is None
@@ -293,13 +293,13 @@ def test_small_maps_are_guarded_too(wrong: cs.Scenario) -> None:
 def test_an_unguarded_filter_says_nothing_of_rejection(uvd: cs.Scenario) -> None:
     trial = cs.simulate(uvd)
     assert run_filter(cs.get_filter("ekf-uvd"), trial, uvd.belief).rejected is None
-    assert step_through(cs.get_filter("ekf-uvd").twin, trial, uvd.belief).rejected is None
+    assert step_through(cs.get_filter("ekf-uvd").textbook, trial, uvd.belief).rejected is None
 
 
 def test_what_is_wrong_is_rejected(linear: cs.Scenario, rng: np.random.Generator) -> None:
     """In a linear world with exact covariances: most of what is wrong, and few of the rest."""
     trial = corrupted(cs.simulate(linear), rng, 0.1)
-    rejected = run_filter(cs.guarded(cs.get_filter("kf").twin, "joint"), trial, linear.belief).rejected
+    rejected = run_filter(cs.guarded(cs.get_filter("kf").textbook, "joint"), trial, linear.belief).rejected
     assert rejected is not None
     assert (rejected & trial.spurious).sum() > 0.6 * trial.spurious.sum()
 

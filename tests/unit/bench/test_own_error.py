@@ -48,7 +48,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def test_estimates_carry_the_convention_the_covariance_and_the_map(uvd: cs.Scenario) -> None:
     trial = cs.simulate(uvd, 1, seed=5)
-    said, twin = (run_filter(f, trial, uvd.belief) for f in (Invariant(), cs.get_filter("ekf-uvd").twin))
+    said, twin = (run_filter(f, trial, uvd.belief) for f in (Invariant(), cs.get_filter("ekf-uvd").textbook))
     assert (said.error, twin.error, twin.own) == ("right", "so2", None)
     assert said.own is not None
     for k in (0, 10, 59):
@@ -80,7 +80,7 @@ class WithJoint(Invariant):
     """Gives the joint Gaussian of pose and map too."""
 
     def joint(self, state: Any) -> Any:
-        return self.twin.joint(state)
+        return self.textbook.joint(state)
 
 
 def test_the_joint_covariance_is_sorted_as_the_map_is(uvd: cs.Scenario) -> None:

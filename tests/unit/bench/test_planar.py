@@ -75,7 +75,7 @@ def test_a_bearing_is_taken_by_the_shorter_way_round() -> None:
 def test_full_turns_of_a_bearing_change_nothing(small: Small, method: str) -> None:
     """The twin, step by step; its kernel has the same numbers (tests/oracle/test_combinations.py)."""
     scenario = small("range-bearing", truth__steps=40)
-    trial, twin = cs.simulate(scenario), cs.get_filter(f"{method}-rb").twin
+    trial, twin = cs.simulate(scenario), cs.get_filter(f"{method}-rb").textbook
     rng = np.random.default_rng(1)
     turned = trial.z + np.column_stack([np.zeros(len(trial.z)), 2.0 * np.pi * rng.integers(-1, 2, len(trial.z))])
     others = [step_through(twin, each, scenario.belief) for each in (trial, replace(trial, z=turned))]

@@ -25,10 +25,11 @@ from consistency.bench.tuning.balance import balanced, directions, nearest
 from consistency.bench.tuning.bench import Bench
 from consistency.bench.tuning.groups import groups_of, rounded, scaled, sigma_by_channel
 from consistency.bench.tuning.parts import part_of, parts_of
+from consistency.bench.tuning.result import Tuning, factor_text, lines
 from consistency.bench.tuning.scores import require_scorable, score_of
-from consistency.bench.tuning.tune import MOST_TOLERATED, Tuning, tolerant
+from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
 from consistency.bench.tuning.why import with_noise
-from consistency.bench.tuning.wording import as_data, factor_text, lines
+from consistency.bench.tuning.writing import as_data
 from consistency.referee.cli import main
 from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.records import Interval
@@ -95,7 +96,7 @@ def test_what_is_judged_has_the_digits_that_are_written(uvd: cs.Scenario) -> Non
 
 
 def test_the_score_by_innovations_is_their_log_density(linear: cs.Scenario) -> None:
-    trial, twin = cs.simulate(linear, seed=SEED), cs.get_filter("kf").twin
+    trial, twin = cs.simulate(linear, seed=SEED), cs.get_filter("kf").textbook
     state, wanted = twin.init(problem_of(trial, linear.belief)), []
     for step in range(1, trial.steps + 1):
         state, info = twin.update(twin.predict(state, trial.control(step)), trial.observation(step))
@@ -287,7 +288,7 @@ def test_before_and_after_are_judged_on_the_same_fresh_runs(tuned: Tuning) -> No
 def test_a_filter_that_is_not_compiled_hears_the_factors(small: Small) -> None:
     scenario = off(small("linear-gaussian", truth__steps=20), 1.0, 4.0)
     kf = cs.get_filter("kf")
-    compiled, plain = (cs.tune(scenario, filter_, runs=3, seed=SEED, jobs=2) for filter_ in (kf, kf.twin))
+    compiled, plain = (cs.tune(scenario, filter_, runs=3, seed=SEED, jobs=2) for filter_ in (kf, kf.textbook))
     for a, b in zip(compiled.factors, plain.factors, strict=True):
         assert a.value == pytest.approx(b.value, rel=0.01)  # to where the search settles
     assert plain.factors[1].value > 2.0

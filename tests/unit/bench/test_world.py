@@ -13,8 +13,8 @@ import pytest
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.filters.plain import Unicycle
-from consistency.bench.filters.plain_sensors import PointSensor
+from consistency.bench.filters.textbook.basics import Unicycle
+from consistency.bench.filters.textbook.sensors import PointSensor
 from consistency.bench.simulation import draw_landmarks, planned_controls, planned_path, require_landmarks_in_view
 from consistency.bench.types import Control, Trial
 from consistency.referee.geometry import rotation

@@ -10,9 +10,10 @@ import pytest
 import scripts
 
 import consistency as cs
-from consistency.bench.pages.front_end import ellipse, matches_png, samples_png
 from consistency.referee.document.looks import style
 from consistency.stereo.vision import RelativePose
+
+figures = scripts.experiment("front_end_figures")
 
 ROOT = Path(__file__).parents[3]
 META = """
@@ -65,13 +66,13 @@ def test_without_data_it_says_what_to_set(
 
 def test_an_ellipse_is_where_the_mahalanobis_distance_is_its_scale() -> None:
     S, centre = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([3.0, -1.0])
-    curve = ellipse(centre, S, 2.0, style(0))
+    curve = figures.ellipse(centre, S, 2.0, style(0))
     e = np.stack([curve.x, curve.y], axis=1) - centre
     np.testing.assert_allclose(np.einsum("ni,ij,nj->n", e, np.linalg.inv(S), e), 4.0)
 
 
 def test_figures_are_png(rng: np.random.Generator) -> None:
     image, S = np.zeros((40, 60), np.uint8), np.eye(6)
-    for png in (matches_png(image, np.array([[10.0, 10.0]]), np.eye(2)[None], 50),
-                samples_png(1e-3 * rng.normal(size=(50, 6)), np.zeros(6), 1e-6 * S, 50)):  # fmt: skip
+    for png in (figures.matches_png(image, np.array([[10.0, 10.0]]), np.eye(2)[None], 50),
+                figures.samples_png(1e-3 * rng.normal(size=(50, 6)), np.zeros(6), 1e-6 * S, 50)):  # fmt: skip
         assert png.startswith(b"\x89PNG")

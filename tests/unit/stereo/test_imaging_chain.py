@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scripts import experiment
 
 import consistency as cs
 from consistency.referee.types import Array
@@ -31,18 +32,7 @@ from consistency.stereo.imaging.correspondence import (
     SemiGlobal,
 )
 from consistency.stereo.imaging.filtering import Evidence, LeftRightCheck, TrackResidual, dissimilarity, patches
-from consistency.stereo.imaging.protocols import (
-    Stops,
-    drive,
-    office,
-    partition,
-    pose_at,
-    retreat,
-    rigid_residual,
-    shaken,
-    stand,
-    wall_texture,
-)
+from consistency.stereo.imaging.protocols import Stops, pose_at, stand, wall_texture
 from consistency.stereo.imaging.render import film
 from consistency.stereo.imaging.scene import Layer, Scene
 from consistency.stereo.imaging.selection import GoodFeatures, Spread
@@ -50,6 +40,8 @@ from consistency.stereo.imaging.texture import Plain, RandomTexture
 from consistency.stereo.imaging.tracking import Klt, KnownProjection
 
 pytest.importorskip("cv2")
+
+drives = experiment("image_drives")
 
 CAMERA = StereoCamera()
 WRONG = StereoCamera(Camera(lens=Lens(0.005)), Camera(lens=Lens(-0.005), turned=(0.001, 0.002, 0.001)))
@@ -242,12 +234,12 @@ def test_the_crossing_of_a_pole_and_an_edge_is_no_rigid_point() -> None:
     z = np.concatenate([np.column_stack([uv, 13.5 / depth[0]]) for uv in (point, crossing, shaky)])
     zero = np.zeros(60, int)
     tracks = Tracks(zero, np.tile(np.arange(20), 3), np.repeat([3, 8, 9], 20), z, z, z, zero, zero, zero)
-    names, residual = rigid_residual(tracks, poses, CAMERA)
+    names, residual = drives.rigid_residual(tracks, poses, CAMERA)
     assert names.tolist() == [3, 8, 9]
     assert residual[0] < 1e-6
     assert residual[1] > 0.5
     assert residual[2] == pytest.approx(0.5 / np.sqrt(2), rel=0.1)
-    assert np.isnan(rigid_residual(tracks.take(tracks.frame < 2), poses, CAMERA)[1]).all()
+    assert np.isnan(drives.rigid_residual(tracks.take(tracks.frame < 2), poses, CAMERA)[1]).all()
 
 
 def test_joined_tracks_keep_their_own_numbers() -> None:
@@ -278,7 +270,7 @@ def test_standing_does_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_a_retreat_goes_from_near_to_far() -> None:
-    tracks = retreat(Chain(), CAMERA, Stops(farthest=2.0, step=0.1), np.random.default_rng(7))
+    tracks = drives.retreat(Chain(), CAMERA, Stops(farthest=2.0, step=0.1), np.random.default_rng(7))
     d = [tracks.truth[tracks.frame == frame, 2] for frame in (0, 10)]
     np.testing.assert_allclose(d[0], 13.5)
     np.testing.assert_allclose(d[1], 6.75)
@@ -286,17 +278,17 @@ def test_a_retreat_goes_from_near_to_far() -> None:
 
 def test_shaking_turns_and_does_not_move() -> None:
     """2,000 poses: the sd within 6 standard errors (false alarm below 1e-8)."""
-    turned = shaken(np.zeros((2000, 6)), 0.01, np.random.default_rng(8))
+    turned = drives.shaken(np.zeros((2000, 6)), 0.01, np.random.default_rng(8))
     assert not turned[:, :3].any()
     np.testing.assert_allclose(turned[:, 3:].std(axis=0), 0.01, rtol=6 / np.sqrt(4000))
-    assert not shaken(np.zeros((5, 6)), 0.0, np.random.default_rng(8)).any()
+    assert not drives.shaken(np.zeros((5, 6)), 0.0, np.random.default_rng(8)).any()
 
 
 def test_scenes_have_depths_and_junctions(rng: np.random.Generator) -> None:
-    tracks = drive(Chain(Spread(30, 6, 5)), CAMERA, office(rng), rng, images=3)
+    tracks = drives.drive(Chain(Spread(30, 6, 5)), CAMERA, drives.office(rng), rng, images=3)
     assert np.ptp(tracks.truth[tracks.frame == 0, 2]) > 0.5
-    scene = partition(rng)
-    tracks = drive(Chain(Spread(40, 8, 5, 0.15), stereo_first=False), CAMERA, scene, rng, images=2)
+    scene = drives.partition(rng)
+    tracks = drives.drive(Chain(Spread(40, 8, 5, 0.15), stereo_first=False), CAMERA, scene, rng, images=2)
     assert (tracks.label == JUNCTION).sum() > 5
     assert (tracks.label == POINT).sum() > 5
     assert wall_texture(rng).grey(np.zeros(3), np.zeros(3), 0.01).shape == (3,)

@@ -39,7 +39,7 @@ def moving(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     for name, value in {"WALLS": 2, "SCENES": 1, "VIEWS": 5, "IMAGES": 4, "ROBOTS": 1, "DRAWS": 20}.items():
         monkeypatch.setattr(module, name, value)
     monkeypatch.setattr(module, "Stops", lambda step=0.1: Stops(farthest=1.2, step=max(step, 0.1), images=1))
-    monkeypatch.setattr(module, "office", lambda rng: Scene((Layer.facing(3.0, wall_texture(rng)),)))
+    monkeypatch.setattr(module.drives, "office", lambda rng: Scene((Layer.facing(3.0, wall_texture(rng)),)))
     return module
 
 

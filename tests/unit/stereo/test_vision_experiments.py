@@ -16,7 +16,8 @@ from consistency.bench.pages.sections import first_order as first_order_section
 from consistency.bench.pages.sections import shares
 from consistency.stereo.pages import scenes
 from consistency.stereo.vision import RelativePose
-from consistency.stereo.vision.synthetic import MOTION, SIZE, common_points, disparity_noise, published_rig
+
+rigs = experiment("published_rig")
 
 
 @pytest.fixture
@@ -90,14 +91,14 @@ def test_the_report_shows_the_tables(name: str, figures: ModuleType, first_order
 
 
 def test_points_that_all_images_see(rng: np.random.Generator) -> None:
-    rig = published_rig(0.2)
+    rig = rigs.published_rig(0.2)
     assert rig.baseline == pytest.approx(0.2)
-    p = common_points(rng, rig, MOTION, 200, 2.0, 6.0)
+    p = rigs.common_points(rng, rig, rigs.MOTION, 200, 2.0, 6.0)
     assert p.shape == (200, 3)
     assert rig.inside(rig.project(p)).all()
-    assert rig.inside(rig.project(MOTION.inverse().apply(p))).all()
+    assert rig.inside(rig.project(rigs.MOTION.inverse().apply(p))).all()
     assert (p[:, 2] >= 2.0).all()
     assert (p[:, 2] <= 6.0).all()
     assert not rig.inside(rig.project(RelativePose(np.eye(3), np.array([6.0, 0, 0])).apply(p))).all()
-    assert disparity_noise(rig, 5.0, 1.0) == pytest.approx(np.sqrt(2) * 5 / (500 * 0.2))
-    assert rig.image_size == SIZE
+    assert rigs.disparity_noise(rig, 5.0, 1.0) == pytest.approx(np.sqrt(2) * 5 / (500 * 0.2))
+    assert rig.image_size == rigs.SIZE

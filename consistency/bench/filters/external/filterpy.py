@@ -1,8 +1,8 @@
 """filterpy 2.x in the bench: its ExtendedKalmanFilter and UnscentedKalmanFilter do predict and update.
 
-What filterpy leaves to its user comes from the textbook twins: the models, and new landmarks. The
+What filterpy leaves to its user comes from the reference implementations: the models, and new landmarks. The
 sigma points are filterpy's MerweScaledSigmaPoints over the whole state; kappa is set so that their spread
-is that of the L variables involved, and the square root is taken in the twins' order (robot, landmarks
+is that of the L variables involved, and the square root is taken in their order (robot, landmarks
 seen in this step as observed, the rest).
 """
 
@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from consistency.bench.filters import plain
-from consistency.bench.filters.methods.ukf import ordered_root
-from consistency.bench.filters.plain import SlamState
-from consistency.bench.filters.plain_sensors import PointSensor
+from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.sensors import PointSensor
+from consistency.bench.filters.textbook.ukf import ordered_root
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Control, Info
 from consistency.referee.types import Array
@@ -35,10 +35,10 @@ class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x = self.f(self.x)
 
 
-class FilterpyEkf(plain.WorldPointTwin):
+class FilterpyEkf(basics.WorldPointFilter):
     """EKF-SLAM with filterpy's predict and (Joseph form) update."""
 
-    robot = plain.Unicycle()
+    robot = basics.Unicycle()
 
     def __init__(self, name: str, uvd: bool) -> None:
         super().__init__(name, uvd)
@@ -49,21 +49,21 @@ class FilterpyEkf(plain.WorldPointTwin):
         F, G = self.robot.jacobians(state.x[:3], control)
         ekf.F = np.eye(len(state.x))
         ekf.F[:3, :3] = F
-        ekf.Q = _padded(plain.process_noise(G, state.problem.belief), len(state.x))
+        ekf.Q = _padded(basics.process_noise(G, state.problem.belief), len(state.x))
         ekf.predict()
         return replace(state, x=ekf.x, P=ekf.P)
 
     def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
         ekf = _Ekf(state, lambda x: x)
-        zhat, H = plain.expect(state, seen, self.uvd)
-        ekf.update(z.ravel(), HJacobian=lambda _: H, Hx=lambda _: zhat, R=plain.block_diagonal(R))
+        zhat, H = basics.expect(state, seen, self.uvd)
+        ekf.update(z.ravel(), HJacobian=lambda _: H, Hx=lambda _: zhat, R=basics.block_diagonal(R))
         return replace(state, x=ekf.x, P=ekf.P), Info(ekf.y, ekf.S, ekf.K)
 
 
-class FilterpyUkf(plain.WorldPointTwin):
+class FilterpyUkf(basics.WorldPointFilter):
     """UKF-SLAM with filterpy's unscented transforms over the whole state."""
 
-    robot = plain.Unicycle()
+    robot = basics.Unicycle()
 
     def __init__(self, name: str, uvd: bool) -> None:
         super().__init__(name, uvd)
@@ -75,7 +75,7 @@ class FilterpyUkf(plain.WorldPointTwin):
 
         ukf = _ukf(state, np.arange(3), f, lambda x: x[:3])
         _, G = self.robot.jacobians(state.x[:3], control)
-        ukf.Q = _padded(plain.process_noise(G, state.problem.belief), len(state.x))
+        ukf.Q = _padded(basics.process_noise(G, state.problem.belief), len(state.x))
         ukf.predict()
         return replace(state, x=ukf.x, P=ukf.P)
 
@@ -85,7 +85,7 @@ class FilterpyUkf(plain.WorldPointTwin):
         involved = np.concatenate([np.arange(3), at.ravel()])
         ukf = _ukf(state, involved, lambda x, dt: x, lambda x: sensor.measure(x[:3], x[at]).ravel(), dim_z=z.size)
         ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
-        ukf.update(z.ravel(), R=plain.block_diagonal(R))
+        ukf.update(z.ravel(), R=basics.block_diagonal(R))
         return replace(state, x=ukf.x, P=ukf.P), Info(ukf.y, ukf.S, ukf.K)
 
 

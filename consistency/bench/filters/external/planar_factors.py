@@ -29,9 +29,10 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from consistency.bench.filters import plain
-from consistency.bench.filters.centred import untruncated
-from consistency.bench.filters.plain_sensors import bias_at, disparity_sigma
+from consistency.bench.filters.believed_noise import bias_at, disparity_sigma
+from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.inverse_range import untruncated
+from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.models import stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Observation
@@ -81,7 +82,7 @@ class PlanarStereo:
 
     def moved(self, pose: Array, control: Control) -> Array:
         """Pose (3,) after a step without noise."""
-        return plain.Unicycle().move(pose, control)
+        return basics.Unicycle().move(pose, control)
 
     def motion(self, step: int, control: Control) -> gtsam.CustomFactor:
         """From the pose before to that of ``step``: the way in the frame of the pose before, and the turn."""
@@ -91,7 +92,7 @@ class PlanarStereo:
 
         def error(poses: list[Array]) -> tuple[Array, list[Array]]:
             before, after = poses if step > 1 else (start, *poses)
-            by_after = plain.heading_matrix(before[2]).T
+            by_after = heading_matrix(before[2]).T
             way = by_after @ (after - before)
             by_before = -by_after
             by_before[:2, 2] = way[1], -way[0]
@@ -103,7 +104,7 @@ class PlanarStereo:
 
     def placed(self, label: int, pose: Array, z: Array) -> Array:
         """A landmark (3,) by its first observation; where it is told from is kept."""
-        R, z = plain.heading_matrix(pose[2]), z - bias_at(z[None], self.problem.belief.sensor)[0]
+        R, z = heading_matrix(pose[2]), z - bias_at(z[None], self.problem.belief.sensor)[0]
         way = R @ self.axes @ self._points(z)
         self.origins[label] = np.array([pose[0], pose[1], 0.0]) + R @ self.offset
         r = float(np.linalg.norm(way))
@@ -149,7 +150,7 @@ class PlanarStereo:
         The points q (m, 3), rho (m, 1), and the Jacobians (m, 3, 3) of q by the pose and by the landmark
         """
         (sa, se), (ca, ce), rho = np.sin(landmarks[:, :2]).T, np.cos(landmarks[:, :2]).T, landmarks[:, 2:]
-        turn = plain.heading_matrix(pose[2])
+        turn = heading_matrix(pose[2])
         axes = turn @ self.axes  # of the sensor in the world
         apart = origins - [pose[0], pose[1], 0.0]
         body = (np.array([ce * ca, ce * sa, se]).T + rho * apart) @ turn

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.filters.guard.deciding import kept
-from consistency.bench.filters.guard.settings import KINDS, limits_of
+from consistency.bench.filters.guard.settings import limits_of
 from consistency.bench.protocols import Filter, Problem
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Control, Gaussian, Info, Observation
-from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
 DECLARED = ("sensors", "needs", "error", "realisable", "uvd")  # of a filter, that its guarded form declares as well
@@ -128,31 +127,3 @@ class Guarded:
 
 def _some(observation: Observation, keep: Array) -> Observation:
     return Observation(observation.landmarks[keep], observation.z[keep])
-
-
-def guarded(filter_: Filter, kind: str) -> Any:
-    """A filter behind a guard, under its name with ``+kind``; one of the bench stays compiled.
-
-    Parameters
-    ----------
-    filter_ : object with ``init``, ``predict``, ``update`` and ``pose`` whose ``update`` returns :class:`Info`
-    kind : "gate", "joint" or "ransac"
-
-    Raises
-    ------
-    InputError
-        There is no such guard, or this filter cannot be guarded.
-
-    >>> guarded(get_filter("ekf-uvd"), "gate").name  # doctest: +SKIP
-    'ekf-uvd+gate'
-    """
-    from consistency.bench.filters.compiled import Compiled  # which knows of guards
-
-    name = getattr(filter_, "name", type(filter_).__name__)
-    if kind not in KINDS:
-        raise InputError(f"filter '{name}': unknown guard '{kind}'; known: {', '.join(KINDS)}")
-    if isinstance(filter_, Guarded) or isinstance(getattr(filter_, "twin", None), Guarded):
-        raise InputError(f"filter '{name}' has a guard already; it may have one")
-    if getattr(filter_, "innovates", True) is False:
-        raise InputError(f"filter '{name}' cannot be guarded: it gives no innovations to judge observations by")
-    return filter_.guarded(kind) if isinstance(filter_, Compiled) else Guarded(filter_, kind)

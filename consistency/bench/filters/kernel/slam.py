@@ -353,8 +353,8 @@ def predict_innovation(
 ) -> tuple[int, float]:
     """Upper half of ``work.S`` (s m, s m) <- innovation covariance; column n + base of ``work.A`` <- innovation (s m,).
 
-    They are those of an update in step k + 1 with the ``m`` landmarks that ``work`` lists, as the twin's ``Info`` has
-    them; the state stays as it is. Returns a code of REASONS, 0 where all is well, and a sum that is finite if all is.
+    They are those of an update in step k + 1 with the ``m`` landmarks that ``work`` lists, as ``Info`` has them; the
+    state stays as it is. Returns a code of REASONS, 0 where all is well, and a sum that is finite if all is.
     """
     raise NotImplementedError
 

@@ -1,1 +1,1 @@
-"""Filters: one file for each method, with the parts that it is made of and its plain NumPy twin."""
+"""Compiled filters: a file for each method, with the parts that its kernel is made of."""

@@ -1,22 +1,14 @@
-"""Cubature SLAM, Arasaratnam & Haykin (2009): the unscented filter with its points fixed to the cubature rule.
-
-The third-degree spherical-radial rule has 2 L points at +-sqrt(L) columns of a root of P, with weights 1 / (2 L) and no
-centre. Sigma points with alpha = 1, beta = kappa = 0 are these, and are the default of a belief: then ``ckf`` and
-``ukf`` are one filter. This one has them whatever the belief says of sigma points. L counts the variables that f or h
-reads, as in ``update/unscented.py``; a rule over the whole state would have a spread that grows with the map.
-"""
+"""Cubature SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.ckf`."""
 
 from __future__ import annotations
 
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.kernel.slam import Slam
 from consistency.bench.filters.methods import ukf
+from consistency.bench.filters.textbook.ckf import CUBATURE, CubatureKalman
 from consistency.bench.filters.update.unscented import Unscented
 from consistency.bench.protocols import Problem
-from consistency.bench.scenario import SigmaPoints
 from consistency.referee.types import Array
-
-CUBATURE = SigmaPoints(alpha=1.0, beta=0.0, kappa=0.0)
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:
@@ -30,5 +22,5 @@ def uvd_parts(problem: Problem, controls: Array) -> Slam:
     return xyz_parts(problem, controls)._replace(sensor=ukf.uvd_parts(problem, controls).sensor)
 
 
-XYZ = Compiled(ukf.UnscentedKalman("ckf-xyz", uvd=False, points=CUBATURE), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
-UVD = Compiled(ukf.UnscentedKalman("ckf-uvd", uvd=True, points=CUBATURE), uvd_parts, sensors=("uvd",), uvd=True)
+XYZ = Compiled(CubatureKalman("ckf-xyz", uvd=False), xyz_parts, sensors=("xyz", "uvd"), uvd=False)
+UVD = Compiled(CubatureKalman("ckf-uvd", uvd=True), uvd_parts, sensors=("uvd",), uvd=True)

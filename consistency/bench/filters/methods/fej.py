@@ -1,66 +1,14 @@
-"""EKF-SLAM with first-estimates Jacobians (FEJ): Huang, Mourikis & Roumeliotis (2010), IJRR 29(5).
-
-The EKF linearises one variable at several estimates, and the linearised system then seems to tell the heading of
-robot and map together, which no relative observation does. With every Jacobian at first estimates
-(``point/first_estimate.py``) its unobservable directions are as many as those of SLAM. The price is a linearisation
-at estimates that are not the best ones.
-"""
+"""EKF-SLAM with first-estimates Jacobians, compiled. Equations and source: :mod:`consistency.filters.textbook.fej`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import numpy as np
-
-from consistency.bench.filters import plain
 from consistency.bench.filters.compiled import Compiled, planar
 from consistency.bench.filters.kernel.slam import Slam
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.plain import SlamState
 from consistency.bench.filters.point.first_estimate import FirstEstimate
+from consistency.bench.filters.textbook.fej import FirstEstimateKalman
 from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Info, Observation
 from consistency.referee.types import Array
-
-
-@dataclass(frozen=True)
-class FirstState:
-    """The state of the EKF and the first estimates of its variables."""
-
-    slam: SlamState
-    first: Array  # (n,), of the pose the prediction in this step
-
-
-class FirstEstimateKalman(plain.NotingTwin):
-    """EKF-SLAM with every variable linearised at its first estimate."""
-
-    robot = plain.Unicycle()
-
-    def init(self, problem: Problem) -> FirstState:
-        return FirstState(plain.start(problem), problem.start.copy())
-
-    def predict(self, state: FirstState, control: Control) -> FirstState:
-        pose = state.slam.x[:3]
-        predicted = self.robot.move(pose, control)
-        slam = plain.predict_by(state.slam, control, predicted[:2] - state.first[:2], pose)
-        return FirstState(slam, np.concatenate([predicted, state.first[3:]]))
-
-    def update(self, state: FirstState, observation: Observation) -> tuple[FirstState, Info]:
-        first, known = state.first, len(state.slam.x)
-
-        def correct(slam: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-            return plain.correct_about(slam, first, seen, z, R, self.uvd)
-
-        def locate(slam: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
-            landmark, Jp, Jz = plain.locate_point(slam, z, self.uvd)
-            Jp[:2, 2] = plain.quarter_turn(landmark[:2] - first[:2])
-            return landmark, Jp, Jz
-
-        slam, info = plain.update_jointly(state.slam, observation, self.uvd, correct, locate)
-        return FirstState(slam, np.concatenate([first, slam.x[known:]])), info
-
-    def forget(self, state: FirstState, landmark: int) -> FirstState:
-        return FirstState(plain.without(state.slam, landmark), state.first[state.slam.beside(landmark)])
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:

@@ -1,17 +1,11 @@
-"""Iterated EKF-SLAM: the update linearised again where it led to, Bell & Cathey (1993).
-
-Each pass linearises h at the result of the one before and solves from the same prior; what it converges to is the
-most probable state. The covariance is that of the last pass, from the prior.
-"""
+"""Iterated EKF-SLAM, compiled. Equations and source: :mod:`consistency.filters.textbook.iekf`."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters import plain
 from consistency.bench.filters.compiled import Compiled, planar
 from consistency.bench.filters.kernel.arrays import vector
 from consistency.bench.filters.kernel.covariance import state_index
@@ -33,13 +27,10 @@ from consistency.bench.filters.kernel.slam import (
 )
 from consistency.bench.filters.kernel.work import Work
 from consistency.bench.filters.methods import ekf
-from consistency.bench.filters.plain import SlamState
+from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman
 from consistency.bench.filters.update.joint import predict_by_error, predict_innovation_linearised
 from consistency.bench.protocols import Problem
-from consistency.bench.types import Control, Info
 from consistency.referee.types import Array
-
-PASSES = 5  # linearisations of an update; the first is the EKF's
 
 
 @part(error="Additive", point="AtEstimate")
@@ -110,27 +101,6 @@ def _relate_to_prior(slam: Slam, state: State, m: int, y: Array, work: Work[Prio
                 y[s * i + a] -= work.Hp[i, a, c] * (prior[c] - x[c])
             for c in range(w):
                 y[s * i + a] -= work.Hl[i, a, c] * (prior[r + w * i + c] - x[o + c])
-
-
-class IteratedKalman(plain.WorldPointTwin):
-    """EKF-SLAM whose update is a Gauss-Newton iteration."""
-
-    def __init__(self, name: str, uvd: bool, passes: int = PASSES) -> None:
-        super().__init__(name, uvd)
-        self.passes = passes
-
-    def predict(self, state: SlamState, control: Control) -> SlamState:
-        return plain.predict_extended(state, control)
-
-    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-        x, infos = state.x, []
-        for _ in range(self.passes):
-            zhat, H = plain.expect(replace(state, x=x), seen, self.uvd)
-            innovation = plain.innovation_of(state, z, zhat, self.uvd) - H @ (state.x - x)
-            S, W = plain.gain(state.P, H, plain.block_diagonal(R))
-            x = state.x + W @ innovation
-            infos.append(Info(innovation, S, W))
-        return replace(state, x=x, P=state.P - W @ S @ W.T), infos[0]
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:

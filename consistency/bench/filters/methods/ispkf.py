@@ -1,24 +1,11 @@
-"""The unscented update linearised again where it led to: iterated sigma points, Sibley, Sukhatme & Matthies (2006).
-
-"The iterated sigma point Kalman filter with applications to long range stereo", Robotics: Science and Systems II, as
-Barfoot (2017), sec. 4.2.10, writes it. From the prior (x, P) a pass about x_i draws sigma points with mean x_i and the
-covariance P of the prior, gets from them the mean z_i, Cov(z, z) and Cov(x, z) of the observation, and gives
-
-    x_i+1 = x + Cov(x, z) S^-1 (z - z_i - A (x - x_i)),    S = Cov(z, z) + R,    A = Cov(z, x) P^-1.
-
-The first pass is that of the unscented filter. With points that lie close together it is the iterated EKF. The
-covariance is that of the last pass, P - Cov(x, z) S^-1 Cov(z, x): it is the prior that the points spread by in every
-pass, so that nothing is counted twice.
-"""
+"""Iterated sigma points, compiled. Equations and source: :mod:`consistency.filters.textbook.ispkf`."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters import plain
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.kernel.covariance import state_index
 from consistency.bench.filters.kernel.dispatch import implement, part
@@ -39,14 +26,10 @@ from consistency.bench.filters.kernel.slam import (
 from consistency.bench.filters.kernel.work import Work
 from consistency.bench.filters.methods import ukf
 from consistency.bench.filters.parts import sensor_of
-from consistency.bench.filters.plain import SlamState
-from consistency.bench.filters.plain_sensors import view
+from consistency.bench.filters.textbook.ispkf import PASSES, IteratedPointsKalman
 from consistency.bench.filters.update.unscented import SigmaRoom, Unscented, innovate_by_points
 from consistency.bench.protocols import Problem
-from consistency.bench.types import Info
 from consistency.referee.types import Array
-
-PASSES = 5  # linearisations of an update; the first is the unscented filter's
 
 
 @part(error="Additive", point="AtEstimate")
@@ -120,35 +103,6 @@ def _relate_to_prior(r: int, w: int, state: State, m: int, y: Array, work: Work[
         away = work.room.prior[a] - state.x[state_index(r, w, a, work.at)]
         for row in range(len(y)):
             y[row] -= work.room.Mt[a, row] * away
-
-
-class IteratedPointsKalman(ukf.UnscentedKalman):
-    """UKF-SLAM whose update is iterated; it predicts as the unscented filter does."""
-
-    def __init__(self, name: str, uvd: bool, passes: int = PASSES) -> None:
-        super().__init__(name, uvd)
-        self.passes = passes
-
-    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
-        at = np.array([state.at(label) for label in seen])[:, None] + np.arange(3)
-        involved = np.concatenate([np.arange(3), at.ravel()])
-        sensor = view(state.problem.belief.sensor, self.uvd)
-        set_ = state.problem.belief.sigma_points
-        x, infos = state.x, []
-        for _ in range(self.passes):
-            points, wm, wc = ukf.sigma_points(x, state.P, involved, set_)
-            Z = sensor.measure(points[:, None, :3], points[:, at]).reshape(len(points), -1)
-            zhat = wm @ Z
-            S = (Z - zhat).T @ (wc[:, None] * (Z - zhat)) + plain.block_diagonal(R)
-            C = (points - x).T @ (wc[:, None] * (Z - zhat))
-            W = np.linalg.solve(S, C.T).T
-            # only the involved variables have moved; P of these may be singular in the first steps
-            slope = C[involved].T @ np.linalg.pinv(state.P[np.ix_(involved, involved)], hermitian=True)
-            innovation = z.ravel() - zhat - slope @ (state.x - x)[involved]
-            x = state.x.copy()
-            x[involved] += W[involved] @ innovation
-            infos.append(Info(innovation, S, W))
-        return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), infos[0]
 
 
 def xyz_parts(problem: Problem, controls: Array) -> Slam:

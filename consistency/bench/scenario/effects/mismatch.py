@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal, cast
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import model_validator
@@ -10,9 +10,6 @@ from pydantic import model_validator
 from consistency.bench.scenario.effects.effect import ListedEffect, register
 from consistency.bench.scenario.effects.observations import NO_LANDMARK, Context, Observations
 from consistency.bench.scenario.tables import Positive, Rate
-
-if TYPE_CHECKING:
-    from consistency.bench.scenario.sensor import UvdSensor
 
 
 @register
@@ -38,7 +35,9 @@ class Mismatch(ListedEffect):
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
         """All rows, some of them mismatched."""
         hit = np.flatnonzero(rng.random(len(observations)) < self.rate)
-        low, high = self.disparity or cast("UvdSensor", context.sensor).disparity
+        searched = self.disparity or context.sensor.search_range
+        assert searched is not None
+        low, high = searched
         z, source = observations.z.copy(), observations.sources.copy()
         z[hit, 2], source[hit] = rng.uniform(low, high, len(hit)), NO_LANDMARK
         return observations.with_z(z, source)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.bench.models import planar, point, stereo
+from consistency.bench.scenario.view import SeeingSensor
 from consistency.referee.types import Array, Indices
-
-if TYPE_CHECKING:
-    from consistency.bench.scenario.sensor import TrueSensor
 
 NO_LANDMARK = -1  # source of an observation that is of no landmark
 
@@ -114,7 +111,7 @@ class Context:
 
     Attributes
     ----------
-    sensor : TrueSensor
+    sensor : SeeingSensor
     landmarks : (N, 3)
         True positions in the world, m.
     path : (T + 1, 3)
@@ -123,7 +120,7 @@ class Context:
         The path without any noise.
     """
 
-    sensor: TrueSensor
+    sensor: SeeingSensor
     landmarks: Array
     path: Array
     planned: Array

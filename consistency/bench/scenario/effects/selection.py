@@ -69,7 +69,7 @@ class Selection(ListedEffect):
         """Of each row the rank without what other tracks add to it, its cell, and whether it is near; (M,) each."""
         u, v, d = observations.z.T
         strength = np.random.default_rng(self.seed).random(observations.ids)[observations.landmark]
-        most = getattr(context.sensor, "disparity", (0.0, np.inf))[1]
+        most = (context.sensor.search_range or (0.0, np.inf))[1]
         rank = self.strength * strength + self.stereo * np.clip(d / most, 0.0, 1.0)
         if context.sensor.image is None:
             return rank, np.zeros(len(d), np.int64), (d >= self.near).astype(np.int64)

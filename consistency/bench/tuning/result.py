@@ -1,30 +1,91 @@
-"""What came of a fit: in words, for programs, and as files to go on with."""
+"""The result of a fit, and how it is put in words."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from consistency.bench.scenario import Belief, scenario_text, toml_text
 from consistency.bench.scenario.tables import SIGMA_UNITS
 from consistency.bench.store.log import Log, sensor_text
-from consistency.bench.store.storage import write_folder
 from consistency.bench.tuning.fit import LIMIT
-from consistency.bench.tuning.groups import sigma_by_channel
-from consistency.bench.tuning.parts import with_belief
-from consistency.bench.tuning.tune import Factor, Setting, Tuning
+from consistency.bench.tuning.groups import Group, sigma_by_channel
+from consistency.bench.tuning.parts import Parts, with_belief
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.export import plain
+from consistency.referee.diagnostics.records import Interval
 from consistency.referee.diagnostics.wording import short
-from consistency.referee.system.provenance import manifest_of
 
 TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}
-KIND = "tuning"
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Factor on the variances of a group of noises, with a 95 % interval, NaN without one.
+
+    The interval is open, with an end of 0 or infinity, on a side on which the data do not bound the factor.
+    ``edge`` is -1 or 1 where the factor lies at the lower or upper limit of what is tried, which is then no estimate.
+    """
+
+    group: Group
+    value: float
+    interval: Interval
+    edge: int = 0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A fit, the belief that it leads to, and the verdict on it."""
+
+    by: str  # "innovations", "nees", or "size": nearest to consistent where errors are as large as stated
+    factors: tuple[Factor, ...]
+    belief: Belief
+    verdict: Verdict
+    settings: int  # that were tried
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Result of a fit, with the verdicts before and after it.
+
+    ``chosen`` is the fitted setting. If a fault is found in it and the truth is known, ``other`` is the setting nearest
+    to consistent on the runs of the fit, among settings whose errors have the stated size; ``tried`` is the number of
+    those settings. ``no_setting`` is true if a fault is found in both, and also in other runs of a scenario with its
+    true noises believed.
+    """
+
+    filter: str
+    parts: Parts
+    before: Verdict  # with the belief as it was, on the runs that are judged
+    chosen: Setting
+    other: Setting | None
+    tried: int
+    no_setting: bool  # no setting is consistent, as far as they were tried
+    why: tuple[str, ...]  # what the referee finds, and the cause
+    seconds: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """After the fit, on runs that it has not seen."""
+        return self.chosen.verdict
+
+    @property
+    def consistent(self) -> bool:
+        return self.verdict.consistent
+
+    @property
+    def factors(self) -> tuple[Factor, ...]:
+        return self.chosen.factors
+
+    @property
+    def belief(self) -> Belief:
+        """With the noises of the chosen setting."""
+        return self.chosen.belief
+
+    def __str__(self) -> str:
+        return "\n".join(lines(self))
 
 
 def lines(tuning: Tuning, out: Path | None = None) -> list[str]:
@@ -55,12 +116,6 @@ def lines(tuning: Tuning, out: Path | None = None) -> list[str]:
     if out is not None:
         text += ["", f"{out} has {', '.join(files(tuning))}{_next(tuning, out)}"]
     return text
-
-
-def verdicts(tuning: Tuning) -> dict[str, Verdict]:
-    """Rows of the table of verdicts, by name."""
-    rows = {f"{tuning.filter}, as believed": tuning.before, f"{tuning.filter}, tuned": tuning.verdict}
-    return rows | ({} if tuning.other is None else {f"{tuning.filter}, scaled to its errors": tuning.other.verdict})
 
 
 def _factors(setting: Setting, before: Belief) -> list[str]:
@@ -116,27 +171,6 @@ def files(tuning: Tuning) -> dict[str, str]:
     return named
 
 
-def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
-    """Write the files of a fit, with its outcome, as a folder that appears whole.
-
-    Raises
-    ------
-    InputError
-        The folder is there already, or cannot be written.
-    """
-    outcome = json.dumps(as_data(tuning, out), indent=2, allow_nan=False) + "\n"
-    texts = files(tuning) | {"tuning.json": outcome}
-
-    def contents(at: Path) -> None:
-        for name, text in texts.items():
-            (at / name).write_text(text, encoding="utf-8")
-
-    world = tuning.parts.world
-    origin = {"log": world.name, "log_sha256": world.sha256} if isinstance(world, Log) else {"scenario": world.name}
-    manifest = manifest_of(KIND, wall=tuning.seconds, filters=[tuning.filter], **origin)
-    write_folder(out, {}, manifest, contents, overwrite)
-
-
 def _next(tuning: Tuning, out: Path) -> str:
     """What to do with the files."""
     world, run = tuning.parts.world, "consistency run"
@@ -145,45 +179,3 @@ def _next(tuning: Tuning, out: Path) -> str:
         return f"; put it in the place of {Path(world.name) / 'sensor.toml'}, and run: {use}"
     [name] = files(tuning)
     return f"; judged again by: {run} {out / name} --filter {tuning.filter} {tuning.parts.again} --out results"
-
-
-def as_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
-    """The outcome for programs; numbers that are not finite become null. An open interval has low 0 or high null."""
-    data = {
-        "filter": tuning.filter,
-        "world": tuning.parts.world.name,
-        "fitted_on": tuning.parts.about[0],
-        "judged_on": tuning.parts.about[1],
-        "before": _verdict(tuning.before),
-        "chosen": _setting(tuning.chosen),
-        "nearest": None if tuning.other is None else _setting(tuning.other),
-        "tried": tuning.tried,
-        "consistent": tuning.consistent,
-        "no_setting": tuning.no_setting,
-        "why": list(tuning.why),
-        "seconds": tuning.seconds,
-        "out": None if out is None else str(out),
-    }
-    return dict(plain(data))
-
-
-def _setting(setting: Setting) -> Mapping[str, Any]:
-    factors = [
-        {
-            "group": factor.group.name, "channels": list(factor.group.channels), "factor": factor.value,
-            "low": factor.interval.low, "high": factor.interval.high, "edge": factor.edge,
-        }
-        for factor in setting.factors
-    ]  # fmt: skip
-    return {
-        "by": setting.by, "factors": factors, "sigma": sigma_by_channel(setting.belief), "settings": setting.settings,
-        "verdict": _verdict(setting.verdict),
-    }  # fmt: skip
-
-
-def _verdict(verdict: Verdict) -> Mapping[str, Any]:
-    return {
-        "status": verdict.status, "reasons": list(verdict.reasons), "runs": verdict.runs,
-        "statistics": plain(verdict.statistics),
-        "detectable": None if verdict.scale is None else verdict.scale.detectable,
-    }  # fmt: skip

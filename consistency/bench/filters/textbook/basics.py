@@ -1,8 +1,7 @@
-"""What the plain twins have in common: SLAM as a textbook writes it, dense and in NumPy, for reading and as oracle.
+"""State and steps that the methods have in common: SLAM after Herath, Kodagoda & Dissanayake (2007) eq. 1-13.
 
-Herath, Kodagoda & Dissanayake (2007) eq. 1-13. Nothing is shared with the kernels but the models. Each twin is a
-class of its own in ``methods``, made of the functions here; those on world points with an additive error share
-:class:`WorldPointTwin`.
+Nothing is shared with the kernels but the models. Each method is a class made of the functions here; those on world
+points with an additive error share :class:`WorldPointFilter`.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import block_diag
 
-from consistency.bench.filters.plain_sensors import heading_matrix as heading_matrix
-from consistency.bench.filters.plain_sensors import sensor_noise, view
+from consistency.bench.filters.believed_noise import sensor_noise
+from consistency.bench.filters.textbook.sensors import view
 from consistency.bench.models import motion
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import Belief
@@ -216,38 +215,38 @@ def joint_of(state: SlamState) -> Gaussian:
     return Gaussian(T @ state.x, T @ state.P @ T.T)
 
 
-class Noting(Protocol):
-    """A state of world points with notes beside it."""
+class WrappedState(Protocol):
+    """A state that holds a ``SlamState`` of world points, and more."""
 
     @property
     def slam(self) -> SlamState: ...
 
 
-class SlamTwin:
-    """What every twin does with a state that is a ``SlamState``."""
+class SlamFilter:
+    """A filter whose state is a ``SlamState``."""
 
     def forget(self, state: SlamState, landmark: int) -> SlamState:
         return without(state, landmark)
 
 
-class NotingTwin:
-    """What a twin says of a state that is a ``SlamState`` with notes beside it."""
+class WrappedFilter:
+    """A filter whose state holds a ``SlamState``, such as one with other points to linearise at."""
 
     def __init__(self, name: str, uvd: bool) -> None:
         self.name, self.uvd = name, uvd
 
-    def pose(self, state: Noting) -> Gaussian:
+    def pose(self, state: WrappedState) -> Gaussian:
         return pose_of(state.slam)
 
-    def map(self, state: Noting) -> dict[int, Gaussian]:
+    def map(self, state: WrappedState) -> dict[int, Gaussian]:
         return map_of(state.slam)
 
-    def joint(self, state: Noting) -> Gaussian:
+    def joint(self, state: WrappedState) -> Gaussian:
         return joint_of(state.slam)
 
 
-class WorldPointTwin(SlamTwin, ABC):
-    """SLAM on points in the world with an additive error; a twin adds how it predicts and how it corrects."""
+class WorldPointFilter(SlamFilter, ABC):
+    """SLAM on points in the world with an additive error; a method adds how it predicts and corrects."""
 
     def __init__(self, name: str, uvd: bool) -> None:
         self.name, self.uvd = name, uvd

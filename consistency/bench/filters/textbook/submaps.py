@@ -26,9 +26,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from consistency.bench.filters import plain
-from consistency.bench.filters.methods.ekf import ExtendedKalman
-from consistency.bench.filters.plain import SlamState
+from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.ekf import ExtendedKalman
+from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Info, Observation
 
@@ -53,7 +54,7 @@ class SubmapKalman:
         self.small = ExtendedKalman(name, uvd)
 
     def init(self, problem: Problem) -> Maps:
-        return self._begun(plain.start(problem))
+        return self._begun(basics.start(problem))
 
     def predict(self, state: Maps, control: Control) -> Maps:
         return replace(state, small=self.small.predict(state.small, control), steps=state.steps + 1)
@@ -65,15 +66,16 @@ class SubmapKalman:
 
     def forget(self, state: Maps, landmark: int) -> Maps:
         large, small = (
-            plain.without(part, landmark) if landmark in part.landmarks else part for part in (state.large, state.small)
+            basics.without(part, landmark) if landmark in part.landmarks else part
+            for part in (state.large, state.small)
         )
         return replace(state, large=large, small=small)
 
     def pose(self, state: Maps) -> Gaussian:
-        return plain.pose_of(in_world(state))
+        return basics.pose_of(in_world(state))
 
     def map(self, state: Maps) -> dict[int, Gaussian]:
-        return plain.map_of(joined(state))
+        return basics.map_of(joined(state))
 
     def _begun(self, large: SlamState) -> Maps:
         return Maps(large, self.small.init(replace(large.problem, start=np.zeros(3))))
@@ -82,7 +84,7 @@ class SubmapKalman:
 def in_world(state: Maps) -> SlamState:
     """Robot, landmarks of the large map and those of the small one, all in the world; a landmark may be there twice."""
     large, small = state.large, state.small
-    origin, n, turn = large.x[:3], len(large.x), plain.heading_matrix(large.x[2])
+    origin, n, turn = large.x[:3], len(large.x), heading_matrix(large.x[2])
     x, J = [large.x[3:]], np.eye(n + len(small.x))
     for o in range(0, len(small.x), 3):
         is_robot = o == 0  # whose third number is a heading
@@ -109,7 +111,7 @@ def joined(state: Maps) -> SlamState:
             o, rows = state.large.at(label), slice(3 * i, 3 * i + 3)
             H[rows, o : o + 3], H[rows, copy : copy + 3] = np.eye(3), -np.eye(3)
             keep[copy : copy + 3] = False
-        S, W = plain.gain(P, H, np.zeros((len(H), len(H))))
+        S, W = basics.gain(P, H, np.zeros((len(H), len(H))))
         x, P = x - W @ H @ x, P - W @ S @ W.T
     new = tuple(label for label in state.small.landmarks if label not in shared)
     P = P[np.ix_(keep, keep)]

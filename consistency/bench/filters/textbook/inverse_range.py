@@ -1,6 +1,6 @@
 """Geometry and conversion of a robot-centred map of inverse ranges, in plain NumPy.
 
-The methods and their sources are in :mod:`consistency.filters.methods.robocentric`.
+The methods and their sources are in :mod:`consistency.filters.textbook.robocentric`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import numpy as np
 from scipy.special import log_ndtr
 from scipy.stats import norm
 
-from consistency.bench.filters import plain
-from consistency.bench.filters.plain_sensors import disparity_sigma
+from consistency.bench.filters.believed_noise import disparity_sigma
+from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.scenario.sensor import BelievedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -79,7 +80,7 @@ def exponential(xi: Array) -> tuple[Array, Array]:
     along = np.sinc(angle / np.pi)
     across = 0.5 * angle if abs(angle) < 1e-4 else (1.0 - np.cos(angle)) / angle
     V = np.array([[along, -across], [across, along]])
-    return plain.heading_matrix(angle)[:2, :2], V @ xi[:2]
+    return heading_matrix(angle)[:2, :2], V @ xi[:2]
 
 
 def moved(pose: Array, xi: Array) -> Array:
@@ -101,7 +102,7 @@ def left_jacobian(xi: Array) -> Array:
 
 def apart(poses: Array, xi: Array) -> tuple[Array, Array]:
     """Poses (k, 3) moved by errors (k, 3), each Exp(xi) T; d error about the moved ones / d xi, (3 k, 3 k)."""
-    C = plain.block_diagonal(np.array([left_jacobian(x) for x in xi]))
+    C = basics.block_diagonal(np.array([left_jacobian(x) for x in xi]))
     return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), C
 
 
@@ -118,13 +119,13 @@ def chained(poses: Array, xi: Array, on: int) -> tuple[Array, Array]:
         if j > 0:
             last = on if j == len(xi) - 1 else j - 1
             before, step, rows[j] = E[last], xi[j] - xi[last], rows[last]
-        M = shift_matrix(before) @ plain.heading_matrix(before[2])  # Ad
+        M = shift_matrix(before) @ heading_matrix(before[2])  # Ad
         B = M @ left_jacobian(step)
         rows[j, :, 3 * j : 3 * j + 3] += B
         if j > 0:
             rows[j, :, 3 * last : 3 * last + 3] -= B
         E[j] = moved(before, M @ step)
-        out[j] = [*(E[j, :2] + plain.heading_matrix(E[j, 2])[:2, :2] @ pose[:2]), E[j, 2] + pose[2]]
+        out[j] = [*(E[j, :2] + heading_matrix(E[j, 2])[:2, :2] @ pose[:2]), E[j, 2] + pose[2]]
     return out, rows.reshape(xi.size, xi.size)
 
 

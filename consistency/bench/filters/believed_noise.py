@@ -1,0 +1,52 @@
+"""Noise and bias of observations as a belief has them: what every filter of the bench is told of its data."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from consistency.bench.models import stereo
+from consistency.bench.scenario import BelievedSensor
+from consistency.referee.types import Array
+
+
+def sensor_noise(z: Array, sensor: BelievedSensor, converted: bool) -> tuple[Array, Array]:
+    """Observations (M, s) less their believed biases, and their noise (M, s, s); as points by eq. 21 if ``converted``.
+
+    The noise of a point is J diag(sigma^2) J' with J the Jacobian of eq. 21 at the measurement. All that the bench's
+    own filters are told of an observation comes from here, or from the three functions below.
+    """
+    z = z - bias_at(z, sensor)
+    variance = variance_at(z, sensor)
+    if not converted:
+        return z, np.broadcast_to(variance, (len(z), *variance.shape[-2:])).copy()
+    points = stereo.triangulate(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0)
+    return np.column_stack(points), point_noise(z, variance, sensor)
+
+
+def bias_at(z: Array, sensor: BelievedSensor) -> Array:
+    """What the belief takes to be the biases of observations z (M, s) as they were measured, (M, s)."""
+    return np.zeros_like(z) if sensor.bias is None else sensor.bias.at(z[:, 0], z[:, 1])
+
+
+def variance_at(z: Array, sensor: BelievedSensor) -> Array:
+    """Noise of observations z (M, s): (s, s) if it is the same everywhere, else (M, s, s)."""
+    if sensor.disparity_growth is None:
+        return np.diag(np.square(sensor.sigma))
+    sigma = np.tile(sensor.sigma, (len(z), 1))
+    sigma[:, 2] = disparity_sigma(z[:, 2], sensor)
+    variance: Array = np.square(sigma)[:, None] * np.eye(3)
+    return variance
+
+
+def disparity_sigma(d: Array, sensor: BelievedSensor) -> Array | float:
+    """Standard deviation of disparities d (M,), px: a number if it is the same everywhere, else (M,)."""
+    growth = sensor.disparity_growth
+    return sensor.sigma[2] if growth is None else sensor.sigma[2] * growth.ratio_at(d)
+
+
+def point_noise(z: Array, variance: Array, sensor: BelievedSensor) -> Array:
+    """Noise (M, 3, 3) of the points of eq. 21 at pixels z (M, 3) that have a ``variance`` (3, 3) or (M, 3, 3), m^2."""
+    entries = stereo.triangulate_jacobian(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0)
+    J = np.stack(np.broadcast_arrays(*entries), axis=-1).reshape(-1, 3, 3)
+    noise: Array = J @ variance @ np.swapaxes(J, 1, 2)
+    return noise

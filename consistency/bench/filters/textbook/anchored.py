@@ -1,0 +1,88 @@
+"""EKF-SLAM on landmarks of six numbers, anchored at where they were first seen: Civera, Davison & Montiel (2008).
+
+A landmark is the position of the sensor when it was first seen (x0, y0, z0 in m), azimuth and elevation of the ray
+in the world (rad), and the inverse of its length (1/m). In inverse depth the error of stereo is nearly Gaussian at
+any distance. The price is a state of twice the size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.basics import SlamState
+from consistency.bench.filters.textbook.sensors import PointSensor, heading_matrix
+from consistency.bench.protocols import Problem
+from consistency.bench.types import Control, Gaussian, Info, Observation
+from consistency.referee.types import Array
+
+
+class AnchoredKalman(basics.SlamFilter):
+    """EKF-SLAM on anchored landmarks, their Jacobians through the point in the world."""
+
+    def __init__(self, name: str, uvd: bool) -> None:
+        self.name, self.uvd = name, uvd
+
+    def init(self, problem: Problem) -> SlamState:
+        return basics.start(problem, width=6)
+
+    def predict(self, state: SlamState, control: Control) -> SlamState:
+        return basics.predict_extended(state, control)
+
+    def update(self, state: SlamState, observation: Observation) -> tuple[SlamState, Info]:
+        return basics.update_jointly(state, observation, self.uvd, self._correct, self._locate)
+
+    def _correct(self, state: SlamState, seen: list[int], z: Array, R: Array) -> tuple[SlamState, Info]:
+        sensor = PointSensor(state.problem.belief.sensor, self.uvd)
+        zhat, H = np.zeros(3 * len(seen)), np.zeros((3 * len(seen), len(state.x)))
+        for i, label in enumerate(seen):
+            rows, at = slice(3 * i, 3 * i + 3), slice(state.at(label), state.at(label) + 6)
+            point, D = anchored_point(state.x[at])
+            zhat[rows] = sensor.measure(state.x[:3], point)
+            H[rows, :3], by_point = sensor.jacobians(state.x[:3], point)
+            H[rows, at] = by_point @ D
+        innovation = z.ravel() - zhat
+        S, W = basics.gain(state.P, H, basics.block_diagonal(R))
+        return replace(state, x=state.x + W @ innovation, P=state.P - W @ S @ W.T), Info(innovation, S, W)
+
+    def _locate(self, state: SlamState, label: int, z: Array) -> tuple[Array, Array, Array]:
+        point, point_by_pose, point_by_z = basics.locate_point(state, z, self.uvd)
+        turn = heading_matrix(state.x[2])
+        mount = np.array(state.problem.belief.sensor.mount.position)
+        anchor = [*state.x[:2], 0.0] + turn @ mount
+        anchor_by_pose = np.column_stack([[1.0, 0, 0], [0, 1.0, 0], turn @ [-mount[1], mount[0], 0.0]])
+        ray = point - anchor
+        flat, length = np.hypot(ray[0], ray[1]), np.linalg.norm(ray)
+        values = np.array([*anchor, np.arctan2(ray[1], ray[0]), np.arctan2(ray[2], flat), 1.0 / length])
+        # azimuth, elevation and inverse length by the point: the inverse of the point by them
+        by_ray = np.linalg.inv(anchored_point(values)[1][:, 3:])
+        Jp = np.vstack([anchor_by_pose, by_ray @ (point_by_pose - anchor_by_pose)])
+        return values, Jp, np.vstack([np.zeros((3, 3)), by_ray @ point_by_z])
+
+    def pose(self, state: SlamState) -> Gaussian:
+        return basics.pose_of(state)
+
+    def map(self, state: SlamState) -> dict[int, Gaussian]:
+        blocks = {label: slice(state.at(label), state.at(label) + 6) for label in state.landmarks}
+        points = {label: anchored_point(state.x[at]) for label, at in blocks.items()}
+        return {label: Gaussian(p, D @ state.P[blocks[label], blocks[label]] @ D.T) for label, (p, D) in points.items()}
+
+    def joint(self, state: SlamState) -> Gaussian:
+        blocks = [slice(at, at + 6) for at in range(3, len(state.x), 6)]
+        mean, D = np.zeros(3 + 3 * len(blocks)), np.zeros((3 + 3 * len(blocks), len(state.x)))
+        mean[:3], D[:3, :3] = state.x[:3], np.eye(3)
+        for i, at in enumerate(blocks, 1):
+            mean[3 * i : 3 * i + 3], D[3 * i : 3 * i + 3, at] = anchored_point(state.x[at])
+        return Gaussian(mean, D @ state.P @ D.T)
+
+
+def anchored_point(values: Array) -> tuple[Array, Array]:
+    """Point (3,) in the world of a landmark's six numbers, with its Jacobian (3, 6)."""
+    azimuth, elevation, rho = values[3:]
+    ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    ray = np.array([ce * ca, ce * sa, se])
+    by_azimuth, by_elevation = np.array([-ce * sa, ce * ca, 0.0]), np.array([-se * ca, -se * sa, ce])
+    D = np.column_stack([np.eye(3), by_azimuth / rho, by_elevation / rho, -ray / rho**2])
+    return values[:3] + ray / rho, D

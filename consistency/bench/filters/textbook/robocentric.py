@@ -1,0 +1,233 @@
+"""Robot-centred EKF-SLAM in inverse range, with landmarks out of sight parked: consistent at a small baseline.
+
+Landmarks are azimuth, elevation (rad) and inverse range (1/m) in the frame of the sensor, where the error of stereo is
+nearly Gaussian; an observation (u, v, d) is converted to the same three numbers, so that insertion and update are
+linear and say nothing about the pose (Castellanos et al. 2007; Civera, Davison & Montiel 2008). Prediction moves all
+landmarks through the new frame. What a landmark that is carried so for hundreds of steps says of the way back is right
+to first order only; one that has not been seen for a while is therefore *parked*: it keeps its numbers in the frame of
+a clone of the pose, and is carried over at once, by an iterated update, when it is seen again.
+
+The error of pose and clones is right-invariant, T_true = Exp(xi) T; M(p) takes (dp, dheading) to xi. A return whose
+turn since the clone is little known is *in doubt*. It corrects poses by decimetres, and what is known of the motion
+from one clone to the next is known in the frame of the first, wherever that is moved. So the poses are moved along a
+chain, E_j = E_j-1 Exp(xi_j - xi_j-1), T_j <- E_j T_j, and the covariance is *turned* with them: the error about the
+moved poses is that of pose j - 1 plus Ad(E_j-1) J_l(xi_j - xi_j-1) times the difference of what is left of xi_j and
+xi_j-1. The robot hangs on the last clone. Where it sees nothing but one landmark in doubt, that landmark *waits* at
+its clone: the robot may then be anywhere on a circle about it, a straight line in xi, whereas a landmark in the frame
+of the robot would keep p + R m / rho to first order only. From the second such step on the robot hangs on that clone,
+since a turn about a point is Exp of one xi, and of a sum of many to first order only.
+
+Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
+its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not
+the conversion of the mean, to second order in the noise of u and v. The noise of the conversion is taken where the
+observation is predicted: taken where it was measured, it would give more weight to errors of one sign.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from consistency.bench.filters.believed_noise import bias_at, variance_at
+from consistency.bench.filters.textbook import basics
+from consistency.bench.filters.textbook.centred import (
+    CentredState,
+    Chart,
+    activated,
+    charted,
+    clones_of,
+    expectation,
+    indices_of,
+    moved_by,
+    settled_clones,
+    shifts_of,
+    with_parked,
+    without_block,
+    without_idle_clones,
+    world_point,
+)
+from consistency.bench.filters.textbook.inverse_range import (
+    Corrections,
+    apart,
+    bias,
+    carried,
+    chained,
+    converted,
+    observed,
+    searched,
+)
+from consistency.bench.filters.textbook.sensors import heading_matrix
+from consistency.bench.protocols import Problem
+from consistency.bench.types import Control, Gaussian, Info, Observation
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import wrap
+from consistency.referee.types import Array
+
+EVERY, UNSEEN = 50, 20  # steps between two rounds of parking, and without a sight before a landmark is parked
+DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
+KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
+PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
+PASSES_CHAINED = 12  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
+TEMPERED = 2.0  # decades by which the noise of a return in doubt is raised in the first pass; then half a decade less
+
+
+class Solution(NamedTuple):
+    """An update with k numbers, as the last pass found it."""
+
+    delta: Array  # (n,), xi of the pose, of clones in the sense of the chart, and errors of landmarks
+    C: Array  # (n, n), error about where the pass began / d delta
+    H: Array  # (k, n), by delta
+    S: Array  # (k, k)
+    W: Array  # (n, k)
+    innovation: Array  # (k,)
+    is_settled: bool
+
+
+class RobotCentredKalman:
+    """EKF-SLAM in a robot-centred map of inverse ranges, every Jacobian by its definition."""
+
+    robot = basics.Unicycle()
+    sensors = ("uvd",)
+
+    def __init__(self, name: str, which: Corrections) -> None:
+        self.name, self.which = name, which
+        self.needs = ("disparity",) if which.truncation else ()
+
+    def init(self, problem: Problem) -> CentredState:
+        sensor = problem.belief.sensor
+        if sensor.model != "uvd":
+            raise InputError(f"filter '{self.name}' needs a uvd sensor, and belief.sensor.model is '{sensor.model}'")
+        if self.which.truncation:
+            searched(sensor, self.name)
+        return CentredState(problem.start.copy(), np.zeros((3, 3)), problem)
+
+    def predict(self, state: CentredState, control: Control) -> CentredState:
+        belief, x, n = state.problem.belief, state.x.copy(), len(state.x)
+        F, G = np.eye(n), np.zeros((n, 2))
+        F[:3, :3], G[:3] = self.robot.jacobians(x[:3], control)
+        x[:3] = self.robot.move(x[:3], control)
+        active = [at for label, at in state.places.items() if label not in state.parked]
+        if active:
+            rows = np.array(active)[:, None] + np.arange(3)
+            forward, turn = control.dt * control.v, control.dt * control.omega
+            R = heading_matrix(-turn)
+            y, J, D, b = carried(x[rows], R, -R[:, 0] * forward, belief.sensor)
+            rho = x[rows][:, 2:]
+            x[rows] = y
+            F[rows[:, :, None], rows[:, None, :]] = J
+            by_forward, by_turn = -rho * R[:, 0], np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1)
+            G[rows] = control.dt * (D @ np.stack([by_forward, by_turn], axis=2))
+        noise = G * [belief.motion.sigma_v, belief.motion.sigma_omega]
+        return replace(state, x=x, P=F @ state.P @ F.T + noise @ noise.T, step=state.step + 1, noise=noise)
+
+    def update(self, state: CentredState, observation: Observation) -> tuple[CentredState, Info]:
+        labels = [int(label) for label in observation.landmarks]
+        known = np.array([label in state.places for label in labels], dtype=bool)
+        info = Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
+        bias = bias_at(observation.z, state.problem.belief.sensor)
+        unbiased = observation.z - bias
+        if known.any():
+            seen = [label for label in labels if label in state.places]
+            state, info = self._correct(state, seen, unbiased[known], bias[known, 2])
+        for label, z in zip(np.array(labels)[~known], unbiased[~known], strict=True):
+            state = self._inserted(state, int(label), z)
+        state = replace(state, seen=state.seen | dict.fromkeys(labels, state.step))
+        if self.which.parking and state.step % EVERY == 0:
+            state = with_parked(state, UNSEEN)
+        return state, info
+
+    def _correct(self, state: CentredState, seen: list[int], z: Array, shift: Array) -> tuple[CentredState, Info]:
+        is_parked = np.array([label in state.parked for label in seen])
+        in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
+        new = np.array([state.step - state.seen[label] > 1 for label in seen])
+        attempts: list[tuple[Chart, int]] = [(apart, PASSES if self.which.iteration and is_parked.any() else 1)]
+        if self.which.turning and in_doubt.any():
+            state = settled_clones(state)
+            held = [state.parked[label] for label in np.array(seen)[in_doubt & ~new]]
+            chain = partial(chained, on=sorted(state.clones).index(min(held, default=max(state.clones))))
+            attempts.insert(0, (chain, PASSES_CHAINED))
+        T = shifts_of(state)
+        P = T @ state.P @ T.T  # of the pose, too, by xi from here on
+        for chart, passes in attempts:
+            found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, passes)
+            if found.is_settled:
+                break
+        after, turned = moved_by(state, found.delta), np.eye(len(state.x))
+        if chart is not apart:
+            (after, _), turned = charted(state, found.delta, chart), found.C
+        turned = np.linalg.inv(shifts_of(after)) @ turned
+        after = replace(after, P=turned @ (P - found.W @ found.S @ found.W.T) @ turned.T)
+        back = [label for label in seen if label in state.parked]
+        if self.which.waiting and len(seen) == 1 and in_doubt.any() and self._waits(state, seen[0]):
+            back = []
+        return activated(after, back), Info(found.innovation, found.S, found.W)
+
+    def _solved(
+        self, state: CentredState, P: Array, seen: list[int], z: Array, shift: Array, is_parked: Array,
+        in_doubt: Array, new: Array, chart: Chart, passes: int,
+    ) -> Solution:  # fmt: skip
+        """The update by at most so many passes of Gauss-Newton, in a chart of the poses."""
+        delta, expected, deviation = np.zeros(len(P)), np.zeros((len(seen), 3)), np.sqrt(np.diag(P))
+        is_chained = self.which.turning and bool(in_doubt.any())  # tried, or given up: all clones are in the update
+        involved = indices_of(state, state.clones if is_chained else clones_of(state, seen), seen)
+        is_tempered, is_settled = bool((in_doubt & new).any()), False
+        for i in range(passes):
+            here, C = charted(state, delta, chart)
+            h, H = expectation(here, seen)
+            H = H @ C
+            expected = np.where(is_parked[:, None] | (i == 0), h, expected)
+            y, R = observed(z, shift, expected, state.problem.belief.sensor, self.which)
+            if is_tempered:
+                R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
+            gap = y - h
+            gap[:, 0] = wrap(gap[:, 0])
+            innovation = gap.ravel() + H @ delta
+            S, W = basics.gain(P, H, basics.block_diagonal(R))
+            before, delta = delta, W @ innovation
+            is_settled = i >= (2 * TEMPERED if is_tempered else 1)
+            is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))
+            if is_settled:
+                break
+        return Solution(delta, C, H, S, W, innovation, is_settled)
+
+    def _is_in_doubt(self, state: CentredState, label: int) -> bool:
+        """Whether the turn since the clone of a parked landmark was little known before the motion of this step."""
+        if not self.which.iteration or label not in state.parked:
+            return False
+        clone = state.clones[state.parked[label]] + 2
+        turn = state.P[2, 2] + state.P[clone, clone] - 2.0 * state.P[2, clone]
+        return bool(turn - state.noise[2] @ state.noise[2] > DOUBT**2)
+
+    def _waits(self, state: CentredState, label: int) -> bool:
+        """Whether the distance of a parked landmark from its clone is well known."""
+        rho = state.places[label] + 2
+        return bool(state.P[rho, rho] < (KNOWN * state.x[rho]) ** 2)
+
+    def _inserted(self, state: CentredState, label: int, z: Array) -> CentredState:
+        sensor, n = state.problem.belief.sensor, len(state.x)
+        (y,), (J,) = converted(z[None], sensor)
+        if self.which.debiasing:
+            y = y - bias(z[None], sensor)[0]
+        P = np.zeros((n + 3, n + 3))
+        P[:n, :n], P[n:, n:] = state.P, J @ variance_at(z[None], sensor).reshape(3, 3) @ J.T
+        return replace(state, x=np.append(state.x, y), P=P, places=state.places | {label: n})
+
+    def forget(self, state: CentredState, landmark: int) -> CentredState:
+        parked = {label: number for label, number in state.parked.items() if label != landmark}
+        return without_idle_clones(without_block(replace(state, parked=parked), state.places[landmark]))
+
+    def pose(self, state: CentredState) -> Gaussian:
+        return Gaussian(state.x[:3], state.P[:3, :3])
+
+    def map(self, state: CentredState) -> dict[int, Gaussian]:
+        points = {label: world_point(state, label) for label in state.places}
+        return {label: Gaussian(point, D @ state.P @ D.T) for label, (point, D) in points.items()}
+
+    def joint(self, state: CentredState) -> Gaussian:
+        points = [world_point(state, label) for label in state.places]
+        mean = np.concatenate([state.x[:3], *(point for point, _ in points)])
+        D = np.vstack([np.eye(3, len(state.x)), *(D for _, D in points)])
+        return Gaussian(mean, D @ state.P @ D.T)

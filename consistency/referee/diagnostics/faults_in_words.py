@@ -29,6 +29,8 @@ def scale_text(v: Verdict, faults: Faults) -> str:
         return ""
     if (MAIN not in faults and STEP not in faults) or _opposite(v, faults):
         return _axes_text(v)
+    if v.status == "inconsistent" and v.scale.inflation.value > 1.0 and _sure(v, -1):
+        return _correlation_text(v)
     where, inflation, about = v.location, v.scale.inflation, ""
     if v.bias is not None and v.bias.inflation_without is not None:
         inflation, about = v.bias.inflation_without, " about the mean"
@@ -118,6 +120,17 @@ def _axes_text(v: Verdict) -> str:
     if not named:
         return "covariance wrong in an axis"
     return f"covariance {', '.join(f'{off_by(i)} in {a}' for a, i in named)}{_since(v)}"
+
+
+def _correlation_text(v: Verdict) -> str:
+    """Axes that are too large, and a direction in which the correlation makes the covariance too small."""
+    assert v.scale is not None
+    large = ", ".join(f"{off_by(i)} in {a}" for a, i in [*_sure(v, -1).items()][:MOST])
+    text = f"covariance {large}"
+    if v.shape is None:
+        return text
+    worst = float(np.linalg.eigvalsh(v.shape.matrix)[-1]) * v.scale.mean_anees / v.scale.dof
+    return f"{text}, but too small by x{_factor(worst)} in one direction{_since(v)}"
 
 
 def _but(v: Verdict, faults: Faults) -> str:

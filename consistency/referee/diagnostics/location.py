@@ -15,7 +15,7 @@ from consistency.referee.diagnostics.coverage import coverage, coverage_interval
 from consistency.referee.diagnostics.credibility import noncredibility
 from consistency.referee.diagnostics.hypothesis_tests import Tests
 from consistency.referee.diagnostics.nees import anees
-from consistency.referee.diagnostics.questions import BIAS, SCALE, SHAPE, STEP
+from consistency.referee.diagnostics.questions import BIAS, MAIN, SCALE, SHAPE, STEP
 from consistency.referee.diagnostics.records import (
     Accuracy,
     Answer,
@@ -66,7 +66,7 @@ def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = Tr
         first_step=first + 1 if first is not None and faulty else None,
         since=since,
         lasting=lasting,
-        subset=chief_axes(sample, late) if sample.errors is not None and _any(answers, SCALE) else None,
+        subset=_subset(sample, late, answers) if sample.errors is not None and _any(answers, SCALE) else None,
         until=until(sample, band, detect) if ordered and _any(answers, (*SCALE, *BIAS)) else None,
     )
 
@@ -133,23 +133,32 @@ def _splits(sample: Sample) -> tuple[Indices, Array, Array]:
     return ends, before[both] / many[both] / sample.dof, after[both] / fewer[both] / sample.dof
 
 
-def chief_axes(sample: Sample, steps: slice = slice(None)) -> str | None:
+def _subset(sample: Sample, steps: slice, answers: Answers) -> str | None:
+    """Axes that carry the fault, None where they err in the other direction than a whole that is at fault."""
+    chief, whole = chief_axes(sample, steps), sample.means(steps).mean()
+    if not chief or not _any(answers, (MAIN,)):
+        return ", ".join(chief) or None
+    own = [sample.group_means([_errors(sample).names.index(name)], steps).mean() for name in chief]
+    return ", ".join(name for name, ratio in zip(chief, own, strict=True) if (ratio > 1.0) == (whole > 1.0)) or None
+
+
+def chief_axes(sample: Sample, steps: slice = slice(None)) -> list[str]:
     """Axes that carry the fault: those farther from 1 than the others together, beyond chance.
 
     With Y_ij the mean NEES of axis j alone in run i and O_ij that of the other axes, each over its mean over runs,
     D_i = Y_ij - O_ij has the standard error of log mean Y_j - log mean O_j to first order; Student's t, two-sided,
-    Bonferroni over axes. None where no axis stands out, or with fewer than 8 runs.
+    Bonferroni over axes. Empty where no axis stands out, or all do, or with fewer than 8 runs.
     """
     assert sample.errors is not None
     names, n = sample.errors.names, sample.dof
     if n == 1 or np.isfinite(sample.nees[:, steps]).any(axis=1).sum() < FEWEST:
-        return None
+        return []
     Y = np.stack([sample.group_means([j], steps) for j in range(n)], axis=-1)
     if not (Y.mean(axis=0) > 0).all():  # an axis without any error
         chief = [name for name, mean in zip(names, Y.mean(axis=0), strict=True) if not mean > 0]
-        return ", ".join(chief) if len(chief) < n else None
+        return chief if len(chief) < n else []
     chief = [name for j, name in enumerate(names) if _stands_out(Y[:, j], (Y.sum(axis=1) - Y[:, j]) / (n - 1), n)]
-    return ", ".join(chief) if 0 < len(chief) < n else None
+    return chief if len(chief) < n else []
 
 
 def _stands_out(own: Array, others: Array, axes: int) -> bool:

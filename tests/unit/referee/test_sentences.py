@@ -159,6 +159,49 @@ def test_a_wrong_scale_beside_a_wrong_sign_is_still_one(rng: np.random.Generator
     assert "no axis by itself" not in verdict.reasons[0]
 
 
+# --- axes too large, and a correlation that makes one direction too small -------------------------------------
+
+
+@pytest.mark.parametrize("stated", [-0.97, 0.97])
+def test_a_wrong_correlation_of_axes_that_are_too_large_is_inconsistent(
+    rng: np.random.Generator, stated: float
+) -> None:
+    error, S = correlated(rng, 0.1, stated)
+    verdict = judged(error, 4.0 * S)
+    assert verdict.status == "inconsistent"
+    found = re.match(
+        r"inconsistent: covariance too large by x(4\.\d*|3\.\d*) .* in [xy], too large by .* in [xy], but too small by "
+        r"x([\d.]+) in one direction; covariance of the wrong shape: correlation ([+-][\d.]+), stated ([+-][\d.]+)",
+        verdict.reasons[0],
+    )
+    assert found, verdict.reasons[0]
+    worst = (1.0 + 0.1) / (1.0 - 0.97) / 4.0 if stated < 0 else (1.0 - 0.1) / (1.0 - 0.97) / 4.0
+    assert float(found[2]) == pytest.approx(worst, rel=0.2)  # the direction in which the stated variance is least
+    assert (float(found[3]), float(found[4])) == (pytest.approx(0.1, abs=0.08), stated)
+    assert "mainly" not in verdict.reasons[0]
+    assert judged(error, 4.0 * S, allow="conservative").status == "overconfident"
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.5, 1.0), (0.5, 4.0)])
+def test_an_axis_that_is_too_small_beside_a_wrong_correlation_is_overconfident(
+    rng: np.random.Generator, x: float, y: float
+) -> None:
+    error, S = correlated(rng, 0.1, -0.97)
+    verdict = judged(error, S * np.sqrt(np.outer([x, y], [x, y])))
+    assert verdict.status == "overconfident"
+
+
+def test_the_axes_that_are_named_err_as_the_whole(rng: np.random.Generator) -> None:
+    """Else one is the main axis of a covariance that is too small, and twelve times too large itself."""
+    error, S = correlated(rng, 0.1, -0.99, n=3)
+    verdict = judged(error, S * np.sqrt(np.outer([12.0, 12.0, 1.0], [12.0, 12.0, 1.0])))
+    assert verdict.scale is not None
+    assert verdict.scale.inflation.low > 1.0
+    assert verdict.location is not None
+    assert verdict.location.subset is None
+    assert verdict.status == "inconsistent"
+
+
 # --- steps -----------------------------------------------------------------------------------------------------
 
 

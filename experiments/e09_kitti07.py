@@ -32,10 +32,10 @@ from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.store.curves import curves
 from consistency.bench.store.log import Log, write_log
 from consistency.bench.store.results import Results, joined
-from consistency.bench.store.storage import require_free
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import anees_interval, chi2_mean_interval, coverage
 from consistency.referee.show.terminal import show
+from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 

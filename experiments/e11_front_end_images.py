@@ -23,10 +23,10 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
-from consistency.bench.store.storage import require_free
 from consistency.referee.diagnostics import Evidence, Verdict, judge, nees
 from consistency.referee.show.terminal import show
 from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.folders import require_free
 from consistency.referee.types import Array
 from consistency.stereo.vision import (
     RelativePose,

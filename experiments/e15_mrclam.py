@@ -26,8 +26,8 @@ from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.store.curves import Curves, curves
 from consistency.bench.store.log import Log, write_log
-from consistency.bench.store.storage import require_free
 from consistency.referee.show.terminal import show
+from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 
 if TYPE_CHECKING:

@@ -25,8 +25,8 @@ import pandas as pd
 import consistency as cs
 from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
-from consistency.bench.store.storage import require_free
 from consistency.referee.show.terminal import show
+from consistency.referee.system.folders import require_free
 from consistency.referee.terminal.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.vision import RelativePose, StereoRig, triangulate

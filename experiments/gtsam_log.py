@@ -21,9 +21,9 @@ import numpy as np
 from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.store.log import write_log
-from consistency.bench.store.storage import require_free
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
+from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 from consistency.stereo.frontend.planar import in_robot_axes, planar_motions, planar_path, robot_axes

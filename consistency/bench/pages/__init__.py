@@ -1,45 +1,20 @@
-"""Pages: results to documents, and documents to files.
+"""Pages on results of the bench and on maps of worlds.
 
 ``build`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each of which
-is described once. Renderers of ``show`` write them. No statistic is computed here that the diagnostics do not already
-have.
+is described once.
 """
 
 from __future__ import annotations
 
-import tempfile
-from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from consistency.referee.errors import InputError
-from consistency.referee.extras import missing, require
-from consistency.referee.show import rendered
-from consistency.referee.system.atomic import write_whole
+from consistency.referee.pages import require_pages, require_writable, write_document
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
     from consistency.bench.sweeps.regime import Regime
-    from consistency.referee.diagnostics import Evidence, Verdict
-    from consistency.referee.document.blocks import Document
-    from consistency.referee.terminal.progress import Advance
-    from consistency.referee.verdicts.monitoring import Watched
-    from consistency.stereo.characterising.characterise import Characterisation
 
-__all__ = [
-    "require_pages",
-    "require_plot",
-    "write_file_pages",
-    "write_file_reports",
-    "write_monitor_plot",
-    "write_regime_reports",
-    "write_reports",
-    "write_sensor_reports",
-    "write_text_file",
-]
-
-KINDS = (".png", ".pdf", ".svg")  # of a plot
+__all__ = ["write_regime_reports", "write_reports"]
 
 
 def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: bool) -> list[Path]:
@@ -60,7 +35,7 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     InputError
         The folder cannot be read, or a file exists or cannot be written.
     """
-    from consistency.bench.store.storage import read_manifest
+    from consistency.referee.system.folders import read_manifest
 
     manifest = read_manifest(Path(folder))
     require_pages(html, pdf, overwrite)
@@ -69,33 +44,8 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
 
     parts = len(folders_of(Path(folder), manifest)) + sum(path is not None for path in (html, pdf))
     with progress("report", parts, "parts", brief=True) as advance:
-        _write_document(compose(build_report(Path(folder), advance)), html, pdf, advance=advance)
+        write_document(compose(build_report(Path(folder), advance)), html, pdf, advance=advance)
     return [path for path in (html, pdf) if path is not None]
-
-
-def require_pages(html: Path | None, pdf: Path | None, overwrite: bool) -> None:
-    """Refuse, before any work, files of a report that cannot be written; None leaves one out.
-
-    Raises
-    ------
-    InputError
-        Both are the same, or one exists or cannot be written.
-    """
-    if html is not None and pdf is not None and html.absolute() == pdf.absolute():
-        raise InputError(f"{html}: is named for both HTML and PDF; name two files")
-    for path in (html, pdf):
-        if path is not None:
-            _require_writable(path, overwrite)
-
-
-def write_file_pages(
-    records: Sequence[Evidence], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
-) -> None:
-    """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
-    from consistency.referee.pages.files import compose_files
-    from consistency.referee.system.provenance import manifest_of
-
-    _write_document(compose_files(records, judged, title, manifest_of(kind="verdict", source=title)), html, pdf)
 
 
 def write_regime_reports(regime: Regime, folder: Path) -> list[Path]:
@@ -108,163 +58,8 @@ def write_regime_reports(regime: Regime, folder: Path) -> list[Path]:
     """
     targets = [folder / "report.html", folder / "report.pdf"]
     for path in targets:
-        _require_writable(path, overwrite=True)
+        require_writable(path, overwrite=True)
     from consistency.bench.pages.regime import compose_regime
 
-    _write_document(compose_regime(regime), *targets)
+    write_document(compose_regime(regime), *targets)
     return targets
-
-
-def write_sensor_reports(of: Characterisation, folder: Path, data: str, overwrite: bool = False) -> list[Path]:
-    """``report.html``, ``report.pdf`` and ``characterisation.json`` in a folder that appears whole or not at all.
-
-    Parameters
-    ----------
-    data : text of the JSON file
-
-    Raises
-    ------
-    InputError
-        The folder exists or cannot be written.
-    """
-    from consistency.bench.store.storage import write_folder
-    from consistency.referee.system.provenance import manifest_of
-    from consistency.stereo.pages.sensor import compose_sensor
-
-    manifest = manifest_of(kind="characterisation", source=of.source)
-    document = compose_sensor(of, manifest)
-
-    def contents(at: Path) -> None:
-        _write_document(document, at / "report.html", at / "report.pdf")
-        _write(at / "characterisation.json", data.encode("utf-8"))
-
-    write_folder(folder, {}, manifest, contents, overwrite)
-    return [folder / name for name in ("report.html", "report.pdf", "characterisation.json")]
-
-
-def write_file_reports(
-    records: Sequence[Evidence],
-    judged: Mapping[str, Verdict],
-    folder: Path,
-    title: str,
-    data: str,
-    overwrite: bool = False,
-) -> list[Path]:
-    """``report.html``, ``report.pdf`` and ``verdict.json`` in a folder that appears whole or not at all.
-
-    Without the packages of [report] the page is a static one, and there is no PDF.
-
-    Parameters
-    ----------
-    judged : verdicts by name of the records that are shown
-    data : text of the JSON file
-
-    Raises
-    ------
-    InputError
-        The folder exists or cannot be written.
-    """
-    from consistency.bench.store.storage import write_folder
-    from consistency.referee.system.provenance import manifest_of
-
-    manifest = manifest_of(kind="verdict", source=title)
-    write = _static_page(records, judged, title) if missing("report") else _pages(records, judged, title, manifest)
-
-    def contents(at: Path) -> None:
-        write(at)
-        _write(at / "verdict.json", data.encode("utf-8"))
-
-    write_folder(folder, {}, manifest, contents, overwrite)
-    names = ("report.html", "report.pdf", "verdict.json")
-    return [path for path in (folder / name for name in names) if path.exists()]
-
-
-def _pages(
-    records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str, manifest: dict[str, Any]
-) -> Callable[[Path], None]:
-    from consistency.referee.pages.files import compose_files
-
-    document = compose_files(records, judged, title, manifest)
-    return lambda at: _write_document(document, at / "report.html", at / "report.pdf")
-
-
-def write_text_file(document: Document, path: Path, overwrite: bool) -> Path:
-    """One file, in the format of its suffix.
-
-    Raises
-    ------
-    InputError
-        The file exists or cannot be written.
-    """
-    _require_writable(path, overwrite)
-    _write(path, rendered(document, path).encode("utf-8"))
-    return path
-
-
-def _static_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
-    from consistency.referee.pages.plain import compose_plain
-    from consistency.referee.show.static import render
-
-    text = render(compose_plain(records, judged, title))
-    return lambda at: _write(at / "report.html", text.encode("utf-8"))
-
-
-def _write_document(
-    document: Document, html: Path | None, pdf: Path | None, *, advance: Advance = lambda _: None
-) -> None:
-    """The document in both formats, each file whole or not at all; None leaves one out."""
-    from consistency.referee.show.html import render_html
-    from consistency.referee.show.pdf import pdf_beside
-
-    contents: list[tuple[Path, bytes]] = []
-    with pdf_beside(document) if pdf is not None else nullcontext(bytes) as finished:
-        if html is not None:
-            contents.append((html, render_html(document).encode("utf-8")))
-            advance(1)
-        if pdf is not None:
-            contents.append((pdf, finished()))
-            advance(1)
-    for path, content in contents:
-        _write(path, content)
-
-
-def require_plot(path: Path, overwrite: bool) -> None:
-    """Refuse, before any work, a plot that cannot be written.
-
-    Raises
-    ------
-    InputError
-        The kind of file is unknown, the file exists, or it cannot be written.
-    """
-    if path.suffix.lower() not in KINDS:
-        raise InputError(f"--plot {path}: must end in {', '.join(KINDS)}")
-    require("a plot", "plot")
-    _require_writable(path, overwrite)
-
-
-def write_monitor_plot(path: Path, watched: Watched) -> None:
-    """NIS and evidence of a run over its steps, as PNG, PDF or SVG by the suffix of ``path``."""
-    from consistency.referee.pages.monitor import monitor_plot
-
-    _write(path, monitor_plot(watched, path.suffix.lower().removeprefix(".")))
-
-
-def _require_writable(path: Path, overwrite: bool) -> None:
-    """Refuse, before any work, what cannot be written or must not be replaced."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; name a file")
-    if (path.exists() or path.is_symlink()) and not overwrite:
-        raise InputError(f"{path}: exists already; name another file or add --overwrite")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
-            pass
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        write_whole(path, content, 0o644)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

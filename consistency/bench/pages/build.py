@@ -16,11 +16,11 @@ from consistency.bench.runs.findings import read_findings
 from consistency.bench.store.curves import curves, nis_ratio, steps_of
 from consistency.bench.store.judge import design_of, verdict_by, with_map
 from consistency.bench.store.results import open_results
-from consistency.bench.store.storage import read_manifest
 from consistency.referee.diagnostics import Settings
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.errors import InputError
 from consistency.referee.pages.clock import clock_of
+from consistency.referee.system.folders import read_manifest
 from consistency.referee.terminal.progress import Advance
 
 

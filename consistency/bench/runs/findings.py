@@ -24,13 +24,14 @@ from consistency.bench.scenario import Scenario, data_folder, load_scenario
 from consistency.bench.store.curves import Curves, curves
 from consistency.bench.store.judge import analyse
 from consistency.bench.store.results import Results, joined
-from consistency.bench.store.storage import require_free, write_folder
+from consistency.bench.store.storage import write_folder
 from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.reading import read_json, reading
 from consistency.referee.show.terminal import show
+from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.terminal.progress import quiet, say
 

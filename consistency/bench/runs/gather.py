@@ -31,9 +31,10 @@ from consistency.bench.store.results import (
     rejections_table,
     truth_table,
 )
-from consistency.bench.store.storage import NewFolder
+from consistency.bench.store.storage import put_in_place
 from consistency.referee.errors import InputError
 from consistency.referee.reading.columns import COLUMNS
+from consistency.referee.system.folders import NewFolder
 from consistency.referee.system.machine import this_machine
 from consistency.referee.system.stopping import undisturbed
 from consistency.referee.types import Failure
@@ -166,7 +167,7 @@ class Gathered:
                 write_table(new.path / "landmarks.parquet", "landmarks", landmarks)
             if (rejections := self._all_rejections()) is not None:
                 write_table(new.path / "rejections.parquet", "rejections", rejections)
-        return StoredResults(new.folder, failures, landmarks, new.put_in_place(manifest), rejections)
+        return StoredResults(new.folder, failures, landmarks, put_in_place(new, manifest), rejections)
 
     def _write(
         self, new: NewFolder, table: str, of: Callable[[str], Iterator[Columns]], columns: Sequence[str] = ()

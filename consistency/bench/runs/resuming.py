@@ -10,8 +10,8 @@ from typing import Any
 
 from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.results import StoredResults, Tables, open_results
-from consistency.bench.store.storage import NewFolder
 from consistency.referee.errors import InputError
+from consistency.referee.system.folders import NewFolder
 from consistency.referee.system.machine import in_words, this_machine
 from consistency.referee.terminal.progress import say
 

@@ -17,9 +17,9 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from consistency.bench.store.parquet import Columns
-from consistency.bench.store.storage import require_free, writing
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import make_durable
+from consistency.referee.system.folders import require_free, writing
 from consistency.referee.types import Array
 
 MARK = b"run:"

@@ -18,7 +18,7 @@ from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.scenario import Scenario, explain
 from consistency.bench.store.parquet import OPTIONAL, Columns, columns_of, read_batches, read_parquet, require_table
 from consistency.bench.store.soundness import require_manifest, require_rows
-from consistency.bench.store.storage import read_manifest, require_unchanged, write_folder
+from consistency.bench.store.storage import require_unchanged, write_folder
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.diagnostics.landmarks import joint_nees
 from consistency.referee.diagnostics.whitening import whiten
@@ -27,6 +27,7 @@ from consistency.referee.geometry import pose_error
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error, planar_map_error
 from consistency.referee.reading import LARGEST_NUMBER
 from consistency.referee.reading.columns import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
+from consistency.referee.system.folders import read_manifest
 from consistency.referee.types import Array, Failure, Indices
 
 NUMBERS = [column for column in COLUMNS["estimates"] if column != "filter"]

@@ -15,13 +15,14 @@ from typing import Any
 
 from consistency.bench.scenario import Scenario
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.store.storage import read_manifest, write_folder
+from consistency.bench.store.storage import write_folder
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellResult, Outcome, plain_numbers, result_from
 from consistency.bench.sweeps.plan import MOST_CELLS, Cell, Rule, Sweep
 from consistency.referee.errors import InputError
 from consistency.referee.reading import reading
 from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.folders import read_manifest
 from consistency.referee.system.provenance import manifest_of
 
 KIND, CELL_KIND = "sweep", "cell"

@@ -12,7 +12,8 @@ from consistency.bench.store.storage import write_folder
 from consistency.bench.tuning.groups import sigma_by_channel
 from consistency.bench.tuning.result import Setting, Tuning, files
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.system.provenance import manifest_of, plain
+from consistency.referee.diagnostics.export import plain
+from consistency.referee.system.provenance import manifest_of
 
 KIND = "tuning"
 

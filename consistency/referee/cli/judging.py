@@ -90,8 +90,8 @@ def analyse(
         verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None and not is_file:
-            from consistency.bench.pages import write_file_reports
-            from consistency.bench.store.storage import require_free
+            from consistency.referee.pages import write_file_reports
+            from consistency.referee.system.folders import require_free
 
             try:
                 require_free(report, overwrite, "verdict", "--report")
@@ -121,7 +121,7 @@ def analyse(
             print(f"consistency: {text}", file=sys.stderr)
     shown = document(verdicts, path.name)
     if report is not None and is_file:
-        from consistency.bench.pages import write_text_file
+        from consistency.referee.pages import write_text_file
 
         try:
             written = [write_text_file(shown, report, overwrite)]
@@ -156,7 +156,8 @@ def report(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Write a report of results as one offline HTML file and a PDF."""
-    from consistency.bench.pages import require_pages, write_file_pages, write_reports
+    from consistency.bench.pages import write_reports
+    from consistency.referee.pages import require_pages, write_file_pages
     from consistency.referee.verdicts.files import analyse_recordings
 
     estimates = are_files(path, files)

@@ -173,7 +173,7 @@ def _drawn(sheet: Sheet, path: str | Path | None) -> Drawn:
 
     figure = drawn(sheet)
     if path is not None:
-        from consistency.bench.pages import require_plot
+        from consistency.referee.pages import require_plot
 
         path = Path(path)
         require_plot(path, overwrite=True)

@@ -42,13 +42,13 @@ def characterise(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --out and --report.")] = False,
 ) -> None:
     """Measure a stereo sensor: noise, growth with disparity, bias map, tails, whiteness, each with an interval."""
-    from consistency.bench.pages import write_sensor_reports
-    from consistency.bench.store.storage import require_free
     from consistency.referee.show import terminal
+    from consistency.referee.system.folders import require_free
     from consistency.stereo.characterising.printing import blocks
     from consistency.stereo.characterising.sources import CORNERS, NODES, Options, characterise_source, counts
     from consistency.stereo.characterising.writing import as_json as json_of
     from consistency.stereo.characterising.writing import require_free_file, sensor_text, write_sensor
+    from consistency.stereo.pages import write_sensor_reports
 
     require_free_file(out, overwrite)
     if report is not None:

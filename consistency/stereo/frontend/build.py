@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from consistency.bench.store.log import View, write_log
-from consistency.bench.store.storage import require_free, write_folder
+from consistency.bench.store.storage import write_folder
 from consistency.referee.errors import InputError
+from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of

@@ -26,10 +26,9 @@ from consistency.bench.runs.gather import Gathered
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.simulation import World
 from consistency.bench.store import journal as journals
-from consistency.bench.store import storage
 from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.results import Outcome, open_results
-from consistency.referee.system import stopping
+from consistency.referee.system import folders, stopping
 from consistency.referee.system.stopping import Stop, stoppable
 from consistency.referee.terminal.progress import progress, say
 
@@ -305,7 +304,7 @@ def test_killed_while_results_were_replaced(uvd: cs.Scenario, whole: Path, tmp_p
             raise SystemExit("killed")
         replace(source, target)
 
-    monkeypatch.setattr(storage.os, "replace", dies)
+    monkeypatch.setattr(folders.os, "replace", dies)
     with pytest.raises(SystemExit):
         cs.run_trials(uvd, FILTER, RUNS, seed=3, jobs=1, out=out, resume=True)
     monkeypatch.undo()

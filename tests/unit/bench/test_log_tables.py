@@ -12,9 +12,9 @@ import pytest
 import consistency as cs
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.log import read_log
-from consistency.bench.store.storage import read_manifest
 from consistency.referee.cli import main
 from consistency.referee.errors import InputError
+from consistency.referee.system.folders import read_manifest
 from consistency.stereo.characterising.recorded import is_log
 
 NAMES = ("controls", "observations", "truth", "landmarks")

@@ -15,10 +15,10 @@ import pytest
 from matplotlib import image
 
 import consistency as cs
-from consistency.bench.pages import require_plot, write_monitor_plot
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.monitor import monitor_document
 from consistency.referee.errors import InputError
+from consistency.referee.pages import require_plot, write_monitor_plot
 from consistency.referee.pages.monitor import POINTS, averaged, monitor_plot, sheet
 from consistency.referee.show import paper
 from consistency.referee.show.json import render

@@ -19,9 +19,9 @@ from edited import accept_changes
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.store.curves import curves
-from consistency.bench.store.storage import require_free
 from consistency.bench.types import Control, Gaussian, Observation
 from consistency.referee.reading.columns import COLUMNS
+from consistency.referee.system.folders import require_free
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.bench.store.log import read_log
-from consistency.bench.store.storage import read_manifest
 from consistency.referee.sources import spatial_error
+from consistency.referee.system.folders import read_manifest
 from consistency.referee.types import Array
 from consistency.stereo.frontend import Options, write_frontend_log
 from consistency.stereo.frontend.planar import OPTICAL, in_robot_axes, planar_motions, planar_path, robot_axes

@@ -1,0 +1,174 @@
+"""Output folders: files and a manifest, written whole or not at all."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from consistency.referee.errors import InputError
+from consistency.referee.reading import one_line, read_json
+from consistency.referee.system.atomic import make_durable
+from consistency.referee.system.provenance import SCHEMA_VERSION
+from consistency.referee.system.stopping import undisturbed
+
+# --- writing -------------------------------------------------------------------------------------
+
+
+def require_free(folder: Path, overwrite: bool, kind: str = "results", option: str = "--out") -> None:
+    """Refuse, before any work, a folder that exists or cannot be made.
+
+    With ``overwrite`` only a folder that this bench wrote may be replaced, and only by one of its own
+    ``kind`` (results, log, findings).
+    """
+    try:
+        there = folder.exists() or folder.is_symlink()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{option} {one_line(folder)}: no folder can have that name ({one_line(error, 60)})") from None
+    if there:
+        if not overwrite:
+            raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite")
+        try:
+            before = read_manifest(folder).get("kind")
+            if before != kind:
+                raise InputError(f"it holds {before}, not {kind}")
+        except InputError as error:
+            raise InputError(
+                f"{option} {folder}: is not an output folder of this bench; not overwritten ({error})"
+            ) from None
+    with writing(folder, option), tempfile.TemporaryDirectory(dir=_above(folder), prefix=f".{folder.name}."):
+        pass
+
+
+@contextmanager
+def writing(folder: Path, option: str = "--out") -> Iterator[None]:
+    """Where the system refuses, say it of the option."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{option} {folder}: cannot be written ({error.strerror or error})") from error
+
+
+def _above(folder: Path) -> Path:
+    """The nearest folder above that is there."""
+    return next(parent for parent in folder.absolute().parents if parent.exists())
+
+
+class NewFolder:
+    """An output folder in the making, beside its place; as a context it is gone at the end unless it was put there.
+
+    ``path`` is where its files are written: in the folder ``within``, or where none is given in one of its own.
+    Whatever is refused is refused at the beginning, see :func:`require_free`. With ``overwrite`` an output folder of
+    this bench is replaced; with ``keep_others`` the files in it that are not written again stay. ``is_placed`` says
+    whether it stands where it stays.
+    """
+
+    def __init__(
+        self, folder: Path, kind: str, overwrite: bool = False, keep_others: bool = False, within: Path | None = None
+    ) -> None:
+        require_free(folder, overwrite, kind)
+        self.folder, self.kind, self.overwrite, self.keep_others = folder, kind, overwrite, keep_others
+        self.within, self.is_placed = within, False
+        if within is not None:
+            self.path = within / "tables"
+            shutil.rmtree(self.path, ignore_errors=True)  # of a process that was ended
+            return
+        with self.writing():
+            self.path = Path(tempfile.mkdtemp(dir=_above(folder), prefix=f".{folder.name}."))
+
+    def __enter__(self) -> NewFolder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Where the system refuses, say it of the option ``--out``."""
+        with writing(self.folder):
+            yield
+
+    def put_in_place(self, manifest: dict[str, Any]) -> None:
+        """Write the manifest and move the folder to its place as a whole.
+
+        Raises
+        ------
+        InputError
+            The place was taken meanwhile; the folder then stands beside it, by the name that is said. The system
+            refuses.
+        """
+        with self.writing():
+            (self.path / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+            self.path.chmod(0o755)
+            for path in (*self.path.iterdir(), self.path):
+                make_durable(path)
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            require_free(self.folder, self.overwrite, self.kind)  # the work may have taken hours
+        except InputError as error:
+            raise InputError(f"{error}; the finished work is in {self._put_beside()}") from None
+        with self.writing():
+            _put_in_place(self.path, self.folder, self.keep_others, self.within)
+            make_durable(self.folder.parent)
+        self.is_placed = True
+
+    def _put_beside(self) -> Path:
+        """Move the folder to the first free name: the place was taken while the work was done."""
+        names = (self.folder.with_name(f"{self.folder.name}-{number}") for number in itertools.count(2))
+        beside = next(path for path in names if not (path.exists() or path.is_symlink()))
+        with self.writing():
+            os.replace(self.path, beside)
+        self.is_placed = True
+        return beside
+
+
+def write_folder(
+    folder: Path,
+    manifest: dict[str, Any],
+    contents: Callable[[Path], None],
+    overwrite: bool = False,
+) -> None:
+    """The manifest, which says what ``kind`` of folder it is, and what ``contents`` writes, as a :class:`NewFolder`."""
+    with undisturbed(), NewFolder(folder, manifest["kind"], overwrite) as new:
+        with new.writing():
+            contents(new.path)
+        new.put_in_place(manifest | {"tables": []})
+
+
+def _put_in_place(partial: Path, folder: Path, keep_others: bool, within: Path | None) -> None:
+    if not folder.exists():
+        os.replace(partial, folder)
+        return
+    if keep_others:
+        for path in folder.iterdir():
+            if not (partial / path.name).exists():
+                copy = shutil.copytree if path.is_dir() else shutil.copy2
+                copy(path, partial / path.name)
+    aside = within or Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    shutil.rmtree(aside / "replaced", ignore_errors=True)
+    os.replace(folder, aside / "replaced")
+    os.replace(partial, folder)
+    if within is None:
+        shutil.rmtree(aside)
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """``manifest.json`` of an output folder."""
+    path = folder / "manifest.json"
+    if not folder.is_dir():
+        raise InputError(f"{folder}: {'a file, not a folder' if folder.exists() else 'no such folder'}")
+    if not path.exists():
+        raise InputError(f"{path}: missing; give a folder that 'consistency' wrote")
+    manifest = read_json(path)
+    if not isinstance(manifest, dict) or manifest.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(f"{path}: key 'schema_version' must be {SCHEMA_VERSION}; write the folder again")
+    return manifest

@@ -162,7 +162,7 @@ def large_file(path: Path, rows: int) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--signals", type=int, default=300)
-    parser.add_argument("--resumes", type=int, default=60, help="at most")
+    parser.add_argument("--resumes", type=int, default=60, help="at most; 0 begins at once")
     parser.add_argument("--runs", type=int, default=300, help="of a command, so that it takes 20 s")
     parser.add_argument("--rows", type=int, default=3_000_000, help="of the large file")
     parser.add_argument("--seed", type=int, default=None)
@@ -172,7 +172,7 @@ def main() -> int:
         top, whole = Path(name), dict[str, Path]()
         large_file(top / "large.csv", arguments.rows)
         for which, command in COMMANDS.items():
-            if command.resume is not None:
+            if command.resume is not None and arguments.resumes:
                 prepared(top / which, arguments)
                 words = [word.format(runs=arguments.runs) for word in command.words]
                 subprocess.run(words, cwd=top / which, check=True, capture_output=True)

@@ -15,8 +15,7 @@ import pytest
 from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
 from consistency.referee.gating.budget import in_place_rate
-from consistency.referee.gating.report import lines, refusal, write
-from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, to_property
+from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, refusal, to_property
 from consistency.referee.gating.watch import DEFAULTS, Entry, Watch, current, watching
 
 NAME = "consistency-gates"
@@ -161,6 +160,8 @@ class Gates:
             if session.exitstatus == pytest.ExitCode.OK:
                 session.exitstatus = pytest.ExitCode.TESTS_FAILED
         if self.path is not None and not self.config.option.collectonly:
+            from consistency.referee.gating.report import write
+
             write(self.ledger, self.path)
 
     def _fail(self, nodeid: str, location: tuple[str, int | None, str], text: str) -> None:
@@ -174,6 +175,8 @@ class Gates:
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         if self.ledger.tests:
+            from consistency.referee.gating.report import lines
+
             terminalreporter.section("consistency gates")
             for line in lines(self.ledger):
                 terminalreporter.write_line(line)

@@ -122,7 +122,7 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
     assert heads == "filter,verdict,ANEES,ratio,RMSE m,RMSE deg,NIS/dof,failed"
     assert cells.startswith("est,overconfident,29.00,")
     refusal = (
-        "from pathlib import Path\nfrom consistency.referee.gating.report import refusal\nprint(refusal(Path('a.b')))"
+        "from pathlib import Path\nfrom consistency.referee.gating.session import refusal\nprint(refusal(Path('a.b')))"
     )
     assert ".csv" in python(copy, refusal).stdout
 

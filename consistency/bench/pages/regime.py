@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from consistency.bench.pages.sections.provenance import facts
 from consistency.bench.sweeps import axes as grid
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell as GridCell
+from consistency.bench.sweeps.printing import by_verdict
 from consistency.bench.sweeps.regime import Regime
 from consistency.referee.diagnostics.records import STATUSES
 from consistency.referee.document.blocks import (
@@ -106,16 +106,9 @@ def method(regime: Regime) -> str:
 
 def _summary(regime: Regime) -> Table:
     """Table with a row for each filter: cells by verdict, and the median cost."""
-    by_filter = {name: [r for (_, n), r in regime.results.items() if n == name] for name in regime.sweep.filters}
-    counts = {name: Counter(r.status for r in results) for name, results in by_filter.items()}
-    statuses = [status for status in STATUSES if any(count[status] for count in counts.values())]
+    statuses, rows = by_verdict(regime)
     heads = (Column(status.capitalize(), HYPHENATED.get(status, ""), number=True) for status in statuses)
     columns = (Column("Filter", width="3.4cm"), *heads, Column("Cost", number=True))
-    rows: list[tuple[Cell, ...]] = []
-    for name, results in by_filter.items():
-        costs = [r.cost for r in results if np.isfinite(r.cost)]
-        cost = f"×{np.median(costs):.2g}" if costs else "–"
-        rows.append((name, *(str(counts[name][status]) for status in statuses), cost))
     return table(columns, rows, "Cells by verdict, a row a filter", caption="Cells by verdict, and the median cost.")
 
 

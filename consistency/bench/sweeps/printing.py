@@ -14,6 +14,7 @@ from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.records import STATUSES
 from consistency.referee.diagnostics.wording import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Status, Table, Text, table
+from consistency.referee.document.wording import NONE
 
 MOST_CELLS = 48  # for a table of all cells on a terminal; map.csv has any number
 WIDEST = 36  # characters of a value in it
@@ -24,17 +25,22 @@ OF_ADVICE = (
 )
 
 
+def by_verdict(regime: Regime) -> tuple[list[str], list[tuple[Cell, ...]]]:
+    """Statuses that occur, and for each filter its name, the number of cells with each, and the median cost of a step."""
+    by_filter = {name: [r for (_, n), r in regime.results.items() if n == name] for name in regime.sweep.filters}
+    counts = {name: Counter(r.status for r in results) for name, results in by_filter.items()}
+    statuses = [status for status in STATUSES if any(count[status] for count in counts.values())]
+    rows: list[tuple[Cell, ...]] = []
+    for name, results in by_filter.items():
+        costs = [r.cost for r in results if np.isfinite(r.cost)]
+        cost = f"×{np.median(costs):.2g}" if costs else NONE
+        rows.append((name, *(str(counts[name][status]) for status in statuses), cost))
+    return statuses, rows
+
+
 def regime_blocks(regime: Regime) -> tuple[Block, ...]:
     """A row for each filter, number of cells by verdict and the cost of a step; then the cells, if they are few."""
-    counts = {
-        name: Counter(r.status for (_, n), r in regime.results.items() if n == name) for name in regime.sweep.filters
-    }
-    statuses = [status for status in STATUSES if any(count[status] for count in counts.values())]
-    rows = []
-    for name, count in counts.items():
-        costs = [r.cost for (_, n), r in regime.results.items() if n == name and np.isfinite(r.cost)]
-        cost = f"×{np.median(costs):.2g}" if costs else "-"
-        rows.append((name, *(str(count[status]) for status in statuses), cost))
+    statuses, rows = by_verdict(regime)
     heads = (Column("filter"), *(Column(head, number=True) for head in (*statuses, "cost")))
     blocks: list[Block] = [table(heads, rows, "Cells by verdict")]
     cells = regime.sweep.cells

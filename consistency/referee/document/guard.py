@@ -5,8 +5,8 @@ from __future__ import annotations
 from consistency.referee.diagnostics import Interval
 from consistency.referee.diagnostics.records import RejectionScore
 from consistency.referee.document.blocks import Cell, Column, Quantity
+from consistency.referee.document.wording import NONE
 
-NONE = Quantity(None)
 COLUMNS = (
     Column("Observations", number=True),
     Column("Spurious", number=True),

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from consistency.referee.diagnostics import Interval, MapScore
 from consistency.referee.diagnostics.wording import short
 from consistency.referee.document.blocks import Cell, Column, Quantity
-from consistency.referee.document.wording import PLAIN, written
+from consistency.referee.document.wording import NONE, PLAIN, written
 
-NONE = Quantity(None)
 COLUMNS = (
     Column("Verdict on the map", "Verdict on\nthe map", width="1.2fr"),
     Column("Mean NEES / 3 of landmarks", "Mean NEES / 3\nof landmarks", number=True),

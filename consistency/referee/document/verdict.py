@@ -1,8 +1,7 @@
 """A verdict in rows and columns: which figures stand where, in which order, and what they are called.
 
 Every place that shows verdicts takes them from here: terminal, reports, notebooks, static pages. What a view shows is a
-tuple of :class:`Measure`; to show another figure, write its function in ``figures`` and put it into the views that have
-room for it.
+tuple of :class:`Measure`; to show another figure, write its function and put it into the views that have room for it.
 """
 
 from __future__ import annotations
@@ -15,8 +14,7 @@ import numpy as np
 
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.export import flat
-from consistency.referee.diagnostics.wording import p_text, percent, plain, plural, question_text, short
-from consistency.referee.document import figures
+from consistency.referee.diagnostics.wording import UNCERTAIN, p_text, percent, plain, plural, question_text, short
 from consistency.referee.document.blocks import (
     Block,
     Cell,
@@ -26,6 +24,7 @@ from consistency.referee.document.blocks import (
     Quantity,
     Reason,
     Reasons,
+    Status,
     Table,
     Text,
     table,
@@ -33,6 +32,7 @@ from consistency.referee.document.blocks import (
 from consistency.referee.document.guard import rejection_text
 from consistency.referee.document.looks import Look
 from consistency.referee.document.map import map_lines, map_summary
+from consistency.referee.document.wording import NONE, brief, number, p_cell
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 
 
@@ -62,32 +62,91 @@ def _is_empty(cell: Cell) -> bool:
     return isinstance(cell, Quantity) and cell.is_empty
 
 
-# --- views ------------------------------------------------------------------------------------------
+# --- figures and views ------------------------------------------------------------------------------
+
+
+def _mean_anees(v: Verdict, digits: str = "") -> Quantity:
+    return Quantity(v.scale.mean_anees if v.scale else None, digits=digits)
+
+
+def factor(v: Verdict) -> Quantity:
+    """What makes the stated covariance that of the errors."""
+    return Quantity(v.inflation, v.inflation_interval, limit=UNCERTAIN, is_factor=True)
+
+
+def shown_inside(v: Verdict) -> Cell:
+    """Whether the ratio of true to stated covariance was shown to lie where it should, and the p value."""
+    shown = v.equivalence
+    if shown is None or not np.isfinite(shown.p_value):
+        return NONE
+    return f"{'yes' if shown.shown else 'no'}, p {p_cell(shown.p_value)}"
+
+
+def _rmse_position(v: Verdict) -> Quantity:
+    return Quantity(v.in_world.accuracy.rmse_position if v.in_world.accuracy else None, digits=".3f")
+
+
+def _rmse_heading(v: Verdict) -> Quantity:
+    accuracy = v.in_world.accuracy
+    return Quantity(np.rad2deg(accuracy.rmse_heading) if accuracy else None, digits=".2f")
+
+
+def _nis(v: Verdict, is_aside: bool = False) -> Quantity:
+    """NIS per degree of freedom, in parentheses where it is not judged."""
+    return Quantity(v.innovations.ratio if v.innovations else None, digits=".3f", is_aside=is_aside)
+
+
+def _nis_expected(v: Verdict) -> Cell:
+    if v.innovations is None or not np.isfinite(v.innovations.ratio):
+        return NONE
+    expected = " to ".join(number(end, ".3f") for end in v.innovations.interval)
+    return f"{v.innovations.ratio:.3f} ({expected if v.innovations.judged else 'not judged'})"
+
+
+def _coverage(v: Verdict) -> Cell:
+    shares = np.empty(0) if v.accuracy is None else v.accuracy.coverage
+    return " / ".join(number(100 * share, ".1f") for share in shares) if np.isfinite(shares).any() else NONE
+
+
+def _failed(v: Verdict) -> Cell:
+    return f"{len(v.failures)} of {v.runs}"
+
 
 FILTER = Column("Filter", width="1.3fr")
-STATUS = Measure(Column("Verdict"), figures.status)
-ANEES = Measure(Column("Mean ANEES", "Mean\nANEES", number=True), figures.mean_anees)
-FACTOR = Measure(Column("Covariance to multiply by", "Covariance to\nmultiply by", number=True), figures.factor)
-BRIEF = (STATUS, ANEES, FACTOR)
+BRIEF = (
+    Measure(Column("Verdict"), lambda v: Status(v.status)),
+    Measure(Column("Mean ANEES", "Mean\nANEES", number=True), _mean_anees),
+    Measure(Column("Covariance to multiply by", "Covariance to\nmultiply by", number=True), factor),
+)
 TERMINAL = (
-    Measure(Column("verdict"), figures.status_and_source),
-    Measure(Column("ANEES", number=True), lambda v: figures.mean_anees(v, ".2f")),
-    Measure(Column("ratio", number=True), figures.ratio),
-    Measure(Column("RMSE m", number=True), figures.rmse_position),
-    Measure(Column("RMSE deg", number=True), figures.rmse_heading),
-    Measure(Column("NIS/dof", number=True), figures.nis),
-    Measure(Column("failed", number=True), figures.failed),
+    Measure(Column("verdict"), lambda v: Status(v.status, " (NIS only)" if v.scale is None else "")),
+    Measure(Column("ANEES", number=True), lambda v: _mean_anees(v, ".2f")),
+    Measure(Column("ratio", number=True), lambda v: Quantity(v.inflation, v.inflation_interval)),
+    Measure(Column("RMSE m", number=True), _rmse_position),
+    Measure(Column("RMSE deg", number=True), _rmse_heading),
+    Measure(Column("NIS/dof", number=True), _nis),
+    Measure(Column("failed", number=True), _failed),
 )
 IN_WORLD = 3  # of these are shown of the additive error, too
 FURTHER = (
-    Measure(Column("Mean ANEES accepted", "Mean ANEES\naccepted", number=True), figures.accepted),
     Measure(
-        Column("Covariance ratio that would be found", "Ratio that\nwould be found", number=True), figures.detectable
+        Column("Mean ANEES accepted", "Mean ANEES\naccepted", number=True),
+        lambda v: " to ".join(map(brief, v.scale.accepted)) if v.scale and np.isfinite(v.scale.accepted[0]) else NONE,
     ),
-    Measure(Column("2-sigma coverage, all steps (%)", "Coverage 2σ (%)\nall steps", number=True), figures.coverage),
-    Measure(Column("Noncredibility (dB)", "Noncredi-\nbility (dB)", number=True), figures.noncredibility),
-    Measure(Column("Inclination (dB)", "Incli-\nnation (dB)", number=True), figures.inclination),
-    Measure(Column("NIS / dof (95 % expected)", "NIS / dof\n(95 % expected)", number=True), figures.nis_expected),
+    Measure(
+        Column("Covariance ratio that would be found", "Ratio that\nwould be found", number=True),
+        lambda v: Quantity(v.scale.detectable if v.scale else None, digits=".2g", is_factor=True),
+    ),
+    Measure(Column("2-sigma coverage, all steps (%)", "Coverage 2σ (%)\nall steps", number=True), _coverage),
+    Measure(
+        Column("Noncredibility (dB)", "Noncredi-\nbility (dB)", number=True),
+        lambda v: Quantity(v.accuracy.nci if v.accuracy else None, digits=".1f"),
+    ),
+    Measure(
+        Column("Inclination (dB)", "Incli-\nnation (dB)", number=True),
+        lambda v: Quantity(v.accuracy.inclination if v.accuracy else None, digits="+.1f"),
+    ),
+    Measure(Column("NIS / dof (95 % expected)", "NIS / dof\n(95 % expected)", number=True), _nis_expected),
 )
 
 
@@ -95,14 +154,23 @@ def page(inside: str) -> tuple[Measure, ...]:
     """Of a report; ``inside`` is where the ratio of consistent filters is shown to be."""
     return (
         *BRIEF,
-        Measure(Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True), figures.shown_inside),
-        Measure(Column("Worst axis", "Worst\naxis", number=True), figures.worst_axis),
-        Measure(Column("Mainly", number=True), figures.mainly),
-        Measure(Column("Since step", "Since\nstep", number=True), figures.since),
-        Measure(Column("RMSE position (m)", "RMSE\n(m)", number=True), figures.rmse_position),
-        Measure(Column("RMSE heading (deg)", "RMSE\n(deg)", number=True), figures.rmse_heading),
-        Measure(Column("NIS / dof", "NIS\n/ dof", number=True), figures.nis_aside),
-        Measure(Column("Failed runs", "Failed\nruns", number=True), figures.failed),
+        Measure(Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True), shown_inside),
+        Measure(
+            Column("Worst axis", "Worst\naxis", number=True),
+            lambda v: f"{v.worst_axis[0]}, {plain(v.worst_axis[1])}" if v.worst_axis else NONE,
+        ),
+        Measure(Column("Mainly", number=True), lambda v: v.subset or NONE),
+        Measure(
+            Column("Since step", "Since\nstep", number=True),
+            lambda v: str(v.location.since) if v.location and v.location.since is not None else NONE,
+        ),
+        Measure(Column("RMSE position (m)", "RMSE\n(m)", number=True), _rmse_position),
+        Measure(Column("RMSE heading (deg)", "RMSE\n(deg)", number=True), _rmse_heading),
+        Measure(
+            Column("NIS / dof", "NIS\n/ dof", number=True),
+            lambda v: _nis(v, is_aside=v.innovations is not None and not v.innovations.judged),
+        ),
+        Measure(Column("Failed runs", "Failed\nruns", number=True), _failed),
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from consistency.referee.diagnostics.wording import short
 from consistency.referee.document.blocks import Answer, Cell, Quantity, Reason, Status
 
+NONE = Quantity(None)
 SMALLEST = 1e-6  # p value below which digits say nothing
 
 

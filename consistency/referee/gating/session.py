@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import tempfile
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from consistency.referee.gating.budget import final_rate
 from consistency.referee.gating.watch import Entry, Terms
 from consistency.referee.gating.wording import fault_text, few_to_compare
+from consistency.referee.show import FORMATS
 
 PROPERTY = "consistency"  # of a test, one a gate: JSON without the statistics
 STATISTICS = "consistency_statistics"  # attribute of its reports: of every gate, as JSON
@@ -135,3 +139,21 @@ def outcome(e: Entry) -> str:
 def wanted(e: Entry) -> bool:
     """The gate did not pass, and its test did."""
     return e.outcome != "passed" and e.test_outcome == "passed"
+
+
+def refusal(path: Path) -> str:
+    """Why a report cannot be written there, and what to do; '' if it can."""
+    if path.suffix.lower() not in FORMATS:
+        return f"--consistency-report {path}: must end in {' or '.join(FORMATS)}"
+    if path.is_dir():
+        return f"--consistency-report {path}: is a folder; name a file in it"
+    if not path.parent.is_dir():
+        return f"--consistency-report {path}: the folder {path.parent} does not exist; make it first"
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        return f"--consistency-report {path}: cannot be written ({error.strerror}); name another file"
+    return ""

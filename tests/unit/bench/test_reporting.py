@@ -42,11 +42,10 @@ from consistency.referee.diagnostics import Answer, Evidence, Interval, Settings
 from consistency.referee.diagnostics.questions import DIRECTION, STEP
 from consistency.referee.diagnostics.records import STATUSES
 from consistency.referee.diagnostics.wording import short
-from consistency.referee.document import figures
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.drawing import Figure, Intervals, Line, Points, Span
 from consistency.referee.document.thin import thin
-from consistency.referee.document.verdict import FURTHER, page
+from consistency.referee.document.verdict import FURTHER, factor, page, shown_inside
 from consistency.referee.document.wording import written
 from consistency.referee.pages.clock import clock_of
 from consistency.referee.reading.columns import COVARIANCE
@@ -252,9 +251,9 @@ def test_an_interval_that_says_nothing_is_shown_as_such(report, ends):
     (study,) = report.studies
     track = study.tracks[0]
     scale = replace(track.verdict.scale, inflation=Interval(2.5, *ends))
-    assert written(figures.factor(replace(track.verdict, scale=scale))) == "×2.50 [unknown]"
+    assert written(factor(replace(track.verdict, scale=scale))) == "×2.50 [unknown]"
     scale = replace(scale, inflation=Interval(2.5, 1.5, 4.0))
-    assert written(figures.factor(replace(track.verdict, scale=scale))) == "×2.50 [1.50, 4.00]"
+    assert written(factor(replace(track.verdict, scale=scale))) == "×2.50 [1.50, 4.00]"
 
 
 def test_the_diagnosis_is_what_the_verdict_holds(report):
@@ -404,10 +403,10 @@ def test_every_status_is_shown_with_its_meaning(report):
 
 def test_consistent_has_been_shown_and_undecided_says_what_would_decide(report):
     tracks = every_status(report.studies[0].tracks[0])
-    assert written(figures.shown_inside(tracks["consistent"].verdict)).startswith("yes, p ")
-    assert written(figures.shown_inside(tracks["overconfident"].verdict)) == "no, p 1"
+    assert written(shown_inside(tracks["consistent"].verdict)).startswith("yes, p ")
+    assert written(shown_inside(tracks["overconfident"].verdict)) == "no, p 1"
     shown = tracks["undecided"].verdict.scale.equivalence
-    assert written(figures.shown_inside(tracks["undecided"].verdict)) == f"no, p {shown.p_value:.2g}"
+    assert written(shown_inside(tracks["undecided"].verdict)) == f"no, p {shown.p_value:.2g}"
     sentence = tracks["undecided"].verdict.reasons[0]
     assert f"{shown.runs} such runs would probably decide" in sentence
     assert f"[{short(tracks['undecided'].verdict.inflation_interval[0])}, " in sentence
@@ -507,8 +506,8 @@ def test_without_truth_only_a_declared_optimal_gain_is_put_to_the_test(report):
     assert "no filter can be judged: the truth is not known, and none declares an optimal gain" in text(unknown)
     assert "test of the innovations" not in text(unknown)
     assert unknown.verdict.status == "undecided"
-    assert written(figures.shown_inside(unknown.verdict)) == "–"
-    assert written(figures.shown_inside(good.verdict)).startswith("yes")
+    assert written(shown_inside(unknown.verdict)) == "–"
+    assert written(shown_inside(good.verdict)).startswith("yes")
     study = replace(report.studies[0], tracks=(unknown,))
     assert "reported and not judged" in no_truth.note(study)
     assert "all that can be judged" in no_truth.note(replace(study, tracks=(good, unknown)))

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from consistency.referee.diagnostics import gate_runs
 from consistency.referee.gating.budget import FIRST, final_rate, in_place_rate
-from consistency.referee.gating.report import refusal
+from consistency.referee.gating.session import refusal
 
 SAMPLES = '''
 import numpy as np

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,13 +17,12 @@ from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stre
 import consistency as cs
 from consistency.referee.cli import main as command
 from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.independence import ENOUGH
-from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error, spatial_error
-from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
+from consistency.referee.geometry.groups import carried, composed, matrices, to_left
 from consistency.referee.notebook.records import Record
 from consistency.referee.sources.relative import Stretch, windows_of
-from consistency.referee.sources.windows import Relative, relative_of, windows
-from consistency.referee.system.provenance import plain
+from consistency.referee.sources.windows import Relative
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline_of_files
 from consistency.referee.verdicts.comparison import compare_with
@@ -40,87 +38,6 @@ def main(arguments: list[str]) -> int:
     with pytest.raises(SystemExit) as end:
         command(arguments)
     return int(end.value.code or 0)
-
-
-def random_poses(rng: np.random.Generator, group: str, number: int) -> Array:
-    return exp(rng.normal(size=(number, len(AXES[group]))))
-
-
-def error_of(group: str, truth: Array, estimate: Array, convention: str) -> Array:
-    of = planar_error if group == "SE(2)" else spatial_error
-    return of(vectors(truth), vectors(estimate), convention)
-
-
-# --- groups ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("group", GROUPS)
-def test_matrices_inverse_log_and_adjoint(group: str, rng: np.random.Generator) -> None:
-    T, U = random_poses(rng, group, 20), random_poses(rng, group, 20)
-    np.testing.assert_allclose(matrices(vectors(T)), T, atol=1e-12)
-    np.testing.assert_allclose(inverse(T) @ T, np.broadcast_to(np.eye(T.shape[-1]), T.shape), atol=1e-12)
-    np.testing.assert_allclose(exp(log(T)), T, atol=1e-9)
-    e = 0.1 * rng.normal(size=(20, len(AXES[group])))
-    moved = np.einsum("nij,nj->ni", adjoint(T), e)
-    np.testing.assert_allclose(T @ exp(e) @ inverse(T), exp(moved), atol=1e-9)
-    np.testing.assert_allclose(adjoint(T) @ adjoint(U), adjoint(T @ U), atol=1e-9)
-    np.testing.assert_allclose(composed(np.stack([T[0], U[0], T[1]]))[2], T[0] @ U[0] @ T[1], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("group", "convention"), [("SE(2)", c) for c in PLANAR if c != "vector"] + [("SE(3)", c) for c in SPATIAL]
-)
-def test_every_convention_becomes_the_left_error(group: str, convention: str, rng: np.random.Generator) -> None:
-    T = random_poses(rng, group, 10)
-    truth = T @ exp(1e-6 * rng.normal(size=(10, len(AXES[group]))))
-    left, own = (error_of(group, truth, T, c) for c in ("left", convention))
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", to_left(T, convention), own), left, atol=1e-10)
-
-
-# --- covariances, by finite differences --------------------------------------------------------------
-
-
-def numerical(of: Callable[[Array], Array], n: int, step: float = 1e-6) -> Array:
-    """Jacobian of a function of (n,) at zero, by central differences."""
-    return np.stack([(of(step * u) - of(-step * u)) / (2.0 * step) for u in np.eye(n)], axis=-1)
-
-
-@pytest.mark.parametrize("group", GROUPS)
-def test_motions_make_up_the_covariance_of_a_window(group: str, rng: np.random.Generator) -> None:
-    simulated, n, size = drive(rng, group, 8), len(AXES[group]), 4
-    found = windows_of(motion_stretch(simulated), Relative(size, "step", True, True))
-    assert len(found.t) == 2
-    for window in range(2):
-        D = simulated.motions[window * size : (window + 1) * size]
-
-        def end(e: Array, D: Array = D) -> Array:
-            return log(inverse(composed(D)[-1:]) @ composed(D @ exp(e.reshape(size, n)))[-1:])[0]
-
-        J = numerical(end, size * n)
-        S = np.kron(np.eye(size), simulated.covariance[0])
-        np.testing.assert_allclose(found.covariance[window], J @ S @ J.T, rtol=1e-6, atol=1e-11)
-        true = inverse(simulated.truth[window * size]) @ simulated.truth[(window + 1) * size]
-        np.testing.assert_allclose(found.error[window], log(inverse(composed(D)[-1]) @ true[None])[0], atol=1e-10)
-
-
-@pytest.mark.parametrize("group", GROUPS)
-def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group: str, rng: np.random.Generator) -> None:
-    stretch, n, kind = pose_stretch(rng, group, 3, 5, 1.0, 0), len(AXES[group]), DECLARED[group]
-    found = windows_of(stretch, Relative(1, "step"))
-    T = matrices(stretch.estimate)
-    for k in (1, 2):
-
-        def window(e: Array, k: int = k) -> Array:
-            both = np.stack([e[:n], e[n:]])
-            moved = T[k - 1 : k + 1] @ exp(np.einsum("nij,nj->ni", to_left(T[k - 1 : k + 1], kind), both))
-            return log(inverse(inverse(T[k - 1]) @ T[k])[None] @ (inverse(moved[0]) @ moved[1]))[0]
-
-        J = numerical(window, 2 * n)
-        assert stretch.cross is not None
-        joint = np.block(
-            [[stretch.covariance[k - 1], stretch.cross[k]], [stretch.cross[k].T, stretch.covariance[k]]]
-        )  # fmt: skip
-        np.testing.assert_allclose(found.covariance[k - 1], J @ joint @ J.T, rtol=1e-6, atol=1e-10)
 
 
 # --- frames ------------------------------------------------------------------------------------------
@@ -185,63 +102,6 @@ def test_another_world_of_either_changes_no_number_of_poses(group: str, rng: np.
     same(statistics(runs, "1", False), statistics(turned, "1", False))
 
 
-# --- windows -------------------------------------------------------------------------------------------
-
-
-def test_windows_in_steps_seconds_and_metres() -> None:
-    t, rows = np.arange(11) * 0.5, np.arange(11)
-    place = np.column_stack([np.cumsum([0, 1, 1, 1, 3, 1, 1, 1, 1, 1, 1.0]), np.zeros(11)])
-
-    def cut(text: str) -> list[tuple[int, int]]:
-        relative = relative_of(text)
-        assert relative is not None
-        first, last, _ = windows(t, place, rows, relative, "f")
-        return list(zip(first.tolist(), last.tolist(), strict=True))
-
-    assert cut("4") == [(0, 4), (4, 8)]
-    assert cut("2s") == [(0, 4), (4, 8)]
-    assert cut("1.2s") == [(0, 3), (3, 6), (6, 9)]
-    assert cut("3m") == [(0, 3), (3, 4), (4, 7), (7, 10)]
-
-
-def test_a_window_over_missing_rows_is_left_out() -> None:
-    rows = np.array([0, 2, 4, 9, 11, 13])
-    first, last, left_out = windows(np.arange(14.0), np.zeros((6, 2)), rows, Relative(2, "s"), "f")
-    assert (first.tolist(), last.tolist(), left_out) == ([0, 2, 9, 11], [2, 4, 11, 13], 1)
-
-
-def test_rows_without_truth_change_no_other_window(rng: np.random.Generator) -> None:
-    stretch, size = motion_stretch(drive(rng, "SE(2)", 12)), Relative(2, "step", True, True)
-    there = np.delete(np.arange(13), 3)
-    whole, some = windows_of(stretch, size), windows_of(replace(stretch, rows=there, truth=stretch.truth[there]), size)
-    same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.start[:, None] == some.start))
-    assert len(here) >= 4
-    np.testing.assert_array_equal(some.error[here], whole.error[same])
-    np.testing.assert_array_equal(some.covariance[here], whole.covariance[same])
-
-
-def test_time_on_a_common_clock_of_1970_is_no_matter_of_rounding() -> None:
-    t = 1.7e9 + np.arange(101) * 0.1
-    first, last, _ = windows(t, np.zeros((101, 2)), np.arange(101), Relative(1, "s"), "f")
-    assert (last - first == 10).all()
-    assert len(first) == 10
-
-
-@pytest.mark.parametrize("text", ["0", "-1", "1.5", "ten", "10h", "nan", "inf", "1e", "s", ""])
-def test_sizes_that_are_none(text: str) -> None:
-    with pytest.raises(cs.InputError, match="must be a whole number of steps"):
-        relative_of(text)
-
-
-@pytest.mark.parametrize(
-    ("text", "shown"), [("100", "100 steps"), ("1", "1 step"), ("10s", "10 s"), ("0.5 m", "0.5 m")]
-)
-def test_sizes_as_they_are_shown(text: str, shown: str) -> None:
-    relative = relative_of(text)
-    assert relative is not None
-    assert relative.text == shown
-
-
 # --- verdicts --------------------------------------------------------------------------------------------
 
 
@@ -275,51 +135,6 @@ def test_declared_windows_are_runs(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
 
 
-@pytest.mark.parametrize("row", [1, 7, 12, 29])
-def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> None:
-    stretch = motion_stretch(drive(rng, "SE(3)", 29))
-    stretch.estimate[row] = np.nan
-    record = recorded([stretch], "5", True)
-    assert [f.reason for f in record.failures] == [f"estimate is not finite (row {row})"]
-    found = windows_of(stretch, Relative(5, "step", True))
-    assert (found.start[-1], found.t[-1]) == (stretch.t[row - 1], stretch.t[row])
-    verdict = analyse_recordings([record])["log"]
-    assert verdict.runs == (row - 1) // 5 + 1
-    assert verdict.status != "consistent"
-    assert any(f"1 of {verdict.runs} windows failed, first window {verdict.runs}: " in r for r in verdict.reasons)
-
-
-def test_a_covariance_that_is_not_finite_is_named(rng: np.random.Generator) -> None:
-    stretch = motion_stretch(drive(rng, "SE(2)", 20))
-    stretch.covariance[8, 0, 0] = np.inf
-    assert recorded([stretch], "5", True).failures[0].reason == "covariance is not finite (row 8)"
-    found = windows_of(stretch, Relative(5, "step", True))
-    np.testing.assert_array_equal(found.error[-1], 0.0)
-    assert np.isnan(found.covariance[-1]).all()
-
-
-def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
-    for group in GROUPS:
-        stretch = pose_stretch(rng, group, 6, 5, 1.0, 0)
-        stretch.estimate[0] = np.nan
-        record = recorded([stretch], "1", False)
-        assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
-        assert windows_of(stretch, Relative(1, "step")).start.tolist() == [stretch.t[0]]
-        assert analyse_recordings([record])["log"].status == "failed"
-
-
-def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None:
-    """Errors of a bias of three sigma, and of a noisy truth: certain but for 1e-5."""
-    simulated = drive(rng, "SE(2)", 200)
-    biased = simulated.motions @ exp(np.array([[0.1, 0.0, 0.0]]) + 0.01 * rng.normal(size=(200, 3)))
-    truth = composed(np.concatenate([np.eye(3)[None], biased]))
-    notes = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True).notes
-    assert any("neighbouring windows go the same way" in note for note in notes)
-    jitter = simulated.truth @ exp(rng.normal(size=(201, 3)) * [0.3, 0.3, 0.0])
-    notes = recorded([motion_stretch(replace(simulated, truth=jitter))], "1", True).notes
-    assert any("neighbouring windows go opposite ways" in note for note in notes)
-
-
 def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Evidence:
     """Independent windows of poses, by declaration only; true errors are 3 times what is stated."""
     runs = [pose_stretch(rng, "SE(2)", steps + 1, 5, 9.0, run) for run in range(windows // steps)]
@@ -347,38 +162,12 @@ def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
         compare_with(base, base, [])
 
 
-def test_motions_are_judged_however_few(rng: np.random.Generator) -> None:
-    assert recorded([motion_stretch(drive(rng, "SE(2)", 20))], "1", True).unshown == ""
-
-
 def test_a_failed_window_stays_failed(rng: np.random.Generator) -> None:
     stretch = pose_stretch(rng, "SE(2)", 30, 5, 1.0, 0)
     stretch.estimate[20] = np.nan
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), relative)
     assert analyse_recordings([record])["log"].status == "failed"
-
-
-def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng: np.random.Generator) -> None:
-    """True motions that err by 0.2 or 5 sigma for 50 windows at a time: certain but for 1e-5."""
-    simulated = drive(rng, "SE(2)", 400)
-    n = 3
-    root = np.linalg.cholesky(simulated.covariance[0])
-    size = np.where(np.arange(400) // 50 % 2, 5.0, 0.2)[:, None]
-    moved = simulated.motions @ exp(size * rng.normal(size=(400, n)) @ root.T)
-    truth = composed(np.concatenate([np.eye(3)[None], moved]))
-    record = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True)
-    assert any("errors of neighbouring windows are of like size" in note for note in record.notes)
-    verdict = analyse_recordings([record])["log"]
-    assert verdict.reasons[0].endswith("the motions do not seem to be independent, on which this rests")
-    plain_one = recorded([motion_stretch(drive(rng, "SE(2)", 19))], "1", True)
-    assert (plain_one.caption, plain_one.unshown) == ("", "")
-
-
-def test_windows_too_wide_for_first_order_are_named(rng: np.random.Generator) -> None:
-    simulated = drive(rng, "SE(2)", 200, sigma=np.array([0.01, 0.01, 0.05]))
-    assert any("to first order is doubtful" in note for note in recorded([motion_stretch(simulated)], "50", True).notes)
-    assert not any("first order" in note for note in recorded([motion_stretch(simulated)], "1", True).notes)
 
 
 # --- files -----------------------------------------------------------------------------------------------

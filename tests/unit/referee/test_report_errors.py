@@ -15,7 +15,7 @@ from consistency.bench.pages.model import Study
 from consistency.bench.pages.sections import anees, maps, own_errors, verdicts
 from consistency.referee.diagnostics import Interval, MapScore
 from consistency.referee.document.blocks import Cell, Name, Quantity, Status, Table
-from consistency.referee.document.figures import rmse_position
+from consistency.referee.document.verdict import page
 from consistency.referee.document.wording import brief, written
 
 
@@ -65,7 +65,8 @@ def test_captions_name_the_filters_with_an_error_of_their_own(study: Study) -> N
 
 def test_the_rmse_is_that_of_the_pose_in_the_world(study: Study) -> None:
     track = study.tracks[1]
-    cell = written(rmse_position(track.verdict))
+    [measure] = [m for m in page("") if m.column.head == "RMSE position (m)"]
+    cell = written(measure.cell(track.verdict))
     assert cell == f"{track.verdict.world.accuracy.rmse_position:.3f}"
     assert cell != f"{track.verdict.accuracy.rmse_position:.3f}", "negative control"
 

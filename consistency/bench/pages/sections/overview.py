@@ -11,9 +11,8 @@ from consistency.bench.pages.section import OPENING, Section
 from consistency.referee.diagnostics import Interval
 from consistency.referee.document.blocks import Block, Column, Name, Table, table
 from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span, dodge
-from consistency.referee.document.figures import factor
 from consistency.referee.document.looks import EXPECTED, SHADE, solid
-from consistency.referee.document.verdict import BRIEF, cells, columns
+from consistency.referee.document.verdict import BRIEF, cells, columns, factor
 from consistency.referee.document.wording import written
 
 TITLE = "Which filter tells the truth about its uncertainty, and where?"

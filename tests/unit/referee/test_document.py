@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.document import figures
 from consistency.referee.document.blocks import (
     Answer,
     Bullets,
@@ -188,4 +187,3 @@ def test_a_verdict_prints_itself_by_the_renderers() -> None:
     v = verdict_of(2.0)
     assert str(v).splitlines()[0] == f"f is {v.reasons[0]}"
     assert v._repr_html_().startswith(f"<div><p><strong>f</strong> is {v.reasons[0]}</p><table>")
-    assert written(figures.nis(v), PLAIN) == "-"

@@ -33,7 +33,7 @@ from calibration_rows import CONFIDENCE, Row, document, kept, write_docs
 from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
 
 import consistency as cs
-from consistency.bench.store.curves import curves
+from consistency.bench.runs.records import record_of
 from consistency.referee.diagnostics import (
     Evidence,
     Settings,
@@ -211,7 +211,7 @@ def _kalman_runs(count: int, seed: int, folder: Path) -> Path:
     for chunk in range(-(-count // CHUNK)):
         runs = min(CHUNK, count - chunk * CHUNK)
         of_chunk = int(np.random.default_rng((seed, chunk)).integers(2**31))
-        c = curves(cs.run_trials(scenario, ["kf"], runs=runs, seed=of_chunk), "kf")
+        c = record_of(cs.run_trials(scenario, ["kf"], runs=runs, seed=of_chunk), "kf")
         assert c.error is not None
         covariance = np.asarray(c.covariance)
         assert (covariance == covariance[0]).all()

@@ -28,7 +28,7 @@ from consistency.referee.sources.relative import Stretch, relative_recording
 from consistency.referee.sources.sheet import Places
 from consistency.referee.sources.windows import relative_of
 from consistency.referee.types import Array
-from consistency.referee.verdicts.files import analyse_recordings
+from consistency.referee.verdicts.judge import analyse
 
 DT, SPEED = 0.1, 1.5  # s, m/s
 TURN = 0.03  # rad a step, and its spread
@@ -133,7 +133,7 @@ def recorded(stretches: list[Stretch], size: str, motions: bool) -> Evidence:
 
 
 def verdict_on(record: Evidence) -> Verdict:
-    return analyse_recordings([record])["log"]
+    return analyse([record])["log"]
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics import Comparison, Verdict, gate_runs
+from consistency.referee.diagnostics import Comparison, Record, Settings, Verdict, gate_runs, judge
 from consistency.referee.diagnostics.comparison import FEWEST
-from consistency.referee.gating.checks import Arrays, Candidate, evidence, of_results
+from consistency.referee.gating.checks import checked, of_results, planned_dof
 from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
 from consistency.referee.gating.watch import DEFAULTS, Entry, Terms, current, terms
 from consistency.referee.gating.wording import fault_text, few_to_compare, undecided_text
 
 if TYPE_CHECKING:
-    from consistency.bench.store.results import Results
     from consistency.referee.verdicts.baselines import Baseline
+    from consistency.referee.verdicts.sources import Results
 
 
 class ConsistencyError(AssertionError):
@@ -116,23 +116,25 @@ def assert_consistent(
     }  # fmt: skip
     if filter is not None or hasattr(errors, "estimates"):
         _refuse(arrays, "results bring their own")
-        candidate = of_results(cast("Results", errors), filter, name, subsets, method, skip)
+        record = of_results(cast("Results", errors), filter, name, skip)
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
-        unchecked = Arrays(cast(ArrayLike, errors), **arrays)
-        candidate = evidence(name or "the estimator", unchecked, subsets, method, optimal_gain, skip)
+        record = checked(
+            name or "the estimator", cast(ArrayLike, errors), **arrays, subsets=subsets, optimal_gain=optimal_gain,
+            skip=skip,
+        )  # fmt: skip
 
     def look(rate: float) -> _Look:
-        verdict = candidate.judge(rate, demand)
-        sure = bool(candidate.failures) or verdict.status == "failed"
+        verdict = judge(record, _settings(rate, demand, subsets, method))
+        sure = bool(record.failures) or verdict.status == "failed"
         bad = verdict.status not in ("consistent", "undecided")
         return _Look(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
-        return gate_runs(candidate.planned_dof, demand.detect, rate, demand.power, demand.allow, demand.lost)
+        return gate_runs(planned_dof(record), demand.detect, rate, demand.power, demand.allow, demand.lost)
 
-    result = _settle("assert_consistent", candidate, demand, look, needed)
+    result = _settle("assert_consistent", record, demand, look, needed)
     assert result.verdict is not None
     return result.verdict
 
@@ -198,9 +200,10 @@ def assert_not_worse(
             raise ValueError("than and reference need results in place of errors_a")
         if nees_a is not None and dof is None:
             dof = current().marked.get("dof")
-        a = Arrays(cast(ArrayLike, errors_a), covariances_a, nees_a, dof, axes=axes)
-        b = Arrays(errors_b, covariances_b, nees_b, dof, axes=axes)
-        sides = of_arrays(name or "the candidate", a, b, skip)
+        both: dict[str, Any] = {"dof": dof, "axes": axes, "skip": skip}
+        a = {"errors": errors_a, "covariances": covariances_a, "nees": nees_a, **both}
+        b = {"errors": errors_b, "covariances": covariances_b, "nees": nees_b, **both}
+        sides = of_arrays(name or "the candidate", a, b)
     return _compare(sides, demand)
 
 
@@ -209,7 +212,7 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
     if sides.usable_runs < FEWEST:
         if sides.failed_more:
             fault = f"worse than {sides.name_b}: {sides.failures.a} runs failed, of {sides.name_b} {sides.failures.b}"
-            verdict = sides.candidate.judge(demand.false_alarm, demand)
+            verdict = judge(sides.candidate, _settings(demand.false_alarm, demand))
             raise ConsistencyError(fault_text("assert_not_worse", sides.candidate.name, [fault]), verdict)
         raise InsufficientTrials(
             f"assert_not_worse: {sides.usable_runs} runs are too few for a standard error; simulate {FEWEST} at least",
@@ -249,31 +252,38 @@ class _Look:
 
 
 def _settle(
-    gate: str, candidate: Candidate, demand: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
+    gate: str, record: Record, demand: Terms, look: Callable[[float], _Look], needed: Callable[[float], int]
 ) -> _Look:
     """Record the result of a gate, and raise if it is already decided."""
     __tracebackhide__ = True
     result, late = look(demand.false_alarm), None
+    runs, dof = len(record.run_numbers), planned_dof(record)
     fault = result.bad and (demand.may_fail or result.sure)
     if not fault and demand.budget is not None and result.p_value <= demand.budget:
         late = look(max(result.p_value, 1e-300))  # in case the end of the session finds it
     least = needed(demand.planned)
-    few = not fault and (candidate.runs < least if result.verdict is None else result.status == "undecided")
+    few = not fault and (runs < least if result.verdict is None else result.status == "undecided")
     outcome = "fault found" if fault else "too few runs" if few else "passed"
     if few:  # ask for what is enough at the end of the session too, and for more than there are
-        least = max(needed(demand.false_alarm), _deciding(result, candidate.runs))
-    current().keep(_entry(gate, candidate, demand, result, late, outcome, least))
+        least = max(needed(demand.false_alarm), _deciding(result, runs))
+    current().keep(_entry(gate, record, demand, result, late, outcome, least))
     if fault:
-        verdict = result.verdict or candidate.judge(demand.false_alarm, demand)
-        raise ConsistencyError(fault_text(gate, candidate.name, result.reasons), verdict, result.comparison)
+        verdict = result.verdict or judge(record, _settings(demand.false_alarm, demand))
+        raise ConsistencyError(fault_text(gate, record.name, result.reasons), verdict, result.comparison)
     if few:
         if result.verdict is None:
-            text = few_to_compare(gate, candidate.name, candidate.runs, least, demand)
+            text = few_to_compare(gate, record.name, runs, least, demand)
         else:
-            text = undecided_text(gate, candidate.name, result.reasons[0], least, candidate.planned_dof, demand)
-            text += _marker_text(candidate.planned_dof, candidate.runs)
-        raise InsufficientTrials(text, least, candidate.runs, result.verdict)
+            text = undecided_text(gate, record.name, result.reasons[0], least, dof, demand)
+            text += _marker_text(dof, runs)
+        raise InsufficientTrials(text, least, runs, result.verdict)
     return result
+
+
+def _settings(
+    rate: float, demand: Terms, subsets: Mapping[str, Sequence[int]] | None = None, method: str = "max"
+) -> Settings:
+    return Settings(rate, demand.detect, demand.power, demand.tolerance, demand.allow, method, subsets, demand.lost)
 
 
 def _marker_text(dof: int, runs: int) -> str:
@@ -297,7 +307,7 @@ def _deciding(result: _Look, runs: int) -> int:
 
 
 def _entry(
-    gate: str, candidate: Candidate, demand: Terms, result: _Look, late: _Look | None, outcome: str, least: int
+    gate: str, record: Record, demand: Terms, result: _Look, late: _Look | None, outcome: str, least: int
 ) -> Entry:
     statistics = result.verdict.statistics if result.verdict is not None else {}
     fields = _summary(result)
@@ -307,10 +317,10 @@ def _entry(
         fields["spread"] = {key: value for key, value in spread.items() if np.isfinite(value)}
         statistics = {"differences": [vars(d) for d in c.differences]}
     return Entry(
-        gate=gate, name=candidate.name, outcome=outcome, p_value=_finite(result.p_value),
+        gate=gate, name=record.name, outcome=outcome, p_value=_finite(result.p_value),
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
-        runs=candidate.runs, needed=least, dof=candidate.planned_dof, detect=demand.detect, power=demand.power,
+        runs=len(record.run_numbers), needed=least, dof=planned_dof(record), detect=demand.detect, power=demand.power,
         allow=demand.allow, lost=demand.lost, late={} if late is None else _summary(late), statistics=statistics,
         **fields,
     )  # fmt: skip

@@ -32,7 +32,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(?!consistency[.:]).*"),  # types and modules of others, or an alias of arrays
     (
         r"py:class",
-        r"consistency\..*\.(Backend|Curves|DisparityGrowth|Group|Lens|Moments|Observations|Parts|Space|Sweep|Tables)",
+        r"consistency\..*\.(Backend|DisparityGrowth|Group|Lens|Moments|Observations|Parts|Space|Sweep|Tables)",
     ),  # in signatures, not public
     (r"py:class", r"consistency\.imaging\.\w+\.(Correspondence|Filter|Selection|Tracking)"),  # stages of the chain
 ]

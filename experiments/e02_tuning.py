@@ -7,7 +7,6 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.findings import script
-from consistency.bench.store.curves import Curves
 from consistency.referee.diagnostics.coverage import TWO_SIGMA
 
 FINDINGS = ("fig2b", "fig2c")
@@ -58,17 +57,17 @@ def main(study: cs.Study) -> list[cs.Finding]:
     ]
 
 
-def inside(curves: Curves) -> np.ndarray:
+def inside(curves: cs.Record) -> np.ndarray:
     """Share of judged steps within 2 sigma, for each run and axis, shape (runs, 3); 0 after a failure."""
     assert curves.error is not None
     assert curves.nees is not None
-    sigma = np.sqrt(np.diagonal(curves.covariance, axis1=-2, axis2=-1))
+    sigma = np.sqrt(np.diagonal(np.asarray(curves.covariance), axis1=-2, axis2=-1))
     deficient = np.isfinite(curves.error).all(axis=-1) & ~np.isfinite(curves.nees)
     within = np.nan_to_num(np.abs(curves.error), nan=np.inf) <= 2 * np.nan_to_num(sigma)
     return np.asarray((within & ~deficient[..., None]).sum(axis=1) / (~deficient).sum(axis=1)[:, None])
 
 
-def bound(curves: Curves, side: str) -> np.ndarray:
+def bound(curves: cs.Record, side: str) -> np.ndarray:
     """One-sided confidence bound of the mean share for each axis; NaN, which passes no rule, with one run."""
     shares, sign = inside(curves), {"lower": -1.0, "upper": 1.0}[side]
     if len(shares) < 2:
@@ -77,7 +76,7 @@ def bound(curves: Curves, side: str) -> np.ndarray:
     return np.asarray(shares.mean(axis=0) + sign * stats.t.ppf(1 - LEVEL, len(shares) - 1) * error)
 
 
-def shares(curves: Curves) -> str:
+def shares(curves: cs.Record) -> str:
     """The shares and their one-sided bounds in words."""
     rows = zip(
         ("x", "y", "heading"), inside(curves).mean(axis=0), bound(curves, "lower"), bound(curves, "upper"), strict=True

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import consistency as cs
+from consistency.bench.runs.by_run import run_means, wins
 from consistency.bench.runs.findings import script
-from consistency.bench.store.curves import Curves, run_means, wins
 
 FINDINGS = ("fig11b", "fig13a", "fig13b", "consistent-stereo")
 
@@ -89,7 +89,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     ]
 
 
-def removed(ekf: Curves, ukf: Curves, seed: int) -> tuple[float, float, float]:
+def removed(ekf: cs.Record, ukf: cs.Record, seed: int) -> tuple[float, float, float]:
     """Share of the median run's excess NEES that the UKF removes, with a 95 % bootstrap interval over paired runs."""
     pairs = np.column_stack([run_means(ekf), run_means(ukf)])
     drawn = np.random.default_rng(seed).integers(len(pairs), size=(2000, len(pairs)))
@@ -99,7 +99,7 @@ def removed(ekf: Curves, ukf: Curves, seed: int) -> tuple[float, float, float]:
     return float(gains[0]), float(low), float(high)
 
 
-def said(verdict: cs.Verdict, curves: Curves) -> str:
+def said(verdict: cs.Verdict, curves: cs.Record) -> str:
     """Filter, verdict, and mean NEES over all, in the median and in the worst run, in words."""
     runs, accuracy = run_means(curves), verdict.accuracy
     assert accuracy is not None

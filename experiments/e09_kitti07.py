@@ -29,7 +29,7 @@ from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
-from consistency.bench.store.curves import curves
+from consistency.bench.runs.records import record_of
 from consistency.bench.store.log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
@@ -140,20 +140,21 @@ class Measured:
 
 def measured(results: Results, name: str) -> Measured:
     """Statistics of the one run of filter ``name``."""
-    c = curves(results, name)
+    c = record_of(results, name)
     assert c.error is not None
     assert c.nees is not None
     error, P, nees = c.error[0, SETTLED:], np.asarray(c.covariance)[0, SETTLED:], c.nees[0, SETTLED:]
     bound = anees_interval(3, 1, 1 - 2 * ALARM / len(nees))[1]  # one-sided
     outside = np.abs(error) > 2 * np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    dof = int(c.nis_dof[np.isfinite(c.nis)].sum())
+    nis = np.asarray(c.nis)
+    dof = int(np.asarray(c.nis_dof)[np.isfinite(nis)].sum())
     far = np.hypot(*c.error[0, :, :2].T)
     return Measured(
         nees=float("inf") if c.failures else float(nees.mean()) / 3,
         above=int((nees > bound).sum()),
         covered=coverage(error, P),
         left=[SETTLED + 1 + int(np.argmax(axis)) if axis.any() else 0 for axis in outside.T],
-        nis=float(np.nansum(c.nis)) / dof,
+        nis=float(np.nansum(nis)) / dof,
         nis_low=chi2_mean_interval(dof)[0],
         sigma_heading=float(np.sqrt(P[-1, 2, 2])),
         last=float(far[-1]),

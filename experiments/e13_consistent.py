@@ -13,9 +13,10 @@ import consistency as cs
 from consistency.bench.filters.methods.robocentric import PARKED, compiled
 from consistency.bench.filters.textbook.inverse_range import Corrections
 from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
+from consistency.bench.runs.by_run import log_rmse
 from consistency.bench.runs.findings import script, sibling
+from consistency.bench.runs.records import record_of
 from consistency.bench.scenario import UniformLandmarks
-from consistency.bench.store.curves import curves, log_rmse
 from consistency.referee.terminal.progress import each
 
 FINDINGS = (
@@ -256,9 +257,9 @@ def accuracy(study: cs.Study) -> cs.Finding:
     for cell in asked:
         names = [PARKED.name, *RIVALS]
         results = cs.run_trials(cell.scenario(), names, study.runs, study.seed, study.jobs)
-        ours = log_rmse(curves(results, PARKED.name), (0, 1))
+        ours = log_rmse(record_of(results, PARKED.name), (0, 1))
         for name in RIVALS:
-            theirs = log_rmse(curves(results, name), (0, 1))
+            theirs = log_rmse(record_of(results, name), (0, 1))
             both = np.isfinite(ours) & np.isfinite(theirs)
             enough = both.sum() > 1
             p = float(ttest_rel(ours[both], theirs[both], alternative="greater").pvalue) if enough else np.nan

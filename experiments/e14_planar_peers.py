@@ -100,7 +100,7 @@ def worlds(name: str) -> list[cs.Scenario]:
 
 def of_runs(study: cs.Study, world: cs.Scenario, name: str) -> Array:
     """NEES and mean square errors of position and heading of each run, (R, 3)."""
-    _, c = study.judged(world, name)
+    c = study.judged(world, name)[1].in_world
     assert c.error is not None
     assert c.nees is not None
     square = np.square(c.error[:, SKIPPED:])

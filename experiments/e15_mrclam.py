@@ -24,7 +24,7 @@ import consistency as cs
 from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
-from consistency.bench.store.curves import Curves, curves
+from consistency.bench.runs.records import record_of
 from consistency.bench.store.log import Log, write_log
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
@@ -89,7 +89,7 @@ def measure(study: cs.Study, logs: dict[str, Drive]) -> list[cs.Finding]:
         print(f"{name}: {', '.join(FILTERS)}", file=sys.stderr, flush=True)
         results = study.kept[name] = run_log(drive.log, FILTERS, study.jobs)
         verdicts = cs.analyse(results)
-        here = [row(name, filter_, verdicts[filter_], curves(results, filter_)) for filter_ in FILTERS]
+        here = [row(name, filter_, verdicts[filter_], record_of(results, filter_).in_world) for filter_ in FILTERS]
         rows += here
         findings.append(finding(study, name, drive, here))
     study.tables["mrclam"] = pd.DataFrame(rows)
@@ -108,13 +108,14 @@ class Row(NamedTuple):
     heading: float  # RMSE, rad
 
 
-def row(name: str, filter_: str, verdict: cs.Verdict, c: Curves) -> Row:
+def row(name: str, filter_: str, verdict: cs.Verdict, c: cs.Record) -> Row:
     """Averages over one drive."""
     assert c.error is not None
     assert c.nees is not None
     nees = np.inf if c.failures else float(np.nanmean(c.nees)) / 3
     square = np.square(c.error[0])
-    nis = float(np.nansum(c.nis) / c.nis_dof[np.isfinite(c.nis)].sum())
+    values, dof = np.asarray(c.nis), np.asarray(c.nis_dof)
+    nis = float(np.nansum(values) / dof[np.isfinite(values)].sum())
     position, heading = np.sqrt(np.nanmean(square[:, :2].sum(axis=1))), np.sqrt(np.nanmean(square[:, 2]))
     return Row(name, filter_, verdict.status, nees, nis, float(position), float(heading))
 

@@ -13,9 +13,9 @@ from scipy.optimize import brentq
 from scipy.stats import bootstrap
 
 import consistency as cs
+from consistency.bench.runs.by_run import run_means
 from consistency.bench.runs.findings import OURS, script
 from consistency.bench.scenario.effects.distortion import Distortion
-from consistency.bench.store.curves import Curves, run_means
 from consistency.referee.types import Array
 
 FINDINGS = ("bias-or-noise", "bias-survivors")
@@ -128,7 +128,7 @@ def nodes_of(world: cs.Scenario) -> pd.DataFrame:
     return pd.DataFrame({"u": u, "v": v, "bias_d": bias.at(u, v)[:, 2]})
 
 
-def over_steps(belief: str, curves: Curves) -> pd.DataFrame:
+def over_steps(belief: str, curves: cs.Record) -> pd.DataFrame:
     """Mean NEES of all runs in each step."""
     assert curves.nees is not None
     known = np.isfinite(curves.nees).any(axis=0)

@@ -10,8 +10,8 @@ import pandas as pd
 from scipy.stats import ttest_rel
 
 import consistency as cs
+from consistency.bench.runs.by_run import log_rmse
 from consistency.bench.runs.findings import OURS, script
-from consistency.bench.store.curves import Curves, log_rmse
 from consistency.referee.terminal.progress import each
 from consistency.referee.types import Array
 
@@ -252,10 +252,11 @@ def near_far_mix(study: cs.Study) -> cs.Finding:
 # --- of runs -----------------------------------------------------------------------------------------
 
 
-def log_nees(curves: Curves) -> Array:
+def log_nees(curves: cs.Record) -> Array:
     """log of the mean NEES of each run (runs,), NaN where it failed."""
-    assert curves.nees is not None
-    value: Array = np.log(np.nanmean(curves.nees, axis=1))
+    nees = curves.in_world.nees
+    assert nees is not None
+    value: Array = np.log(np.nanmean(nees, axis=1))
     return value
 
 
@@ -271,7 +272,7 @@ def rmse(verdict: cs.Verdict) -> tuple[float, float]:
     return verdict.accuracy.rmse_position, float(np.degrees(verdict.accuracy.rmse_heading))
 
 
-def outcomes(cases: Mapping[str, tuple[cs.Verdict, Curves]]) -> pd.DataFrame:
+def outcomes(cases: Mapping[str, tuple[cs.Verdict, cs.Record]]) -> pd.DataFrame:
     """Verdict, ANEES and RMSE of each case; precision and recall of its guard, NaN without one."""
     rows = []
     for case, (verdict, _) in cases.items():
@@ -282,12 +283,13 @@ def outcomes(cases: Mapping[str, tuple[cs.Verdict, Curves]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def first_run(curves: Curves) -> pd.DataFrame:
+def first_run(record: cs.Record) -> pd.DataFrame:
     """Errors of the first run and their stated standard deviations in each step, m and degrees."""
-    assert curves.error is not None
-    scale = np.array([1.0, 1.0, np.degrees(1.0)])
-    error = scale * curves.error[0]
-    sigma = scale * np.sqrt(np.maximum(np.diagonal(curves.covariance[0], axis1=-2, axis2=-1), 0.0))
+    world, scale = record.in_world, np.array([1.0, 1.0, np.degrees(1.0)])
+    assert world.error is not None
+    assert world.covariance is not None
+    error = scale * world.error[0]
+    sigma = scale * np.sqrt(np.maximum(np.diagonal(world.covariance[0], axis1=-2, axis2=-1), 0.0))
     columns = {name: error[:, k] for k, name in enumerate(POSE)}
     bounds = {f"sigma_{name}": sigma[:, k] for k, name in enumerate(POSE)}
     return pd.DataFrame({"step": np.arange(1, len(error) + 1), **columns, **bounds})

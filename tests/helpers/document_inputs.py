@@ -31,7 +31,7 @@ REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
 NOT_RUN = [
     ("docs/case-studies.md", "python docs/case-studies", "needs gtsam; tests/oracle/test_gtsam_imu.py runs it"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
-    ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and tests/unit/bench/test_slurm.py stand in"),
+    ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and unit/bench/test_slurm.py stand in"),
     ("docs/compiling.md", "consistency compile", "compiles many filters; tests/smoke/test_compile_cli.py compiles one"),
     ("docs/consistent.md", "consistency reproduce", STUDY),
     ("docs/conventions.md", "", "tests/unit/referee/test_conventions.py runs all of it"),

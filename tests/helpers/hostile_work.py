@@ -14,8 +14,8 @@ import tomli_w
 from hostile import LINE_TWICE, OPENCV, OPTIMAL, RESULTS, TOML, TREE, TWICE, Target, command, quietly
 
 import consistency as cs
+from consistency.bench.runs.records import record_of
 from consistency.bench.simulation import World
-from consistency.bench.store.curves import curves
 from consistency.bench.store.results import open_results
 from consistency.bench.sweeps.cell import CellResult, Outcome, runs_table
 from consistency.bench.sweeps.folder import SweepFolder, Work
@@ -83,7 +83,7 @@ def _write_maps(folder: Path) -> None:
     sweep = SweepFolder(load_sweep(folder / "sweep.toml"), folder / "map")
     sweep.begin()
     numbers = (48, 0, 3.0, 2.5, 3.5, 1.0, 0.9, 1.1, 0.1, 0.01, 1.0, 20.0)
-    runs = runs_table(curves(open_results(folder.parent / "results"), "one"))
+    runs = runs_table(record_of(open_results(folder.parent / "results"), "one"))
     for cell in sweep.sweep.cells:
         for name, status in zip(sweep.sweep.filters, ("consistent", "overconfident"), strict=True):
             sweep.write(Work(cell, name), Outcome(CellResult(status, status, *numbers), runs), wall=1.0)

@@ -21,7 +21,7 @@ class Doubled(ast.NodeTransformer):
 
 
 def edit(folder: str) -> None:
-    """Load the modules in a folder of ``consistency.bench.filters`` with other numbers, and leave no bytecode of them."""
+    """Load the modules in a folder of the package's filters with other numbers, and leave no bytecode of them."""
     get_code = SourceFileLoader.get_code
 
     def edited(self: SourceFileLoader, name: str) -> Any:

@@ -13,7 +13,7 @@ from recorded import read_recordings
 
 from consistency.referee.cli import main
 from consistency.referee.errors import InputError
-from consistency.referee.verdicts.baselines import baseline_of_files
+from consistency.referee.verdicts.baselines import baseline
 
 OPTIONS = ("--truth", "truth.csv", "--state", "a,b")
 RUNS, STEPS = 24, 15
@@ -117,7 +117,7 @@ def test_files_without_truth(folder: Path) -> None:
     table = pd.read_csv(folder / "honest.csv")
     table.assign(nis=1.0, nis_dof=2).to_csv(folder / "nis.csv", index=False)
     with pytest.raises(InputError, match="has no truth of nis; give it with --truth"):
-        baseline_of_files(read_recordings(folder / "nis.csv", state=["a", "b"]), "nis.csv")
+        baseline(read_recordings(folder / "nis.csv", state=["a", "b"]), "nis.csv")
 
 
 def test_errors_of_different_components(folder: Path) -> None:

@@ -12,8 +12,8 @@ import pytest
 
 import consistency as cs
 from consistency.bench.pages import write_reports
-from consistency.bench.pages.sections.questions import MARKS
 from consistency.referee.diagnostics.records import STATUSES
+from consistency.referee.pages.questions import MARKS
 
 pytestmark = pytest.mark.browser
 

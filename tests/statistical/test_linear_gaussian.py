@@ -14,7 +14,8 @@ import pytest
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.store.curves import Curves, curves
+from consistency.bench.runs.records import record_of
+from consistency.referee.diagnostics import Record
 
 pytestmark = pytest.mark.slow
 
@@ -46,8 +47,8 @@ def results() -> cs.Results:
 
 
 @pytest.fixture(scope="module")
-def kf(results: cs.Results) -> Curves:
-    return curves(results, "kf")
+def kf(results: cs.Results) -> Record:
+    return record_of(results, "kf")
 
 
 @pytest.fixture(scope="module", params=[1 / 1.5, 1.5], ids=["overconfident", "conservative"])
@@ -55,27 +56,27 @@ def off(request: pytest.FixtureRequest) -> tuple[float, cs.Results]:
     return request.param, run(request.param)
 
 
-def anees_holds(c: Curves, step: int) -> bool:
+def anees_holds(c: Record, step: int) -> bool:
     low, high = cs.anees_interval(3, RUNS, 1 - ALPHA)
     return bool(low <= c.nees[:, step - 1].mean() <= high)
 
 
-def nis_sum_holds(c: Curves) -> bool:
+def nis_sum_holds(c: Record) -> bool:
     low, high = stats.chi2.interval(1 - ALPHA, c.nis_dof.sum())
     return bool(low <= np.nansum(c.nis) <= high)
 
 
-def nis_of_runs_holds(c: Curves) -> bool:
+def nis_of_runs_holds(c: Record) -> bool:
     """The NIS of a run is chi-square with its degrees of freedom, independently of other runs."""
     p = stats.chi2.cdf(np.nansum(c.nis, axis=1), c.nis_dof.sum(axis=1))
     return bool(stats.kstest(p, "uniform").pvalue > ALPHA)
 
 
-def nees_of_runs_holds(c: Curves) -> bool:
+def nees_of_runs_holds(c: Record) -> bool:
     return bool(stats.kstest(c.nees[:, -1], stats.chi2(3).cdf).pvalue > ALPHA)
 
 
-def test_no_run_fails_and_only_the_first_step_is_left_out(results: cs.Results, kf: Curves) -> None:
+def test_no_run_fails_and_only_the_first_step_is_left_out(results: cs.Results, kf: Record) -> None:
     assert len(results.failures) == 0
     assert kf.nees.shape == (RUNS, STEPS)
     assert np.isnan(kf.nees[:, 0]).all()
@@ -83,19 +84,19 @@ def test_no_run_fails_and_only_the_first_step_is_left_out(results: cs.Results, k
 
 
 @pytest.mark.parametrize("step", CHECKPOINTS)
-def test_anees_is_three(kf: Curves, step: int) -> None:
+def test_anees_is_three(kf: Record, step: int) -> None:
     assert anees_holds(kf, step)
 
 
-def test_sum_of_nis_is_its_degrees_of_freedom(kf: Curves) -> None:
+def test_sum_of_nis_is_its_degrees_of_freedom(kf: Record) -> None:
     assert nis_sum_holds(kf)
 
 
-def test_nis_of_single_runs_is_chi_square(kf: Curves) -> None:
+def test_nis_of_single_runs_is_chi_square(kf: Record) -> None:
     assert nis_of_runs_holds(kf)
 
 
-def test_nees_of_single_runs_is_chi_square(kf: Curves) -> None:
+def test_nees_of_single_runs_is_chi_square(kf: Record) -> None:
     assert nees_of_runs_holds(kf)
 
 
@@ -107,7 +108,7 @@ def test_the_verdict_is_consistent(results: cs.Results) -> None:
 def test_a_belief_off_by_half_is_caught_everywhere(off: tuple[float, cs.Results]) -> None:
     """Negative control of all ten tests: ANEES becomes 6.75 or 1.33."""
     factor, wrong = off
-    c = curves(wrong, "kf")
+    c = record_of(wrong, "kf")
     assert not any(anees_holds(c, step) for step in CHECKPOINTS)
     assert not nis_sum_holds(c)
     assert not nis_of_runs_holds(c)

@@ -10,7 +10,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.runs.findings import reproduce
-from consistency.bench.store.curves import curves
+from consistency.bench.runs.records import record_of
 
 REFERENCE = Path(__file__).parents[2] / "reports" / "reference"
 
@@ -21,7 +21,7 @@ def summary(folder: Path) -> dict[str, dict[str, list[object]]]:
     for path in sorted(folder.glob("*/estimates.parquet")):
         results = cs.read_results(path.parent)
         out[path.parent.name] = {
-            name: [verdict.status, float(np.median(np.nanmean(curves(results, name).nees, axis=1)))]
+            name: [verdict.status, float(np.median(np.nanmean(record_of(results, name).nees, axis=1)))]
             for name, verdict in cs.analyse(results).items()
         }
     return out

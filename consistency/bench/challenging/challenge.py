@@ -19,12 +19,12 @@ from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.montecarlo import resolve_filters, run_trials
 from consistency.bench.scenario import Scenario, load_scenario
-from consistency.bench.store.judge import analyse
 from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.diagnostics import Settings, Verdict, gate_runs
 from consistency.referee.diagnostics.questions import SCALE
 from consistency.referee.errors import InputError
 from consistency.referee.reading.columns import POSE
+from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base

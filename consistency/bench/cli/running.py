@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -89,12 +90,12 @@ def run(
     from consistency.bench.runs.montecarlo import Interrupted, resolve_filters, run_log, run_trials
     from consistency.bench.runs.sequential import run_until_decided
     from consistency.bench.scenario import load_scenario
-    from consistency.bench.store.judge import analyse
     from consistency.bench.store.log import read_log
     from consistency.bench.store.results import Results, StoredResults
     from consistency.referee.document.verdict import document
     from consistency.referee.show import terminal
     from consistency.referee.terminal.progress import say
+    from consistency.referee.verdicts.judge import analyse
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
@@ -118,10 +119,9 @@ def run(
                 raise InputError("--runs, --seed and --until-decided do not go with --log: a log has the runs it has")
             recorded = read_log(log)
             if screen is not None:
-                from consistency.stereo.frontend.screening import screened_log, screening_line
-
-                recorded = screened_log(recorded, screen)
-                say(screening_line(recorded))
+                screening = import_module("consistency.stereo.frontend.screening")  # the bench does not know it
+                recorded = screening.screened_log(recorded, screen)
+                say(screening.screening_line(recorded))
             resolve_filters(filters, recorded.belief, recorded.name)
             if out.resolve() == log.resolve() or log.resolve() in out.resolve().parents:
                 raise InputError(f"--out {out}: lies in the log; choose another folder")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,16 @@ import numpy as np
 from consistency.bench.pages.answer import answer
 from consistency.bench.pages.contents import SECTIONS
 from consistency.bench.pages.model import Report, Study, Track
-from consistency.bench.pages.section import OPENING, STUDY, Section
+from consistency.bench.runs.by_run import nis_ratio
 from consistency.bench.runs.findings import read_findings
-from consistency.bench.store.curves import curves, nis_ratio, steps_of
-from consistency.bench.store.judge import design_of, verdict_by, with_map
+from consistency.bench.runs.records import design_of, record_of, steps_of
 from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Settings
+from consistency.referee.diagnostics.judging import judge_runs, with_map
 from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.errors import InputError
 from consistency.referee.pages.clock import clock_of
+from consistency.referee.pages.section import OPENING, STUDY, Section
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.terminal.progress import Advance
 
@@ -68,12 +70,14 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
     shown_run = int(runs[0]) if len(runs) else 0
 
     def track(name: str) -> Track:
-        c, number = curves(results, name, steps, maps=False), styles.setdefault(name, len(styles))
-        verdict, ends, shown = verdict_by(c, Settings(), design), c.ends, c.of_run(shown_run)
-        ratio = nis_ratio(c, verdict.runs)
-        del c  # its arrays are free before the maps are read
-        verdict = with_map(verdict, results, ends, Settings(), design)
-        return Track(name, number, f"{index}:{number}", verdict, ends.failures, shown, ratio, results)
+        number, read = styles.setdefault(name, len(styles)), partial(record_of, results, name, steps)
+        record = read()
+        verdict, ends = judge_runs(record, Settings(), design), record.ends
+        shown = record.of_runs(np.flatnonzero(record.run_numbers == shown_run))
+        ratio = nis_ratio(record, verdict.runs)
+        del record  # its arrays are free before the maps are read
+        verdict = with_map(verdict, ends, Settings(), design)
+        return Track(name, number, f"{index}:{number}", verdict, ends.failures, shown, ratio, read)
 
     tracks = tuple(track(name) for name in results.filters)
     return Study(

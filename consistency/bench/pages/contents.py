@@ -5,17 +5,19 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from consistency.bench.pages.section import Section
+from consistency.referee.pages.section import Section
 
-# modules with a SECTION, by their names below the package: some are of the stereo laboratory, which the bench does not know
+# modules with a SECTION, by name below the package: some are of the stereo laboratory, which the bench does not know
 NAMES = (
     *(
         f"bench.pages.sections.{name}"
         for name in (
             "overview", "findings", "filters", "verdicts", "anees", "no_truth", "world", "pose_errors", "innovations",
-            "questions", "axes", "nees", "further", "own_errors", "maps", "rejections",
         )
     ),
+    "referee.pages.questions",
+    "referee.pages.axes",
+    *(f"bench.pages.sections.{name}" for name in ("nees", "further", "own_errors", "maps", "rejections")),
     "stereo.pages.stereo_noise",
     "bench.pages.sections.shares",
     "stereo.pages.scenes",

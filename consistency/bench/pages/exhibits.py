@@ -9,12 +9,12 @@ from typing import Any
 import pandas as pd
 
 from consistency.bench.pages.model import Report
-from consistency.bench.pages.section import Part, Section
 from consistency.bench.pages.tables import extra_table
 from consistency.bench.types import outcome
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Small, Stack, Status, Table, table
 from consistency.referee.document.drawing import Figure, Key, Panel, Sheet
 from consistency.referee.document.wording import number, p_cell
+from consistency.referee.pages.section import Part, Section
 
 OF_FINDINGS = (
     Column("Finding", width="2.5cm"),

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.bench.pages.heat import PAPER_TITLE, heat_figure, on_paper
-from consistency.bench.pages.sections.provenance import facts
 from consistency.bench.sweeps import axes as grid
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell as GridCell
@@ -31,6 +30,7 @@ from consistency.referee.document.blocks import (
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, Tips
 from consistency.referee.document.looks import COLOURS, Look, style
 from consistency.referee.document.wording import listed, number
+from consistency.referee.pages.provenance import facts
 from consistency.referee.types import Array
 
 # colour and marker of a verdict: each has a shape of its own, so that a grey print still reads

@@ -20,20 +20,20 @@ from consistency.bench.pages.finding import findings_table
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
+from consistency.bench.runs.records import record_of
 from consistency.bench.scenario import Scenario, data_folder, load_scenario
-from consistency.bench.store.curves import Curves, curves
-from consistency.bench.store.judge import analyse
 from consistency.bench.store.results import Results, joined
 from consistency.bench.store.storage import write_folder
 from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding
-from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.reading import read_json, reading
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.terminal.progress import quiet, say
+from consistency.referee.verdicts.judge import analyse
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 WAITING = 30.0  # seconds between lines on a process that is waited for
@@ -59,7 +59,7 @@ class Study:
         self.workers = worker_count(jobs)
         self.kept: dict[str, Results] = {}
         self.tables: dict[str, pd.DataFrame] = {}
-        self._judged: dict[tuple[str, str], tuple[Verdict, Curves]] = {}
+        self._judged: dict[tuple[str, str], tuple[Verdict, Record]] = {}
 
     def wants(self, finding: str) -> bool:
         """Whether a finding is asked for; one that takes long and is not need not be worked out."""
@@ -78,12 +78,12 @@ class Study:
             self.kept[world.name] = new if have is None else joined([have, new])
         return self.kept[world.name]
 
-    def judged(self, scenario: str | Scenario, filter_name: str) -> tuple[Verdict, Curves]:
-        """Verdict and curves of one filter on a scenario; each is worked out once."""
+    def judged(self, scenario: str | Scenario, filter_name: str) -> tuple[Verdict, Record]:
+        """Verdict and record of one filter on a scenario; each is worked out once."""
         results = self.results(scenario, [filter_name])
         key = str(results.manifest["scenario_hash"]), filter_name
         if key not in self._judged:
-            self._judged[key] = analyse(results, [filter_name])[filter_name], curves(results, filter_name)
+            self._judged[key] = analyse(results, [filter_name])[filter_name], record_of(results, filter_name)
         return self._judged[key]
 
     def finding(self, holds: bool, scenario: str, verdict_if_not: str = NOT_REPRODUCED, **text: str) -> Finding:

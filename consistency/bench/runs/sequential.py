@@ -12,14 +12,14 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.backends.local import Local
 from consistency.bench.runs.campaign import Campaign
 from consistency.bench.runs.montecarlo import studied
+from consistency.bench.runs.records import record_of
 from consistency.bench.runs.work import Backend
 from consistency.bench.scenario import Scenario
-from consistency.bench.store.curves import Curves, curves
 from consistency.bench.store.journal import Journal
-from consistency.bench.store.judge import beside, evidence_of
 from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics import Design, Verdict, look, sequential_design, speaks
+from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
+from consistency.referee.diagnostics.judging import of_look, with_map
 from consistency.referee.errors import InputError
 from consistency.referee.reading.columns import POSE
 from consistency.referee.terminal.progress import say
@@ -80,19 +80,19 @@ def run_until_decided(
     ) as campaign:  # fmt: skip
         _require_less(campaign, max_runs)
         names = campaign.gathered.filters
-        read = partial(_curves, campaign, scenario.truth.steps)
+        read = partial(_record, campaign, scenario.truth.steps)
         results = campaign.finish(_rounds(campaign, looks(design, names, read, decided), decided, names))
     return results, {name: decided[name] for name in names}
 
 
 def looks(
-    design: Design, filters: Sequence[str], read: Callable[[int, str], Curves], decided: dict[str, Verdict]
+    design: Design, filters: Sequence[str], read: Callable[[int, str], Record], decided: dict[str, Verdict]
 ) -> Iterator[int]:
     """Yield the number of runs of each inspection, look when they are there, and end when all ``filters`` are decided.
 
     Parameters
     ----------
-    read : arrays of the first runs of a filter, by their number and its name
+    read : record of the first runs of a filter, by their number and its name
     decided : where verdicts go, by filter
     """
     for runs, spent in design.inspections():
@@ -105,16 +105,17 @@ def looks(
             return
 
 
-def _look(design: Design, c: Curves, runs: int, spent: float | None) -> Verdict | None:
+def _look(design: Design, record: Record, runs: int, spent: float | None) -> Verdict | None:
     """What is said after so many runs; None where it is not the time to ask."""
-    evidence = evidence_of(c, runs)
-    if runs != design.max_runs and not speaks(design, evidence, spent):
+    some = record.first_runs(runs)
+    if runs != design.max_runs and not speaks(design, some, spent):
         return None
-    return beside(look(design, evidence, spent), c, design, runs)
+    verdict = of_look(look(design, some, spent), runs, record, design)
+    return with_map(verdict, record.ends, design.settings, design)
 
 
-def _curves(campaign: Campaign, steps: int, runs: int, name: str) -> Curves:
-    return curves(campaign.so_far(runs), name, steps)
+def _record(campaign: Campaign, steps: int, runs: int, name: str) -> Record:
+    return record_of(campaign.so_far(runs), name, steps)
 
 
 def _rounds(

@@ -15,16 +15,17 @@ from consistency.bench.filters import get_filter
 from consistency.bench.filters.compiled import Compiled, one_blas_thread
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.protocols import Filter, WholeTrial
+from consistency.bench.runs.by_run import run_means
 from consistency.bench.runs.isolating import Isolation
+from consistency.bench.runs.records import record_of
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.runs.work import Backend
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import simulate
-from consistency.bench.store.curves import Curves, curves, run_means
 from consistency.bench.store.journal import Journal
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.bench.types import Trial
-from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.terminal.progress import quiet
 
 TIMED = 3  # times that a trial is timed, of which the least counts, and trials that are tried
@@ -92,7 +93,7 @@ def run_cell(
                 cell.scenario, [filter_name], **sweep.rule.model_dump(), seed=sweep.seed_of(cell), jobs=jobs,
                 backend=backend, journal=journal,
             )  # fmt: skip
-        verdict, found = verdicts[filter_name], curves(results, filter_name)
+        verdict, found = verdicts[filter_name], record_of(results, filter_name)
     except Exception as error:  # what breaks one cell must not end a night of others
         if isinstance(error, OSError) or isinstance(error.__cause__, OSError):  # it would break all of them
             raise
@@ -119,19 +120,20 @@ def result_of(verdict: Verdict, cost: float = np.nan, step_us: float = np.nan) -
     )  # fmt: skip
 
 
-def runs_table(found: Curves) -> pd.DataFrame:
+def runs_table(found: Record) -> pd.DataFrame:
     """A row for each run: mean NEES, RMSE of position (m) and heading (rad) in judged steps, and failure."""
-    assert found.error is not None
-    assert found.judged.nees is not None
+    error, runs = found.in_world.error, found.run_numbers
+    assert error is not None
+    assert found.nees is not None
     failed = {failure.run: failure for failure in found.failures}
-    square = np.where(np.isfinite(found.judged.nees)[..., None], found.error**2, np.nan)
+    square = np.where(np.isfinite(found.nees)[..., None], error**2, np.nan)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Mean of empty slice")  # a run without an estimate
         mean = np.nanmean(square, axis=1)
-    steps = [failed[run].step if run in failed else None for run in found.runs]
-    reasons = [failed[run].reason if run in failed else None for run in found.runs]
+    steps = [failed[run].step if run in failed else None for run in runs]
+    reasons = [failed[run].reason if run in failed else None for run in runs]
     position = np.sqrt(mean[:, 0] + mean[:, 1])
-    columns = (found.runs, run_means(found), position, np.sqrt(mean[:, 2]), pd.array(steps, "Int64"), reasons)
+    columns = (runs, run_means(found), position, np.sqrt(mean[:, 2]), pd.array(steps, "Int64"), reasons)
     return pd.DataFrame(dict(zip(RUN_COLUMNS, columns, strict=True)))
 
 

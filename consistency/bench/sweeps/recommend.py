@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.store.judge import analyse
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell, text_of
 from consistency.bench.sweeps.regime import Regime, ranked
@@ -17,6 +16,7 @@ from consistency.bench.sweeps.rig import ALIKE, Place, Request, Rig, differences
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.terminal.progress import quiet
+from consistency.referee.verdicts.judge import analyse
 
 MOST = 2  # filters that are confirmed: each may have to be compiled
 OPEN = ("consistent", "undecided")  # what confirming runs say where they find no fault

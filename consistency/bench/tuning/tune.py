@@ -14,7 +14,6 @@ from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import Belief, Scenario, load_scenario
-from consistency.bench.store.judge import analyse
 from consistency.bench.store.log import Log
 from consistency.bench.tuning.balance import balanced, nearest
 from consistency.bench.tuning.bench import Bench
@@ -29,6 +28,7 @@ from consistency.referee.diagnostics.records import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.terminal.progress import quiet, say
 from consistency.referee.types import Array
+from consistency.referee.verdicts.judge import analyse
 
 OTHER_STARTS = (10.0, 0.1, 100.0)  # common factors to begin with where a run fails at the one that the data ask for
 

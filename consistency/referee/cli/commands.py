@@ -48,7 +48,7 @@ ROWS = (
         "monitor innovations.csv --innovations optimal --plot alarm.png",
         "monitor flight.ulg"),
     # the laboratory
-    Row("list", "referee.cli.listing:list_"),
+    Row("list", "bench.cli.listing:list_"),
     Row("simulate", "bench.cli.running:simulate", "bench", "simulate herath2007-stereo --runs 10 --out log"),
     Row("frontend", "stereo.cli.frontend:frontend", "vision",
         "frontend IMAGES --out drive",

@@ -34,7 +34,7 @@ def compare(
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
     from consistency.referee.show import json, terminal
-    from consistency.referee.verdicts.baselines import baseline_of_files, is_baseline, read_baseline
+    from consistency.referee.verdicts.baselines import baseline, is_baseline, read_baseline
     from consistency.referee.verdicts.comparison import compare_filters, compare_with, document
     from consistency.referee.verdicts.options import skip_asked
 
@@ -53,7 +53,7 @@ def compare(
         )
     read = {each: read_files(each, files) for each in estimates}
     new, *old = (
-        baseline_of_files(read[each], str(each), files.truth, first) if each in read else read_baseline(each, first)
+        baseline(read[each], str(each), first, files.truth) if each in read else read_baseline(each, first)
         for each in sides
     )
     if old:
@@ -78,15 +78,10 @@ def baseline(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Keep what a later 'compare' needs of results, one row a run."""
-    from consistency.referee.verdicts.baselines import baseline_of_files, write_baseline
+    from consistency.referee.verdicts.baselines import baseline as summarised
+    from consistency.referee.verdicts.baselines import write_baseline
 
-    if are_files(path, files):
-        recordings = read_files(path, files)
-        write_baseline(baseline_of_files(recordings, str(path), files.truth, skip), out, overwrite)
-        tell_notes(recordings)
-    else:
-        from consistency.bench.store.results import open_results
-        from consistency.referee.verdicts.baselines import baseline_of
-
-        write_baseline(baseline_of(open_results(path), str(path), skip), out, overwrite)
+    recordings = read_files(path, files) if are_files(path, files) else None
+    write_baseline(summarised(path if recordings is None else recordings, str(path), skip, files.truth), out, overwrite)
+    tell_notes(recordings or [])
     print(f"baseline in {out}; next: consistency compare NEW {out}")

@@ -25,6 +25,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
 from consistency.referee.reading.options import Reading
+from consistency.referee.reading.outside import outside
 
 
 @reads_files
@@ -71,8 +72,9 @@ def analyse(
     """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.referee.document.verdict import document
     from consistency.referee.show import FORMATS, json, terminal
-    from consistency.referee.verdicts.files import analyse_recordings
+    from consistency.referee.verdicts.judge import analyse as judge
     from consistency.referee.verdicts.options import settings_of, skip_asked
+    from consistency.referee.verdicts.sources import source_of
 
     if fail_on not in (None, "inconsistent"):
         raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
@@ -87,7 +89,7 @@ def analyse(
         raise InputError("--overwrite goes with --report: nothing else is written")
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
-        verdicts = analyse_recordings(recordings, filters, settings, optimal_gain=innovations is not None)
+        verdicts = judge(recordings, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         if report is not None and not is_file:
             from consistency.referee.pages import write_file_reports
@@ -102,20 +104,16 @@ def analyse(
             except InputError as error:
                 refused = error
     else:
-        from consistency.bench.store.judge import analyse as judge_results
-        from consistency.bench.store.results import open_results
-
-        results = open_results(path)
+        results = source_of(path)
         if report is not None and not is_file:
             raise InputError(f"--report: is for files of another estimator; for {path} use 'consistency report {path}'")
         if innovations is not None:
             raise InputError(
                 "--innovations is for files of another estimator; filters of the bench declare it themselves"
             )
-        verdicts = judge_results(results, filters, settings=settings, skip=first)
-        if not results.manifest["complete"]:
-            done, total = results.manifest["finished_runs"], results.manifest["runs"]
-            text = f"{path}: only {done} of {total} runs are there; the same 'consistency run' with --resume goes on"
+        verdicts = judge(results, filters, settings=settings, skip=first)
+        if results.unfinished:
+            text = f"{path}: {results.unfinished}; the same 'consistency run' with --resume goes on"
             if fail_on:
                 raise InputError(f"--fail-on: {text}")
             print(f"consistency: {text}", file=sys.stderr)
@@ -156,9 +154,8 @@ def report(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Write a report of results as one offline HTML file and a PDF."""
-    from consistency.bench.pages import write_reports
     from consistency.referee.pages import require_pages, write_file_pages
-    from consistency.referee.verdicts.files import analyse_recordings
+    from consistency.referee.verdicts.judge import analyse as judge
 
     estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
@@ -167,10 +164,10 @@ def report(
     if estimates:
         require_pages(*targets, overwrite)
         recordings = read_files(path, files)
-        write_file_pages(recordings, analyse_recordings(recordings), *targets, path.name)
+        write_file_pages(recordings, judge(recordings), *targets, path.name)
         tell_notes(recordings)
     else:
-        write_reports(path, *targets, overwrite)
+        outside("report")(path, *targets, overwrite)
     for target in targets:
         if target is not None:
             print(target)
@@ -210,17 +207,10 @@ def plan(
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
     pilots = None
     if like is not None:
-        from consistency.bench.store.judge import pilots_of
-        from consistency.bench.store.results import open_results
-
-        pilots = pilots_of(open_results(like), filters)
+        pilots = outside("pilot")(like, filters)
     elif scenario is not None:
-        from consistency.bench.runs.montecarlo import run_trials
-        from consistency.bench.scenario import load_scenario
-        from consistency.bench.store.judge import pilots_of
-
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost)  # refuse before the work
-        pilots = pilots_of(run_trials(load_scenario(scenario), filters or [], pilot_runs, seed), filters)
+        pilots = outside("pilot runs")(scenario, filters, pilot_runs, seed)
     planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost)
     if as_json:
         print(json.dumps(planned, indent=2))

@@ -16,6 +16,7 @@ from consistency.referee.diagnostics.equivalence import equivalence
 from consistency.referee.diagnostics.independence import Independence, independence
 from consistency.referee.diagnostics.innovations import NisTest, Whiteness, nis_of, nis_test, nis_whiteness, whiteness
 from consistency.referee.diagnostics.intervals import anees_interval, chi2_mean_interval
+from consistency.referee.diagnostics.judging import judge
 from consistency.referee.diagnostics.landmarks import map_score
 from consistency.referee.diagnostics.lost import lost_bound
 from consistency.referee.diagnostics.monitor import Alarm, Monitor
@@ -32,12 +33,11 @@ from consistency.referee.diagnostics.planning import (
     required_runs,
 )
 from consistency.referee.diagnostics.questions import answers
+from consistency.referee.diagnostics.record import Evidence, JointNees, MapRecord, Record, Rejections
 from consistency.referee.diagnostics.records import (
     Answer,
     Equivalence,
-    Evidence,
     Interval,
-    JointNees,
     MapScore,
     RejectionScore,
     Settings,
@@ -47,7 +47,6 @@ from consistency.referee.diagnostics.rejection import clustered_share, rejection
 from consistency.referee.diagnostics.scale import MeanTest, mean_test, ratio_interval
 from consistency.referee.diagnostics.sequential import Design, follow, look, sequential_design, speaks
 from consistency.referee.diagnostics.shape import identity_statistic, mean_shape, sphericity
-from consistency.referee.diagnostics.verdict import judge
 from consistency.referee.diagnostics.whitening import spread_steps, standardise, whiten
 
 __all__ = [
@@ -66,6 +65,7 @@ __all__ = [
     "Interval",
     "JointNees",
     "Largest",
+    "MapRecord",
     "MapScore",
     "MeanTest",
     "Monitor",
@@ -74,7 +74,9 @@ __all__ = [
     "Outlier",
     "PilotPlan",
     "Pit",
+    "Record",
     "RejectionScore",
+    "Rejections",
     "RunSummary",
     "Settings",
     "Verdict",

@@ -11,7 +11,8 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.distribution import kolmogorov
 from consistency.referee.diagnostics.landmarks import POSE
 from consistency.referee.diagnostics.questions import JOINT, JOINT_DISTRIBUTION
-from consistency.referee.diagnostics.records import JointNees, JointScore, Settings
+from consistency.referee.diagnostics.record import JointNees
+from consistency.referee.diagnostics.records import JointScore, Settings
 from consistency.referee.diagnostics.scale import ratio_interval
 from consistency.referee.types import Array, Indices
 

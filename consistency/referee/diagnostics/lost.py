@@ -7,7 +7,8 @@ from scipy import special
 
 from consistency.referee.diagnostics.eprocess import ever
 from consistency.referee.diagnostics.planning import lost_runs, share_limit
-from consistency.referee.diagnostics.records import Evidence, Lost, Settings
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.records import Lost, Settings
 from consistency.referee.diagnostics.scale import run_means
 from consistency.referee.types import Array
 
@@ -41,7 +42,7 @@ def lost_evidence(is_lost: Array, share: float) -> Array:
     return np.asarray(np.exp(np.minimum(special.logsumexp(np.cumsum(gains, axis=0), axis=1) - np.log(len(q)), 700.0)))
 
 
-def lost_of(evidence: Evidence, nees: Array, dof: int, settings: Settings, any_time: bool = False) -> Lost | None:
+def lost_of(evidence: Record, nees: Array, dof: int, settings: Settings, any_time: bool = False) -> Lost | None:
     """Lost runs among those that failed or have a NEES, and the share not excluded; None without such a run.
 
     Parameters

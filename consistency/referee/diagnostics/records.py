@@ -1,18 +1,19 @@
-"""Input, settings and output of the referee: frozen records, with the shape of each field."""
+"""Settings and output of the referee: frozen, with the shape of each field; :mod:`record` has its input."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.ends import EarlyEnds
-from consistency.referee.diagnostics.skipping import Skip, Skipped, without_first
-from consistency.referee.diagnostics.symmetric import Symmetric
+from consistency.referee.diagnostics.record import Record, shown_by
+from consistency.referee.diagnostics.skipping import Skipped
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
@@ -43,98 +44,7 @@ class Interval(NamedTuple):
         return self.low <= value <= self.high
 
 
-# --- input of the referee -----------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class JointNees:
-    """NEES of pose and map together, in two independent parts of which it is the sum; N runs.
-
-    NaN where a run has none, infinite where its joint covariance is not positive definite.
-    """
-
-    pose: Array  # (N,), chi-square with 3 degrees of freedom if the covariance is right
-    map: Array  # (N,), of all landmarks given the pose, chi-square with ``dof``
-    dof: Indices  # (N,), ``width`` a landmark
-    landmarks: Array | None = None  # (N, L), ``map`` by landmark, each given the pose and the landmarks before it
-    width: int = 3  # degrees of freedom of a landmark, 2 in the plane
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them.
-
-    This is the input of every verdict, from arrays of a gate, files, or results of the bench. From the step of a
-    failure on all values are NaN. If the start is known exactly, its covariance is singular: in those steps the NEES
-    and, for files, the covariance are NaN, and the error is not.
-    """
-
-    name: str
-    error: Array | None = None  # (runs, steps, n), truth minus estimate; NaN where a run has no estimate
-    covariance: Array | Symmetric | None = None  # (runs, steps, n, n)
-    nees: Array | None = None  # (runs, steps), NaN where it does not count; worked out from the errors if not given
-    dof: int = 0  # dimension of the error, where NEES stands alone; 0 where there is none
-    nis: Array | None = None  # (runs, steps), NaN where there was no innovation
-    nis_dof: Array | None = None  # (runs, steps)
-    innovations: Array | None = None  # (runs, steps, m), for their whiteness; without them the NIS has to do
-    innovation_covariances: Array | None = None  # (runs, steps, m, m)
-    optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
-    failures: tuple[Failure, ...] = ()  # Failure.step counts the columns from 1, as the verdict does
-    axes: Sequence[str] = ()  # names of the n components, if they have any
-    runs: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
-    landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
-    joint: JointNees | None = None  # of a map
-    unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
-    skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
-
-    # what a fit to the truth leaves of the errors
-    align: str = "none"  # how the estimates were moved into the world of the truth
-    caption: str = ""  # note of the verdict on that
-    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
-    unavailable: Collection[str] = ()  # questions that cannot be answered after the fit, which are not asked
-    unseen: float = 0.0  # share of the NEES that the fit may have absorbed: consistent is shown with it added
-
-    # origin
-    t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
-    times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
-    convention: str = ""  # of the error
-    notes: tuple[str, ...] = ()  # notes for the reader: the convention, left-out steps
-    window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
-    independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
-    unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
-
-    @property
-    def run_numbers(self) -> Indices:
-        """Labels of the runs, (runs,)."""
-        if self.runs is not None:
-            return self.runs
-        there = (self.error, self.nees, self.nis, self.innovations)
-        return np.arange(next((len(array) for array in there if array is not None), 0))
-
-    def without_first(self, skip: Skip | None) -> Evidence:
-        """The first steps of each run left out of the statistics: covariance, NEES and NIS are NaN there.
-
-        Raises
-        ------
-        InputError
-            Nothing is left, or seconds are asked for and there are no times.
-        """
-        arrays = {"covariance": self.covariance, "nees": self.nees, "nis": self.nis, "nis_dof": self.nis_dof}
-        try:
-            rest, skipped = without_first(skip, arrays, self.name, self.t if self.times is None else self.times)
-        except ValueError as error:
-            raise InputError(f"--{error}") from None
-        return replace(self, **rest, skipped=skipped)
-
-    @property
-    def left_out_steps(self) -> list[int]:
-        """Steps, counted from 1, in which the covariance of some run is not of full rank yet."""
-        if self.error is None or self.nees is None:
-            return []
-        deficient = np.isfinite(self.error).all(axis=-1) & np.isnan(self.nees)
-        if self.skipped is not None:
-            deficient[:, : self.skipped.steps] = False
-        return [int(k) + 1 for k in np.flatnonzero(deficient.any(axis=0))]
+# --- questions -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -431,10 +341,11 @@ class Verdict:
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
     joint: JointScore | None = None  # of the verdict on a map
     rejection: RejectionScore | None = None  # of a filter with a guard
-    unit: str = "run"  # what a run is called, as in :class:`Evidence`
+    unit: str = "run"  # what a run is called, as in :class:`~consistency.diagnostics.record.Record`
     lost: Lost | None = None  # where there is a NEES
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
     skipped: Skipped | None = None  # first steps of each run that were left out
+    record: Record | None = None  # what was judged, where it is kept to be drawn
 
     @property
     def in_world(self) -> Verdict:
@@ -533,6 +444,20 @@ class Verdict:
 
     def _repr_html_(self) -> str:
         return _shown(self, "static")
+
+        return _shown(self, "static") + ("" if self.record is None else shown_by("picture_html", self.record, self))
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Errors with their bounds, NEES with its band, and coverage; arguments as those of :meth:`Record.plot`.
+
+        Raises
+        ------
+        InputError
+            The verdict was not made by ``consistency.judge``, or nothing can be drawn.
+        """
+        if self.record is None:
+            raise InputError(f"{self.filter}: the record was not kept with the verdict; draw record.plot() of it")
+        return shown_by("plot", self.record, self, path)
 
 
 def _shown(verdict: Verdict, renderer: str) -> str:

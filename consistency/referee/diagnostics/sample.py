@@ -1,4 +1,4 @@
-"""Evidence prepared for the tests: whitened errors, the NEES that counts, run means."""
+"""Record prepared for the tests: whitened errors, the NEES that counts, run means."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from consistency.referee.diagnostics.blocks import by_runs, by_steps, of_runs
 from consistency.referee.diagnostics.innovations import nis_of
-from consistency.referee.diagnostics.records import Evidence, Settings
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.records import Settings
 from consistency.referee.diagnostics.scale import means_and_counts, run_means
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.validity import negative
@@ -120,7 +121,7 @@ class Sample:
         return Sample(self.nees, self.dof, replace(e, centre=centre))
 
 
-def sample_of(evidence: Evidence, settings: Settings) -> Sample | None:
+def sample_of(evidence: Record, settings: Settings) -> Sample | None:
     """Sample of the errors, or of the NEES alone; None without either.
 
     Raises
@@ -165,7 +166,7 @@ def groups_of(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | Non
     return groups
 
 
-def innovations_of(evidence: Evidence) -> tuple[Array, Array] | None:
+def innovations_of(evidence: Record) -> tuple[Array, Array] | None:
     """NIS and its degrees of freedom, (runs, steps) each; None without any."""
     if evidence.nis is not None and evidence.nis_dof is not None:
         return evidence.nis, evidence.nis_dof
@@ -174,7 +175,7 @@ def innovations_of(evidence: Evidence) -> tuple[Array, Array] | None:
     return None
 
 
-def shape_of(e: Evidence) -> tuple[int, int]:
+def shape_of(e: Record) -> tuple[int, int]:
     """Runs and steps that all arrays agree on.
 
     Raises
@@ -199,7 +200,7 @@ def shape_of(e: Evidence) -> tuple[int, int]:
     return int(runs), int(steps)
 
 
-def impossible(e: Evidence, counted: Array) -> Array:
+def impossible(e: Record, counted: Array) -> Array:
     """(runs, steps) of bool: impossible values, an infinite error or a covariance with a negative variance."""
     assert e.error is not None
     assert e.covariance is not None

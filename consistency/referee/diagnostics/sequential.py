@@ -9,9 +9,10 @@ from itertools import takewhile
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.eprocess import e_process, ever
 from consistency.referee.diagnostics.questions import MAIN, SHARES
-from consistency.referee.diagnostics.records import Evidence, Settings, Verdict
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.records import Settings, Verdict
 from consistency.referee.diagnostics.sample import sample_of
-from consistency.referee.diagnostics.verdict import Look, judge
+from consistency.referee.diagnostics.verdict import Look, judge_alone
 
 FIRST = 12  # runs at the first look; with fewer hardly anything but a failed run would be found
 PARTS = 4  # times that the scale is looked at from one look to the next
@@ -62,30 +63,30 @@ class Design:
             runs, j = 2 * runs, j + 1
 
 
-def look(design: Design, evidence: Evidence, spent: float | None) -> Verdict:
+def look(design: Design, evidence: Record, spent: float | None) -> Verdict:
     """The verdict at one inspection: `undecided` means that the runs go on.
 
     A filter without truth is judged by its innovations, at looks only.
     """
-    verdict = judge(evidence, design.settings, Look(spent, _scale(design, evidence)))
+    verdict = judge_alone(evidence, design.settings, Look(spent, _scale(design, evidence)))
     if spent is None and verdict.consistent:
         text = "undecided: no fault found in the scale; the other questions are asked at the next look"
         return replace(verdict, status="undecided", reasons=(text, *verdict.reasons[1:]))
     return verdict
 
 
-def speaks(design: Design, evidence: Evidence, spent: float | None) -> bool:
+def speaks(design: Design, evidence: Record, spent: float | None) -> bool:
     """Whether this inspection can decide. Between looks only a fault of the scale does."""
     return spent is not None or _scale(design, evidence) <= SHARES[MAIN] * design.false_alarm
 
 
-def _scale(design: Design, evidence: Evidence) -> float:
+def _scale(design: Design, evidence: Record) -> float:
     """p value of the scale, valid at any time; 1 without truth."""
     sample = sample_of(evidence, design.settings)
     return 1.0 if sample is None else ever(e_process(sample.means(), sample.dof).both)
 
 
-def follow(design: Design, evidence_of: Callable[[int], Evidence], limit: int | None = None) -> tuple[Verdict, int]:
+def follow(design: Design, evidence_of: Callable[[int], Record], limit: int | None = None) -> tuple[Verdict, int]:
     """Inspect runs until decided; return the verdict and the number of runs used.
 
     Parameters

@@ -28,7 +28,8 @@ from consistency.referee.diagnostics.questions import (
     STEP,
     answers,
 )
-from consistency.referee.diagnostics.records import Answer, Equivalence, Evidence, Innovations, Settings, Verdict
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.records import Answer, Equivalence, Innovations, Settings, Verdict
 from consistency.referee.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.referee.diagnostics.sample import shape_of as shape_of_arrays
 from consistency.referee.diagnostics.scaling import scale_of
@@ -46,33 +47,8 @@ class Look:
     scale: float  # p value of the scale, valid at any time
 
 
-def judge(evidence: Evidence, settings: Settings = DEFAULT, look: Look | None = None) -> Verdict:
-    """Judge one filter: a status of ``records.STATUSES``, with reasons.
-
-    Runs are independent, steps are not: every test takes a run as one observation, or holds under any
-    dependence between steps. A filter whose errors are Gaussian with the stated covariance is found at fault in
-    any of the questions (``consistency.referee.diagnostics.questions``) with probability ``false_alarm`` at most;
-    half of that belongs to the mean NEES, for which :func:`gate_runs` plans. A filter is *consistent* if no question
-    found a fault, and two one-sided tests put the ratio of true to stated covariance inside [1 / detect, detect]; with
-    ``lost``, the share of lost runs is shown to be at most that, too. Without a fault and without this evidence, the
-    filter is undecided. A filter with failed runs is never consistent.
-
-    Innovations are judged where an optimal gain is declared, otherwise they are reported: only those of an optimal gain
-    are white. Without truth they are judged alone.
-
-    If a fit to the truth absorbed an unknown part of the errors (``Evidence.reduced``), a covariance that is too large
-    is no fault, as with ``allow="conservative"``. *Consistent* is still shown on both sides, after adding the largest
-    share of the NEES that the fit may have absorbed (``Evidence.unseen``). Questions that cannot be answered after the
-    fit (``Evidence.unavailable``) are not asked.
-
-    A map is judged likewise, with its landmarks in the place of steps (``Evidence.landmarks``) and with the NEES of
-    pose and map together, where it is given.
-
-    Raises
-    ------
-    ValueError
-        Nothing to judge is given, or shapes or options do not fit.
-    """
+def judge_alone(evidence: Record, settings: Settings = DEFAULT, look: Look | None = None) -> Verdict:
+    """Judge the errors and innovations of a record, and nothing beside them; see :func:`judging.judge`."""
     runs, steps = shape_of_arrays(evidence)
     both_sides = settings
     settings = replace(settings, allow="conservative") if evidence.reduced else settings
@@ -117,7 +93,7 @@ def _at(look: Look, p_values: dict[str, float]) -> dict[str, float]:
 # --- innovations -------------------------------------------------------------------------------------
 
 
-def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | None, dict[str, float]]:
+def _innovations(evidence: Record, settings: Settings) -> tuple[Innovations | None, dict[str, float]]:
     nis_and_dof = innovations_of(evidence)
     if nis_and_dof is None:
         return None, {}
@@ -140,7 +116,7 @@ def _innovations(evidence: Evidence, settings: Settings) -> tuple[Innovations | 
 # --- results beside the p values -----------------------------------------------------------------
 
 
-def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: Tests, shown: Equivalence) -> Verdict:
+def _with_records(verdict: Verdict, evidence: Record, sample: Sample, tests: Tests, shown: Equivalence) -> Verdict:
     settings = verdict.settings
     if settings.tolerance is not None:
         verdict = replace(verdict, answers=_excused(verdict.answers, _tolerated(sample, tests, settings)))
@@ -170,7 +146,7 @@ def _with_records(verdict: Verdict, evidence: Evidence, sample: Sample, tests: T
     )
 
 
-def _equivalence(sample: Sample, settings: Settings, look: Look | None, evidence: Evidence) -> Equivalence:
+def _equivalence(sample: Sample, settings: Settings, look: Look | None, evidence: Record) -> Equivalence:
     if look is not None:
         return equivalence_by_betting(sample.means(), sample.dof, settings)
     factor = max(settings.factor, settings.tolerated)

@@ -3,80 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge, nis_of
-from consistency.referee.diagnostics.skipping import Skip, skip_of, without_first
+from consistency.referee.diagnostics import Record, nis_of
+from consistency.referee.diagnostics.skipping import Skip, skip_of
 from consistency.referee.diagnostics.validity import Validity, classify
-from consistency.referee.gating.watch import Terms
-from consistency.referee.reading.columns import POSE
-from consistency.referee.types import Array, Failure, Indices
-
-if TYPE_CHECKING:
-    from consistency.bench.store.results import Results
+from consistency.referee.errors import InputError
+from consistency.referee.types import Array, Indices
+from consistency.referee.verdicts.sources import Results, source_of
 
 
-@dataclass(frozen=True)
-class Arrays:
-    """The arrays that a gate is called with, unchecked; shapes as in :func:`consistency.testing.assert_consistent`."""
-
-    errors: ArrayLike | None = None  # (runs, steps, n)
-    covariances: ArrayLike | None = None  # (runs, steps, n, n)
-    nees: ArrayLike | None = None  # (runs, steps)
-    dof: int | None = None
-    nis: ArrayLike | None = None  # (runs, steps)
-    nis_dof: ArrayLike | None = None  # (runs, steps)
-    innovations: ArrayLike | None = None  # (runs, steps, m)
-    innovation_covariances: ArrayLike | None = None  # (runs, steps, m, m)
-    axes: Sequence[str] | None = None  # names of the n components
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """The runs of one estimator, and how it wants to be looked at."""
-
-    evidence: Evidence
-    runs: int
-    planned_dof: int  # degrees of freedom that one run is sure to bring
-    subsets: Mapping[str, Sequence[int]] | None = None
-    method: str = "max"
-
-    @property
-    def name(self) -> str:
-        return self.evidence.name
-
-    @property
-    def failures(self) -> tuple[Failure, ...]:
-        return self.evidence.failures
-
-    def judge(self, false_alarm: float, terms: Terms) -> Verdict:
-        """See :func:`consistency.diagnostics.judge`."""
-        settings = Settings(
-            false_alarm, terms.detect, terms.power, terms.tolerance, terms.allow, self.method, self.subsets, terms.lost
-        )
-        return judge(self.evidence, settings)
-
-
-def evidence(
+def checked(
     name: str,
-    unchecked: Arrays,
+    errors: ArrayLike | None = None,
+    covariances: ArrayLike | None = None,
+    nees: ArrayLike | None = None,
+    dof: int | None = None,
+    nis: ArrayLike | None = None,
+    nis_dof: ArrayLike | None = None,
+    innovations: ArrayLike | None = None,
+    innovation_covariances: ArrayLike | None = None,
+    axes: Sequence[str] | None = None,
     subsets: Mapping[str, Sequence[int]] | None = None,
-    method: str = "max",
     optimal_gain: bool = False,
     skip: str | float | Skip | None = None,
-) -> Candidate:
-    """One estimator with checked arrays; errors as :func:`consistency.testing.assert_consistent`."""
-    errors, covariances, nees, dof, axes = (
-        unchecked.errors,
-        unchecked.covariances,
-        unchecked.nees,
-        unchecked.dof,
-        unchecked.axes,
-    )
+) -> Record:
+    """One estimator with checked arrays; arguments and errors as :func:`consistency.testing.assert_consistent`."""
     arrays: dict[str, Any] = {"axes": () if axes is None else tuple(axes)}
     if (errors is None) != (covariances is None):
         there, missing = ("covariances", "errors") if errors is None else ("errors", "covariances")
@@ -88,7 +44,7 @@ def evidence(
         n = arrays["error"].shape[-1]
         if dof is not None and dof != n:
             raise ValueError(f"dof is {dof}, but the errors have {n} components")
-        dof = n
+        arrays["dof"] = n
     elif nees is not None:
         if dof is None:
             raise ValueError("nees without dof: give dof, the dimension of the error")
@@ -98,36 +54,34 @@ def evidence(
         for key, value in (("axes", axes), ("subsets", subsets)):
             if value is not None:
                 raise ValueError(f"{key} needs errors and covariances: the nees does not know its components")
-    arrays |= _innovations(unchecked.nis, unchecked.nis_dof, unchecked.innovations, unchecked.innovation_covariances)
+    arrays |= _innovations(nis, nis_dof, innovations, innovation_covariances)
     first = next((arrays[key] for key in ("error", "nees", "nis") if key in arrays), None)
     if first is None:
         raise ValueError("nothing to judge: give errors and covariances, or nees and dof, or nis and nis_dof")
     for key in ("nis", "innovations"):
         if key in arrays and arrays[key].shape[:2] != first.shape[:2]:
             raise ValueError(f"{key} has {arrays[key].shape[:2]} runs and steps, the errors have {first.shape[:2]}")
-    if dof is None or ("error" not in arrays and "nees" not in arrays):
-        if not optimal_gain:
-            raise ValueError(
-                "innovations alone are judged only with optimal_gain=True: those of any other gain are not white, nor "
-                "of the stated size, even if the filter is right"
-            )
-        dof = 0
-    parts = {key: arrays.get(key) for key in ("covariance", "nees", "nis", "nis_dof", "innovations")}
-    rest, skipped = without_first(skip_of(skip), parts, name)
-    arrays |= {key: value for key, value in rest.items() if value is not None}
-    dof = dof or max(1, int(arrays["nis_dof"].sum(axis=1).min()))
-    full = Evidence(name, **arrays, optimal_gain=optimal_gain, skipped=skipped)
-    return Candidate(full, len(first), dof, subsets, method)
+    if "dof" not in arrays and not optimal_gain:
+        raise ValueError(
+            "innovations alone are judged only with optimal_gain=True: those of any other gain are not white, nor of "
+            "the stated size, even if the filter is right"
+        )
+    try:
+        return Record(name, **arrays, optimal_gain=optimal_gain).without_first(skip_of(skip))
+    except InputError as error:
+        raise ValueError(str(error).removeprefix("--")) from None
+
+
+def planned_dof(record: Record) -> int:
+    """Degrees of freedom that one run is sure to bring: of an error, or else of the innovations of a run."""
+    if record.dof or record.nis_dof is None:
+        return record.dof
+    return max(1, int(record.nis_dof.sum(axis=1).min()))
 
 
 def of_results(
-    results: Results,
-    filter_name: str | None,
-    name: str | None = None,
-    subsets: Mapping[str, Sequence[int]] | None = None,
-    method: str = "max",
-    skip: str | float | Skip | None = None,
-) -> Candidate:
+    results: Results, filter_name: str | None, name: str | None = None, skip: str | float | Skip | None = None
+) -> Record:
     """One filter of the bench's own results, with its failed runs.
 
     Steps whose covariance is rank-deficient are left out, as everywhere in the bench.
@@ -137,20 +91,14 @@ def of_results(
     ValueError
         No results, no such filter, or more than one to choose from; ``skip`` leaves nothing.
     """
-    from consistency.bench.store.curves import curves
-    from consistency.bench.store.judge import evidence_of
-    from consistency.bench.store.results import Results
-
-    if not isinstance(results, Results):
+    if not hasattr(results, "batches"):
         raise ValueError("filter names one in the results of consistency.run_trials; give those in place of errors")
     if filter_name is None:
         if len(results.filters) != 1:
             raise ValueError(f"filter: name one of {', '.join(results.filters)}")
         filter_name = results.filters[0]
-    c = curves(results, filter_name).without_first(skip_of(skip))
-    full = evidence_of(c)
-    dof = len(POSE) if c.error is not None else max(1, int(c.nis_dof.sum(axis=1).min()))
-    return Candidate(replace(full, name=name or filter_name), len(c.runs), dof, subsets, method)
+    record = source_of(results).record(filter_name).without_first(skip_of(skip))
+    return replace(record.errors_alone, name=name or filter_name)
 
 
 # --- arrays ----------------------------------------------------------------------------------------

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Comparison, RunSummary, compare, summary, whiten
+from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary, whiten
 from consistency.referee.diagnostics.comparison import FailedRuns
 from consistency.referee.diagnostics.skipping import Skip
-from consistency.referee.gating.checks import Arrays, Candidate, evidence, of_results
+from consistency.referee.gating.checks import checked, of_results, planned_dof
 from consistency.referee.reading.columns import POSE
 
 if TYPE_CHECKING:
-    from consistency.bench.store.results import Results
     from consistency.referee.verdicts.baselines import Baseline
+    from consistency.referee.verdicts.sources import Results
 
 
 NONE_FAILED = FailedRuns(0, 0)
@@ -26,7 +27,7 @@ NONE_FAILED = FailedRuns(0, 0)
 class Sides:
     """Two filters to compare."""
 
-    candidate: Candidate
+    candidate: Record
     a: RunSummary
     b: RunSummary
     name_b: str
@@ -68,28 +69,33 @@ class Sides:
         return lines
 
 
-def of_arrays(name: str, candidate: Arrays, reference: Arrays, skip: str | float | Skip | None = None) -> Sides:
-    """Both sides from arrays, row i of both the same trial; errors as :func:`consistency.testing.assert_not_worse`."""
-    a, row_a = _side("candidate a", name, candidate, skip)
-    b, row_b = _side("reference b", name, reference, skip)
-    if a.runs != b.runs:
-        raise ValueError(f"the candidate has {a.runs} runs and the reference {b.runs}; row i of both must be one trial")
-    if a.planned_dof != b.planned_dof:
-        raise ValueError(f"the errors have {a.planned_dof} and {b.planned_dof} components")
-    return Sides(
-        a, row_a, row_b, "the reference", None if candidate.axes is None else tuple(candidate.axes), paired=True
-    )
+def of_arrays(name: str, candidate: Mapping[str, Any], reference: Mapping[str, Any]) -> Sides:
+    """Both sides from arguments of :func:`checked`, row i of both the same trial.
+
+    Raises
+    ------
+    ValueError
+        As :func:`consistency.testing.assert_not_worse`.
+    """
+    a, row_a = _side("candidate a", name, candidate)
+    b, row_b = _side("reference b", name, reference)
+    m, n = len(a.run_numbers), len(b.run_numbers)
+    if m != n:
+        raise ValueError(f"the candidate has {m} runs and the reference {n}; row i of both must be one trial")
+    if planned_dof(a) != planned_dof(b):
+        raise ValueError(f"the errors have {planned_dof(a)} and {planned_dof(b)} components")
+    return Sides(a, row_a, row_b, "the reference", tuple(a.axes) or None, paired=True)
 
 
-def _side(side: str, name: str, arrays: Arrays, skip: str | float | Skip | None) -> tuple[Candidate, RunSummary]:
+def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunSummary]:
     try:
-        case = evidence(name, arrays, skip=skip)
+        case = checked(name, **arrays)
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
-    e, P = case.evidence.error, case.evidence.covariance
-    values = case.evidence.nees if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
+    e, P = case.error, case.covariance
+    values = case.nees if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
     assert values is not None
-    return case, summary(values, case.planned_dof, e, P)
+    return case, summary(values, case.dof, e, P)
 
 
 def of_filters(
@@ -107,12 +113,12 @@ def of_filters(
     ValueError
         No such filter, nothing to compare with, or a baseline that cannot be read.
     """
-    from consistency.referee.verdicts.baselines import Baseline, baseline_of, read_baseline, require_skip
+    from consistency.referee.verdicts.baselines import Baseline, baseline, read_baseline, require_skip
 
     if reference is None and than is None:
         raise ValueError("than: name the filter to compare with, or give other results as reference")
     candidate = of_results(results, filter_name, name, skip=skip)
-    new = baseline_of(results, skip=skip)
+    new = baseline(results, skip=skip)
     if reference is None:
         old = new
     elif isinstance(reference, Baseline):
@@ -121,7 +127,7 @@ def of_filters(
         old = (
             read_baseline(Path(reference), skip)
             if isinstance(reference, str | Path)
-            else baseline_of(reference, skip=skip)
+            else baseline(reference, skip=skip)
         )
     of_a = filter_name or results.filters[0]
     of_b = than or of_a

@@ -1,85 +1,20 @@
-"""Records of files and verdicts on them, which draw themselves."""
+"""Files of another estimator to a record, and the verdict on it; both draw themselves."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from html import escape
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
-from consistency.referee.diagnostics import Evidence, Verdict
-from consistency.referee.diagnostics.wording import plural
-from consistency.referee.document.blocks import Bullets, Facts
+from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.errors import InputError
-from consistency.referee.extras import require
 from consistency.referee.reading.options import Reading
-from consistency.referee.show.static import block
 from consistency.referee.sources import read_recordings
-from consistency.referee.system.atomic import write_whole
-from consistency.referee.verdicts.files import analyse_recordings
+from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import settings_of, skip_asked
 
-if TYPE_CHECKING:
-    from consistency.referee.document.drawing import Sheet
-    from consistency.referee.show.paper import Drawn
-
-
-@dataclass(frozen=True, repr=False)
-class Record(Evidence):
-    """Estimates of one estimator from files, beside the truth; made by :func:`read`."""
-
-    def plot(self, path: str | Path | None = None) -> Drawn:
-        """Error of each component in one run with the stated 2-sigma bounds, and the coverage.
-
-        Parameters
-        ----------
-        path : .png, .pdf or .svg to write as well; one that is there is replaced
-
-        Returns
-        -------
-        A figure of Matplotlib, which notebooks show
-
-        Raises
-        ------
-        InputError
-            There is no error to draw, or the file cannot be written.
-        """
-        from consistency.referee.pages.files import record_sheet
-
-        return _drawn(record_sheet(self), path)
-
-    def __repr__(self) -> str:
-        runs, unit = plural(len(self.run_numbers), "run"), "step" if self.window is None else "window"
-        size = f"{runs} x {plural(len(self.t), unit)}"
-        return f"<Record {self.name}: {size}, error {self.convention or '-'} of {', '.join(self.axes)}>"
-
-    def _repr_html_(self) -> str:
-        rows = (
-            ("runs", str(len(self.run_numbers))), ("steps", str(len(self.t))), ("error", self.convention or "-"),
-            ("components", ", ".join(self.axes)), ("failed runs", str(len(self.failures))),
-        )  # fmt: skip
-        return f"<div><strong>{escape(self.name)}</strong>{block(Facts(rows))}{block(Bullets(self.notes))}</div>"
-
-
-@dataclass(frozen=True, repr=False)
-class Judgement(Verdict):
-    """A verdict on a :class:`Record`; made by :func:`judge`."""
-
-    record: Record | None = None
-
-    def plot(self, path: str | Path | None = None) -> Drawn:
-        """Errors with their bounds, NEES with its band, and coverage; arguments of :meth:`Record.plot`."""
-        from consistency.referee.pages.files import record_sheet
-
-        assert self.record is not None
-        return _drawn(record_sheet(self.record, self), path)
-
-    def _repr_html_(self) -> str:
-        from consistency.referee.pages.plain import picture
-
-        assert self.record is not None
-        return super()._repr_html_() + "".join(map(block, picture(self.record, self)))
+Judgement = Verdict  # name of earlier versions
 
 
 def read(
@@ -140,10 +75,10 @@ def read(
     name = next(iter(named)) if filter is None else filter
     if name not in named:
         raise InputError(f"filter '{name}' is not in {estimates}; there are: {', '.join(named)}")
-    return Record(**_parts(named[name]))
+    return named[name]
 
 
-def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | None = None, **settings: Any) -> Judgement:
+def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | None = None, **settings: Any) -> Verdict:
     """Judge a record: consistent, overconfident, conservative, undecided, ..., with reasons.
 
     Parameters
@@ -158,24 +93,6 @@ def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | Non
     InputError
         A setting out of its range, or nothing is left.
     """
-    record = cast(Record, record.without_first(skip_asked(skip)))
-    verdict = analyse_recordings([record], None, settings_of(**settings), optimal_gain)[record.name]
-    return Judgement(**_parts(verdict), record=record)
-
-
-def _parts(of: Any) -> dict[str, Any]:
-    return {field.name: getattr(of, field.name) for field in fields(of)}
-
-
-def _drawn(sheet: Sheet, path: str | Path | None) -> Drawn:
-    require("a plot", "plot")
-    from consistency.referee.show.paper import drawn, picture
-
-    figure = drawn(sheet)
-    if path is not None:
-        from consistency.referee.pages import require_plot
-
-        path = Path(path)
-        require_plot(path, overwrite=True)
-        write_whole(path, picture(figure, path.suffix.lower().removeprefix(".")), 0o644)
-    return figure
+    record = record.without_first(skip_asked(skip))
+    verdict = analyse([record], settings=settings_of(**settings), optimal_gain=optimal_gain)[record.name]
+    return replace(verdict, record=record)

@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 from scipy import special, stats
 
-from consistency.bench.pages.model import Estimator, Judged, wide
-from consistency.bench.pages.sections import axes, questions, verdicts
-from consistency.bench.pages.sections.pose_errors import SIGMAS, ZERO
-from consistency.bench.pages.sections.provenance import facts
 from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.wording import plural
 from consistency.referee.document.blocks import Block, Chapter, Document, Facts, Text
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
-from consistency.referee.document.looks import EXPECTED, LIMIT, SHADE, Look, style
+from consistency.referee.document.looks import EXPECTED, LIMIT, SHADE, SIGMAS, ZERO, Look, style
 from consistency.referee.errors import InputError
+from consistency.referee.pages import axes, questions, verdicts
 from consistency.referee.pages.clock import Clock, clock_of
+from consistency.referee.pages.judged import Estimator, Judged, wide
 from consistency.referee.pages.one_step import errors_of_runs, has_one_step, nees_of_runs
+from consistency.referee.pages.provenance import facts
 from consistency.referee.types import Array
 
 MOST_PANELS = 12  # components of an error that are drawn

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from consistency.bench.pages.model import wide
-from consistency.bench.pages.sections.pose_errors import SIGMAS, ZERO
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.wording import plural
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Mark, Panel, Points, Rule, Sheet
-from consistency.referee.document.looks import EXPECTED, SHADE, style
+from consistency.referee.document.looks import EXPECTED, SHADE, SIGMAS, ZERO, style
+from consistency.referee.pages.judged import wide
 
 EACH = replace(style(0), size=2.5, alpha=0.7)
 

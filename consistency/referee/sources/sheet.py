@@ -15,6 +15,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.reading import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
+from consistency.referee.reading.outside import outside
 from consistency.referee.sources.text import Block, blocks
 from consistency.referee.types import Array, Indices
 
@@ -173,9 +174,7 @@ def _read_parquet(path: Path) -> Sheet:
     if not is_file(path):
         raise InputError(f"{path}: no such file")
     require(f"{path}: Parquet", "parquet")
-    from consistency.bench.store.parquet import read_columns
-
-    columns, rows = read_columns(path, "cannot be read as Parquet")
+    columns, rows = outside("columns")(path, "cannot be read as Parquet")
     return Sheet(path, columns, np.arange(rows), "row")
 
 

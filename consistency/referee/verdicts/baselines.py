@@ -7,11 +7,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Evidence, RunSummary, summary
+from consistency.referee.diagnostics import Record, RunSummary, summary
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.skipping import Skip
 from consistency.referee.errors import InputError
@@ -19,12 +19,8 @@ from consistency.referee.reading import HUGE, read_json, reading
 from consistency.referee.reading.columns import POSE
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
-from consistency.referee.verdicts.files import evidence_of_windows
 from consistency.referee.verdicts.options import skip_asked
-
-if TYPE_CHECKING:
-    from consistency.bench.store.curves import Curves
-    from consistency.bench.store.results import Tables
+from consistency.referee.verdicts.sources import Results, Source, source_of
 
 HIGHEST_DOF = 1000  # of an error in a baseline
 FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")
@@ -39,7 +35,6 @@ class Baseline:
     origin: tuple[Any, Any]  # scenario hash and seed, or what a log or truth holds: the same trials have the same
     filters: dict[str, RunSummary]
     failures: dict[str, int]
-    manifest: dict[str, Any]
     axes: dict[str, tuple[str, ...]]  # names of the components of each filter's error
     skip: str | None = None  # first steps that were left out: 20, 2s
 
@@ -48,62 +43,42 @@ class Baseline:
         return self is other or (self.origin[0] is not None and self.origin == other.origin)
 
 
-def baseline_of(results: Tables, name: str = "results", skip: str | float | Skip | None = None) -> Baseline:
-    """Summaries of all filters, with the first steps of each run left out where ``skip`` says so.
-
-    Raises
-    ------
-    InputError
-        The results have no truth, or nothing is left.
-    """
-    first = skip_asked(skip)
-    if not results.has_truth:
-        raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
-    from consistency.bench.store.curves import curves, steps_of
-
-    steps = steps_of(results)
-    filters = {
-        each: _summary_of(curves(results, each, steps, maps=False).without_first(first)) for each in results.filters
-    }
-    failures = {each: int((results.failures["filter"] == each).sum()) for each in results.filters}
-    scenario = results.scenario
-    m = results.manifest
-    origin = (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed"))
-    axes = dict.fromkeys(filters, tuple(POSE))
-    return Baseline(name, scenario.name if scenario else None, origin, filters, failures, m, axes, _option(first))
-
-
-def _option(skip: Skip | None) -> str | None:
-    return None if skip is None else skip.option
-
-
-def baseline_of_files(
-    recordings: Sequence[Evidence], name: str, truth: Path | None = None, skip: str | float | Skip | None = None
+def baseline(
+    of: Source | Sequence[Record] | Results | str | Path,
+    name: str = "results",
+    skip: str | float | Skip | None = None,
+    truth: Path | None = None,
 ) -> Baseline:
-    """Summaries of estimators whose files were read, with the first steps left out where ``skip`` says so.
+    """Summaries of all filters, with the first steps of each run left out where ``skip`` says so.
 
     Parameters
     ----------
+    of : results of ``consistency.run_trials``, a folder of them, or a sequence of records
     truth : file, or folder of them, beside which the estimates were read; the same trials have the same
 
     Raises
     ------
     InputError
-        An estimator has no NEES, or nothing of it is left.
+        A filter has no NEES, or nothing of it is left.
     """
-    filters, first = {}, skip_asked(skip)
-    for r in recordings:
-        r = r.without_first(first)
-        if r.nees is None:
-            raise InputError(f"{name}: has no truth of {r.name}; give it with --truth, as only a NEES can be compared")
-        of = evidence_of_windows(r) if r.independent and not r.unshown else r
-        assert of.nees is not None
-        filters[r.name] = summary(of.nees, r.dof, of.error, of.covariance, of.run_numbers)
-    failures = {r.name: len(r.failures) for r in recordings}
-    origin = (None if truth is None else _digest(truth), None)
-    return Baseline(
-        name, None, origin, filters, failures, {}, {r.name: tuple(r.axes) for r in recordings}, _option(first)
-    )
+    first, filters, failures, axes = skip_asked(skip), {}, {}, {}
+    source = source_of(of)
+    if not source.has_truth:
+        raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
+    for each in source.filters:
+        record = source.record(each).without_first(first)
+        if record.nees is None:
+            raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
+        filters[each] = _summary(record if record.unshown else record.as_runs)
+        failures[each], axes[each] = len(record.failures), tuple(record.axes)
+    trials = source.trials if truth is None else (_digest(truth), None)
+    return Baseline(name, source.scenario, trials, filters, failures, axes, None if first is None else first.option)
+
+
+def _summary(record: Record) -> RunSummary:
+    assert record.nees is not None
+    world = record.in_world
+    return summary(record.nees, record.dof, world.error, world.covariance, record.run_numbers)
 
 
 def _digest(truth: Path) -> str:
@@ -117,14 +92,8 @@ def _digest(truth: Path) -> str:
     return digest.hexdigest()
 
 
-def _summary_of(c: Curves) -> RunSummary:
-    nees = c.judged.nees
-    assert nees is not None
-    return summary(nees, len(POSE), c.error, c.covariance, c.runs)
-
-
-def write_baseline(of: Tables | Baseline, path: Path, overwrite: bool = False) -> None:
-    """Keep the summaries of results as a small JSON file, for version control.
+def write_baseline(of: Results | Baseline, path: Path, overwrite: bool = False) -> None:
+    """Keep a :class:`Baseline`, or the one of results, as a small JSON file, for version control.
 
     Raises
     ------
@@ -133,7 +102,7 @@ def write_baseline(of: Tables | Baseline, path: Path, overwrite: bool = False) -
     """
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
-    base = of if isinstance(of, Baseline) else baseline_of(of, str(path))
+    base = of if isinstance(of, Baseline) else baseline(of, str(path))
     data = manifest_of(
         kind="baseline",
         scenario=base.scenario,
@@ -172,9 +141,7 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
         Neither, or damaged.
     """
     if path.is_dir():
-        from consistency.bench.store.results import open_results
-
-        return baseline_of(open_results(path), str(path), skip)
+        return baseline(path, str(path), skip)
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "baseline" or data.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: is no baseline; write one with 'consistency baseline DIR --out {path}'")
@@ -193,7 +160,7 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
     filters = {name: row[0] for name, row in rows.items()}
     failures = {name: row[1] for name, row in rows.items()}
     axes = {name: row[2] for name, row in rows.items()}
-    base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, data, axes, left_out)
+    base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out)
     return require_skip(base, skip)
 
 
@@ -205,7 +172,8 @@ def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
     InputError
         They were not.
     """
-    asked = _option(skip_asked(skip))
+    first = skip_asked(skip)
+    asked = None if first is None else first.option
     if base.skip != asked:
         own = "of all steps" if base.skip is None else f"with --skip {base.skip}"
         wanted = "without --skip" if asked is None else f"with --skip {asked}"

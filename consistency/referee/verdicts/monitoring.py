@@ -12,12 +12,12 @@ import numpy as np
 
 from consistency.referee.diagnostics import Alarm, Monitor
 from consistency.referee.errors import InputError
-from consistency.referee.sources.nis import NisLog, checked_dof, choose, read_nis, stream_nis
+from consistency.referee.reading.outside import outside
+from consistency.referee.sources.nis import NisLog, read_nis, stream_nis
 from consistency.referee.sources.ulog import SUFFIX, read_ulog
 from consistency.referee.types import Array
 
 OPTIMAL = "optimal"
-COLUMNS = ["run", "step", "t", "nis", "nis_dof"]
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,8 @@ def read_innovations(path: Path, filter_name: str | None = None, run: int | None
     """
     if path.suffix.lower() == SUFFIX:
         return read_ulog(path, filter_name, run)
-    return _of_results(path, filter_name, run) if path.is_dir() else read_nis(path, filter_name, run)
+    read: Callable[..., NisLog] = outside("innovations") if path.is_dir() else read_nis
+    return read(path, filter_name, run)
 
 
 def watch(log: NisLog, monitor: Monitor) -> Watched:
@@ -113,23 +114,3 @@ def _updated(monitor: Monitor, place: str, nis: float, dof: float) -> Alarm | No
         return monitor.update(nis, dof)  # type: ignore[arg-type]  # refuses what is not whole
     except ValueError as error:
         raise InputError(f"{place}: {error}") from None
-
-
-def _of_results(folder: Path, filter_name: str | None, run: int | None) -> NisLog:
-    from consistency.bench.store.results import open_results
-
-    results = open_results(folder)
-    name = choose(folder, "filter", results.filters, filter_name)
-    run_number = choose(folder, "run", results.runs_of(name).tolist(), run)
-    parts = []
-    for batch in results.batches("estimates", COLUMNS, name):
-        rows = batch["run"] == run_number
-        parts.append(np.stack([batch[column][rows].astype(float) for column in COLUMNS[1:]]))
-    step, t, nis, dof = np.concatenate(parts, axis=1) if parts else np.empty((4, 0))
-    if not len(step):
-        raise InputError(f"{folder}: run {run_number} of '{name}' failed before its first estimate")
-    order = np.argsort(step, kind="stable")
-    step, t, nis, dof = step[order], t[order], nis[order], dof[order]
-    return NisLog(
-        name, step, t, nis, checked_dof(nis, dof, lambda row: f"{folder}, run {run_number}, step {step[row]:g}")
-    )

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from consistency.bench.pages.sections.provenance import facts
 from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Table, Text, table
 from consistency.referee.document.drawing import (
     Axis,
@@ -27,6 +26,7 @@ from consistency.referee.document.drawing import (
     Stems,
 )
 from consistency.referee.document.looks import COLOURS, EXPECTED, SHADE, Look, style
+from consistency.referee.pages.provenance import facts
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
 from consistency.stereo.characterising.wording import counted, interval, sentences

@@ -10,11 +10,11 @@ from scipy import stats
 
 from consistency.bench.models.stereo import project, triangulate_jacobian
 from consistency.bench.pages.model import Report
-from consistency.bench.pages.section import Part, Section
 from consistency.bench.pages.tables import extra_table
 from consistency.bench.types import Gaussian
 from consistency.referee.document.drawing import Axis, Bars, Figure, Key, Line, Panel, Points, Sheet, xy
 from consistency.referee.document.looks import Look, style
+from consistency.referee.pages.section import Part, Section
 from consistency.referee.types import Array
 
 NOISE = Part("distributions", "What eq. 21 does to Gaussian pixels (fig. 12)", "Stereo noise")

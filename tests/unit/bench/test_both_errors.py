@@ -14,12 +14,13 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.runs.by_run import run_means
+from consistency.bench.runs.records import record_of
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.bench.store.curves import curves, run_means
-from consistency.bench.store.judge import analyse, evidence_of, until_decided
 from consistency.bench.store.results import open_results
 from consistency.referee.cli import main
-from consistency.referee.diagnostics import Evidence, Interval, Settings, judge, map_score
+from consistency.referee.diagnostics import Interval, Settings, map_score, sequential_design
+from consistency.referee.diagnostics.judging import judge_runs, with_map
 from consistency.referee.diagnostics.records import MapScore
 from consistency.referee.diagnostics.scale import ratio_interval
 from consistency.referee.document.map import map_text
@@ -27,8 +28,9 @@ from consistency.referee.document.verdict import document
 from consistency.referee.reading.columns import OWN_COVARIANCE
 from consistency.referee.show.json import render
 from consistency.referee.show.terminal import show
-from consistency.referee.verdicts.baselines import baseline_of
-from consistency.referee.verdicts.files import analyse_recordings
+from consistency.referee.types import Failure
+from consistency.referee.verdicts.baselines import baseline
+from consistency.referee.verdicts.judge import analyse
 
 RUNS = 24
 KEYS = ["run", "step", "t", "x", "y", "heading"]
@@ -65,31 +67,30 @@ def exported(results: cs.Results, tmp_path_factory: pytest.TempPathFactory) -> t
 
 
 def test_both_ways_in_give_the_same_nees_and_verdict(results: cs.Results, exported: tuple[Path, Path]) -> None:
-    c = curves(results, "right")
-    assert c.own is not None
+    c = record_of(results, "right")
     [recording] = read_recordings(*exported, error="right")
-    np.testing.assert_allclose(recording.nees, c.own.nees, rtol=1e-9)
-    np.testing.assert_allclose(recording.error[:, 1:], c.own.error[:, 1:], rtol=0, atol=1e-12)
-    ours, theirs = cs.analyse(results)["right"], analyse_recordings([recording])["right"]
+    np.testing.assert_allclose(recording.nees, c.nees, rtol=1e-9)
+    np.testing.assert_allclose(recording.error[:, 1:], c.error[:, 1:], rtol=0, atol=1e-12)
+    ours, theirs = cs.analyse(results)["right"], analyse([recording])["right"]
     assert (ours.status, ours.convention) == (theirs.status, theirs.convention)
     assert ours.statistic == pytest.approx(theirs.statistic, rel=1e-9)
     assert ours.inflation_interval == pytest.approx(theirs.inflation_interval, rel=1e-9)
     [wrong] = read_recordings(*exported, error="so2")
-    assert np.nanmax(np.abs(wrong.nees - c.own.nees)) > 1.0, "negative control"
+    assert np.nanmax(np.abs(wrong.nees - c.nees)) > 1.0, "negative control"
 
 
 def test_both_ways_of_the_invariant_filter_of_the_bench(uvd: cs.Scenario, tmp_path: Path) -> None:
     results = cs.run_trials(uvd, ["ri-ekf-uvd"], runs=RUNS, seed=5, jobs=1)
-    c = curves(results, "ri-ekf-uvd")
+    c = record_of(results, "ri-ekf-uvd")
     [recording] = read_recordings(*export(results, "ri-ekf-uvd", tmp_path), error="right")
-    np.testing.assert_allclose(recording.nees, c.judged.nees, rtol=1e-9)
-    ours, theirs = cs.analyse(results)["ri-ekf-uvd"], analyse_recordings([recording])["ri-ekf-uvd"]
+    np.testing.assert_allclose(recording.nees, c.nees, rtol=1e-9)
+    ours, theirs = cs.analyse(results)["ri-ekf-uvd"], analyse([recording])["ri-ekf-uvd"]
     assert (ours.status, ours.convention) == (theirs.status, "right")
     trial = cs.simulate(uvd, 3, seed=5)
     compiled = run_filter(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
     stepped = step_through(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
     np.testing.assert_allclose(stepped.own, compiled.own, rtol=1e-7, atol=1e-12)
-    np.testing.assert_array_equal(c.own.covariance[3, 1:], compiled.own[1:])
+    np.testing.assert_array_equal(c.covariance[3, 1:], compiled.own[1:])
 
 
 def test_both_ways_by_the_command_line(
@@ -123,7 +124,7 @@ def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder: Path)
     by_name = {
         r.name: r for r in read_recordings(folder / "estimates.parquet", folder / "truth.parquet", error="right")
     }
-    c = curves(open_results(folder), "ekf-uvd")
+    c = record_of(open_results(folder), "ekf-uvd")
     np.testing.assert_array_equal(by_name["ekf-uvd"].covariance[:, 1:], c.covariance[:, 1:])
     assert not any("own_P" in note for note in by_name["ekf-uvd"].notes)
     assert any("own_P" in note for note in by_name["right"].notes)
@@ -132,18 +133,19 @@ def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder: Path)
 # --- what is judged ---------------------------------------------------------------------------------
 
 
-def test_curves_hold_both_errors(results: cs.Results, folder: Path) -> None:
+def test_a_record_holds_both_errors(results: cs.Results, folder: Path) -> None:
     for source in (results, open_results(folder)):
-        c = curves(source, "right")
+        c = record_of(source, "right")
         rows = results.estimates.query("filter == 'right' and run == 3")
-        assert c.own is not None
-        np.testing.assert_array_equal(c.own.nees[3], rows["own_nees"])
-        np.testing.assert_array_equal(c.own.covariance[3, :, 0, 2], rows["own_P_xh"])
-        np.testing.assert_array_equal(c.own.covariance[3, :, 2, 0], rows["own_P_xh"])
-        np.testing.assert_array_equal(c.nees[3], rows["nees"])
-        assert c.judged is c.own
-        assert (c.convention, curves(source, "ekf-uvd").convention) == ("right", "so2")
-        assert curves(source, "ekf-uvd").own is None
+        np.testing.assert_array_equal(c.nees[3], rows["own_nees"])
+        np.testing.assert_array_equal(c.covariance[3, :, 0, 2], rows["own_P_xh"])
+        np.testing.assert_array_equal(c.covariance[3, :, 2, 0], rows["own_P_xh"])
+        np.testing.assert_array_equal(c.in_world.nees[3], rows["nees"])
+        np.testing.assert_array_equal(c.in_world.nis[3], rows["nis"])
+        np.testing.assert_array_equal(c.in_world.covariance[3, :, 0, 2], rows["P_xh"])
+        assert (c.convention, c.in_world.convention) == ("right", "")
+        plain = record_of(source, "ekf-uvd")
+        assert (plain.world, plain.in_world, plain.convention) == (None, plain, "")
 
 
 def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results: cs.Results) -> None:
@@ -168,9 +170,9 @@ def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results: cs.Re
 
 
 def test_run_means_and_baselines_are_of_the_own_error(results: cs.Results) -> None:
-    c = curves(results, "right")
-    np.testing.assert_allclose(run_means(c), np.nanmean(c.own.nees, axis=1), rtol=1e-12)
-    np.testing.assert_allclose(baseline_of(results).filters["right"].nees, run_means(c) / 3.0, rtol=1e-12)
+    c = record_of(results, "right")
+    np.testing.assert_allclose(run_means(c), np.nanmean(c.nees, axis=1), rtol=1e-12)
+    np.testing.assert_allclose(baseline(results).filters["right"].nees, run_means(c) / 3.0, rtol=1e-12)
 
 
 def test_a_null_where_the_own_covariance_should_be(results: cs.Results) -> None:
@@ -183,10 +185,10 @@ def test_a_null_where_the_own_covariance_should_be(results: cs.Results) -> None:
 def test_until_decided_says_both(uvd: cs.Scenario) -> None:
     results, verdicts = run_until_decided(uvd, [Invariant()], max_runs=13, seed=5, jobs=1)
     v = verdicts["right"]
-    c = curves(results, "right")
-    assert (v.convention, v.runs) == ("right", len(c.runs))
+    c = record_of(results, "right")
+    assert (v.convention, v.runs) == ("right", len(c.run_numbers))
     assert v.world is not None
-    assert v.world.scale.mean_anees == pytest.approx(np.nanmean(c.nees[: v.world.runs]))
+    assert v.world.scale.mean_anees == pytest.approx(np.nanmean(c.in_world.nees[: v.world.runs]))
     assert v.map is not None
     assert v.map.runs == v.runs
     again = analyse(results)["right"]
@@ -194,9 +196,8 @@ def test_until_decided_says_both(uvd: cs.Scenario) -> None:
 
 
 def test_a_look_scores_the_maps_of_its_own_runs(results: cs.Results) -> None:
-    from consistency.referee.diagnostics import sequential_design
-
-    v = until_decided(curves(results, "ekf-uvd"), sequential_design(3, max_runs=12))
+    record, design = record_of(results, "ekf-uvd"), sequential_design(3, max_runs=12)
+    v = with_map(judge_runs(record, Settings(), design), record.ends, Settings(), design)
     assert (v.runs, v.map.runs) == (12, 12)
 
 
@@ -307,12 +308,15 @@ def test_json_holds_both(results: cs.Results) -> None:
     assert own["map_ratio_interval"] == list(v.map.ratio[1:])
 
 
-def test_evidence_names_the_error_it_is_of(results: cs.Results) -> None:
-    c = curves(results, "right")
-    own, additive = evidence_of(c, 10), evidence_of(c, 10, additive=True)
-    np.testing.assert_array_equal(own.nees, c.own.nees[:10])
-    np.testing.assert_array_equal(additive.nees, c.nees[:10])
-    np.testing.assert_array_equal(own.covariance, c.own.covariance[:10])
-    np.testing.assert_array_equal(additive.error, c.error[:10])
-    assert isinstance(own, Evidence)
-    assert judge(own, Settings()).status == judge(evidence_of(c, 10), Settings()).status
+def test_some_runs_have_both_errors_and_their_own_failures(results: cs.Results) -> None:
+    failures = (Failure("right", 3, 2, "NaN"), Failure("right", 11, 2, "NaN"))
+    c = replace(record_of(results, "right"), failures=failures)
+    some = c.first_runs(10)
+    np.testing.assert_array_equal(some.nees, c.nees[:10])
+    np.testing.assert_array_equal(some.in_world.nees, c.in_world.nees[:10])
+    np.testing.assert_array_equal(some.covariance, c.covariance[:10])
+    np.testing.assert_array_equal(some.in_world.error, c.in_world.error[:10])
+    np.testing.assert_array_equal(some.run_numbers, np.arange(10))
+    assert some.failures == failures[:1]
+    one = c.of_runs(np.flatnonzero(c.run_numbers == 11))
+    assert (one.nis.shape[0], one.failures) == (1, failures[1:])

@@ -15,8 +15,7 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.bench.store.curves import curves
-from consistency.bench.store.judge import analyse, verdict_of
+from consistency.bench.runs.records import record_of
 from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Evidence, Settings, blocks, judge, summary
 from consistency.referee.diagnostics.sample import sample_of
@@ -24,6 +23,7 @@ from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
 from consistency.referee.show.json import render
+from consistency.referee.verdicts.judge import analyse
 
 STEPS = 200
 RUNS = 4000
@@ -167,7 +167,7 @@ def _again(table: pd.DataFrame, times: int) -> pd.DataFrame:
 
 def test_a_filter_read_in_parts_is_judged_as_in_whole(folders: tuple[Path, Path]) -> None:
     results = open_results(folders[0])
-    whole = {name: verdict_of(curves(results, name), Settings()) for name in results.filters}
+    whole = {name: judge(record_of(results, name)) for name in results.filters}
     assert whole["ekf-uvd"].map is not None
     assert render(document(analyse(results))) == render(document(whole))
 
@@ -186,7 +186,8 @@ print(most() - before)
 """
 READ = "from consistency.bench.store.results import open_results\n"
 WORK = {
-    "analyse": READ + "from consistency.bench.store.judge import analyse\nwork = lambda f: analyse(open_results(f))",
+    "analyse": READ
+    + "from consistency.referee.verdicts.judge import analyse\nwork = lambda f: analyse(open_results(f))",
     "report": "from consistency.bench.pages.build import build_report as work",
     "baseline": "from consistency.referee.verdicts.baselines import read_baseline as work",
 }

@@ -244,7 +244,7 @@ def with_something(x: complex) -> float:
 
 
 def keys_with_other_numbers(folder: str) -> dict[str, str]:
-    """Keys of the kernels of built-in filters, with every number in a folder of ``consistency.bench.filters`` doubled."""
+    """Keys of the kernels of built-in filters, with every number in a folder of the filters doubled."""
     command = [sys.executable, kernel_keys.__file__, folder]
     out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240).stdout
     keys: dict[str, str] = json.loads(out)

@@ -40,7 +40,7 @@ def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path: Path, rmse:
     cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=3, seed=0, jobs=1).write(tmp_path / "run")
     report = build_report(tmp_path / "run")
     (study,) = report.studies
-    error = study.tracks[0].curves.error
+    error = study.tracks[0].record().in_world.error
     np.testing.assert_allclose(rmse.read(study).curves[0][1], np.sqrt((error[..., :2] ** 2).sum(-1).mean(axis=0)))
 
     titles = [figure.title for figure in build.compose(report).figures]

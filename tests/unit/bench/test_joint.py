@@ -11,8 +11,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.filters import get_filter
-from consistency.bench.store.curves import curves
-from consistency.bench.store.judge import map_evidence
+from consistency.bench.runs.records import record_of
 from consistency.referee.diagnostics import Evidence, JointNees, Settings, Verdict, judge
 from consistency.referee.diagnostics.joint import joint_test, near
 from consistency.referee.diagnostics.landmarks import joint_nees
@@ -198,8 +197,8 @@ def results() -> cs.Results:
 
 
 def _evidence(results: cs.Results, name: str) -> Evidence:
-    c = curves(results, name)
-    evidence = map_evidence(c.ends, c.landmarks)
+    ends = record_of(results, name).ends
+    evidence = ends.map().record(ends.nees[:, 0])
     assert evidence is not None
     return evidence
 

@@ -17,10 +17,10 @@ from consistency.bench.runs import gather, sequential
 from consistency.bench.runs.montecarlo import Interrupted, run_log, simulate_log
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.runs.work import Work
-from consistency.bench.store.curves import Curves
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import Outcome, StoredResults, open_results
 from consistency.bench.types import Trial
+from consistency.referee.diagnostics import Record
 from consistency.referee.document.verdict import document
 from consistency.referee.show.json import render
 
@@ -128,14 +128,14 @@ def test_ctrl_c_keeps_what_is_finished(
     """While runs are done, and while a look is taken after the last of them."""
     with monkeypatch.context() as patch:
         if look:
-            beside = sequential.beside
+            of_look = sequential.of_look
 
-            def pressed(verdict: Any, c: Curves, design: Any, runs: int) -> Any:
+            def pressed(verdict: Any, runs: int, record: Record, design: Any) -> Any:
                 if runs == 20:
                     raise KeyboardInterrupt
-                return beside(verdict, c, design, runs)
+                return of_look(verdict, runs, record, design)
 
-            patch.setattr(sequential, "beside", pressed)
+            patch.setattr(sequential, "of_look", pressed)
         else:
             stop_at(14, KeyboardInterrupt())
         with pytest.raises(Interrupted) as stop:
@@ -176,14 +176,14 @@ def test_a_plain_run_goes_on_until_decided(world: cs.Scenario, whole: Path, tmp_
         with pytest.raises(cs.InputError, match=message):
             run_until_decided(world, ["kf"], out=tmp_path / str(runs), resume=True, **one)
     runs_seen: list[int] = []
-    read = sequential.curves
+    read = sequential.record_of
 
-    def seen(tables: Any, name: str, steps: int) -> Curves:
+    def seen(tables: Any, name: str, steps: int) -> Record:
         runs_seen.append(len(tables.runs_of(name)))
         return read(tables, name, steps)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sequential, "curves", seen)
+        patch.setattr(sequential, "record_of", seen)
         previous = open_results(tmp_path / "17")
         _, verdicts = run_until_decided(world, ["kf"], previous=previous, **OPEN)
     assert runs_seen == [12, 15, 18, 20]
@@ -205,21 +205,21 @@ def test_two_filters_on_disk_are_those_in_memory(world: cs.Scenario, uvd: cs.Sce
 def test_a_look_holds_one_filter_and_no_outcome(
     uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    curves: weakref.WeakSet[Any] = weakref.WeakSet()
+    records: weakref.WeakSet[Any] = weakref.WeakSet()
     outcomes: weakref.WeakSet[Any] = weakref.WeakSet()
-    most, read, add = [0, 0], sequential.curves, gather.Gathered.add
+    most, read, add = [0, 0], sequential.record_of, gather.Gathered.add
 
     class Counted(Outcome):
         __hash__ = object.__hash__
 
-    class Held(Curves):
+    class Held(Record):
         __hash__ = object.__hash__
 
-    def held(*arguments: Any) -> Curves:
-        c = Held(**vars(read(*arguments)))
-        curves.add(c)
-        most[0] = max(most[0], len(curves))
-        return c
+    def held(*arguments: Any) -> Record:
+        record = Held(**vars(read(*arguments)))
+        records.add(record)
+        most[0] = max(most[0], len(records))
+        return record
 
     def counted(self: gather.Gathered, outcome: Outcome) -> None:
         known = Counted(**vars(outcome))
@@ -227,7 +227,7 @@ def test_a_look_holds_one_filter_and_no_outcome(
         most[1] = max(most[1], len(outcomes))
         add(self, known)
 
-    monkeypatch.setattr(sequential, "curves", held)
+    monkeypatch.setattr(sequential, "record_of", held)
     monkeypatch.setattr(gather.Gathered, "add", counted)
     run_until_decided(uvd, ["ekf-uvd", "ekf-xyz"], max_runs=14, jobs=1, out=tmp_path / "out")
     assert most == [1, 1]

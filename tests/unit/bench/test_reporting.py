@@ -23,16 +23,13 @@ from consistency.bench.pages.build import build_report, compose
 from consistency.bench.pages.model import Report, Study, Track
 from consistency.bench.pages.sections import (
     anees,
-    axes,
     first_order,
     innovations,
     nees,
     no_truth,
     pose_errors,
-    questions,
     referee,
     shares,
-    verdicts,
     world,
 )
 from consistency.bench.runs.findings import Finding
@@ -47,6 +44,7 @@ from consistency.referee.document.drawing import Figure, Intervals, Line, Points
 from consistency.referee.document.thin import thin
 from consistency.referee.document.verdict import FURTHER, factor, page, shown_inside
 from consistency.referee.document.wording import written
+from consistency.referee.pages import axes, questions, verdicts
 from consistency.referee.pages.clock import clock_of
 from consistency.referee.reading.columns import COVARIANCE
 from consistency.referee.show import html, pdf

@@ -18,7 +18,7 @@ from edited import accept_changes
 
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
-from consistency.bench.store.curves import curves
+from consistency.bench.runs.records import record_of
 from consistency.bench.types import Control, Gaussian, Observation
 from consistency.referee.reading.columns import COLUMNS
 from consistency.referee.system.folders import require_free
@@ -144,8 +144,8 @@ def test_nees_is_null_only_while_the_pose_is_not_of_full_rank(results: cs.Result
         assert row.nees == pytest.approx(e @ np.linalg.inv(P) @ e, rel=1e-6)
 
 
-def test_curves_put_every_row_in_its_place(results: cs.Results) -> None:
-    c = curves(results, "sleepy")
+def test_a_record_puts_every_row_in_its_place(results: cs.Results) -> None:
+    c = record_of(results, "sleepy")
     assert c.nees.shape == (4, 60)
     assert np.array_equal(np.isfinite(c.nees), np.broadcast_to(np.arange(60) < 4, (4, 60)))
     assert [(failure.run, failure.step) for failure in c.failures] == [(0, 5), (1, 5), (2, 5), (3, 5)]
@@ -154,9 +154,9 @@ def test_curves_put_every_row_in_its_place(results: cs.Results) -> None:
     assert c.error[2, 2, 0] == true["x"] - row["x"]
     assert c.covariance[2, 2, 0, 2] == c.covariance[2, 2, 2, 0] == row["P_xh"]
     assert c.nees[2, 2] == row["nees"]
-    assert np.allclose(curves(results, "ekf-xyz").t, 0.1 * np.arange(1, 61))
+    assert np.allclose(record_of(results, "ekf-xyz").t, 0.1 * np.arange(1, 61))
     with pytest.raises(cs.InputError, match="filter 'kf' is not in these results; there are: ekf-xyz, sleepy"):
-        curves(results, "kf")
+        record_of(results, "kf")
 
 
 @pytest.mark.parametrize("confidence", [0.0, 1.0, 95.0])

@@ -15,7 +15,6 @@ import pytest
 import consistency as cs
 from consistency import testing
 from consistency.referee.cli import main
-from consistency.referee.notebook.records import Judgement
 
 DOCS = Path(__file__).parents[3] / "docs"
 FOLDER = DOCS / "case-studies"
@@ -31,7 +30,7 @@ ROWS = {  # of the table in docs/case-studies.md: archive, and status by version
 
 
 @cache
-def verdict(version: str, kind: str = "") -> Judgement:
+def verdict(version: str, kind: str = "") -> cs.Verdict:
     return cs.judge(cs.read(FOLDER / f"gtsam-{version}{kind}.npz"))
 
 

@@ -19,7 +19,7 @@ from consistency.referee.diagnostics.contrast import Contrast, contrast, margin
 from consistency.referee.gating.session import needed_at
 from consistency.referee.gating.watch import Watch, watching
 from consistency.referee.types import Array
-from consistency.referee.verdicts.baselines import baseline_of, baseline_of_files, read_baseline, write_baseline
+from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
 from consistency.referee.verdicts.comparison import Compared, compare_filters, compare_with
 from consistency.testing import InsufficientTrials, assert_not_worse
 
@@ -448,7 +448,7 @@ def results() -> cs.Results:
 
 
 def test_two_filters_of_the_same_trials(results: cs.Results) -> None:
-    (compared,) = compare_filters(baseline_of(results), ["ekf-xyz", "ekf-uvd"])
+    (compared,) = compare_filters(baseline(results), ["ekf-xyz", "ekf-uvd"])
     assert compared.comparison.paired
     assert compared.sentence.startswith("ekf-xyz is ")
     names = [d.name for d in compared.comparison.differences]
@@ -459,7 +459,7 @@ def test_two_filters_of_the_same_trials(results: cs.Results) -> None:
 
 def test_a_baseline_read_back_is_the_same(results: cs.Results, tmp_path: Path) -> None:
     write_baseline(results, tmp_path / "base.json")
-    for compared in compare_with(baseline_of(results), read_baseline(tmp_path / "base.json"), []):
+    for compared in compare_with(baseline(results), read_baseline(tmp_path / "base.json"), []):
         assert compared.comparison.paired
         assert compared.comparison.distance == 0.0
         assert not compared.worse
@@ -468,7 +468,7 @@ def test_a_baseline_read_back_is_the_same(results: cs.Results, tmp_path: Path) -
 
 def test_other_trials_are_not_paired(results: cs.Results) -> None:
     other = cs.run_trials(results.scenario, ["ekf-uvd"], runs=12, seed=4)
-    (compared,) = compare_with(baseline_of(results), baseline_of(other), [])
+    (compared,) = compare_with(baseline(results), baseline(other), [])
     assert not compared.comparison.paired
     assert "not the same" in compared.sentence
 
@@ -490,7 +490,7 @@ def test_bad_baselines_are_refused(results: cs.Results, tmp_path: Path) -> None:
             read_baseline(path)
     with pytest.raises(cs.InputError, match="cannot be read"):
         read_baseline(tmp_path / "nix.json")
-    base = baseline_of(results)
+    base = baseline(results)
     with pytest.raises(cs.InputError, match="is not in"):
         compare_filters(base, ["ekf-uvd", "nix"])
     with pytest.raises(cs.InputError, match="give two filters"):
@@ -502,7 +502,7 @@ def test_files_whose_truth_is_not_known_are_other_trials(tmp_path) -> None:
     rng = np.random.default_rng(515)
     for name in ("a", "b"):
         np.savez(tmp_path / f"{name}.npz", errors=rng.normal(size=(9, 5, 1)), covariances=np.ones((9, 5, 1, 1)))
-    a, b = (baseline_of_files(read_recordings(tmp_path / f"{name}.npz"), name) for name in ("a", "b"))
+    a, b = (baseline(read_recordings(tmp_path / f"{name}.npz"), name) for name in ("a", "b"))
     assert a.of_the_trials_of(a)
     assert not a.of_the_trials_of(b)
     (compared,) = compare_with(a, b, [])

@@ -6,48 +6,47 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from consistency.bench.store.curves import Curves, run_means, wins
+from consistency.bench.runs.by_run import run_means, wins
+from consistency.referee.diagnostics import Record
 from consistency.referee.types import Array, Failure
 
 
-def curves(nees: Array, failed: tuple[int, ...] = (), first: int = 0) -> Curves:
-    """Curves of runs ``first``, ``first`` + 1, ... in which the runs named ``failed`` broke down."""
-    runs, steps = nees.shape
-    return Curves(
-        filter="f", runs=np.arange(first, first + runs), t=np.arange(1.0, steps + 1.0),
-        covariance=np.full((runs, steps, 3, 3), np.nan), error=None, nees=nees, nis=np.full(nees.shape, np.nan),
-        nis_dof=np.zeros(nees.shape, np.int64), failures=tuple(Failure("f", run, 2, "NaN") for run in failed),
-    )  # fmt: skip
+def record_of(nees: Array, failed: tuple[int, ...] = (), first: int = 0) -> Record:
+    """Runs ``first``, ``first`` + 1, ... in which the runs named ``failed`` broke down."""
+    failures = tuple(Failure("f", run, 2, "NaN") for run in failed)
+    return Record("f", nees=nees, dof=3, failures=failures, runs=np.arange(first, first + len(nees)))
 
 
 def test_run_means_by_hand() -> None:
     nan = np.nan
     nees = np.array([[1.0, 2.0, 6.0], [nan, 2.0, 4.0], [0.5, nan, nan], [nan, nan, nan]])
-    np.testing.assert_array_equal(run_means(curves(nees)), [3.0, 3.0, 0.5, np.inf])
+    np.testing.assert_array_equal(run_means(record_of(nees)), [3.0, 3.0, 0.5, np.inf])
 
 
 def test_a_failed_run_is_infinite_whatever_it_had_before() -> None:
     nees = np.array([[1.0, np.nan], [1.0, 1.0], [0.1, np.nan]])
-    np.testing.assert_array_equal(run_means(curves(nees, failed=(5, 7), first=5)), [np.inf, 1.0, np.inf])
+    np.testing.assert_array_equal(run_means(record_of(nees, failed=(5, 7), first=5)), [np.inf, 1.0, np.inf])
 
 
 def test_a_failed_run_loses() -> None:
     """Run 1 of a has the lowest NEES until it fails; runs that fail in both are no win for either."""
-    a = curves(np.array([[1.0, 1.0], [0.1, np.nan], [2.0, 2.0], [0.1, np.nan], [3.0, 3.0], [1.0, 1.0]]), failed=(1, 3))
-    b = curves(np.array([[2.0, 2.0], [5.0, 5.0], [1.0, 1.0], [0.2, np.nan], [3.0, 3.0], [9.0, 9.0]]), failed=(3,))
+    a = record_of(
+        np.array([[1.0, 1.0], [0.1, np.nan], [2.0, 2.0], [0.1, np.nan], [3.0, 3.0], [1.0, 1.0]]), failed=(1, 3)
+    )
+    b = record_of(np.array([[2.0, 2.0], [5.0, 5.0], [1.0, 1.0], [0.2, np.nan], [3.0, 3.0], [9.0, 9.0]]), failed=(3,))
     assert wins(a, b) == (2, pytest.approx(stats.binomtest(2, 4).pvalue))
     assert wins(b, a) == (2, pytest.approx(1.0))
-    whole = curves(np.array([[2.0, 2.0]] * 6))
+    whole = record_of(np.array([[2.0, 2.0]] * 6))
     assert wins(a, whole) == (2, pytest.approx(stats.binomtest(2, 5).pvalue))
 
 
 def test_the_sign_test_of_wins() -> None:
     """All of eight: p = 2 / 2^8 on two sides."""
-    low, high = curves(np.ones((8, 2))), curves(np.full((8, 2), 2.0))
+    low, high = record_of(np.ones((8, 2))), record_of(np.full((8, 2), 2.0))
     assert wins(low, high) == (8, pytest.approx(2.0 / 256.0))
     assert wins(high, low) == (0, pytest.approx(2.0 / 256.0))
-    assert wins(curves(np.ones((8, 2)), failed=tuple(range(8))), high) == (0, pytest.approx(2.0 / 256.0))
+    assert wins(record_of(np.ones((8, 2)), failed=tuple(range(8))), high) == (0, pytest.approx(2.0 / 256.0))
 
 
 def test_nothing_but_ties() -> None:
-    assert wins(curves(np.ones((8, 2))), curves(np.ones((8, 2)))) == (0, 1.0)
+    assert wins(record_of(np.ones((8, 2))), record_of(np.ones((8, 2)))) == (0, 1.0)

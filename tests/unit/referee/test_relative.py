@@ -20,13 +20,12 @@ from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.independence import ENOUGH
 from consistency.referee.geometry.groups import carried, composed, matrices, to_left
-from consistency.referee.notebook.records import Record
 from consistency.referee.sources.relative import Stretch, windows_of
 from consistency.referee.sources.windows import Relative
 from consistency.referee.types import Array
-from consistency.referee.verdicts.baselines import baseline_of_files
+from consistency.referee.verdicts.baselines import baseline
 from consistency.referee.verdicts.comparison import compare_with
-from consistency.referee.verdicts.files import analyse_recordings
+from consistency.referee.verdicts.judge import analyse
 
 GROUPS = tuple(world.SIGMA)
 SURE = 1e-5  # false-alarm rate of a verdict in a test
@@ -48,7 +47,7 @@ def statistics(stretches: list[Stretch], size: str, motions: bool) -> dict[str, 
 
 
 def verdict_of(stretches: list[Stretch], size: str, motions: bool) -> Verdict:
-    return analyse_recordings([recorded(stretches, size, motions)])["log"]
+    return analyse([recorded(stretches, size, motions)])["log"]
 
 
 def same(a: object, b: object) -> None:
@@ -110,14 +109,10 @@ def test_right_motions_are_consistent_and_wrong_ones_are_found(group: str, rng: 
     """One of the two fails by chance in fewer than 1e-5 of all draws: 100 windows, and a ratio of 4."""
     for ratio, status in ((1.0, "consistent"), (4.0, "overconfident"), (0.2, "conservative")):
         record = recorded([motion_stretch(drive(rng, group, 500, ratio))], "5", True)
-        verdict = cs.judge(cs_record(record), false_alarm=SURE, detect=4.0)
+        verdict = cs.judge(record, false_alarm=SURE, detect=4.0)
         assert verdict.status == status
         assert (verdict.runs, verdict.steps, verdict.unit) == (100, 1, "window")
         assert "windows" in verdict.reasons[0] or status != "consistent"
-
-
-def cs_record(record: Evidence) -> Record:
-    return Record(**{name: getattr(record, name) for name in record.__dataclass_fields__})
 
 
 def test_windows_that_may_depend_are_steps_of_their_run(rng: np.random.Generator) -> None:
@@ -130,7 +125,7 @@ def test_declared_windows_are_runs(rng: np.random.Generator) -> None:
     runs = [pose_stretch(rng, "SE(2)", 11, 5, 1.0, run) for run in range(3)]
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", runs, AXES["SE(2)"], range(3), relative)
-    verdict = analyse_recordings([record])["log"]
+    verdict = analyse([record])["log"]
     assert (verdict.runs, verdict.steps, verdict.unit) == (30, 1, "window")
     np.testing.assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
 
@@ -145,7 +140,7 @@ def declared(rng: np.random.Generator, windows: int, steps: int = 10) -> Evidenc
 
 def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
     """Errors x9: found by 150 windows, and neither a fault nor an all-clear is said with 140."""
-    few = analyse_recordings([declared(rng, ENOUGH - 10)])["log"]
+    few = analyse([declared(rng, ENOUGH - 10)])["log"]
     assert few.status == "undecided"
     assert few.faults == ()
     assert few.answers == ()
@@ -153,11 +148,11 @@ def test_few_windows_do_not_show_independence(rng: np.random.Generator) -> None:
     assert "the covariance ratio would be" in few.reasons[0]
     assert few.equivalence is not None
     assert not few.equivalence.shown
-    enough = analyse_recordings([declared(rng, ENOUGH)])["log"]
+    enough = analyse([declared(rng, ENOUGH)])["log"]
     assert enough.status == "overconfident"
     right = replace(declared(rng, 30), unshown="")
-    assert analyse_recordings([right])["log"].runs == 30
-    base = baseline_of_files([declared(rng, 50)], "log")
+    assert analyse([right])["log"].runs == 30
+    base = baseline([declared(rng, 50)], "log")
     with pytest.raises(cs.InputError, match="at least 8 runs"):
         compare_with(base, base, [])
 
@@ -167,7 +162,7 @@ def test_a_failed_window_stays_failed(rng: np.random.Generator) -> None:
     stretch.estimate[20] = np.nan
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), relative)
-    assert analyse_recordings([record])["log"].status == "failed"
+    assert analyse([record])["log"].status == "failed"
 
 
 # --- files -----------------------------------------------------------------------------------------------
@@ -381,7 +376,7 @@ def test_a_real_sequence_from_images_to_windows(tmp_path: Path, name: str, truth
 def test_the_example_of_the_manual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (example,) = (block.text for block in blocks("docs/files.md", "python") if "wheels" in block.text)
-    names: dict[str, Record] = {}
+    names: dict[str, Evidence] = {}
     exec(example, names)
     verdict = cs.judge(names["record"])
     assert (verdict.runs, verdict.unit, verdict.status) == (60, "window", "consistent")

@@ -12,11 +12,12 @@ import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.build import build_report
 from consistency.bench.pages.model import Study
-from consistency.bench.pages.sections import anees, maps, own_errors, verdicts
+from consistency.bench.pages.sections import anees, maps, own_errors
 from consistency.referee.diagnostics import Interval, MapScore
 from consistency.referee.document.blocks import Cell, Name, Quantity, Status, Table
 from consistency.referee.document.verdict import page
 from consistency.referee.document.wording import brief, written
+from consistency.referee.pages import verdicts
 
 
 @pytest.fixture(scope="module")

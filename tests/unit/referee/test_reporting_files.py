@@ -25,7 +25,7 @@ from consistency.referee.pages.files import (
     shown_run,
     unit_of,
 )
-from consistency.referee.verdicts.files import analyse_recordings
+from consistency.referee.verdicts.judge import analyse
 
 RUNS, STEPS = 30, 25
 
@@ -58,7 +58,7 @@ def main(arguments: list[str]) -> int:
 
 def document(path: Path) -> Any:
     records = read_recordings(path)
-    return compose_files(records, analyse_recordings(records), path.name, {"command": "consistency analyse"})
+    return compose_files(records, analyse(records), path.name, {"command": "consistency analyse"})
 
 
 def figures(of: Any) -> dict[str, Figure]:
@@ -192,7 +192,7 @@ def test_each_of_several_estimators_has_its_sentence(tmp_path: Path, rng: np.ran
     (tmp_path / "e.csv").write_text("\n".join(lines))
     (tmp_path / "t.csv").write_text("step,a\n" + "".join(f"{k},0\n" for k in range(1, STEPS + 1)))
     records = read_recordings(tmp_path / "e.csv", tmp_path / "t.csv", state=["a"])
-    made = compose_files(records, analyse_recordings(records), "e.csv", {})
+    made = compose_files(records, analyse(records), "e.csv", {})
     assert [chapter.title for chapter in made.chapters[:2]] == ["good", "bad"]
     assert isinstance(made.chapters[1].blocks[0], Text)
     assert made.chapters[1].blocks[0].text.startswith("bad is overconfident")

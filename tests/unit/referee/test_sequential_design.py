@@ -6,7 +6,6 @@ Seeds are fixed and were not chosen; counts have limits at 1e-5.
 from __future__ import annotations
 
 import itertools
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from consistency.bench.runs import sequential
 from consistency.referee.diagnostics import (
     Design,
     Evidence,
+    Record,
     Verdict,
     e_process,
     ever,
@@ -27,7 +27,7 @@ from consistency.referee.diagnostics import (
     sequential_design,
 )
 from consistency.referee.diagnostics.equivalence import equivalence_by_betting
-from consistency.referee.diagnostics.verdict import Look
+from consistency.referee.diagnostics.verdict import Look, judge_alone
 from consistency.referee.types import Array, Failure
 
 SURE = 1e-5
@@ -177,9 +177,9 @@ def test_a_look_inside_judge() -> None:
     """A scale just below and just above its half of the rate."""
     evidence = evidence_from(independent(np.random.default_rng(79), 24, 6, 3))(24)
     design = Design(3, false_alarm=0.01)
-    found = judge(evidence, design.settings, Look(None, 0.00499))
+    found = judge_alone(evidence, design.settings, Look(None, 0.00499))
     assert found.faults == ("scale",)
-    assert judge(evidence, design.settings, Look(None, 0.00501)).faults == ()
+    assert judge_alone(evidence, design.settings, Look(None, 0.00501)).faults == ()
 
 
 # --- until decided -------------------------------------------------------------------------------------
@@ -282,18 +282,19 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch: pytest.MonkeyPa
     script = {("early", 12): "overconfident", ("late", 24): "conservative"}
 
     def verdict_at(design: Design, evidence: Evidence, spent: float | None) -> Verdict:
-        runs = evidence.run_numbers[0]  # type: ignore[index]
+        runs = len(evidence.run_numbers)
         calls.append((evidence.name, runs))
         status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
         return Verdict(evidence.name, status, (f"{status}: at {runs}",), runs, 1, design.settings)
 
     monkeypatch.setattr(sequential, "look", verdict_at)
     monkeypatch.setattr(sequential, "speaks", lambda design, evidence, spent: spent is not None)
-    bare = {"own": None, "landmarks": None, "rejections": None}
-    monkeypatch.setattr(sequential, "evidence_of", lambda c, runs: Evidence(c.name, runs=[runs]))
     verdicts: dict[str, Verdict] = {}
-    read = lambda runs, name: SimpleNamespace(name=name, **bare)  # noqa: E731
-    counts = list(sequential.looks(sequential_design(3), ["early", "late"], read, verdicts))  # type: ignore[arg-type]
+
+    def read(runs: int, name: str) -> Record:
+        return Record(name, runs=np.arange(runs))
+
+    counts = list(sequential.looks(sequential_design(3), ["early", "late"], read, verdicts))
     assert counts == [12, 15, 18, 21, 24]
     assert {name: v.status for name, v in verdicts.items()} == {"early": "overconfident", "late": "conservative"}
     assert [call for call in calls if call[0] == "early"] == [("early", 12)]

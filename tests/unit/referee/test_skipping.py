@@ -13,13 +13,13 @@ from draws import autoregression, fully_dependent, identities, independent, verd
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.bench.store.curves import Curves, Errors
 from consistency.referee.cli import main as command
+from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.skipping import Skip, skip_of
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.referee.verdicts.baselines import baseline_of_files, read_baseline, write_baseline
+from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
 from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse
 
 RUNS, STEPS, FIRST = 30, 40, 6
@@ -191,33 +191,33 @@ def test_a_comparison_without_the_first_steps(errors: Array, rng: np.random.Gene
 
 def test_a_baseline_holds_what_it_was_written_with(archive: Path, tmp_path: Path) -> None:
     records = read_recordings(archive)
-    write_baseline(baseline_of_files(records, "mine", skip=FIRST), tmp_path / "base.json")
+    write_baseline(baseline(records, "mine", skip=FIRST), tmp_path / "base.json")
     assert read_baseline(tmp_path / "base.json", skip="6").skip == "6"
     for skip, wanted in ((None, "without --skip"), (7, "with --skip 7")):
         with pytest.raises(InputError, match=f"was written with --skip 6; write it again {wanted}"):
             read_baseline(tmp_path / "base.json", skip=skip)
-    means = baseline_of_files(records, "mine").filters["mine"].nees
-    rest = baseline_of_files(records, "mine", skip=FIRST).filters["mine"].nees
+    means = baseline(records, "mine").filters["mine"].nees
+    rest = baseline(records, "mine", skip=FIRST).filters["mine"].nees
     assert (rest < means).all()
 
 
-def test_curves_of_results() -> None:
+def test_records_of_two_errors() -> None:
     """Errors stay, and so does the error of the filter's own; what they are held against is left out."""
     shape = (2, 4)
     P, own = Symmetric.filled(shape, 3, 1.0), Symmetric.filled(shape, 3, 2.0)
     numbers = np.ones(shape)
     error = np.ones((*shape, 3))
-    c = Curves(
-        "f", np.arange(2), np.arange(1.0, 5.0), P, error, numbers, numbers, numbers.astype(np.int64), (),
-        convention="left", own=Errors(error, own, numbers),
+    c = Record(
+        "f", error, own, numbers, nis=numbers, nis_dof=numbers.astype(np.int64), t=np.arange(1.0, 5.0),
+        convention="left", world=Record("f", error, P, numbers),
     )  # fmt: skip
     rest = c.without_first(Skip(2.0, "s"))
-    assert rest.own is not None
-    for values in (rest.nees, rest.nis, rest.covariance.entry(0, 1), rest.own.nees, rest.own.covariance.entry(2, 2)):
+    world = rest.in_world
+    for values in (rest.nees, rest.nis, rest.covariance.entry(0, 1), world.nees, world.covariance.entry(2, 2)):
         np.testing.assert_array_equal(np.isnan(values), [[True, True, False, False]] * 2)
     np.testing.assert_array_equal(rest.nis_dof, [[0, 0, 1, 1]] * 2)
     assert rest.nis_dof.dtype == np.int64
-    assert rest.error is error
+    assert rest.error is world.error is error
     assert np.isfinite(P.entry(0, 0)).all()
     with pytest.raises(InputError, match="--skip 4: nothing of f is left"):
         c.without_first(Skip(4))

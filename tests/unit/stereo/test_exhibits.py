@@ -13,9 +13,9 @@ from scripts import experiment
 import consistency as cs
 from consistency.bench.pages.build import build_report
 from consistency.bench.pages.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, section
-from consistency.bench.pages.section import Part
 from consistency.referee.document.blocks import Block, Column, Heading, Stack, Status, Table
 from consistency.referee.document.drawing import Figure, Line, Points, Rule
+from consistency.referee.pages.section import Part
 from consistency.stereo.pages import biases, image_tracks, images, sensor_issues
 
 SECTIONS = (biases, sensor_issues, images, image_tracks)

@@ -90,10 +90,10 @@ def test_so_many_features_from_here_to_there(issues: ModuleType) -> None:
 def test_statistics_of_runs(issues: ModuleType) -> None:
     error = np.zeros((2, 4, 3))
     error[0, :, :2], error[0, :, 2], error[1, :, :2], error[1, :, 2] = [3.0, 4.0], 1.0, 1.0, 0.5
-    curves: Any = SimpleNamespace(additive=SimpleNamespace(error=error), nees=np.array([[2.0, np.nan], [4.0, 6.0]]))
-    assert issues.log_rmse(curves, (0, 1))[0] == pytest.approx(np.log(5.0))
-    assert issues.log_rmse(curves, (2,))[1] == pytest.approx(np.log(0.5))
-    assert issues.log_nees(curves) == pytest.approx(np.log([2.0, 5.0]))
+    record = cs.Record("f", error, nees=np.array([[2.0, np.nan], [4.0, 6.0]]))
+    assert issues.log_rmse(record, (0, 1))[0] == pytest.approx(np.log(5.0))
+    assert issues.log_rmse(record, (2,))[1] == pytest.approx(np.log(0.5))
+    assert issues.log_nees(record) == pytest.approx(np.log([2.0, 5.0]))
     low, high = np.array([0.0, 0.1, 0.2, np.nan]), np.array([1.0, 1.2, 1.1, -9.0])
     assert issues.greater(high, low) < 0.01 < 0.99 < issues.greater(low, high)
 
@@ -125,7 +125,7 @@ def test_errors_of_the_first_run(issues: ModuleType) -> None:
     covariance[0, 1, 0, 0] = np.nan
     error = np.zeros((2, 2, 3))
     error[0, 1] = 1.0, 2.0, np.radians(3.0)
-    table = issues.first_run(SimpleNamespace(error=error, covariance=covariance))
+    table = issues.first_run(cs.Record("f", error, covariance))
     expected = [[1, 0, 0, 0, 2, 3, 5], [2, 1, 2, 3, np.nan, 3, 5]]
     np.testing.assert_allclose(table.to_numpy(float), expected)
     assert table.columns.tolist() == ["step", "x", "y", "heading", "sigma_x", "sigma_y", "sigma_heading"]

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.model import Study, Track, wide
-from consistency.bench.pages.section import STUDY, Section
+from consistency.bench.pages.model import Study, Track
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.questions import STEP
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Rule, Sheet, xy
 from consistency.referee.document.looks import EXPECTED, LIMIT, SHADE
 from consistency.referee.document.wording import listed
+from consistency.referee.pages.judged import wide
+from consistency.referee.pages.section import STUDY, Section
 from consistency.referee.types import Array
 
 DIMENSION = "3"  # of a pose: what is expected where no filter has a band

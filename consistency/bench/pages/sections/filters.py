@@ -7,10 +7,10 @@ from typing import Any
 import pandas as pd
 
 from consistency.bench.pages.model import Report
-from consistency.bench.pages.section import Part, Section
 from consistency.bench.pages.tables import extra_table
 from consistency.referee.document.blocks import Block, Cell, Column, Small, Stack, Status, table
 from consistency.referee.document.wording import brief
+from consistency.referee.pages.section import Part, Section
 
 FILTERS = Part("filters", "Filters side by side", "Filters")
 FILE = "filters.parquet"

@@ -6,8 +6,8 @@ from typing import Any
 
 from consistency.bench.pages.exhibits import findings_table
 from consistency.bench.pages.model import Report
-from consistency.bench.pages.section import Part, Section
 from consistency.referee.document.blocks import Table
+from consistency.referee.pages.section import Part, Section
 
 FINDINGS = Part("findings", "Findings: published beside measured", "Findings")
 CAPTION = "Rules of acceptance are constants of the scripts, fixed before this run"

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.bench.pages.model import Report
-from consistency.bench.pages.section import FRONT_END, Section
 from consistency.bench.pages.tables import extra_table
 from consistency.referee.document.drawing import Axis, Figure, Key, Panel, Points, Rule, Sheet
 from consistency.referee.document.looks import ACCEPTED, EXPECTED, LIMIT, REJECTED
 from consistency.referee.errors import InputError
+from consistency.referee.pages.section import FRONT_END, Section
 from consistency.referee.types import Array
 
 FILE = "first_order.parquet"

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from consistency.bench.pages.model import Study
-from consistency.bench.pages.section import STUDY, Section
 from consistency.referee.document.blocks import Block, Heading, Name, table
 from consistency.referee.document.verdict import FILTER, FURTHER, cells, columns
+from consistency.referee.pages.section import STUDY, Section
 
 CAPTION = (
     "Noncredibility index and inclination (Li & Zhao 2006): 0 dB is credible, 10 dB a covariance wrong by a factor "

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.bench.pages.model import Study, Track, wide
-from consistency.bench.pages.section import STUDY, Section
+from consistency.bench.pages.model import Study, Track
 from consistency.referee.document.drawing import (
     Axis,
     Band,
@@ -25,6 +24,8 @@ from consistency.referee.document.drawing import (
 )
 from consistency.referee.document.looks import EXPECTED, SHADE, Look
 from consistency.referee.document.wording import listed
+from consistency.referee.pages.judged import wide
+from consistency.referee.pages.section import STUDY, Section
 from consistency.referee.types import Array
 
 LEAST = 0.1  # correlation drawn on either side of zero, so that noise does not look large

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from consistency.bench.pages.model import Study, Track
-from consistency.bench.pages.section import STUDY, Section
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.document.blocks import Block, Heading, Name, Text, table
 from consistency.referee.document.map import COLUMNS, map_cells
 from consistency.referee.document.verdict import FILTER
+from consistency.referee.pages.section import STUDY, Section
 
 CAPTION = (
     "Landmarks in the map after the last step of runs that did not fail. NEES over degrees of freedom: 1 is right, "

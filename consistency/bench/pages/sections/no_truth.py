@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from consistency.bench.pages.model import Study
-from consistency.bench.pages.section import STUDY, Section
 from consistency.referee.document.blocks import Text
+from consistency.referee.pages.section import STUDY, Section
 
 
 def read(study: Study) -> Study | None:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.bench.pages.model import Report, Track
-from consistency.bench.pages.section import OPENING, Section
 from consistency.referee.diagnostics import Interval
 from consistency.referee.document.blocks import Block, Column, Name, Table, table
 from consistency.referee.document.drawing import Axis, Figure, Intervals, Key, Panel, Rule, Sheet, Span, dodge
 from consistency.referee.document.looks import EXPECTED, SHADE, solid
 from consistency.referee.document.verdict import BRIEF, cells, columns, factor
 from consistency.referee.document.wording import written
+from consistency.referee.pages.section import OPENING, Section
 
 TITLE = "Which filter tells the truth about its uncertainty, and where?"
 LABEL = "covariance ratio (truth / stated)"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from consistency.bench.pages.model import Study, Track
-from consistency.bench.pages.section import STUDY, Section
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, table
 from consistency.referee.document.verdict import BRIEF, FILTER, cells, columns
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+from consistency.referee.pages.section import STUDY, Section
 
 COLUMNS = (FILTER, Column("Error", width="2.4fr"), *columns(BRIEF))
 

@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.bench.pages.model import Study, Track
-from consistency.bench.pages.section import STUDY, Section
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Panel, Rule, Sheet
-from consistency.referee.document.looks import Look, solid
+from consistency.referee.document.looks import SIGMAS, ZERO, Look, solid
+from consistency.referee.pages.section import STUDY, Section
 from consistency.referee.types import Array
 
 COMPONENTS = (("x", "m"), ("y", "m"), ("heading", "deg"))
 DEGREES = np.array([1.0, 1.0, 180.0 / np.pi])
-SIGMAS = 2.0
-ZERO = Look("#555555", width=0.5)
 BOUND = Key("2-sigma bounds, thin, in the filter's colour", Look("#333333", (3.0, 2.0), width=0.8))
 
 
@@ -45,14 +43,14 @@ def read(study: Study) -> PoseErrors | None:
 
 
 def _pose_error(track: Track) -> PoseError | None:
-    c = track.shown
-    if c.error is None:
+    run = track.shown.in_world
+    if run.error is None or run.covariance is None:
         return None
-    if not len(c.runs):
-        empty = np.full((len(c.t), 3), np.nan)
+    if not len(run.error):
+        empty = np.full((len(run.t), 3), np.nan)
         return PoseError(track, empty, empty)
-    variance = np.diagonal(c.covariance[0], axis1=-2, axis2=-1)
-    return PoseError(track, DEGREES * c.error[0], DEGREES * np.sqrt(np.maximum(variance, 0.0)))
+    variance = np.diagonal(run.covariance[0], axis1=-2, axis2=-1)
+    return PoseError(track, DEGREES * run.error[0], DEGREES * np.sqrt(np.maximum(variance, 0.0)))
 
 
 def figures(errors: PoseErrors) -> tuple[Figure, ...]:

@@ -6,9 +6,9 @@ import json
 from typing import Any
 
 from consistency.bench.pages.model import Report, Study
-from consistency.bench.pages.section import Part, Section
 from consistency.referee.document.blocks import Block, Details, Facts, Settings
-from consistency.referee.document.wording import number
+from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.section import Part, Section
 
 PROVENANCE = Part("provenance", "Provenance", "Provenance")
 SHORT = 4000  # characters of settings that surely fit on one page
@@ -50,25 +50,6 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [_rounded(item) for item in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
-def facts(manifest: dict[str, Any]) -> tuple[tuple[str, str], ...]:
-    """What a manifest says of its run."""
-    versions = manifest.get("versions") or {}
-    wall, screening = manifest.get("wall_time_s"), manifest.get("screening")
-    rows = {
-        "Seed": manifest.get("seed"),
-        "Runs": manifest.get("runs"),
-        "Scenario hash": manifest.get("scenario_hash"),
-        "Screened": screening and "{broken} of {judged} observations leave the common motion".format_map(screening),
-        "Command": manifest.get("command"),
-        "Git commit": manifest.get("git_commit"),
-        "Wall time": None if wall is None else f"{number(float(wall), '.1f')} s",
-        "Versions": ", ".join(f"{name} {version}" for name, version in versions.items()) or None,
-    }
-    if manifest.get("complete") is False:
-        rows["Complete"] = "no: the run was interrupted; the numbers are of the finished runs"
-    return tuple((name, str(value)) for name, value in rows.items() if value is not None)
 
 
 SECTION = Section(PROVENANCE, read, show)

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.pages.model import Report
-from consistency.bench.pages.section import Part, Section
 from consistency.bench.scenario import data_folder
 from consistency.referee.diagnostics.intervals import binomial_interval
 from consistency.referee.document.blocks import Block, Cell, Column, Details, Facts, Table, Text
+from consistency.referee.pages.section import Part, Section
 
 REFEREE = Part("calibration", "How far the referee can be trusted", "The referee")
 NAME = "calibration.json"

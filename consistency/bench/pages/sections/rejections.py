@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from consistency.bench.pages.model import Study
-from consistency.bench.pages.section import STUDY, Section
 from consistency.referee.document.blocks import Block, Heading, Name, table
 from consistency.referee.document.guard import COLUMNS, rejection_cells
 from consistency.referee.document.verdict import FILTER
+from consistency.referee.pages.section import STUDY, Section
 
 CAPTION = (
     "Observations offered to filters with a guard, over all runs. Precision: the share of the rejected ones that are "

@@ -8,10 +8,10 @@ import numpy as np
 
 from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.pages.model import Study, Track
-from consistency.bench.pages.section import STUDY, Section
 from consistency.bench.simulation import simulate
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Sheet, xy
 from consistency.referee.document.looks import ODOMETRY, TRUTH, Look
+from consistency.referee.pages.section import STUDY, Section
 from consistency.referee.types import Array, Indices
 
 LANDMARK = Look("#8c8c8c", marker="*", size=4.0)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from consistency.bench.pages.model import Judged
-from consistency.bench.pages.section import STUDY, Section
 from consistency.referee.diagnostics import Answer
 from consistency.referee.diagnostics.questions import ABOUT, MAIN
 from consistency.referee.document import blocks
 from consistency.referee.document.blocks import Block, Column, Heading, Small, Stack, Text, table
 from consistency.referee.document.wording import p_cell
+from consistency.referee.pages.judged import Judged
+from consistency.referee.pages.section import STUDY, Section
 
 FOUND, TOLERATED, NOT_FOUND, NOT_ASKED = "✗", "≈", "○", "–"
 MARKS = {FOUND: "found", TOLERATED: "found, within the tolerance", NOT_FOUND: "not found", NOT_ASKED: "not asked"}

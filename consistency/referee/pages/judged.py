@@ -1,0 +1,97 @@
+"""Estimators that were judged on the same runs, as pages show them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from consistency.referee.diagnostics import Verdict
+from consistency.referee.document.drawing import Key, Owner
+from consistency.referee.document.looks import Look, style
+from consistency.referee.pages.clock import Clock
+from consistency.referee.types import Array, Failure, Indices
+
+SINGLE_RUN = 1
+DECADE = 10.0  # values that span more are drawn on a log axis
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """One filter or estimator in one study, with the verdict on it."""
+
+    name: str
+    style: int  # the same number for the same filter in the whole report
+    tag: str  # of the filter in this study, for what belongs to it on a page
+    verdict: Verdict
+    failures: tuple[Failure, ...]  # of all runs, also of those after the look that decided
+
+    @property
+    def look(self) -> Look:
+        return style(self.style)
+
+    @property
+    def owner(self) -> Owner:
+        return Owner(self.name, self.tag)
+
+    @property
+    def innovations_judged(self) -> bool:
+        """Whether the filter declares an optimal gain; innovations of any other are reported only."""
+        return self.verdict.innovations is not None and self.verdict.innovations.judged
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Estimators that were judged on the same runs."""
+
+    name: str
+    summary: str
+    runs: int
+    shown_run: int  # the one that is drawn where only one can be
+    clock: Clock
+    steps: Indices  # (T,), 1..T
+    tracks: tuple[Estimator, ...]
+    until_decided: bool  # each verdict is that of the look that decided it
+
+    @property
+    def has_truth(self) -> bool:
+        return any(track.verdict.scale is not None for track in self.tracks)
+
+    @property
+    def single(self) -> bool:
+        """One run: the curve is a NEES, no average."""
+        return self.runs == SINGLE_RUN
+
+    @property
+    def statistic(self) -> str:
+        return "NEES" if self.single else "ANEES"
+
+    @property
+    def judged(self) -> list[str]:
+        """Filters whose innovations are judged."""
+        return [track.name for track in self.tracks if track.innovations_judged]
+
+    @property
+    def own_errors(self) -> list[str]:
+        """Filters that are judged in an error of their own, with its convention."""
+        return [f"{t.name} ({t.verdict.convention})" for t in self.tracks if t.verdict.world is not None]
+
+    @property
+    def failures(self) -> list[tuple[str, int, int, str]]:
+        """Filter, run, step and reason of every failed run."""
+        return [
+            (track.name, int(failure.run), int(failure.step), failure.reason)
+            for track in self.tracks
+            for failure in track.failures
+        ]
+
+    def keys(self, marked: bool = False) -> tuple[Key, ...]:
+        """Entries of a legend, one a filter; ``marked``: with the filter's marker."""
+        return tuple(Key(track.name, track.look, marked=marked, owner=track.owner) for track in self.tracks)
+
+
+def wide(values: list[Array]) -> bool:
+    """Whether the values above zero, in arrays of any shape, span more than a decade."""
+    flat = np.concatenate([v.ravel() for v in values]) if values else np.empty(0)
+    flat = flat[np.isfinite(flat) & (flat > 0)]
+    return bool(flat.size) and bool(flat.max() > DECADE * flat.min())

@@ -1,0 +1,57 @@
+"""From records to verdicts, whatever their source."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from consistency.referee.diagnostics import Design, Record, Settings, Verdict
+from consistency.referee.diagnostics.judging import judge_runs, with_map
+from consistency.referee.diagnostics.skipping import Skip
+from consistency.referee.verdicts.options import settings_of, skip_asked
+from consistency.referee.verdicts.sources import Results, Source, source_of
+
+
+def analyse(
+    results: Source | Sequence[Record] | Results | str | Path,
+    filters: Sequence[str] | None = None,
+    confidence: float | None = None,
+    settings: Settings | None = None,
+    skip: str | float | Skip | None = None,
+    optimal_gain: bool = False,
+) -> dict[str, Verdict]:
+    """A verdict for every filter of the results, or for those named.
+
+    Parameters
+    ----------
+    results : of ``consistency.run_trials``, a folder of them, or a sequence of records
+    confidence : 1 less the false-alarm rate of a verdict, in place of ``settings``
+    settings : what to ask; the defaults of :class:`Settings` where None. Results of a run until decided are then
+        judged as that run was.
+    skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
+    optimal_gain : the filters declare one, so that their innovations are judged; results say it themselves
+
+    Raises
+    ------
+    InputError
+        Unknown filter, a confidence outside (0, 1), or nothing is left.
+    """
+    source = source_of(results)
+    design = source.design() if settings is None and confidence is None else None
+    settings = settings_of(confidence) if settings is None else settings
+    first, verdicts = skip_asked(skip), {}
+    for name in filters or source.filters:
+        verdict, ends = _of_poses(_record(source.record(name), first, optimal_gain), settings, design)
+        verdicts[name] = with_map(verdict, ends, settings, design)
+    return verdicts
+
+
+def _record(record: Record, first: Skip | None, optimal_gain: bool) -> Record:
+    record = record if first is None else record.without_first(first)
+    return replace(record, optimal_gain=True) if optimal_gain else record
+
+
+def _of_poses(record: Record, settings: Settings, design: Design | None) -> tuple[Verdict, Record]:
+    """A verdict without the maps; the arrays are free before those are read."""
+    return judge_runs(record, settings, design), record.ends

@@ -25,7 +25,7 @@ from scipy import signal, stats
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.geometry import wrap
 from consistency.referee.sources.alignment import Aligned, clocks_and_frames
-from consistency.referee.sources.frames import Frame, moved
+from consistency.referee.sources.frames import WorldTransform, moved
 from consistency.referee.sources.poses import Poses
 from consistency.referee.sources.sheet import Places
 from consistency.referee.types import Array
@@ -182,8 +182,8 @@ def displaced(rng: np.random.Generator, runs: Sequence[Poses], mode: str) -> lis
     if mode in ("none", "offset"):
         return list(runs)
 
-    def frame() -> Frame:
-        return Frame.about_z(rng.uniform(-np.pi, np.pi), rng.uniform(-50.0, 50.0, 2))
+    def frame() -> WorldTransform:
+        return WorldTransform.about_z(rng.uniform(-np.pi, np.pi), rng.uniform(-50.0, 50.0, 2))
 
     one = frame()
     return [moved(p, one if mode.endswith("-all") else frame()) for p in runs]

@@ -22,8 +22,8 @@ import numpy as np
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.tuning.bench import Bench
-from consistency.bench.tuning.fit import Fit
+from consistency.bench.tuning.bench import BeliefScorer
+from consistency.bench.tuning.fit import FactorFit
 from consistency.bench.tuning.groups import groups_of, scaled
 from consistency.bench.tuning.parts import parts_of
 from consistency.bench.tuning.tune import _Tuner
@@ -162,14 +162,14 @@ def intervals(name: str, world: World, options: argparse.Namespace) -> bool:
     return bool(min(rates) <= SURE)
 
 
-def fit_in(world: World, seed: int, jobs: int) -> tuple[Fit, Array]:
+def fit_in(world: World, seed: int, jobs: int) -> tuple[FactorFit, Array]:
     """A fit without a verdict, and the true factors (2,)."""
     rng = np.random.default_rng((seed, 1))
     true = FACTOR ** rng.uniform(-1.0, 1.0, 2)
     parts = parts_of(wrong(world.scenario(), *true), world.runs, seed)
     parts = replace(parts, trials=[world.observed(trial, rng) for trial in parts.trials])
     kf, groups = cs.get_filter("kf"), groups_of("Q,R", parts.belief)
-    with Bench(kf, parts.trials, parts.belief, "innovations", jobs) as bench:
+    with BeliefScorer(kf, parts.trials, parts.belief, "innovations", jobs) as bench:
         bench.compile()
         fit = _Tuner(kf, parts, groups, jobs, None, Settings())._fit(bench)
     return fit, true * [1.0, 2.0 if world.uneven else 1.0]
@@ -181,7 +181,7 @@ def speed(options: argparse.Namespace) -> None:
         scenario = cs.load_scenario(world)
         trials = [cs.simulate(scenario, run, options.seed) for run in range(SPEED_RUNS)]
         groups = groups_of("Q,R", scenario.belief)
-        with Bench(cs.get_filter(name), trials, scenario.belief, "innovations", options.jobs) as bench:
+        with BeliefScorer(cs.get_filter(name), trials, scenario.belief, "innovations", options.jobs) as bench:
             bench.compile()
             began = time.monotonic()
             for log_factors in np.random.default_rng(options.seed).uniform(-1.0, 1.0, (SETTINGS, 2)):

@@ -9,7 +9,7 @@ from .bench.scenario import Scenario as Scenario
 from .bench.scenario import load_scenario as load_scenario
 from .bench.scenario import scenario_names as scenario_names
 from .bench.simulation import simulate as simulate
-from .bench.store.judge import analyse as analyse
+from .referee.verdicts.judge import analyse as analyse
 from .bench.store.log import Log as Log
 from .bench.store.log import read_log as read_log
 from .bench.store.results import Results as Results

@@ -21,7 +21,7 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.pages.finding import findings_table
+from consistency.bench.runs.finding import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.diagnostics import Evidence, Verdict, judge, nees
 from consistency.referee.show.terminal import show
@@ -37,7 +37,7 @@ from consistency.stereo.vision import (
     triangulate,
     triangulation_covariance,
 )
-from consistency.stereo.vision.motion import RelativeMotion, Settings, diagonal
+from consistency.stereo.vision.motion import MotionSettings, RelativeMotion, diagonal
 from consistency.stereo.vision.shared import SHARED, fit_shared, sensitivities
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def simulated(rig: StereoRig, m: RelativeMotion, estimator: str, printed: bool, 
     """:data:`SAMPLES` poses of one motion. ``printed``: the feature's variance is its SIFT scale, in px^2."""
     sigma0, sigma1 = m.sigma0, m.sigma1
     if printed:
-        sigma0, sigma1 = (np.sqrt(s / Settings().sigma_per_scale) for s in (sigma0, sigma1))
+        sigma0, sigma1 = (np.sqrt(s / MotionSettings().sigma_per_scale) for s in (sigma0, sigma1))
     clear = m.inliers.copy()
     for uv, s in ((m.uv0, sigma0), (m.uv1, sigma1)):
         d = uv[:, 0] - uv[:, 2] - (rig.K_left[0, 2] - rig.K_right[0, 2])
@@ -290,9 +290,9 @@ def noise(study: cs.Study, case: Case, rng: np.random.Generator) -> list[cs.Find
             study, 1 / FACTOR <= rest.mean() <= FACTOR, "halves",
             statistic="NEES/6 of the difference of poses from disjoint halves of the matches, second half of the drive",
             claim="the propagated covariance is that of the noise of the features",
-            measured=f"{rest.mean():.2f} with sigma = {Settings().sigma_per_scale * np.sqrt(scale):.3f} px per px of "
-            f"scale, fitted to the first half; {nees(gap, spread).mean() / 6:.2f} over all with the default "
-            f"{Settings().sigma_per_scale}",
+            measured=f"{rest.mean():.2f} with sigma = {MotionSettings().sigma_per_scale * np.sqrt(scale):.3f} px per "
+            f"px of scale, fitted to the first half; {nees(gap, spread).mean() / 6:.2f} over all with the default "
+            f"{MotionSettings().sigma_per_scale}",
         ),
         found(
             study, 1 / FACTOR <= means["bias and floor"] <= FACTOR, "noise",

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.pages.finding import findings_table
+from consistency.bench.runs.finding import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
@@ -32,7 +32,7 @@ from consistency.referee.types import Array
 from consistency.stereo.vision import RelativePose, StereoRig, triangulate
 from consistency.stereo.vision.errors import ConsensusError
 from consistency.stereo.vision.features import opencv
-from consistency.stereo.vision.motion import Settings, estimate_motion
+from consistency.stereo.vision.motion import MotionSettings, estimate_motion
 
 if TYPE_CHECKING:
     import front_end_data as data
@@ -90,7 +90,7 @@ def spoilt(rig: StereoRig, m: Matches, condition: str, rng: np.random.Generator)
 def ours(rig: StereoRig, m: Matches, seed: int) -> RelativePose:
     """The front-end's pose of the matches."""
     rng = np.random.default_rng(seed)
-    return estimate_motion(rig, m.uv0, m.uv1, m.sigma0, m.sigma1, Settings(), rng).pose
+    return estimate_motion(rig, m.uv0, m.uv1, m.sigma0, m.sigma1, MotionSettings(), rng).pose
 
 
 def peer(rig: StereoRig, m: Matches, seed: int) -> RelativePose:

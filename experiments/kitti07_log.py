@@ -242,4 +242,4 @@ def continued(track: Array, step: Array) -> Array:
 
 def thinned(rows: pd.DataFrame, slots: int = SLOTS, width: int = 1226) -> pd.DataFrame:
     """Rows (step, landmark, z0, z1, z2) of at most ``slots`` landmarks at once, none older than MAX_AGE."""
-    return tracks.thinned(rows, tracks.Selection(slots, MAX_AGE, MIN_LIFE, BANDS, width))
+    return tracks.thinned(rows, tracks.TrackSelection(slots, MAX_AGE, MIN_LIFE, BANDS, width))

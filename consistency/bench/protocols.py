@@ -11,7 +11,7 @@ from consistency.referee.types import Array
 
 
 @dataclass(frozen=True)
-class Truth:
+class TrialTruth:
     """True poses and landmarks of a trial."""
 
     path: Array  # (T + 1, 3)
@@ -25,7 +25,7 @@ class Problem:
     belief: Belief
     start: Array  # (3,), pose at step 0, known exactly
     landmarks: Array | None = None  # (N, 3): reference of a linear world, None in any other
-    truth: Truth | None = None  # told to a filter that declares ``realisable = False``, None to any other
+    truth: TrialTruth | None = None  # told to a filter that declares ``realisable = False``, None to any other
 
 
 @runtime_checkable

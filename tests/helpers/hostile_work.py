@@ -17,8 +17,8 @@ import consistency as cs
 from consistency.bench.runs.records import record_of
 from consistency.bench.simulation import World
 from consistency.bench.store.results import open_results
-from consistency.bench.sweeps.cell import CellResult, Outcome, runs_table
-from consistency.bench.sweeps.folder import SweepFolder, Work
+from consistency.bench.sweeps.cell import CellOutcome, CellResult, runs_table
+from consistency.bench.sweeps.folder import CellWork, SweepFolder
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.bench.sweeps.regime import regime_of, write_regime
 
@@ -86,7 +86,7 @@ def _write_maps(folder: Path) -> None:
     runs = runs_table(record_of(open_results(folder.parent / "results"), "one"))
     for cell in sweep.sweep.cells:
         for name, status in zip(sweep.sweep.filters, ("consistent", "overconfident"), strict=True):
-            sweep.write(Work(cell, name), Outcome(CellResult(status, status, *numbers), runs), wall=1.0)
+            sweep.write(CellWork(cell, name), CellOutcome(CellResult(status, status, *numbers), runs), wall=1.0)
     write_regime(regime_of(sweep), sweep.path)
 
 

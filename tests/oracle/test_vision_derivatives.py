@@ -15,7 +15,7 @@ from consistency.stereo.vision.propagation import registration_derivatives, tria
 from consistency.stereo.vision.refinement import _profile
 from consistency.stereo.vision.rig import solved
 from consistency.stereo.vision.robust import loss
-from consistency.stereo.vision.twoframe import Measure, Pixels, Points, TwoFrames
+from consistency.stereo.vision.twoframe import Measure, PixelMatches, PointMatches, TwoFrames
 from consistency.stereo.vision.twoframe import derivatives as two_frame_derivatives
 
 Array = np.ndarray[Any, Any]
@@ -108,7 +108,7 @@ def test_registration(vector: tuple[float, ...], rng: np.random.Generator) -> No
 
 
 @pytest.mark.parametrize("vector", POSES[:2])
-@pytest.mark.parametrize("measure", [Points(), Pixels(RIG)], ids=["points", "pixels"])
+@pytest.mark.parametrize("measure", [PointMatches(), PixelMatches(RIG)], ids=["points", "pixels"])
 def test_two_frames(measure: Measure, vector: tuple[float, ...], rng: np.random.Generator) -> None:
     """All blocks of the cost of pose and points, at noisy measurements with correlated noise."""
     pose = RelativePose.from_vector(np.array(vector))
@@ -120,7 +120,7 @@ def test_two_frames(measure: Measure, vector: tuple[float, ...], rng: np.random.
     root = rng.normal(size=(2, n, k, k))
     W1, W2 = root @ np.swapaxes(root, -1, -2)
     f = two_frame_derivatives(TwoFrames(measure, z1, z2, W1, W2), pose, q, exact=True)
-    sensed = seen if isinstance(measure, Pixels) else list
+    sensed = seen if isinstance(measure, PixelMatches) else list
     for i in range(n):
 
         def cost(x: Sequence[HyperDual], i: int = i) -> HyperDual:  # x: d, q, z1, z2
@@ -156,7 +156,7 @@ def test_elimination_and_loss(robust: Any, rng: np.random.Generator) -> None:
     W1, W2 = np.linalg.inv(S1), np.linalg.inv(S2)
     e = (z1 - pose.apply(z2))[0]
     best = z2 + (S2 @ pose.R.T @ G @ e[:, None])[:, :, 0]
-    frames = TwoFrames(Points(), z1, z2, W1, W2)
+    frames = TwoFrames(PointMatches(), z1, z2, W1, W2)
     s = frames.squared(pose, best)
     assert s == pytest.approx(e @ G @ e, rel=1e-10)
     c = 0.7 * float(np.sqrt(s[0]))

@@ -33,7 +33,7 @@ RANKS = {
         "types": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,
         "store.parquet": 3, "store.storage": 4, "store.soundness": 4, "store.tables": 4, "store.journal": 5,
         "store.results": 5, "store.log": 6,
-        "runs.streams": 4, "runs.supervising": 5, "runs.touched": 5, "runs.footprint": 6, "runs.gather": 6,
+        "runs.streams": 4, "runs.finding": 4, "runs.supervising": 5, "runs.touched": 5, "runs.footprint": 6, "runs.gather": 6,
         "runs.isolating": 6, "runs.resuming": 6, "runs.compiling": 6, "runs.work": 7, "runs.backends": 8,
         "runs.campaign": 8, "runs.montecarlo": 9, "runs.records": 6, "runs.by_run": 7, "runs.pilots": 10,
         "runs.sequential": 10, "runs.ahead": 10, "runs.findings": 11,

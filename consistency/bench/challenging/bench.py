@@ -36,7 +36,7 @@ class Done:
     seconds: float  # of the fastest trial; others may have waited for a busy machine
 
 
-class Bench:
+class ChallengeScorer:
     """Scores one filter; to be used in a ``with``, which holds the workers.
 
     The score of a trial is log(mean NEES of the run / 3), which is 0 or a little less for a right filter. The logarithm
@@ -48,7 +48,7 @@ class Bench:
         self._stack = ExitStack()
         self._parallel: Any = None
 
-    def __enter__(self) -> Bench:
+    def __enter__(self) -> ChallengeScorer:
         self._stack.enter_context(one_blas_thread())
         if self.workers > 1:  # kernels release the GIL; other filters run in processes, for which threads wait
             self._stack.enter_context(joblib.parallel_config("threading", n_jobs=self.workers))

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from consistency.bench.challenging.bench import Bench
+from consistency.bench.challenging.bench import ChallengeScorer
 from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search, standard_error
 from consistency.bench.challenging.shrink import shrink
 from consistency.bench.challenging.worlds import Point, Space, space_of
@@ -149,9 +149,9 @@ def challenge(
     scenario = base_of(instance) if base is None else load_scenario(base) if isinstance(base, str) else base
     resolve_filters([instance], scenario.belief)
     space = space_of(scenario, within)
-    with Bench(instance, plan.jobs) as bench:
+    with ChallengeScorer(instance, plan.jobs) as bench:
         bench.compile(corners(space))
-        return Campaign(bench, space, plan).run()
+        return ChallengePhases(bench, space, plan).run()
 
 
 def base_of(filter_: Filter) -> Scenario:
@@ -179,10 +179,10 @@ def scenario_of(space: Space, point: Point) -> Scenario | None:
         return None
 
 
-class Campaign:
+class ChallengePhases:
     """One challenge: the counts, and the phases in order."""
 
-    def __init__(self, bench: Bench, space: Space, plan: Plan) -> None:
+    def __init__(self, bench: ChallengeScorer, space: Space, plan: Plan) -> None:
         self.bench, self.space, self.plan = bench, space, plan
         self.search_seed, self.shrink_seed, self.confirm_seed = plan.seeds
         self.budget = Budget(None if plan.minutes is None else 60.0 * plan.minutes, plan.trials)

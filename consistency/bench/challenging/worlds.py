@@ -37,7 +37,7 @@ FACTORS = {
 
 
 @dataclass(frozen=True)
-class Scale:
+class LogScale:
     """A number on a logarithmic scale."""
 
     name: str
@@ -66,7 +66,7 @@ class Scale:
         """A value half the way to the plain one."""
         return self.at(0.5 * (self.where(value) + self.where(self.plain)))
 
-    def within(self, text: str) -> Scale:
+    def within(self, text: str) -> LogScale:
         """The dimension with the bounds ``LOW:HIGH``, or fixed at ``VALUE``."""
         try:
             low, high = (self._number(float(part)) for part in (text.split(":") if ":" in text else (text, text)))
@@ -130,7 +130,7 @@ class Choice:
         return str(value)
 
 
-Dimension = Scale | Choice
+Dimension = LogScale | Choice
 
 
 @dataclass(frozen=True)
@@ -232,9 +232,9 @@ def _dimensions(base: Scenario) -> list[Dimension]:
     return [*found, _scale("range", truth.sensor.range[1], " m")]
 
 
-def _scale(name: str, base: float, unit: str = "", whole: bool = False) -> Scale:
+def _scale(name: str, base: float, unit: str = "", whole: bool = False) -> LogScale:
     low, high = (float(f"{factor * base:.{DIGITS}g}") for factor in FACTORS[name])
-    return Scale(name, base, max(1, round(low)) if whole else low, round(high) if whole else high, unit, whole)
+    return LogScale(name, base, max(1, round(low)) if whole else low, round(high) if whole else high, unit, whole)
 
 
 # --- from values to keys of a scenario -----------------------------------------------------------------

@@ -23,7 +23,7 @@ from consistency.bench.filters.kernel.gain import HALTED, REASONS
 from consistency.bench.filters.kernel.jit import Outlook
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.slam import Data, Slam, landmark_width, robot_width
-from consistency.bench.protocols import Filter, Problem, Truth
+from consistency.bench.protocols import Filter, Problem, TrialTruth
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Control, Estimates, Gaussian, Info, Map, Observation, Trial
 from consistency.referee.errors import InputError
@@ -265,4 +265,4 @@ def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
         raise InputError(
             f"{needs}: run {trial.run} has observations of things that are no landmark; leave the filter out"
         )
-    return replace(problem, truth=Truth(trial.truth, trial.landmarks))
+    return replace(problem, truth=TrialTruth(trial.truth, trial.landmarks))

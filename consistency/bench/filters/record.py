@@ -12,7 +12,7 @@ from consistency.referee.types import Array, Failure, Indices
 
 
 @dataclass(frozen=True)
-class Record:
+class RunRecord:
     """What a filter has said so far in a run, written as it goes; the arrays may lie where another process reads them.
 
     Rows are of steps 1..T. Those of the step in which the filter is may be half written.
@@ -28,14 +28,14 @@ class Record:
     rejected: Array  # (M,), bool
 
     @classmethod
-    def empty(cls, steps: int, observations: int) -> Record:
+    def empty(cls, steps: int, observations: int) -> RunRecord:
         """Room for one run."""
         at, rejected = np.zeros(1, np.int64), np.zeros(observations, bool)
         pose, covariance, own = (np.empty((steps, *shape)) for shape in ((3,), (3, 3), (3, 3)))
         nis, dof, log_det = (np.empty(steps) for _ in range(3))
         return cls(at, pose, covariance, own, nis, dof, log_det, rejected).begun()
 
-    def begun(self) -> Record:
+    def begun(self) -> RunRecord:
         """The same arrays, as they are before the first step."""
         self.at[:], self.dof[:], self.rejected[:] = 0, 0, False
         for array in (self.pose, self.covariance, self.own, self.nis, self.log_det):

@@ -10,7 +10,7 @@ import numpy as np
 
 from consistency.bench.filters.compiled import problem_for
 from consistency.bench.filters.kernel.linalg import definiteness
-from consistency.bench.filters.record import Record
+from consistency.bench.filters.record import RunRecord
 from consistency.bench.protocols import Filter, WholeTrial
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Gaussian, Info, Map, Trial
@@ -55,7 +55,7 @@ def rejects(filter_: Filter) -> bool:
     return callable(getattr(filter_, "rejected", None))
 
 
-def run_filter(filter_: Filter, trial: Trial, belief: Belief, record: Record | None = None) -> Estimates:
+def run_filter(filter_: Filter, trial: Trial, belief: Belief, record: RunRecord | None = None) -> Estimates:
     """A whole trial through a filter, compiled where it can be.
 
     An exception, an estimate that is not finite or a pose covariance that is not positive definite ends the run as a
@@ -78,7 +78,7 @@ class _Unusable(Exception):
     """What a filter gave cannot be used; the message is the whole reason."""
 
 
-def step_through(filter_: Filter, trial: Trial, belief: Belief, record: Record | None = None) -> Estimates:
+def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecord | None = None) -> Estimates:
     """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``.
 
     ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``rejected`` in each step
@@ -91,7 +91,7 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: Record |
         The filter's error is no convention, or nothing gives its covariance; it needs the truth and there is none.
     """
     T, name, error = trial.steps, name_of(filter_), error_of(filter_)
-    record = record or Record.empty(T, len(trial.landmark))
+    record = record or RunRecord.empty(T, len(trial.landmark))
     given, rank = own_arrays(trial), _Rank(error)
     reason, map_ = "", None
     problem = problem_for(filter_, given, belief)

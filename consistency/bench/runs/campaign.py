@@ -12,8 +12,8 @@ import pandas as pd
 from consistency.bench.filters.stepping import error_of, name_of, optimal_gain
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.gather import Gathered, SoFar
-from consistency.bench.runs.resuming import Place
-from consistency.bench.runs.work import Backend, Work
+from consistency.bench.runs.resuming import ResultsPlace
+from consistency.bench.runs.work import Backend, TrialWork
 from consistency.bench.store.results import Results, StoredResults
 from consistency.referee.geometry.conventions import ADDITIVE
 from consistency.referee.system.provenance import manifest_of
@@ -41,7 +41,12 @@ class Campaign:
     """
 
     def __init__(
-        self, backend: Backend, work: Work, place: Place, fields: Mapping[str, Any], landmarks: pd.DataFrame | None
+        self,
+        backend: Backend,
+        work: TrialWork,
+        place: ResultsPlace,
+        fields: Mapping[str, Any],
+        landmarks: pd.DataFrame | None,
     ) -> None:
         self.backend, self.work, self.place, self.landmarks = backend, work, place, landmarks
         names, errors = [name_of(f) for f in work.filters], own_errors(work.filters)

@@ -20,9 +20,9 @@ from consistency.bench.store.results import (
     MAP_NUMBERS,
     NUMBERS,
     OWN_NUMBERS,
-    Outcome,
     Rejected,
     Results,
+    RunOutcome,
     StoredResults,
     Tables,
     estimates_table,
@@ -98,7 +98,7 @@ class Gathered:
         self._require_readable()
         self._now: Keeps = InMemory() if journal is None else journal
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, outcome: RunOutcome) -> None:
         """Keep what a run left."""
         parts = {f"estimates {name}": columns for name, columns in outcome.estimates.items()}
         parts |= {f"map {name}": columns for name, columns in outcome.maps.items()}

@@ -18,10 +18,10 @@ from joblib.externals.loky.backend import get_context
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.record import Record
+from consistency.bench.filters.record import RunRecord
 from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.supervising import Guest, Reply, Study, Task, supervise
+from consistency.bench.runs.supervising import Guest, Reply, SupervisorSetup, Task, supervise
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
@@ -65,7 +65,7 @@ class Isolation:
         self.compiled = [filter_ for filter_ in filters if isinstance(filter_, Compiled)]
         alone = [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]
         self._guests = {name_of(filter_): _guest(filter_) for filter_ in alone}
-        self._study = Study(self._guests, timeout, memory, tuple(sys.path), _folder())
+        self._study = SupervisorSetup(self._guests, timeout, memory, tuple(sys.path), _folder())
         self._free: list[_Supervisor] = []
         self._busy: set[_Supervisor] = set()
         self._is_open, self._halt = False, np.zeros(1, np.int64)
@@ -118,7 +118,7 @@ class Isolation:
             if reply is not None and not reply.was_stopped:
                 break
         if reply is None:
-            record = Record.empty(trial.steps, len(trial.landmark))
+            record = RunRecord.empty(trial.steps, len(trial.landmark))
             reason = "the supervisor of its process was killed twice"
             return record.estimates(guest.name, trial.run, guest.error, reason=reason, guarded=guest.guarded)
         if reply.estimates is None:
@@ -167,7 +167,7 @@ class _Supervisor:
     def is_alive(self) -> bool:
         return not self.link.closed and self.process.exitcode is None
 
-    def tell(self, study: Study | None) -> bool:
+    def tell(self, study: SupervisorSetup | None) -> bool:
         """Send what the next trials are about; False where it is dead."""
         try:
             self.link.send_bytes(pickle.dumps(study))

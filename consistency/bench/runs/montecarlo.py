@@ -13,12 +13,12 @@ import pandas as pd
 from consistency.bench.filters import filter_names, get_filter, usable_names
 from consistency.bench.filters.stepping import error_of, name_of
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import Campaign, own_errors
 from consistency.bench.runs.campaign import Interrupted as Interrupted
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.resuming import PLAN, place_for, place_with
-from consistency.bench.runs.work import Backend, Recorded, Simulated, Work
+from consistency.bench.runs.work import Backend, Recorded, Simulated, TrialWork
 from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.scenario.tables import UNITS
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
@@ -91,8 +91,8 @@ def run_trials(
     """
     _require_counts(runs, seed)
     with studied(
-        scenario, filters, seed, backend or Local(jobs), timeout, memory, out=out, previous=previous, resume=resume,
-        overwrite=overwrite,
+        scenario, filters, seed, backend or LocalThreads(jobs), timeout, memory, out=out, previous=previous,
+        resume=resume, overwrite=overwrite,
     ) as campaign:  # fmt: skip
         done = campaign.gathered.finished
         if done and max(done) >= runs:
@@ -132,11 +132,11 @@ def run_log(
     """
     instances = resolve_filters(filters, log.belief, log.name)
     trials = {trial.run: trial for trial in log.trials}
-    work = Work(Recorded(trials), Isolation(instances, log.belief, timeout, memory))
+    work = TrialWork(Recorded(trials), Isolation(instances, log.belief, timeout, memory))
     own = {"log_sha256": log.sha256} | ({"screening": log.screening} if log.screening else {})
     fields = {"seed": None, "log": log.name, "belief": log.belief.model_dump(mode="json")} | own
     with place_for(_known(instances) | own, None if out is None else Path(out), None, resume, overwrite) as place:
-        return Campaign(backend or Local(jobs), work, place, fields, log.landmarks).finish([sorted(trials)])
+        return Campaign(backend or LocalThreads(jobs), work, place, fields, log.landmarks).finish([sorted(trials)])
 
 
 @contextmanager
@@ -164,7 +164,7 @@ def studied(
         this study
     """
     instances = resolve_filters(filters, scenario.belief)
-    work = Work(Simulated(scenario, seed), Isolation(instances, scenario.belief, timeout, memory))
+    work = TrialWork(Simulated(scenario, seed), Isolation(instances, scenario.belief, timeout, memory))
     planned = {} if plan is None else {PLAN: dict(plan)}
     known = _known(instances) | {"scenario_hash": scenario.hash, "seed": seed} | planned
     fields = {"seed": seed} | _scenario_entry(scenario) | planned

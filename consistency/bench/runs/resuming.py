@@ -23,7 +23,7 @@ KEYS = {
 
 
 @dataclass(frozen=True)
-class Place:
+class ResultsPlace:
     """Place of the results, with the runs ``kept`` of previous results, and those in the journal.
 
     ``machines`` are those that computed a part of the results, this one last.
@@ -50,7 +50,7 @@ class Place:
 @contextmanager
 def place_for(
     study: Mapping[str, Any], out: Path | None, previous: Tables | None, resume: bool, overwrite: bool
-) -> Iterator[Place]:
+) -> Iterator[ResultsPlace]:
     """The place of the results of a ``study``, which is known by :data:`KEYS`; nothing but memory without ``out``.
 
     With ``resume``, or where ``previous`` are the results in ``out``, what is in ``out`` and in its journal is gone on
@@ -84,12 +84,14 @@ def place_for(
                 unfinished.is_over = new.is_placed
 
 
-def place_with(journal: Journal) -> Place:
+def place_with(journal: Journal) -> ResultsPlace:
     """Results stay in memory, and the finished runs in ``journal``."""
-    return Place(None, journal, None, frozenset(), [this_machine()])
+    return ResultsPlace(None, journal, None, frozenset(), [this_machine()])
 
 
-def _place(study: Mapping[str, Any], new: NewFolder | None, journal: Journal | None, previous: Tables | None) -> Place:
+def _place(
+    study: Mapping[str, Any], new: NewFolder | None, journal: Journal | None, previous: Tables | None
+) -> ResultsPlace:
     sources = [{}] if previous is None else [previous.manifest]
     sources += [] if journal is None or not journal.runs else [journal.study]
     machines: list[dict[str, str]] = []
@@ -103,10 +105,10 @@ def _place(study: Mapping[str, Any], new: NewFolder | None, journal: Journal | N
             "the last digits of the others may differ from those of one machine"
         )
     kept = frozenset() if previous is None else frozenset(previous.finished_runs(study["filters"]))
-    return Place(new, journal, previous, kept, [*others, here])
+    return ResultsPlace(new, journal, previous, kept, [*others, here])
 
 
-def _with_rest(error: InputError, place: Place) -> InputError:
+def _with_rest(error: InputError, place: ResultsPlace) -> InputError:
     """The same error, with what is kept where the system refused to write."""
     assert place.new is not None
     if place.new.is_placed or not place.finished or not isinstance(error.__cause__, OSError):

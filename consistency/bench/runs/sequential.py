@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.campaign import Campaign
 from consistency.bench.runs.montecarlo import studied
 from consistency.bench.runs.records import record_of
@@ -75,7 +75,7 @@ def run_until_decided(
     plan |= {} if lost is None else {"lost": lost}
     design, decided = plan_of(plan), dict[str, Verdict]()
     with studied(
-        scenario, filters, seed, backend or Local(jobs), timeout, memory,
+        scenario, filters, seed, backend or LocalThreads(jobs), timeout, memory,
         out=out, previous=previous, resume=resume, overwrite=overwrite, plan=plan, journal=journal,
     ) as campaign:  # fmt: skip
         _require_less(campaign, max_runs)

@@ -28,7 +28,7 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-from consistency.bench.filters.record import Record
+from consistency.bench.filters.record import RunRecord
 from consistency.bench.filters.stepping import reason_of, run_filter
 from consistency.bench.runs.streams import AT_ONCE, Printed, open_files, redirect
 from consistency.bench.scenario import Belief
@@ -58,7 +58,7 @@ class Guest:
 
 
 @dataclass(frozen=True)
-class Study:
+class SupervisorSetup:
     """What a supervisor is told before the first trial."""
 
     guests: dict[str, Guest]  # by name
@@ -95,11 +95,11 @@ def supervise(link: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     hosts: dict[str, _Host] = {}
     printed: dict[str, Printed] = {}
-    study: Study | None = None
+    study: SupervisorSetup | None = None
     try:
         while study is not None or link.poll(IDLE):
             message = link.recv_bytes()
-            told: Study | Task | None = pickle.loads(message)
+            told: SupervisorSetup | Task | None = pickle.loads(message)
             if isinstance(told, Task):
                 assert study is not None
                 host = _host_for(told, study, hosts, printed.setdefault(told.guest, Printed(told.guest)))
@@ -114,7 +114,7 @@ def supervise(link: Connection) -> None:
         _end(hosts)
 
 
-def _host_for(task: Task, study: Study, hosts: dict[str, _Host], printed: Printed) -> _Host:
+def _host_for(task: Task, study: SupervisorSetup, hosts: dict[str, _Host], printed: Printed) -> _Host:
     """The process that has the filter, a new one where there is none that can take the trial."""
     host = hosts.get(task.guest)
     if host is None or not host.can_take(task.trial):
@@ -133,7 +133,7 @@ def _end(hosts: dict[str, _Host]) -> None:
 class _Host:
     """A process with one filter in it, seen from its supervisor."""
 
-    def __init__(self, study: Study, guest: Guest, trial: Trial, printed: Printed) -> None:
+    def __init__(self, study: SupervisorSetup, guest: Guest, trial: Trial, printed: Printed) -> None:
         self.guest, self.timeout, self.printed, self.is_spent = guest, study.timeout, printed, False
         self.room = _Room(trial.steps, 2 * len(trial.landmark))
         self.link, end = _context.Pipe()
@@ -215,14 +215,14 @@ class _Host:
 
 
 class _Room:
-    """Memory for a :class:`Record` that two processes see."""
+    """Memory for a :class:`RunRecord` that two processes see."""
 
     def __init__(self, steps: int, observations: int) -> None:
         self.steps, self.observations = steps, observations
         self._numbers = _context.RawArray("d", PER_STEP * steps)
         self._at, self._rejected = _context.RawArray("q", 1), _context.RawArray("b", max(observations, 1))
 
-    def record(self, trial: Trial) -> Record:
+    def record(self, trial: Trial) -> RunRecord:
         """The part of it that a trial needs."""
         T, numbers = trial.steps, np.frombuffer(self._numbers)
         parts = np.split(numbers[: PER_STEP * T], np.cumsum([3 * T, 9 * T, 9 * T, T, T]))
@@ -230,7 +230,7 @@ class _Room:
         rejected: Array = np.frombuffer(self._rejected, bool)[: len(trial.landmark)]
         at = np.frombuffer(self._at, np.int64)
         pose, covariance, own = pose.reshape(T, 3), covariance.reshape(T, 3, 3), own.reshape(T, 3, 3)
-        return Record(at, pose, covariance, own, nis, dof, log_det, rejected)
+        return RunRecord(at, pose, covariance, own, nis, dof, log_det, rejected)
 
 
 def _reason(code: int | None) -> str:
@@ -247,7 +247,7 @@ def _reason(code: int | None) -> str:
 # --- in the process of a filter -----------------------------------------------------------------
 
 
-def _host(study: Study, guest: Guest, room: _Room, link: Connection, mouth: Connection) -> None:
+def _host(study: SupervisorSetup, guest: Guest, room: _Room, link: Connection, mouth: Connection) -> None:
     """Work off trials with one filter until the supervisor closes the pipe; what is printed goes to ``mouth``."""
     _settle(study)
     redirect(mouth)
@@ -276,7 +276,7 @@ def _host(study: Study, guest: Guest, room: _Room, link: Connection, mouth: Conn
         link.send_bytes(pickle.dumps(replace(reply, is_spent=now != files)))
 
 
-def _run(guest: Guest, task: Task, record: Record) -> Estimates:
+def _run(guest: Guest, task: Task, record: RunRecord) -> Estimates:
     """Estimates of a trial; whatever the filter throws ends it as a failed run.
 
     The filter is as it was sent, so that no run depends on those that this process did before.
@@ -291,7 +291,7 @@ def _run(guest: Guest, task: Task, record: Record) -> Estimates:
         return record.estimates(guest.name, task.trial.run, guest.error, reason=reason, guarded=guest.guarded)
 
 
-def _settle(study: Study) -> None:
+def _settle(study: SupervisorSetup) -> None:
     """Die with the supervisor, leave no core, and find the modules that the user finds."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(OSError, AttributeError):

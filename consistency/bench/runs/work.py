@@ -14,10 +14,10 @@ from consistency.bench.runs.isolating import Isolation
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
-from consistency.bench.store.results import Outcome, outcome_of
+from consistency.bench.store.results import RunOutcome, outcome_of
 from consistency.bench.types import Trial
 
-Outcomes = Generator[Outcome, None, None]
+Outcomes = Generator[RunOutcome, None, None]
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class Work:
+class TrialWork:
     """Trials, and the filters through which each is put; it can be pickled.
 
     Runs are done in a ``with`` on ``isolation``.
@@ -76,7 +76,7 @@ class Work:
     trials: Callable[[int], Trial]
     isolation: Isolation
 
-    def __call__(self, run: int) -> Outcome:
+    def __call__(self, run: int) -> RunOutcome:
         trial = self.trials(run)
         return outcome_of(trial, self.isolation.run(trial))
 
@@ -105,10 +105,10 @@ class Work:
 class Backend(Protocol):
     """Where runs are done."""
 
-    def prepare(self, work: Work, run: int, /) -> None:
+    def prepare(self, work: TrialWork, run: int, /) -> None:
         """Compile what ``run`` needs, where that is done on this machine."""
 
-    def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
+    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
         """What each run left, in the order in which they end; to be closed, which stops what is not done.
 
         The bits do not depend on who does a run: BLAS has one thread.

@@ -44,7 +44,7 @@ def effects_of(sensor: TrueSensor) -> list[Effect]:
     return [FieldOfView(), *early, noise, *late, *search]
 
 
-class Chain:
+class EffectChain:
     """Effects applied one after the other.
 
     What the first effects do is the same in every run if it depends on the path alone and the path is the same:

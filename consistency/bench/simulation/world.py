@@ -15,7 +15,7 @@ from consistency.bench.scenario import (
 )
 from consistency.bench.scenario.effects import Context, FieldOfView, Observations
 from consistency.bench.simulation.path import planned_controls, start_pose
-from consistency.bench.simulation.sensing import MOTION_NOISE, Chain, effects_of, generator
+from consistency.bench.simulation.sensing import MOTION_NOISE, EffectChain, effects_of, generator
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
@@ -35,7 +35,7 @@ class World:
         self.linear = truth.sensor.model == "linear"
         # noise on the odometry leaves the path as planned, and a linear world looks from it
         self.undisturbed = not self.linear and truth.motion.noise_on != "motion"
-        self._chain = Chain(effects_of(truth.sensor))
+        self._chain = EffectChain(effects_of(truth.sensor))
         self._number = 1 if self.linear else self._chain.leading() if self.undisturbed else 0
         self._shared = self._chain.shared(self.context(self.reference), self._number) if self._number else None
         if self._shared is not None and self.undisturbed:
@@ -132,7 +132,7 @@ def require_landmarks_in_view(scenario: Scenario) -> World:
     for k in range(0, truth.steps, SOME):
         here = slice(k, k + SOME + 1)
         context = Context(sensor, world.landmarks, world.reference[here], world.reference[here])
-        observations = Chain([FieldOfView()]).shared(context, 1)
+        observations = EffectChain([FieldOfView()]).shared(context, 1)
         # effects that are listed may bring any disparity into the search range
         if isinstance(sensor, UvdSensor) and not sensor.effects:
             low, high = sensor.disparity

@@ -48,7 +48,7 @@ class Rejected(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """Results of one run: rows of the tables, by filter, and failures; ``machine`` did it, None for this one."""
 
     run: int
@@ -237,14 +237,14 @@ def joined(parts: Sequence[Results]) -> Results:
     return replace(parts[0], estimates=estimates, failures=failures, manifest=manifest, map=map_, rejections=rejections)
 
 
-def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> Outcome:
+def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> RunOutcome:
     """Rows of the tables for one trial; a failed run has none from the failed step on.
 
     A run whose pose, covariance, NEES or NIS is beyond :data:`LARGEST_NUMBER` has failed in that step.
     """
     rows = [_rows(trial, e) for e in estimates]
     estimates = [e for e, _ in rows]
-    return Outcome(
+    return RunOutcome(
         trial.run,
         {e.filter: columns for e, columns in rows},
         None if trial.truth is None else _truth_columns(trial, trial.truth),

@@ -57,7 +57,7 @@ class CellResult:
 NUMBERS = tuple(f.name for f in fields(CellResult) if f.type == "float")
 
 
-class Outcome(NamedTuple):
+class CellOutcome(NamedTuple):
     """A result with its table of runs."""
 
     result: CellResult
@@ -71,7 +71,7 @@ def run_cell(
     jobs: int = -1,
     backend: Backend | None = None,
     journal: Journal | None = None,
-) -> Outcome:
+) -> CellOutcome:
     """Run one filter in one cell until it is decided.
 
     The trials depend on the sweep's seed and the cell's scenario alone. An exception is a result, too: the filter has
@@ -98,12 +98,12 @@ def run_cell(
         if isinstance(error, OSError) or isinstance(error.__cause__, OSError):  # it would break all of them
             raise
         text = f"failed: {type(error).__name__}: {error}"
-        return Outcome(CellResult(**asdict(nothing) | {"diagnosis": text}), pd.DataFrame(columns=list(RUN_COLUMNS)))
+        return CellOutcome(CellResult(**asdict(nothing) | {"diagnosis": text}), pd.DataFrame(columns=list(RUN_COLUMNS)))
     try:
         cost, step_us = cost_of(filter_name, sweep.reference, cell.scenario, sweep.seed_of(cell))
     except Exception:  # the verdict stands without it
         cost, step_us = np.nan, np.nan
-    return Outcome(result_of(verdict, cost, step_us), runs_table(found))
+    return CellOutcome(result_of(verdict, cost, step_us), runs_table(found))
 
 
 def result_of(verdict: Verdict, cost: float = np.nan, step_us: float = np.nan) -> CellResult:

@@ -17,8 +17,8 @@ from consistency.bench.scenario import Scenario
 from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.storage import write_folder
 from consistency.bench.sweeps.axes import Axis
-from consistency.bench.sweeps.cell import CellResult, Outcome, plain_numbers, result_from
-from consistency.bench.sweeps.plan import MOST_CELLS, Cell, Rule, Sweep
+from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
+from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep
 from consistency.referee.errors import InputError
 from consistency.referee.reading import reading
 from consistency.referee.system.atomic import write_whole
@@ -48,7 +48,7 @@ def code_digest() -> str:
 
 
 @dataclass(frozen=True)
-class Work:
+class CellWork:
     """One filter in one cell."""
 
     cell: Cell
@@ -71,11 +71,11 @@ class SweepFolder:
     def __init__(self, sweep: Sweep, path: Path) -> None:
         self.sweep, self.path = sweep, path
 
-    def place(self, work: Work) -> Path:
+    def place(self, work: CellWork) -> Path:
         """Folder of one filter in one cell."""
         return self.path / CELLS / work.cell.name / work.filter
 
-    def inputs(self, work: Work) -> dict[str, Any]:
+    def inputs(self, work: CellWork) -> dict[str, Any]:
         """What the numbers of a cell depend on."""
         sweep = self.sweep
         return {
@@ -83,7 +83,7 @@ class SweepFolder:
             **sweep.rule.model_dump(), "code": code_digest(),
         }  # fmt: skip
 
-    def done(self, work: Work) -> CellResult | None:
+    def done(self, work: CellWork) -> CellResult | None:
         """The result that is there; None where there is none.
 
         Raises
@@ -105,7 +105,7 @@ class SweepFolder:
         with reading(path / "manifest.json", "key 'result' is damaged; remove that folder"):
             return result_from(manifest["result"])
 
-    def is_missing(self, work: Work) -> bool:
+    def is_missing(self, work: CellWork) -> bool:
         """Whether there is no result, or one with other inputs."""
         try:
             return self.done(work) is None
@@ -142,9 +142,9 @@ class SweepFolder:
             except StaleCell as stale:
                 yield stale
 
-    def all_work(self, part: int = 1, parts: int = 1) -> list[Work]:
+    def all_work(self, part: int = 1, parts: int = 1) -> list[CellWork]:
         """Every filter in every cell of a share."""
-        return [Work(cell, name) for cell in self.sweep.share(part, parts) for name in self.sweep.filters]
+        return [CellWork(cell, name) for cell in self.sweep.share(part, parts) for name in self.sweep.filters]
 
     def begin(self) -> None:
         """Make the folder, or take over the one that is there; other shares may do so at the same time."""
@@ -167,7 +167,7 @@ class SweepFolder:
         write_whole(self.path / "manifest.json", f"{text}\n".encode(), 0o644)
 
     @contextmanager
-    def at_work(self, work: Work) -> Iterator[Journal]:
+    def at_work(self, work: CellWork) -> Iterator[Journal]:
         """The journal of what is finished of a cell; nobody else has it meanwhile, and it is gone with the cell's end.
 
         Raises
@@ -184,7 +184,7 @@ class SweepFolder:
             yield journal
             unfinished.is_over = True
 
-    def write(self, work: Work, outcome: Outcome, wall: float) -> None:
+    def write(self, work: CellWork, outcome: CellOutcome, wall: float) -> None:
         """Put a result in its place as a whole; one that another process has put there meanwhile is replaced."""
         manifest = manifest_of(
             kind=CELL_KIND, wall=wall, inputs=self.inputs(work), cell=work.cell.text,
@@ -201,7 +201,7 @@ class SweepFolder:
         found = {}
         for cell, name in itertools.product(self.sweep.cells, self.sweep.filters):
             try:
-                result = self.done(Work(cell, name))
+                result = self.done(CellWork(cell, name))
             except StaleCell:
                 continue
             if result is not None:
@@ -246,7 +246,7 @@ def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
         sweep = Sweep(
             str(data["name"]), str(data["summary"]), Scenario.model_validate(data["base"]),
             tuple(Axis(key, tuple(values)) for key, values in data["grid"].items()),
-            tuple(data["filters"]), int(data["seed"]), Rule.model_validate(data["rule"]),
+            tuple(data["filters"]), int(data["seed"]), StoppingRule.model_validate(data["rule"]),
         )  # fmt: skip
         _ = sweep.cells  # each is checked when it is made
         return sweep

@@ -32,7 +32,7 @@ LONGEST = 150  # characters of a folder's name
 REFERENCE = {"uvd": "ekf-uvd", "xyz": "ekf-xyz", "linear": "kf"}  # filter whose step costs 1, by the sensor's model
 
 
-class Rule(Table):
+class StoppingRule(Table):
     """When a cell is decided; the keys are those of ``consistency run --until-decided``."""
 
     false_alarm: Positive = 0.01
@@ -57,7 +57,7 @@ class SweepFile(Table):
     base: str  # name or path of a scenario
     filters: Annotated[list[str], Field(min_length=1)]
     seed: Annotated[int, Field(ge=0, strict=True)] = 0
-    rule: Rule = Rule()
+    rule: StoppingRule = StoppingRule()
     grid: Annotated[dict[str, Any], Field(min_length=1)]
 
     @field_validator("grid")
@@ -88,7 +88,7 @@ class Sweep:
     axes: tuple[Axis, ...]
     filters: tuple[str, ...]
     seed: int
-    rule: Rule
+    rule: StoppingRule
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.sweeps.cell import CellResult, plain_numbers
-from consistency.bench.sweeps.recommend import OPEN, Advice, Candidate
+from consistency.bench.sweeps.recommend import OPEN, Advice, NearFilter
 from consistency.bench.sweeps.regime import Regime
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.records import STATUSES
@@ -88,7 +88,7 @@ def advice_blocks(advice: Advice) -> tuple[Block, ...]:
     return *map(Text, first), table(OF_ADVICE, rows, "Filters"), Text(""), *map(Text, sentences_of(advice))
 
 
-def _row(c: Candidate) -> tuple[Cell, ...]:
+def _row(c: NearFilter) -> tuple[Cell, ...]:
     near = c.nearest
     said = "-" if c.verdict is None else f"{'no fault found' if c.verdict.status in OPEN else c.verdict.status}"
     return (
@@ -146,14 +146,14 @@ def _none_of(advice: Advice) -> str:
     )
 
 
-def _why(advice: Advice, best: Candidate) -> str:
+def _why(advice: Advice, best: NearFilter) -> str:
     inside = "The rig lies inside the map" if advice.inside else "The rig lies outside the map, which only hints"
     cells = f"all {best.around}" if best.agreeing == best.around else f"{best.agreeing} of the {best.around}"
     where = f"{cells} cells around it" if best.around > 1 else "the cell where it lies"
     return f"{inside}; the filter is consistent in {where}."
 
 
-def _confirmed(advice: Advice, best: Candidate) -> str:
+def _confirmed(advice: Advice, best: NearFilter) -> str:
     """What the confirming runs said, and what they could have missed."""
     assert best.verdict is not None
     rate = 100.0 * advice.regime.sweep.rule.false_alarm
@@ -164,7 +164,7 @@ def _confirmed(advice: Advice, best: Candidate) -> str:
     return f"{found}; {scale}; {power}."
 
 
-def _contradiction(advice: Advice, c: Candidate) -> str:
+def _contradiction(advice: Advice, c: NearFilter) -> str:
     assert c.verdict is not None
     runs = plural(advice.runs, "run")
     return f"Not {c.filter}: consistent on the map, but {runs} of this rig say {c.verdict.reasons[0]}."
@@ -188,7 +188,7 @@ def advice_json(advice: Advice) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _verdict_json(c: Candidate) -> dict[str, Any]:
+def _verdict_json(c: NearFilter) -> dict[str, Any]:
     assert c.verdict is not None
     numbers = {"inflation": c.verdict.inflation, "interval": c.verdict.inflation_interval, "detectable": c.detectable}
     return {"status": c.verdict.status, "reason": c.verdict.reasons[0]} | {k: plain(v) for k, v in numbers.items()}

@@ -12,7 +12,7 @@ from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell, text_of
 from consistency.bench.sweeps.regime import Regime, ranked
-from consistency.bench.sweeps.rig import ALIKE, Place, Request, Rig, differences, distance, place_on, read_rig
+from consistency.bench.sweeps.rig import ALIKE, AxisPlace, Request, Rig, differences, distance, place_on, read_rig
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.terminal.progress import quiet
@@ -29,7 +29,7 @@ SURENESS = {
 
 
 @dataclass(frozen=True)
-class Candidate:
+class NearFilter:
     """A filter as the map has it near the rig."""
 
     filter: str
@@ -56,9 +56,9 @@ class Advice:
 
     rig: Rig
     regime: Regime
-    places: tuple[Place, ...]
+    places: tuple[AxisPlace, ...]
     nearest: Cell
-    candidates: tuple[Candidate, ...]  # the best first
+    candidates: tuple[NearFilter, ...]  # the best first
     unlike: tuple[str, ...]  # keys in which no cell of the map is as the rig is
     runs: int  # confirming runs
     elsewhere: str  # the nearest cell with a filter to trust, where there is none here
@@ -74,7 +74,7 @@ class Advice:
         return tuple(name for name in self.regime.sweep.filters if name not in there)
 
     @property
-    def best(self) -> Candidate | None:
+    def best(self) -> NearFilter | None:
         """The filter to take; None where none is to be trusted."""
         return next((candidate for candidate in self.candidates if candidate.trusted), None)
 
@@ -134,17 +134,17 @@ def _cell(regime: Regime, at: Sequence[int]) -> Cell:
     return sweep.cell(number, tuple(at))
 
 
-def candidates_of(regime: Regime, nearest: Cell, around: Sequence[Cell]) -> list[Candidate]:
+def candidates_of(regime: Regime, nearest: Cell, around: Sequence[Cell]) -> list[NearFilter]:
     """Filters by what the map says: consistent in the nearest cell, in all cells around, then RMSE and cost."""
     here, cells = regime.at(nearest), [regime.at(cell) for cell in around]
     found = []
     for name, result in ranked(here):
         near = [results[name].status == "consistent" for results in cells if name in results]
-        found.append(Candidate(name, result, sum(near), len(cells)))
+        found.append(NearFilter(name, result, sum(near), len(cells)))
     return sorted(found, key=lambda c: (c.nearest.status != "consistent", c.agreeing < c.around))
 
 
-def _judged(candidate: Candidate, verdicts: Mapping[str, Verdict], inside: bool, alike: bool) -> Candidate:
+def _judged(candidate: NearFilter, verdicts: Mapping[str, Verdict], inside: bool, alike: bool) -> NearFilter:
     """How sure it is that the candidate is consistent on the rig."""
     if candidate.nearest.status != "consistent":
         return candidate
@@ -160,12 +160,12 @@ def _judged(candidate: Candidate, verdicts: Mapping[str, Verdict], inside: bool,
     return replace(candidate, verdict=verdict, sure=sure)
 
 
-def _sorted(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def _sorted(candidates: Sequence[NearFilter]) -> tuple[NearFilter, ...]:
     """Contradicted filters behind those that stand, confirmed ones before the others; else as they are."""
     return tuple(sorted(candidates, key=lambda c: (not c.sure, c.sure == "no", c.sure != "" and c.verdict is None)))
 
 
-def _elsewhere(regime: Regime, places: tuple[Place, ...]) -> str:
+def _elsewhere(regime: Regime, places: tuple[AxisPlace, ...]) -> str:
     """The nearest cell where a filter is consistent, in words; empty where there is none."""
     cells = [(distance(places, cell), cell, regime.trusted(cell)) for cell in regime.sweep.cells]
     found = min((entry for entry in cells if entry[2]), key=lambda entry: entry[0], default=None)

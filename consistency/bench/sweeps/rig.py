@@ -140,7 +140,7 @@ def _with_options(scenario: Scenario, request: Request) -> Scenario:
 
 
 @dataclass(frozen=True)
-class Place:
+class AxisPlace:
     """Where a rig lies on one axis of a map."""
 
     axis: Axis
@@ -165,14 +165,14 @@ class Place:
         return f"{self.axis.text} {value}" + ("" if self.inside else f", beyond the map's {values}")
 
 
-def place_on(axis: Axis, value: Any) -> Place:
+def place_on(axis: Axis, value: Any) -> AxisPlace:
     """Where a value lies on an axis, by its logarithm where all values are positive."""
     last = len(axis.values) - 1
     if not axis.numeric or not isinstance(value, int | float) or not np.isfinite(value):
         known = list(axis.values).index(value) if value in axis.values else None
-        return Place(axis, value, float(known or 0), known is not None, (known or 0,))
+        return AxisPlace(axis, value, float(known or 0), known is not None, (known or 0,))
     if axis.log and value <= 0.0:
-        return Place(axis, value, 0.0, False, (0,))
+        return AxisPlace(axis, value, 0.0, False, (0,))
     of = np.log if axis.log else np.asarray
     grid = np.asarray(of(np.array(axis.values, float)), float)
     at = float(of(np.array(float(value))))
@@ -181,10 +181,10 @@ def place_on(axis: Axis, value: Any) -> Place:
     position = float(np.interp(at, grid, np.arange(last + 1)))
     near = round(position)
     around = (near,) if abs(position - near) < AT else (int(np.floor(position)), int(np.ceil(position)))
-    return Place(axis, value, position, inside, around)
+    return AxisPlace(axis, value, position, inside, around)
 
 
-def distance(places: tuple[Place, ...], cell: Cell) -> float:
+def distance(places: tuple[AxisPlace, ...], cell: Cell) -> float:
     """Grid steps from a rig to a cell."""
     return float(np.linalg.norm([i - place.position for i, place in zip(cell.indices, places, strict=True)]))
 

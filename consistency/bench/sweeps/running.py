@@ -15,7 +15,7 @@ from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.work import Backend
 from consistency.bench.store.journal import Busy, Journal
 from consistency.bench.sweeps.cell import CellResult, run_cell
-from consistency.bench.sweeps.folder import SweepFolder, Work
+from consistency.bench.sweeps.folder import CellWork, SweepFolder
 from consistency.bench.sweeps.plan import Sweep
 from consistency.referee.errors import InputError
 from consistency.referee.system.stopping import Stop, stoppable
@@ -79,7 +79,7 @@ def run_sweep(
     return folder, missing
 
 
-def _compile(sweep: Sweep, todo: Sequence[Work], jobs: int) -> None:
+def _compile(sweep: Sweep, todo: Sequence[CellWork], jobs: int) -> None:
     """Compile what the cells need before the first, so that the time left is that of cells."""
     some = todo[:: len(todo) // LOOKED_AT + 1]
     names = ((name, work.cell.scenario) for work in some for name in (work.filter, sweep.reference))
@@ -87,15 +87,15 @@ def _compile(sweep: Sweep, todo: Sequence[Work], jobs: int) -> None:
 
 
 def _in_turn(
-    folder: SweepFolder, todo: Sequence[Work], do: Callable[[SweepFolder, Work, Journal], None]
-) -> Iterator[tuple[Work, float]]:
+    folder: SweepFolder, todo: Sequence[CellWork], do: Callable[[SweepFolder, CellWork, Journal], None]
+) -> Iterator[tuple[CellWork, float]]:
     """Do all of it, and give each when it is there, with the mean time of those that were done here.
 
     What another process is at work on is come back to.
     """
     waiting, is_said, count, started = deque(todo), False, 0, time.monotonic()
     while waiting:
-        busy: deque[Work] = deque()
+        busy: deque[CellWork] = deque()
         for work in waiting:
             try:
                 with _refusals(folder), folder.at_work(work) as journal:
@@ -114,7 +114,7 @@ def _in_turn(
         waiting = busy
 
 
-def _do(stop: Stop, jobs: int, backend: Backend | None, folder: SweepFolder, work: Work, journal: Journal) -> None:
+def _do(stop: Stop, jobs: int, backend: Backend | None, folder: SweepFolder, work: CellWork, journal: Journal) -> None:
     begun = time.monotonic()
     outcome = run_cell(folder.sweep, work.cell, work.filter, jobs, backend, journal)
     if stop.number is not None:  # and the cell took it for an error of its own

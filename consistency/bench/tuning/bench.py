@@ -38,7 +38,7 @@ class Scores:
         return -np.inf if self.failures else float(self.log_density.sum())
 
 
-class Bench:
+class BeliefScorer:
     """Scores a filter on trials under any belief; to be used in a ``with``, whose end kills what still works.
 
     A filter that is not compiled keeps its processes from one setting to the next, with the modules that it imports.
@@ -66,7 +66,7 @@ class Bench:
         self._pool = ThreadPoolExecutor(self.workers)  # kernels release the GIL; other filters run in processes
         self._isolation = Isolation([filter_], belief, timeout)
 
-    def __enter__(self) -> Bench:
+    def __enter__(self) -> BeliefScorer:
         self._isolation.__enter__()
         return self
 

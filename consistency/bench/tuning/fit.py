@@ -21,7 +21,7 @@ Scoring = Callable[[Array], Array | None]  # of log factors (p,): log densities 
 
 
 @dataclass(frozen=True)
-class Fit:
+class FactorFit:
     """Natural logarithms of p factors."""
 
     log_factors: Array  # (p,)
@@ -31,7 +31,7 @@ class Fit:
     settings: int  # that were tried
 
 
-def maximise(score: Scoring, starts: Sequence[Array]) -> Fit | None:
+def maximise(score: Scoring, starts: Sequence[Array]) -> FactorFit | None:
     """The setting of greatest total score from the first of the ``starts`` at which no run fails; None without one.
 
     The search is COBYQA (Ragonneau & Zhang 2025; SciPy), a trust region on quadratic models without derivatives, and
@@ -63,7 +63,7 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> Fit | None:
         moved[free] += np.clip(np.linalg.solve(bend, slope[free]), -STEP, STEP)
         best = moved if search.total(moved) > search.total(best) else best
     interval = Profile(search, search.tried, best, np.nan_to_num(curvature), LIMIT).intervals()
-    return Fit(best, interval, edge, search.total(best) - first, search.settings)
+    return FactorFit(best, interval, edge, search.total(best) - first, search.settings)
 
 
 class _Search:

@@ -22,14 +22,14 @@ CHANNELS = {  # of R, by model of the sensor
 DIGITS = 6  # of a tuned standard deviation, so that what is judged is what is written
 
 
-class Group(NamedTuple):
+class NoiseGroup(NamedTuple):
     """Channels whose variances have one factor, such as ``Q.v``; ``name`` is what the user calls them."""
 
     name: str
     channels: tuple[str, ...]
 
 
-def groups_of(text: str, belief: Belief) -> tuple[Group, ...]:
+def groups_of(text: str, belief: Belief) -> tuple[NoiseGroup, ...]:
     """Groups as the option ``--groups`` has them: "Q,R", "Q.v,Q.omega,R" or "Q,R.u+R.v,R.d".
 
     ``Q`` and ``R`` stand for all their channels with a noise. Channels that no group names stay as they are.
@@ -57,11 +57,11 @@ def groups_of(text: str, belief: Belief) -> tuple[Group, ...]:
         if twice := sorted(seen & set(channels)) or [c for c in channels if channels.count(c) > 1]:
             raise InputError(f"--groups {text}: '{twice[0]}' is named twice; it has one factor")
         seen |= set(channels)
-        groups.append(Group(name, tuple(channels)))
+        groups.append(NoiseGroup(name, tuple(channels)))
     return tuple(groups)
 
 
-def scaled(belief: Belief, groups: Sequence[Group], log_factors: Array) -> Belief:
+def scaled(belief: Belief, groups: Sequence[NoiseGroup], log_factors: Array) -> Belief:
     """The belief with the variances of each group times its factor; ``log_factors`` (groups,)."""
     sigma = sigma_by_channel(belief)
     for group, log_factor in zip(groups, log_factors, strict=True):

@@ -33,7 +33,7 @@ def units(density: Array) -> Array:
     return np.concatenate(parts)
 
 
-class Look(NamedTuple):
+class ProfilePoint(NamedTuple):
     """A setting on the way to an end, and where the other factors should be instead."""
 
     depth: float  # of the profile there: 0 at the best setting, 1 at the end of the interval
@@ -136,7 +136,7 @@ class Profile:
         x[i] = np.clip(self.best[i] + side * guess, -self.limit, self.limit)
         return np.asarray(x)
 
-    def _look(self, x: Array, i: int, careful: bool) -> Look:
+    def _look(self, x: Array, i: int, careful: bool) -> ProfilePoint:
         """Differences tell how the other factors should move; if ``careful``, also how the score bends there.
 
         The score is taken to be quadratic in factors, not in their logarithms: it levels off as a noise goes to 0.
@@ -145,7 +145,7 @@ class Profile:
         others = np.flatnonzero(np.arange(p) != i)
         slope, bend = np.zeros(p), self._bend.copy()
         if not np.isfinite(here):
-            return Look(np.inf, slope, True)
+            return ProfilePoint(np.inf, slope, True)
         for j in others:
             h = -STEP if x[j] > 0.0 else STEP
             ahead = float(self.score(x + h * np.eye(p)[j]).sum())
@@ -164,7 +164,7 @@ class Profile:
         back = max(float(slope @ grown - grown @ bend @ grown / 2.0), 0.0)
         fall = float(self._top.sum()) - here
         step = np.log(np.maximum(1.0 + grown, np.exp(-FARTHEST)))
-        return Look(self.depth(x, back), step, back <= SETTLED * max(fall, NORMAL**2 / 2.0))
+        return ProfilePoint(self.depth(x, back), step, back <= SETTLED * max(fall, NORMAL**2 / 2.0))
 
 
 def _guess(seen: Sequence[tuple[float, float]]) -> float:

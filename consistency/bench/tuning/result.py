@@ -11,7 +11,7 @@ from consistency.bench.scenario import Belief, scenario_text, toml_text
 from consistency.bench.scenario.tables import SIGMA_UNITS
 from consistency.bench.store.log import Log, sensor_text
 from consistency.bench.tuning.fit import LIMIT
-from consistency.bench.tuning.groups import Group, sigma_by_channel
+from consistency.bench.tuning.groups import NoiseGroup, sigma_by_channel
 from consistency.bench.tuning.parts import Parts, with_belief
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import Verdict
@@ -29,7 +29,7 @@ class Factor:
     ``edge`` is -1 or 1 where the factor lies at the lower or upper limit of what is tried, which is then no estimate.
     """
 
-    group: Group
+    group: NoiseGroup
     value: float
     interval: Interval
     edge: int = 0

@@ -16,9 +16,9 @@ from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import Belief, Scenario, load_scenario
 from consistency.bench.store.log import Log
 from consistency.bench.tuning.balance import balanced, nearest
-from consistency.bench.tuning.bench import Bench
-from consistency.bench.tuning.fit import Fit, maximise
-from consistency.bench.tuning.groups import Group, groups_of, rounded, scaled
+from consistency.bench.tuning.bench import BeliefScorer
+from consistency.bench.tuning.fit import FactorFit, maximise
+from consistency.bench.tuning.groups import NoiseGroup, groups_of, rounded, scaled
 from consistency.bench.tuning.parts import Judging, Parts, parts_of
 from consistency.bench.tuning.result import Factor, Setting, Tuning
 from consistency.bench.tuning.scores import require_scorable
@@ -95,7 +95,7 @@ class _Tuner:
         self,
         filter_: Filter,
         parts: Parts,
-        groups: Sequence[Group],
+        groups: Sequence[NoiseGroup],
         jobs: int,
         timeout: float | None,
         settings: Settings,
@@ -105,7 +105,7 @@ class _Tuner:
 
     def fitted(self, by: str) -> Setting:
         """The best setting by a score, with the verdict on it."""
-        with Bench(self.filter, self.parts.trials, self.parts.belief, by, self.jobs, self.timeout) as bench:
+        with BeliefScorer(self.filter, self.parts.trials, self.parts.belief, by, self.jobs, self.timeout) as bench:
             bench.compile()
             fit = self._fit(bench)
         return self._setting(by, fit.log_factors, fit.interval, fit.edge, bench.settings)
@@ -141,7 +141,7 @@ class _Tuner:
             return self._verdict(self.parts.on_fitted, belief, self.settings)
 
         centre = np.array([0.0 if factor.edge else np.log(factor.value) for factor in fitted.factors])
-        with Bench(self.filter, self.parts.trials, self.parts.belief, "nees", self.jobs, self.timeout) as bench:
+        with BeliefScorer(self.filter, self.parts.trials, self.parts.belief, "nees", self.jobs, self.timeout) as bench:
             settings = balanced(centre, ratio, judge)
         best = nearest(settings)
         if best is None:
@@ -164,7 +164,7 @@ class _Tuner:
             results = judging(self.filter, belief, self.jobs, self.timeout)
         return analyse(results, settings=settings)[name_of(self.filter)]
 
-    def _fit(self, bench: Bench) -> Fit:
+    def _fit(self, bench: BeliefScorer) -> FactorFit:
         at_first = bench(self.parts.belief)
         if not at_first.failures and not np.isfinite(at_first.ratio):
             raise InputError(f"{self.parts.world.name}: no step has {_wanted(bench.by)} to fit; give longer runs")
@@ -201,6 +201,6 @@ def _wanted(by: str) -> str:
     return "an innovation" if by == "innovations" else "a NEES"
 
 
-def _factor(group: Group, log_factor: float, interval: Array, edge: int) -> Factor:
+def _factor(group: NoiseGroup, log_factor: float, interval: Array, edge: int) -> Factor:
     value, (low, high) = float(np.exp(log_factor)), np.exp(interval)
     return Factor(group, value, Interval(value, float(low), float(high)), edge)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from consistency.referee.cli.commands import HELP, Group
+from consistency.referee.cli.commands import HELP, CommandGroup
 from consistency.referee.errors import InputError
 from consistency.referee.extras import explained
 
@@ -18,7 +18,7 @@ Abort: Any = typer.Abort
 FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC)}  # a disk, a quota, a limit
 
 app = typer.Typer(
-    cls=Group,
+    cls=CommandGroup,
     help="Do the errors of your estimator have the covariance that it states? 'analyse' judges its files.",
     context_settings={"help_option_names": HELP},
     pretty_exceptions_enable=False,

@@ -115,7 +115,7 @@ class Loaded(Mapping[str, Any]):
         return len(COMMANDS)
 
 
-class Group(TyperGroup):
+class CommandGroup(TyperGroup):
     """The commands of the table, one of which is loaded when it is called."""
 
     def __init__(self, **settings: Any) -> None:

@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.fitted import ENOUGH, inflation_of_mean, le
 from consistency.referee.diagnostics.questions import BIAS, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.referee.errors import InputError
 from consistency.referee.sources.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.sources.frames import Frame, moved
+from consistency.referee.sources.frames import WorldTransform, moved
 from consistency.referee.sources.offset import clock_shift
 from consistency.referee.sources.origin import frame_of_first_pose, from_first_pose
 from consistency.referee.sources.poses import Poses
@@ -59,7 +59,7 @@ class Aligned:
 
 
 def require_alignment(mode: str | None, truth: object) -> str | None:
-    """The mode, None for none.
+    """The alignment that was asked for, or None if there is none.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def clocks_and_frames(
     return shift, notes, replace(found, runs=[replace(p, t=own.t) for p, own in zip(found.runs, runs, strict=True)])
 
 
-def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> list[Frame]:
+def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> list[WorldTransform]:
     """The frame of each run.
 
     Raises
@@ -123,7 +123,7 @@ def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]
 
 
 def aligned(
-    name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int], frames: Sequence[Frame] | None = None
+    name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int], frames: Sequence[WorldTransform] | None = None
 ) -> Aligned:
     """Runs moved into the world of the truth by frames of least NEES, or by their first poses (``origin``).
 
@@ -207,7 +207,7 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
 # --- words --------------------------------------------------------------------------------------------------
 
 
-def _sizes(name: str, mode: str, frames: Sequence[Frame]) -> str:
+def _sizes(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
     """How far the worlds are turned and shifted."""
     if len(frames) == 1 or mode.endswith("-all"):
         axis, where = (

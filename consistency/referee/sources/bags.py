@@ -18,7 +18,7 @@ from consistency.referee.reading.options import Reading
 from consistency.referee.sources.poses import Poses
 from consistency.referee.sources.record import symmetric
 from consistency.referee.sources.sheet import Places
-from consistency.referee.sources.spatial import WHOLE, Source, recordings_of, require_axes
+from consistency.referee.sources.spatial import WHOLE, TrajectorySource, recordings_of, require_axes
 from consistency.referee.sources.tum import UNIT
 from consistency.referee.types import Array
 
@@ -28,7 +28,7 @@ TREE = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 SECOND = 1e-9  # s in a nanosecond
 
 
-class Track(NamedTuple):
+class TopicPoses(NamedTuple):
     """Poses of one topic in order of their stamps, N of them."""
 
     t: Array  # (N,), s
@@ -62,7 +62,7 @@ def read_bags(path: Path, r: Reading) -> list[Evidence]:
     bags = [path] if _is_one(path) else sorted(part for part in path.iterdir() if _is_one(part))
     poses = [_poses(bag, r.topic, r.truth_topic, r.error or "so3", r.tolerance) for bag in bags]
     why = "" if r.error else "; as the ROS messages define it; declare yours with --error"
-    source = Source(path, [(bag, f"{r.truth_topic} of {bag}") for bag in bags], path, why)
+    source = TrajectorySource(path, [(bag, f"{r.truth_topic} of {bag}") for bag in bags], path, why)
     return recordings_of(source, poses, WHOLE, r)
 
 
@@ -154,7 +154,7 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]
         raise InputError(f"{bag}: --truth-topic {frames}: is no transform of /tf; there are: {has}")
 
 
-def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Track:
+def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> TopicPoses:
     """Poses in order of their stamps; of several with the same stamp only the first."""
     rows = [_row(header, content) for header, content in messages]
     if not rows:
@@ -168,7 +168,7 @@ def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Track:
         raise InputError(
             f"{bag}, {topic}: the quaternion at {t[first][bad[0]]:.10g} s has length {length[bad[0]]:.4g}, not 1"
         )
-    return Track(t[first], pose, covariance[first].reshape(-1, 6, 6))
+    return TopicPoses(t[first], pose, covariance[first].reshape(-1, 6, 6))
 
 
 def _row(header: Any, content: Any) -> tuple[float, list[float], Array]:

@@ -19,7 +19,7 @@ GROUPS = {3: ([0, 1],), 6: ([0, 1, 2], [3, 4, 5])}  # position and attitude, of 
 
 
 @dataclass(frozen=True)
-class Fit:
+class ReadingFit:
     """Errors of K estimates in n components under one reading; those that cannot be whitened are left out."""
 
     whitened: Sequence[Array]  # of each run, (k, n)
@@ -98,7 +98,7 @@ class Fit:
         return self.likelihood + best
 
 
-def fit_of(runs: Sequence[Poses], errors: Array | None = None) -> Fit | None:
+def fit_of(runs: Sequence[Poses], errors: Array | None = None) -> ReadingFit | None:
     """Errors of some runs; None without any that can be whitened.
 
     ``errors`` (K, n) are those of all estimates, where they are known.
@@ -126,7 +126,7 @@ def fit_of(runs: Sequence[Poses], errors: Array | None = None) -> Fit | None:
     w[good] = (root @ error[..., None])[..., 0]
     whitened = [part[np.isfinite(part).all(axis=1)] for part in np.split(w, ends)]
     log_det = 2.0 * (np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(sigma).sum(axis=1))
-    return Fit([part for part in whitened if len(part)], root, error, error / sigma, float(log_det.mean()))
+    return ReadingFit([part for part in whitened if len(part)], root, error, error / sigma, float(log_det.mean()))
 
 
 def _memory(runs: Sequence[Array], axis: int) -> float:

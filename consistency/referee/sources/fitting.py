@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
-from consistency.referee.sources.frames import IDENTITY, Frame, fitted_frame, moved, turned_frame
+from consistency.referee.sources.frames import IDENTITY, WorldTransform, fitted_frame, moved, turned_frame
 from consistency.referee.sources.interpolation import Known
 from consistency.referee.sources.poses import Poses
 from consistency.referee.types import Array, Indices
@@ -60,12 +60,12 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
     return np.moveaxis(change.reshape(d, k, len(judged)), 0, -1)
 
 
-def _small(motion: Array) -> Frame:
-    return Frame(Rotation.from_rotvec(motion[3:]), motion[:3])
+def _small(motion: Array) -> WorldTransform:
+    return WorldTransform(Rotation.from_rotvec(motion[3:]), motion[:3])
 
 
-def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: Sequence[int]) -> Frame:
-    """The frame in which the sum of the NEES of all ``runs`` is least, by Gauss and Newton.
+def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: Sequence[int]) -> WorldTransform:
+    """The frame in which the sum of the NEES of all ``runs`` is least, by Gauss-Newton iteration.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     """
     known = [p.known() for p in runs]
 
-    def at(frame: Frame) -> tuple[float, list[Poses], list[Sound]]:
+    def at(frame: WorldTransform) -> tuple[float, list[Poses], list[Sound]]:
         there = [moved(p, frame) for p in runs]
         found = [sound_of(p, judged, k) for p, k in zip(there, known, strict=True)]
         return float(sum(np.square(sound.whitened).sum() for sound in found)), there, found
@@ -97,7 +97,7 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
 
 
 def _step(runs: Sequence[Poses], found: Sequence[Sound], free: Array, judged: Sequence[int]) -> tuple[Array, float]:
-    """Step of Gauss and Newton (d,), and its length in stated standard deviations."""
+    """Gauss-Newton step (d,), and its length in stated standard deviations."""
     tangents = [tangent(p, sound, free, judged).reshape(-1, len(free)) for p, sound in zip(runs, found, strict=True)]
     A, w = np.concatenate(tangents), np.concatenate([sound.whitened.ravel() for sound in found])
     scale = _sizes(A)

@@ -15,25 +15,25 @@ from consistency.referee.types import Array
 
 
 @dataclass(frozen=True)
-class Frame:
+class WorldTransform:
     """Maps a point x of the world of the estimates to turn x + shift in that of the truth."""
 
     turn: Rotation
     shift: Array  # (3,), m; 0 along z in the plane
 
     @staticmethod
-    def about_z(angle: float, shift: Array) -> Frame:
+    def about_z(angle: float, shift: Array) -> WorldTransform:
         """Turn by ``angle``, rad, and shift (2,) or (3,), m."""
-        return Frame(Rotation.from_euler("z", angle), np.append(shift, np.zeros(3 - len(shift))))
+        return WorldTransform(Rotation.from_euler("z", angle), np.append(shift, np.zeros(3 - len(shift))))
 
     @property
     def heading(self) -> float:
         """Turn about z, rad, of a frame that turns about nothing else."""
         return float(self.turn.as_rotvec()[2])
 
-    def after(self, other: Frame) -> Frame:
+    def after(self, other: WorldTransform) -> WorldTransform:
         """Composition of frames: first ``other``, then this one."""
-        return Frame(self.turn * other.turn, self.turn.apply(other.shift) + self.shift)
+        return WorldTransform(self.turn * other.turn, self.turn.apply(other.shift) + self.shift)
 
     def placed(self, values: Array, manifold: Manifold) -> Array:
         """Poses (k, m) of one world in the other; those that are not finite stay."""
@@ -48,16 +48,16 @@ class Frame:
         return out
 
 
-IDENTITY = Frame(Rotation.identity(), np.zeros(3))
+IDENTITY = WorldTransform(Rotation.identity(), np.zeros(3))
 
 
-def moved(p: Poses, frame: Frame) -> Poses:
+def moved(p: Poses, frame: WorldTransform) -> Poses:
     """The estimates in another world, with their covariance."""
     T = carried(p.convention, frame, p.covariance.shape[-1])
     return replace(p, estimate=frame.placed(p.estimate, p.manifold), covariance=T @ p.covariance @ T.T)
 
 
-def carried(convention: str, frame: Frame, n: int) -> Array:
+def carried(convention: str, frame: WorldTransform, n: int) -> Array:
     """Matrix (n, n) that carries an error of a pose over to another world.
 
     An error in the body frame is unchanged; that of ``right`` maps by the adjoint (Sola et al. 2018, eq. 159 and 175).
@@ -76,7 +76,7 @@ def carried(convention: str, frame: Frame, n: int) -> Array:
     return T
 
 
-def fitted_frame(runs: Sequence[Poses]) -> Frame | None:
+def fitted_frame(runs: Sequence[Poses]) -> WorldTransform | None:
     """The turn about z and the shift with which the positions of all runs are nearest to the truth.
 
     Umeyama (1991), in the plane. None with fewer than three estimates.
@@ -87,11 +87,11 @@ def fitted_frame(runs: Sequence[Poses]) -> Frame | None:
     a, b = own - own.mean(axis=0), true - true.mean(axis=0)
     angle = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
     turn = Rotation.from_euler("z", angle)
-    return Frame(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)))
+    return WorldTransform(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)))
 
 
-def turned_frame(runs: Sequence[Poses]) -> Frame:
-    """The frame that makes the orientations of poses in space, and then positions, right in the mean."""
+def turned_frame(runs: Sequence[Poses]) -> WorldTransform:
+    """The frame in which orientations of poses in space, and then positions, are right on average."""
     turns = []
     for p in runs:
         own, true = _pairs(p)
@@ -99,7 +99,7 @@ def turned_frame(runs: Sequence[Poses]) -> Frame:
             turns.append((Rotation.from_quat(true[:, 3:]) * Rotation.from_quat(own[:, 3:]).inv()).mean())
     turn = Rotation.concatenate(turns).mean() if turns else IDENTITY.turn
     own, true = _positions(runs)
-    return Frame(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)) if len(own) else np.zeros(3))
+    return WorldTransform(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)) if len(own) else np.zeros(3))
 
 
 def spread(runs: Sequence[Poses]) -> float:

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
-from consistency.referee.sources.fits import Fit, fit_of
-from consistency.referee.sources.frames import Frame, fitted_frame, moved, spread
+from consistency.referee.sources.fits import ReadingFit, fit_of
+from consistency.referee.sources.frames import WorldTransform, fitted_frame, moved, spread
 from consistency.referee.sources.poses import Poses
 from consistency.referee.types import Array
 
@@ -115,7 +115,7 @@ def _gross(guesses: Sequence[Guess], some: Sequence[Poses]) -> Guess | None:
     return guesses[int(np.flatnonzero(left <= np.nanmin(left) + ALIKE)[0])]
 
 
-def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: Fit) -> Guess | None:
+def _fine(guesses: Sequence[Guess], some: Sequence[Poses], declared: ReadingFit) -> Guess | None:
     """The likeliest guess with which everything is right, where no simple fault is nearly as likely."""
     guesses = [guess for guess in guesses if guess.fine]
     bar, simple, found = LEAST_GAIN + np.log(max(len(guesses), 1)), declared.simple(), []
@@ -227,7 +227,7 @@ def _reordered_states(order: list[int]) -> Change:
 
 def _ned(convention: str) -> Iterator[Guess]:
     """A world whose z points down, with a body whose z does so too or not."""
-    north = Frame(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
+    north = WorldTransform(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
     down = np.diag([1.0, -1.0, -1.0])
     turned = {"so3-body": slice(3, 6), "left": slice(0, 6)}.get(convention, slice(0, 0))
     T = np.eye(6)

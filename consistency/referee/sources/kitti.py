@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.errors import InputError
 from consistency.referee.reading import read_text, reading
 from consistency.referee.reading.kitti import NANO, numbers, place_of, read_keys, read_times, turn
-from consistency.referee.sources.sheet import Lines, Sheet
+from consistency.referee.sources.sheet import Lines, TableRows
 from consistency.referee.types import Array
 
 EARTH = 6378137.0  # m, radius at the equator (WGS 84)
@@ -69,14 +69,14 @@ def drive_poses(folder: Path, body: str) -> tuple[Array, Array]:
     return stamps, poses @ np.linalg.inv(_mount(folder, body))
 
 
-def drive_sheet(folder: Path, body: str | None = None) -> Sheet:
+def drive_sheet(folder: Path, body: str | None = None) -> TableRows:
     """Poses of a drive in the plane: columns t, x, y, heading."""
     if body not in (None, *LEVEL):
         raise InputError(f"--body {body}: with x, y, heading it is {' or '.join(LEVEL)}, whose x and y are level")
     lines = read_drive(folder, body)
     ahead = Rotation.from_quat(lines.values[:, 4:]).apply([1.0, 0.0, 0.0])
     columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
-    return Sheet(folder, columns, lines.line, "packet")
+    return TableRows(folder, columns, lines.line, "packet")
 
 
 def mercator(place: Array) -> Array:

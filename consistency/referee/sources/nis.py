@@ -13,7 +13,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.reading import MOST_DOF, one_line, require_name
 from consistency.referee.sources.archive import load_arrays, run_lengths, step_times, whole_numbers
 from consistency.referee.sources.record import listed
-from consistency.referee.sources.sheet import Sheet, are_dof, bounded, read_sheet
+from consistency.referee.sources.sheet import TableRows, are_dof, bounded, read_sheet
 from consistency.referee.sources.table import row_order
 from consistency.referee.types import Array
 
@@ -105,7 +105,7 @@ def _require_columns(place: str, columns: list[str]) -> None:
         )
 
 
-def _of_one(sheet: Sheet, column: str, choice: str | int | None) -> Sheet:
+def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRows:
     """The rows of one filter or run."""
     if column not in sheet:
         if choice is not None:
@@ -116,7 +116,7 @@ def _of_one(sheet: Sheet, column: str, choice: str | int | None) -> Sheet:
     return sheet.rows(values == choose(sheet.path, column, there, choice))
 
 
-def _of_sheet(name: str, sheet: Sheet) -> NisLog:
+def _of_sheet(name: str, sheet: TableRows) -> NisLog:
     key = next((column for column in ("step", "t") if column in sheet), None)
     if key is not None:
         sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))

@@ -76,7 +76,7 @@ def _named(name: str, found: Offset) -> str:
 def offset_of(runs: Sequence[Poses]) -> Offset | None:
     """The offset of the clocks that fits best; None where nothing moves, or the data are too few.
 
-    The offset minimises the NEES (capped) within a second; one step of Gauss and Newton in each run, or in each of
+    The offset minimises the NEES (capped) within a second; one Gauss-Newton step in each run, or in each of
     ``PARTS`` parts of a single one, tells how far runs agree on it (Student's t).
     """
     some = [sound for poses in runs if len((sound := poses.some(max(MOST // len(runs), 50)).sound()).t)]
@@ -116,7 +116,7 @@ def _size(poses: Poses, shift: float, judged: Array) -> float:
 
 
 def steps_of(poses: Poses, shift: float, parts: int) -> Array:
-    """Step of Gauss and Newton from ``shift`` in each part, s; NaN where nothing moves."""
+    """Gauss-Newton step from ``shift`` in each part, s; NaN where nothing moves."""
     e = whiten(poses.errors(shift), poses.covariance)
     moved = (poses.errors(shift + STEP) - poses.errors(shift - STEP)) / (2.0 * STEP)
     v = whiten(moved, poses.covariance)

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.sources.fitting import Sound, sound_of, tangent
-from consistency.referee.sources.frames import Frame
+from consistency.referee.sources.frames import WorldTransform
 from consistency.referee.sources.poses import Poses
 from consistency.referee.types import Array
 
 
-def frame_of_first_pose(name: str, p: Poses) -> Frame:
+def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
     """The frame in which the first pose is the true one.
 
     Raises
@@ -34,8 +34,8 @@ def frame_of_first_pose(name: str, p: Poses) -> Frame:
     return _onto(turn, estimate[:3], truth[:3])
 
 
-def _onto(turn: Rotation, own: Array, true: Array) -> Frame:
-    return Frame(turn, true - turn.apply(own))
+def _onto(turn: Rotation, own: Array, true: Array) -> WorldTransform:
+    return WorldTransform(turn, true - turn.apply(own))
 
 
 def _first(name: str, p: Poses) -> tuple[int, Array]:

@@ -47,7 +47,7 @@ TRUTHS = {text: value for value in (True, False) for text in (str(value), str(va
 
 
 @dataclass(frozen=True)
-class Sheet:
+class TableRows:
     """A table of N rows, with the place of each row in the file."""
 
     path: Path
@@ -88,9 +88,11 @@ class Sheet:
             raise InputError(f"{self.place(row)}: column '{column}': {what} ({one_line(cells[row], 60)})")
         return values
 
-    def rows(self, keep: Array) -> Sheet:
+    def rows(self, keep: Array) -> TableRows:
         """The rows of a mask or of indices."""
-        return Sheet(self.path, {name: cells[keep] for name, cells in self.data.items()}, self.line[keep], self.unit)
+        return TableRows(
+            self.path, {name: cells[keep] for name, cells in self.data.items()}, self.line[keep], self.unit
+        )
 
     def texts(self, column: str) -> Array:
         """A column as text, (N,)."""
@@ -156,7 +158,7 @@ def are_dof(values: Array) -> Array:
     return np.asarray((values >= 0) & (values < MOST_DOF) & (values == np.round(values)))
 
 
-def read_sheet(path: Path) -> Sheet:
+def read_sheet(path: Path) -> TableRows:
     """A CSV file (comma, semicolon or tab; # comments) or a Parquet file."""
     sheet = _read_parquet(path) if path.suffix.lower() in (".parquet", ".pq") else _read_csv(path)
     if not len(sheet):
@@ -170,15 +172,15 @@ def read_sheet(path: Path) -> Sheet:
     return sheet
 
 
-def _read_parquet(path: Path) -> Sheet:
+def _read_parquet(path: Path) -> TableRows:
     if not is_file(path):
         raise InputError(f"{path}: no such file")
     require(f"{path}: Parquet", "parquet")
     columns, rows = outside("columns")(path, "cannot be read as Parquet")
-    return Sheet(path, columns, np.arange(rows), "row")
+    return TableRows(path, columns, np.arange(rows), "row")
 
 
-def _read_csv(path: Path) -> Sheet:
+def _read_csv(path: Path) -> TableRows:
     names: list[str] = []
     separator, tables, line = ",", list[dict[str, Column]](), list[Indices]()
     for block in blocks(path):
@@ -197,7 +199,7 @@ def _read_csv(path: Path) -> Sheet:
         raise InputError(f"{path}: is empty")
     if not tables:
         raise InputError(f"{path}: holds no row under its header")
-    return Sheet(
+    return TableRows(
         path, {name: _joined([table[name] for table in tables]) for name in names}, np.concatenate(line), "line"
     )
 

@@ -32,7 +32,7 @@ FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, 
 
 
 @dataclass(frozen=True)
-class Source:
+class TrajectorySource:
     """Origin of trajectories, for names and messages."""
 
     path: Path
@@ -61,7 +61,7 @@ def require_axes(axes: Sequence[str] | None) -> None:
 
 
 def recordings_of(
-    source: Source,
+    source: TrajectorySource,
     poses: Sequence[Poses],
     parts: Mapping[str, range],
     r: Reading,

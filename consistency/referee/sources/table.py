@@ -23,7 +23,7 @@ from consistency.referee.sources.matching import common_steps, common_times
 from consistency.referee.sources.poses import Poses
 from consistency.referee.sources.record import Track, assemble, count, listed, symmetric
 from consistency.referee.sources.relative import Stretch, relative_recording
-from consistency.referee.sources.sheet import Places, Sheet, are_dof, read_sheet
+from consistency.referee.sources.sheet import Places, TableRows, are_dof, read_sheet
 from consistency.referee.sources.windows import Relative
 from consistency.referee.types import Array, Indices
 
@@ -82,7 +82,7 @@ def require_poses(path: Path, axes: tuple[str, ...], convention: str, truth: Pat
         raise InputError(f"{path}: --relative needs poses x, y, heading, with --error so2, left or right")
 
 
-def _key(sheet: Sheet, truth: Sheet | None, r: Reading) -> str:
+def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
     """The column that says which estimate belongs to which truth."""
     if r.time_offset is not None:
         if "t" in sheet and truth is not None and "t" in truth:
@@ -101,8 +101,8 @@ def _key(sheet: Sheet, truth: Sheet | None, r: Reading) -> str:
 
 def _recording(
     name: str,
-    sheet: Sheet,
-    truth: Sheet | None,
+    sheet: TableRows,
+    truth: TableRows | None,
     key: str,
     axes: tuple[str, ...],
     convention: str,
@@ -183,7 +183,7 @@ def _recording(
 
 
 def _stretches(
-    sheet: Sheet, runs: Array, keep: Array, true: Array, estimate: Array, covariance: Array, convention: str,
+    sheet: TableRows, runs: Array, keep: Array, true: Array, estimate: Array, covariance: Array, convention: str,
     relative: Relative,
 ) -> list[Stretch]:  # fmt: skip
     """Each run before its windows are taken."""
@@ -202,7 +202,7 @@ def _stretches(
     return found
 
 
-def _cross(sheet: Sheet) -> Array | None:
+def _cross(sheet: TableRows) -> Array | None:
     """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
     out, missing = np.empty((len(sheet), 3, 3)), []
     for (i, a), (j, b) in itertools.product(enumerate(POSE), repeat=2):
@@ -217,7 +217,7 @@ def _cross(sheet: Sheet) -> Array | None:
     return None if missing else out
 
 
-def row_order(sheet: Sheet, runs: Array, key: str) -> Indices:
+def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     """Rows (N,) by run and then by ``key`` (step or t); ``runs`` (N,) has the run of each row.
 
     Timestamps must be in order: a jump back is another run or another clock.
@@ -257,7 +257,7 @@ class Samples(NamedTuple):
         return Samples(self.keys[here], self.values[here], self.row[here], self.runs[here])
 
 
-def _samples(truth: Sheet, axes: tuple[str, ...], key: str) -> Samples:
+def _samples(truth: TableRows, axes: tuple[str, ...], key: str) -> Samples:
     _require(truth, axes)
     values = np.column_stack([truth.numbers(axis, finite=True) for axis in axes])
     runs = truth.numbers("run", whole=True).astype(int) if "run" in truth else None
@@ -270,7 +270,7 @@ def _manifold(convention: str) -> Manifold:
 
 
 def _poses(
-    sheet: Sheet,
+    sheet: TableRows,
     samples: Samples,
     runs: Array,
     t: Array,
@@ -296,8 +296,8 @@ def _poses(
 
 def _matched(
     name: str,
-    sheet: Sheet,
-    truth: Sheet,
+    sheet: TableRows,
+    truth: TableRows,
     samples: Samples,
     runs: Array,
     keys: Array,
@@ -353,7 +353,7 @@ def _equal(steps: Array, reference: Array) -> tuple[Indices, Indices]:
     return own, match
 
 
-def _same_instants(sheet: Sheet, truth: Sheet, keep: Array, partner: Array, max_dt: float) -> None:
+def _same_instants(sheet: TableRows, truth: TableRows, keep: Array, partner: Array, max_dt: float) -> None:
     own = sheet.numbers("t")[keep]
     other = truth.numbers("t")[partner[keep]]
     off = np.flatnonzero(np.abs(own - other) > max_dt + 1e-6)
@@ -377,12 +377,12 @@ def _is_exact(covariance: Array) -> bool:
     return bool(np.isin(classify(covariance, ROUNDED), (Validity.DEFICIENT, Validity.INDEFINITE)).all())
 
 
-def _has_own(sheet: Sheet) -> bool:
+def _has_own(sheet: TableRows) -> bool:
     """Whether the rows are of a filter of the bench that states the covariance of an error of its own."""
     return all(name in sheet and not sheet.empty(name).all() for name in OWN_COVARIANCE)
 
 
-def _covariance(sheet: Sheet, axes: tuple[str, ...], own: bool = False) -> Array:
+def _covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False) -> Array:
     """(N, n, n) from the upper triangle; a lower triangle beside it must agree. ``own``: of the columns own_P_*."""
     _require(sheet, axes)
     if own:
@@ -407,18 +407,18 @@ def _covariance(sheet: Sheet, axes: tuple[str, ...], own: bool = False) -> Array
     return symmetric(out, sheet.place)
 
 
-def _require(sheet: Sheet, axes: tuple[str, ...]) -> None:
+def _require(sheet: TableRows, axes: tuple[str, ...]) -> None:
     missing = [axis for axis in axes if axis not in sheet]
     if missing:
         hint = "; name other states with --state a,b,c" if axes == POSE else ""
         raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}{hint}")
 
 
-def _present(sheet: Sheet, axes: tuple[str, ...]) -> list[Array]:
+def _present(sheet: TableRows, axes: tuple[str, ...]) -> list[Array]:
     return [sheet.numbers(axis) for axis in axes if axis in sheet]
 
 
-def _nis(sheet: Sheet) -> tuple[Array | None, Array | None]:
+def _nis(sheet: TableRows) -> tuple[Array | None, Array | None]:
     if "nis" not in sheet:
         return None, None
     if "nis_dof" not in sheet:

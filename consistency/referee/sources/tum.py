@@ -18,7 +18,15 @@ from consistency.referee.sources.openvins import LAYOUT, States, as_states, read
 from consistency.referee.sources.poses import Poses
 from consistency.referee.sources.record import symmetric
 from consistency.referee.sources.sheet import Lines, Places, read_numbers
-from consistency.referee.sources.spatial import BLOCKS, SINGLE, WHOLE, Source, apart, recordings_of, require_axes
+from consistency.referee.sources.spatial import (
+    BLOCKS,
+    SINGLE,
+    WHOLE,
+    TrajectorySource,
+    apart,
+    recordings_of,
+    require_axes,
+)
 from consistency.referee.sources.windows import Relative
 from consistency.referee.types import Array, Indices
 
@@ -61,7 +69,7 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
             raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
         poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], r.tolerance, r.body))
     why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
-    source = Source(estimates, [(path, true) for path, true, _ in runs], r.covariance or estimates, why)
+    source = TrajectorySource(estimates, [(path, true) for path, true, _ in runs], r.covariance or estimates, why)
     return recordings_of(source, poses, parts, r, relative)
 
 

@@ -12,7 +12,7 @@ from consistency.bench.scenario.effects.nodes import bilinear
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate
 from consistency.stereo.characterising.basis import FEW
-from consistency.stereo.characterising.likelihood import Fit
+from consistency.stereo.characterising.likelihood import LikelihoodFit
 from consistency.stereo.characterising.residuals import Residuals
 
 GRID = (5, 4)  # nodes across and down
@@ -63,7 +63,7 @@ class BiasEstimate:
         return np.asarray(self.believed[k].reshape(len(self.grid.v), len(self.grid.u)))
 
 
-def estimate_bias(fits: Sequence[Fit], grid: Grid, level: float, rate: float) -> BiasEstimate:
+def estimate_bias(fits: Sequence[LikelihoodFit], grid: Grid, level: float, rate: float) -> BiasEstimate:
     """Bias of each coordinate from its fit.
 
     Parameters

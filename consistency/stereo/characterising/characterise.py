@@ -16,9 +16,9 @@ from consistency.stereo.characterising import coordinate
 from consistency.stereo.characterising.basis import octaves
 from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_bias, grid_of
 from consistency.stereo.characterising.coordinate import Levels
-from consistency.stereo.characterising.likelihood import Fit, Rows, fit
-from consistency.stereo.characterising.residuals import Residuals, Selection, select
-from consistency.stereo.characterising.tails import Estimate, Tails, rate, ratios, tails
+from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
+from consistency.stereo.characterising.residuals import Residuals, RowSelection, select
+from consistency.stereo.characterising.tails import IntervalEstimate, ResidualTails, rate, ratios, tails
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # chance that any interval misses
@@ -31,12 +31,12 @@ class Coordinate:
     """Estimates for one coordinate, u, v or d."""
 
     name: str
-    sigma: Estimate  # px, of what is drawn anew
+    sigma: IntervalEstimate  # px, of what is drawn anew
     pooled: float  # px, about the mean of all rows: noise, offsets and bias together; NaN where that is not known
     about_tracks: float  # px, about the means of tracks; NaN likewise
-    correlation: Estimate | None  # with the step before
-    offset: Estimate | None  # share of the variance about the bias map
-    tails: Tails
+    correlation: IntervalEstimate | None  # with the step before
+    offset: IntervalEstimate | None  # share of the variance about the bias map
+    tails: ResidualTails
     lags: Array  # (lags,), autocorrelation along tracks
     bounds: Array  # (lags,), 95 % bound if white
     residuals: Array  # (N,), whitened and standardised
@@ -56,11 +56,11 @@ class Coordinate:
 
 
 @dataclass(frozen=True)
-class Growth:
+class DisparityNoise:
     """Standard deviation of disparity by disparity."""
 
     nodes: Array  # (m,), px
-    sigma: tuple[Estimate, ...]  # px, at each node
+    sigma: tuple[IntervalEstimate, ...]  # px, at each node
     p_value: float  # that it is the same at all
     shown: bool
 
@@ -72,16 +72,16 @@ class Characterisation:
     sensor: PicturedSensor  # as believed so far: model, calibration, image, mount
     source: str
     coordinates: tuple[Coordinate, Coordinate, Coordinate]
-    growth: Growth | None
+    growth: DisparityNoise | None
     bias: BiasEstimate | None  # None where it cannot be told from where the landmarks are
-    gross: Estimate  # share of rows that are grossly wrong
+    gross: IntervalEstimate  # share of rows that are grossly wrong
     tracks: int
     rows: int
     left_out: Mapping[str, int]  # reason: rows
     level: Levels
     kept: Residuals
     notes: tuple[str, ...] = ()  # what could not be estimated, and limits
-    ratio: tuple[Estimate, ...] = ()  # sd while moving over sd at rest, of u, v, d
+    ratio: tuple[IntervalEstimate, ...] = ()  # sd while moving over sd at rest, of u, v, d
 
 
 @one_blas_thread()  # its matrices are small: a second one takes twice the time of the processors, and gains nothing
@@ -129,7 +129,7 @@ def characterise(
         by_disparity = _fitted(kept, 2, X, cells.ridge, hats(kept.ideal[:, 2], nodes), chosen, source, alone)
         p_value = coordinate.growth_p_value(by_disparity)
         shown = p_value < levels.rate / 6
-        growth = Growth(nodes, tuple(coordinate.at_nodes(by_disparity, levels.of("growth"))), p_value, shown)
+        growth = DisparityNoise(nodes, tuple(coordinate.at_nodes(by_disparity, levels.of("growth"))), p_value, shown)
         fits[2] = by_disparity if shown else fits[2]
     return Characterisation(
         sensor, source, _coordinates(fits, kept, levels, alone), growth,
@@ -153,8 +153,8 @@ def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tu
 
 
 def _fitted(
-    data: Residuals, k: int, X: Array, ridge: Array, G: Array, chosen: Selection, source: str, alone: bool
-) -> Fit:
+    data: Residuals, k: int, X: Array, ridge: Array, G: Array, chosen: RowSelection, source: str, alone: bool
+) -> LikelihoodFit:
     """The fit of coordinate ``k``; nodes without any data are no parameters."""
     rows = Rows(data.r[:, k], X, G, data.first, data.gap, ridge)
     try:
@@ -164,13 +164,13 @@ def _fitted(
 
 
 def _coordinates(
-    fits: list[Fit], kept: Residuals, levels: Levels, alone: bool
+    fits: list[LikelihoodFit], kept: Residuals, levels: Levels, alone: bool
 ) -> tuple[Coordinate, Coordinate, Coordinate]:
     u, v, d = (_coordinate(k, fit, kept, levels, alone) for k, fit in enumerate(fits))
     return u, v, d
 
 
-def _coordinate(k: int, of: Fit, kept: Residuals, levels: Levels, alone: bool) -> Coordinate:
+def _coordinate(k: int, of: LikelihoodFit, kept: Residuals, levels: Levels, alone: bool) -> Coordinate:
     r, rows = kept.r[:, k], of.rows
     n = np.diff(np.append(rows.first, len(r)))
     centred = r - (np.add.reduceat(r, rows.first) / n)[rows.track]

@@ -8,8 +8,8 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.types import Array
-from consistency.stereo.characterising.likelihood import Fit
-from consistency.stereo.characterising.tails import Estimate
+from consistency.stereo.characterising.likelihood import LikelihoodFit
+from consistency.stereo.characterising.tails import IntervalEstimate
 
 LAGS = 10  # of the autocorrelation that is shown
 
@@ -35,20 +35,20 @@ class Levels:
         return self.rate / (6 * max(int(getattr(self, group)), 1))
 
 
-def half_width(gradient: Array, fit: Fit, level: float) -> float:
+def half_width(gradient: Array, fit: LikelihoodFit, level: float) -> float:
     """Half of an interval of ``gradient' theta``: the wider of the one for Gaussian noise and the one for any noise."""
     model, robust = (np.sqrt(max(float(gradient @ C @ gradient), 0.0)) for C in (fit.cov, fit.robust))
     dof = max(fit.tracks - 1, 1)
     return float(max(model * stats.norm.isf(level / 2), robust * stats.t.isf(level / 2, dof)))
 
 
-def noise(fit: Fit, level: float) -> Estimate:
+def noise(fit: LikelihoodFit, level: float) -> IntervalEstimate:
     """Standard deviation of what is drawn anew, in the root mean square over the rows, px."""
     log_sigma, gradient = log_level(fit)
     return _exponential(log_sigma, half_width(gradient, fit, level))
 
 
-def log_level(fit: Fit) -> tuple[float, Array]:
+def log_level(fit: LikelihoodFit) -> tuple[float, Array]:
     """Log of the root mean square of the standard deviations, and its gradient by theta (m + 2,)."""
     a, G = fit.parameters.a, fit.rows.G
     sd = G @ a
@@ -56,13 +56,13 @@ def log_level(fit: Fit) -> tuple[float, Array]:
     return float(0.5 * np.log(np.mean(sd**2))), gradient
 
 
-def at_nodes(fit: Fit, level: float) -> list[Estimate]:
+def at_nodes(fit: LikelihoodFit, level: float) -> list[IntervalEstimate]:
     """Standard deviation at each node of disparity, px."""
     m = len(fit.theta) - 2
     return [_exponential(float(fit.theta[j]), half_width(np.eye(m + 2)[j], fit, level)) for j in range(m)]
 
 
-def growth_p_value(fit: Fit) -> float:
+def growth_p_value(fit: LikelihoodFit) -> float:
     """Chance of such differences between the nodes if the noise does not depend on disparity (Wald's test)."""
     m = len(fit.theta) - 2
     if m < 2:
@@ -76,23 +76,23 @@ def growth_p_value(fit: Fit) -> float:
     return max(values)
 
 
-def correlation(fit: Fit, level: float) -> Estimate:
+def correlation(fit: LikelihoodFit, level: float) -> IntervalEstimate:
     """Correlation of the noise with that of the step before."""
     m = len(fit.theta) - 2
     middle, half = float(fit.theta[m]), half_width(np.eye(m + 2)[m], fit, level)
-    return Estimate(float(np.tanh(middle)), float(np.tanh(middle - half)), float(np.tanh(middle + half)))
+    return IntervalEstimate(float(np.tanh(middle)), float(np.tanh(middle - half)), float(np.tanh(middle + half)))
 
 
-def offset_share(fit: Fit, level: float) -> Estimate:
+def offset_share(fit: LikelihoodFit, level: float) -> IntervalEstimate:
     """Share of the offsets of tracks in the variance about the bias map; an interval ends at 0."""
     m, n = len(fit.theta) - 2, max(fit.rows.length, 1.0)
     middle, half = float(fit.theta[-1]), half_width(np.eye(m + 2)[-1], fit, level)
     q = np.maximum(np.expm1(np.array([middle, middle - half, middle + half])) / n, 0.0)
     value, low, high = q / (1.0 + q)
-    return Estimate(float(value), float(low), float(high))
+    return IntervalEstimate(float(value), float(low), float(high))
 
 
-def bias(fit: Fit, level: float) -> tuple[Array, Array, Array]:
+def bias(fit: LikelihoodFit, level: float) -> tuple[Array, Array, Array]:
     """Coefficients (p,) of the bias, half widths (p,) of their intervals, and their covariance (p, p), px."""
     of = fit.regression
     scores = np.add.reduceat(of.X * of.residual[:, None], fit.rows.first, axis=0)
@@ -104,7 +104,7 @@ def bias(fit: Fit, level: float) -> tuple[Array, Array, Array]:
     return of.beta, half, of.cov * wider[:, None] * wider[None, :]
 
 
-def autocorrelation(fit: Fit) -> tuple[Array, Array]:
+def autocorrelation(fit: LikelihoodFit) -> tuple[Array, Array]:
     """Correlation (lags,) along tracks about the bias map and the offsets, and its 95 % bound (lags,) if white.
 
     Products of neighbours are pooled over all tracks. Offsets take part of any correlation away; where a track has n
@@ -128,5 +128,5 @@ def autocorrelation(fit: Fit) -> tuple[Array, Array]:
     return values, bounds
 
 
-def _exponential(middle: float, half: float) -> Estimate:
-    return Estimate(float(np.exp(middle)), float(np.exp(middle - half)), float(np.exp(middle + half)))
+def _exponential(middle: float, half: float) -> IntervalEstimate:
+    return IntervalEstimate(float(np.exp(middle)), float(np.exp(middle - half)), float(np.exp(middle + half)))

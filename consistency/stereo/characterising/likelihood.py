@@ -123,7 +123,7 @@ def regress(rows: Rows, p: Parameters) -> Regression | None:
 
 
 @dataclass(frozen=True)
-class Fit:
+class LikelihoodFit:
     """The largest restricted likelihood and what is known of its place."""
 
     rows: Rows
@@ -138,7 +138,7 @@ class Fit:
         return len(self.rows.first)
 
 
-def fit(rows: Rows, start: float, memory: bool = True) -> Fit:
+def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
     """The parameters of largest restricted likelihood.
 
     Parameters
@@ -179,7 +179,7 @@ def fit(rows: Rows, start: float, memory: bool = True) -> Fit:
     robust = inverse @ (scores.T @ scores) @ inverse * K / max(K - 1, 1)
     cov, scatter = np.zeros((m + 2, m + 2)), np.zeros((m + 2, m + 2))
     cov[np.ix_(free, free)], scatter[np.ix_(free, free)] = inverse, robust
-    return Fit(rows, theta, cov, scatter, regression, parameters)
+    return LikelihoodFit(rows, theta, cov, scatter, regression, parameters)
 
 
 def _held(rows: Rows, bias: Array, full: Callable[[Array], Array], length: float) -> Callable[[Array], float]:

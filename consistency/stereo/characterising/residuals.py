@@ -76,7 +76,7 @@ def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Resid
 
 
 @dataclass(frozen=True)
-class Selection:
+class RowSelection:
     """The rows that the noise is estimated from, and the others."""
 
     kept: Residuals
@@ -85,7 +85,7 @@ class Selection:
     rough: Array  # (3,), px, robust standard deviations
 
 
-def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> Selection:
+def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> RowSelection:
     """Leave out rows near the limits of the sensor, by their ideal values, and those that are grossly wrong.
 
     Near the ends of the search range only some noise is measured; ``MARGIN`` standard deviations away, the variance
@@ -110,7 +110,7 @@ def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> Select
             margin = MARGIN * scale[:, k]
             inside &= (expected[:, k] >= margin - middle) & (expected[:, k] <= size - middle - margin)
     gross = inside & (np.abs(centred) > GROSS * scale).any(axis=1)
-    return Selection(data.keep(inside & ~gross), int(gross.sum()), int((~inside).sum()), rough)
+    return RowSelection(data.keep(inside & ~gross), int(gross.sum()), int((~inside).sum()), rough)
 
 
 def _robust(r: Array, X: Array) -> Array:

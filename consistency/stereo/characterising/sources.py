@@ -14,7 +14,7 @@ NODES, CORNERS = 2, 3  # least numbers across and down, of nodes of a bias map a
 
 
 @dataclass(frozen=True)
-class Options:
+class SourceOptions:
     """What is known of a source beside its files."""
 
     grid: tuple[int, int] | None = None
@@ -36,7 +36,7 @@ class Options:
         return [f"--{name}" for name in names if getattr(self, name) is not None]
 
 
-def characterise_source(source: Path, options: Options) -> Measured:
+def characterise_source(source: Path, options: SourceOptions) -> Measured:
     """The sensor of a log folder or of a folder of images.
 
     Raises
@@ -69,7 +69,7 @@ def characterise_source(source: Path, options: Options) -> Measured:
     return Measured(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
 
 
-def _of_sequence(source: Path, options: Options) -> Measured:
+def _of_sequence(source: Path, options: SourceOptions) -> Measured:
     from consistency.stereo.characterising.pictures import Sources, characterise_images
 
     if options.distortion is not None:

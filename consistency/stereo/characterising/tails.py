@@ -17,7 +17,7 @@ FEWEST = 100  # rows at rest, and moving, that are compared
 
 
 @dataclass(frozen=True)
-class Estimate:
+class IntervalEstimate:
     """A value with its interval."""
 
     value: float
@@ -30,10 +30,10 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Tails:
+class ResidualTails:
     """Shape of standardised residuals."""
 
-    weight: Estimate  # 1 / nu of Student's distribution; 0 is the normal one
+    weight: IntervalEstimate  # 1 / nu of Student's distribution; 0 is the normal one
     skewness: float
     excess_kurtosis: float
     p_value: float  # of normality, D'Agostino & Pearson (1973)
@@ -49,7 +49,7 @@ class Mixture:
     wide: float  # standard deviation of the wide one, likewise
 
 
-def tails(w: Array, level: float) -> Tails:
+def tails(w: Array, level: float) -> ResidualTails:
     """Student's degrees of freedom by the likelihood of residuals (N,), its interval by the ratio of likelihoods.
 
     ``level`` is the chance that the interval misses.
@@ -77,7 +77,9 @@ def tails(w: Array, level: float) -> Tails:
     mixture, fitted = two_normals(w) if low > 0 else (None, np.inf)
     # one parameter more than Student's: by the information criterion of Schwarz (1978)
     better = mixture if 2.0 * fitted + np.log(len(w)) < least else None
-    return Tails(Estimate(value, low, high), shape.skewness, shape.excess_kurtosis, shape.p_value, better)
+    return ResidualTails(
+        IntervalEstimate(value, low, high), shape.skewness, shape.excess_kurtosis, shape.p_value, better
+    )
 
 
 def two_normals(w: Array) -> tuple[Mixture, float]:
@@ -108,13 +110,13 @@ def _negative(w: Array, weight: float, log_scale: float) -> float:
     return float(0.5 * (nu + 1.0) * np.log1p(x2 / nu).sum() + len(w) * (log_scale - constant))
 
 
-def rate(count: int, total: int, level: float) -> Estimate:
+def rate(count: int, total: int, level: float) -> IntervalEstimate:
     """A share with the interval of Clopper & Pearson (1934)."""
     low, high = binomial_interval(count, total, 1.0 - level)
-    return Estimate(count / total, float(low), float(high))
+    return IntervalEstimate(count / total, float(low), float(high))
 
 
-def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -> tuple[Estimate, ...]:
+def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -> tuple[IntervalEstimate, ...]:
     """Noise while moving over noise at rest, of u, v, d; nothing where one of the two has too few data.
 
     Parameters
@@ -139,5 +141,5 @@ def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -
             variance += 0.25 * max(float((spread**2).sum()) / dof.sum() ** 2, 2.0 / dof.sum())
         half = float(np.sqrt(variance) * stats.norm.isf(level / 2))
         value = logs[0] - logs[1]
-        out.append(Estimate(float(np.exp(value)), float(np.exp(value - half)), float(np.exp(value + half))))
+        out.append(IntervalEstimate(float(np.exp(value)), float(np.exp(value - half)), float(np.exp(value + half))))
     return tuple(out)

@@ -45,7 +45,7 @@ def characterise(
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
     from consistency.stereo.characterising.printing import blocks
-    from consistency.stereo.characterising.sources import CORNERS, NODES, Options, characterise_source, counts
+    from consistency.stereo.characterising.sources import CORNERS, NODES, SourceOptions, characterise_source, counts
     from consistency.stereo.characterising.writing import as_json as json_of
     from consistency.stereo.characterising.writing import require_free_file, sensor_text, write_sensor
     from consistency.stereo.pages import write_sensor_reports
@@ -56,7 +56,7 @@ def characterise(
         require_free(report, overwrite, "characterisation", "--report")
     size = None if board is None else counts(board, "--board", CORNERS)
     nodes = None if grid is None else counts(grid, "--grid", NODES)
-    options = Options(
+    options = SourceOptions(
         nodes, at_rest, free_poses, calibration, truth, format, left, right, size, square, distortion, seed
     )
     measured = characterise_source(source, options)

@@ -48,11 +48,11 @@ def frontend(
     overwrite: Overwrite = False,
 ) -> None:
     """Stereo images to a log for filters, and to a trajectory with covariance."""
-    from consistency.stereo.frontend import Options, write_frontend_log
-    from consistency.stereo.vision.motion import Settings
+    from consistency.stereo.frontend import FrontendOptions, write_frontend_log
+    from consistency.stereo.vision.motion import MotionSettings
 
-    settings = Settings(estimator=estimator, **given(sigma_per_scale=sigma_per_scale))
-    options = Options(
+    settings = MotionSettings(estimator=estimator, **given(sigma_per_scale=sigma_per_scale))
+    options = FrontendOptions(
         calibration, truth, format, left, right, rate, lever=lever, planar=planar, seed=seed, settings=settings,
         **given(max_landmarks=max_landmarks),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from consistency.stereo.frontend.truth import find_truth, missing_of_drive, read
 from consistency.stereo.frontend.tum import covariance_text, motions_text, trajectory_text
 from consistency.stereo.vision.features import opencv
 from consistency.stereo.vision.matching import is_rectified
-from consistency.stereo.vision.motion import RelativeMotion, Settings
+from consistency.stereo.vision.motion import MotionSettings, RelativeMotion
 from consistency.stereo.vision.odometry import motion_covariances, trajectory, visual_odometry
 from consistency.stereo.vision.rig import StereoRig
 from consistency.stereo.vision.sequence import Sequence, read_sequence
@@ -30,7 +30,7 @@ AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
-class Options:
+class FrontendOptions:
     """Options for the part of a sequence that becomes a log."""
 
     calibration: Path | None = None
@@ -43,7 +43,7 @@ class Options:
     lever: float = 0.0  # m from the robot's point forward to the camera
     planar: bool = False  # whether the log is written where the motions leave the plane, too
     seed: int = 0  # of RANSAC
-    settings: Settings = field(default_factory=Settings)
+    settings: MotionSettings = field(default_factory=MotionSettings)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _motion_lines(motion: RelativeMotion, out: Path) -> list[str]:
     return [f"motion of the left camera: {shift} mm; {turn} deg", f"no log of {FEWEST - 1} pairs; motion in {out}"]
 
 
-def write_frontend_log(images: Path, out: Path, options: Options, overwrite: bool = False) -> Summary:
+def write_frontend_log(images: Path, out: Path, options: FrontendOptions, overwrite: bool = False) -> Summary:
     """Run the front-end on ``images`` and write the log folder ``out``, whole or not at all.
 
     Two pairs make one motion and no log; nor do motions that leave the plane, unless ``options.planar``.

@@ -18,7 +18,7 @@ from consistency.stereo.vision.motion import RelativeMotion
 from consistency.stereo.vision.pose import RelativePose, angular
 from consistency.stereo.vision.rig import StereoRig
 from consistency.stereo.vision.sequence import Sequence
-from consistency.stereo.vision.tracks import PIXELS, Selection, linked, thinned
+from consistency.stereo.vision.tracks import PIXELS, TrackSelection, linked, thinned
 
 MAX_AGE, MIN_LIFE, BANDS = 12, 2, 3  # observations of a landmark at most and at least, columns: as docs/kitti07.md
 NEAR = 10.0  # standard deviations of its disparity that a landmark has at least: its range is nearly Gaussian
@@ -163,7 +163,7 @@ def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
     rows = rows.assign(piece=np.cumsum((rows["piece"].diff() != 0) | (rows["step"].diff() != 1)))
 
     def selection_of(slots: int) -> pd.DataFrame:
-        return thinned(rows, Selection(slots, MAX_AGE, MIN_LIFE, BANDS, float(width)))
+        return thinned(rows, TrackSelection(slots, MAX_AGE, MIN_LIFE, BANDS, float(width)))
 
     low, high, best = 1, MOST_SLOTS, selection_of(1)
     if (fewest := best["landmark"].nunique()) > most:

@@ -20,7 +20,7 @@ NAMES = ("bias_u_px", "bias_v_px", "bias_d_px")
 
 @dataclass(frozen=True, eq=False)
 class TrackMeans:
-    """Of n tracks: where they are, their mean error and its scatter about the mean."""
+    """Positions of n tracks, their mean errors and the scatter about the mean."""
 
     truth: Array  # (n, 3), mean true u, v, d, px
     mean: Array  # (n, 3), mean error, px

@@ -18,10 +18,17 @@ from consistency.stereo.imaging.correspondence import (
     KnownDisparity,
     SemiGlobal,
 )
-from consistency.stereo.imaging.filtering import Evidence, Filter, LeftRightCheck, TrackResidual, dissimilarity, patches
-from consistency.stereo.imaging.render import Frame
+from consistency.stereo.imaging.filtering import (
+    LeftRightCheck,
+    ObservationFilter,
+    PairObservations,
+    TrackResidual,
+    dissimilarity,
+    patches,
+)
+from consistency.stereo.imaging.render import StereoFrame
 from consistency.stereo.imaging.scene import Scene, to_camera
-from consistency.stereo.imaging.selection import GoodFeatures, Selection, Spread
+from consistency.stereo.imaging.selection import FeatureSelection, GoodFeatures, Spread
 from consistency.stereo.imaging.tracking import Klt, KnownProjection, Tracking
 
 KEPT, NO_DISPARITY, REJECTED = 0, 1, 2  # flags of an observation
@@ -119,10 +126,10 @@ class Chain:
     features that are good as observations in three dimensions.
     """
 
-    selection: Selection = field(default_factory=Spread)
+    selection: FeatureSelection = field(default_factory=Spread)
     tracking: Tracking = field(default_factory=Klt)
     correspondence: Correspondence = field(default_factory=BlockMatching)
-    filters: tuple[Filter, ...] = ()
+    filters: tuple[ObservationFilter, ...] = ()
     stereo_first: bool = True
 
     @classmethod
@@ -140,7 +147,7 @@ class Chain:
         made = {role: stage(role, name, **given.get(role, {})) for role, name in stages.items()}
         return cls(**made, filters=tuple(stage("filter", name, **given.get(name, {})) for name in filters))
 
-    def run(self, frames: Iterable[Frame], scene: Scene, camera: StereoCamera) -> Tracks:
+    def run(self, frames: Iterable[StereoFrame], scene: Scene, camera: StereoCamera) -> Tracks:
         """Tracks of the features of the first frame through all frames.
 
         Raises
@@ -186,7 +193,7 @@ class _State:
             setattr(self, name, getattr(self, name)[chosen])
 
 
-def _begin(chain: Chain, frame: Frame, scene: Scene, camera: StereoCamera) -> _State:
+def _begin(chain: Chain, frame: StereoFrame, scene: Scene, camera: StereoCamera) -> _State:
     uv = chain.selection.choose(frame.left)
     anchors, layer = scene.seen(frame.pose, camera.left.rays(uv))
     d = _disparities(chain, frame, uv, camera.real(to_camera(frame.pose, anchors)))
@@ -196,20 +203,20 @@ def _begin(chain: Chain, frame: Frame, scene: Scene, camera: StereoCamera) -> _S
     return _State(frame.left, uv, np.arange(len(uv)), anchors, at_junction(scene, camera, frame.pose, uv), patch, d)
 
 
-def _follow(chain: Chain, state: _State, frame: Frame, camera: StereoCamera) -> None:
+def _follow(chain: Chain, state: _State, frame: StereoFrame, camera: StereoCamera) -> None:
     true = camera.left.project(to_camera(frame.pose, state.anchors))
     state.uv, found = chain.tracking.follow(state.image, frame.left, state.uv, true)
     state.image = frame.left
     state.keep(found & camera.inside(state.uv, EDGE))
 
 
-def _observed(chain: Chain, state: _State, number: int, frame: Frame, camera: StereoCamera) -> Tracks:
+def _observed(chain: Chain, state: _State, number: int, frame: StereoFrame, camera: StereoCamera) -> Tracks:
     """Rows of one frame."""
     real = camera.real(to_camera(frame.pose, state.anchors))
     d = _disparities(chain, frame, state.uv, real)
     now = patches(frame.left, state.uv, np.where(np.isfinite(d * state.d), d / state.d, 1.0))
     unlike = dissimilarity(state.patch, now)
-    evidence = Evidence(frame.left, frame.right, state.uv, d, unlike, chain.correspondence)
+    evidence = PairObservations(frame.left, frame.right, state.uv, d, unlike, chain.correspondence)
     flag = np.where(np.isfinite(d), KEPT, NO_DISPARITY)
     for check in chain.filters:
         flag = np.where((flag == KEPT) & ~check.keep(evidence), REJECTED, flag)
@@ -223,7 +230,7 @@ def _observed(chain: Chain, state: _State, number: int, frame: Frame, camera: St
     return Tracks(same, same + number, state.track, z, truth, real, unlike, label, flag)
 
 
-def _disparities(chain: Chain, frame: Frame, uv: Array, real: Array) -> Array:
+def _disparities(chain: Chain, frame: StereoFrame, uv: Array, real: Array) -> Array:
     if isinstance(chain.correspondence, KnownDisparity):
         return np.asarray(real[:, 2])
     return chain.correspondence.measure(frame.left, frame.right, uv)

@@ -16,8 +16,8 @@ PATCH = 15  # px, side of the patches that are compared
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What is known of N observations of one pair, without the truth."""
+class PairObservations:
+    """N observations of one image pair, as a filter of observations is given them; the truth is not among them."""
 
     left: Array  # (h, w), 8-bit
     right: Array
@@ -27,10 +27,10 @@ class Evidence:
     correspondence: Correspondence
 
 
-class Filter(Protocol):
+class ObservationFilter(Protocol):
     """Keeps observations or leaves them out."""
 
-    def keep(self, evidence: Evidence) -> Array:
+    def keep(self, evidence: PairObservations) -> Array:
         """Whether each observation is kept, (N,) bool."""
 
 
@@ -40,7 +40,7 @@ class LeftRightCheck:
 
     tolerance: float = 1.0
 
-    def keep(self, evidence: Evidence) -> Array:
+    def keep(self, evidence: PairObservations) -> Array:
         """The right image is searched from its mirror image, in which it is the left one."""
         left, right = (np.ascontiguousarray(image[:, ::-1]) for image in (evidence.right, evidence.left))
         own = np.where(np.isfinite(evidence.d), evidence.d, 0.0)
@@ -55,7 +55,7 @@ class TrackResidual:
 
     limit: float = 0.6
 
-    def keep(self, evidence: Evidence) -> Array:
+    def keep(self, evidence: PairObservations) -> Array:
         return np.asarray(evidence.dissimilarity <= self.limit)
 
 

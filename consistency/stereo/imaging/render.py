@@ -24,7 +24,7 @@ COARSE = 8  # px between the rays by which a layer is found in the image
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class StereoFrame:
     """One image pair and where it was taken."""
 
     left: Array  # (h, w), 8-bit
@@ -113,7 +113,7 @@ def film(
     rng: np.random.Generator,
     noise: float = 3.0,
     nominal: Sequence[Array] | Array | None = None,
-) -> Iterator[Frame]:
+) -> Iterator[StereoFrame]:
     """Frames of a scene, with new noise in each; a pose that repeats is rendered once.
 
     Parameters
@@ -127,4 +127,4 @@ def film(
         if not np.array_equal(pose, last):
             last, pair = pose, render_pair(scene, camera, pose)
         left, right = (digitised(image, noise, rng) for image in pair)
-        yield Frame(left, right, np.asarray(pose), np.asarray(said))
+        yield StereoFrame(left, right, np.asarray(pose), np.asarray(said))

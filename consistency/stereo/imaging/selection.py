@@ -15,7 +15,7 @@ BLOCK = 7  # px, window of the structure tensor
 MARGIN = 12.0  # px from the border, so that the windows of later stages are whole
 
 
-class Selection(Protocol):
+class FeatureSelection(Protocol):
     """Chooses features of one image."""
 
     def choose(self, image: Array) -> Array:

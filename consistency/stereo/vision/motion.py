@@ -39,7 +39,7 @@ Pair = tuple[Array, Array]
 
 
 @dataclass(frozen=True)
-class Settings:
+class MotionSettings:
     """What the front-end does with images; the defaults are those of docs/front-end.md, with their origin."""
 
     features: int = COUNT  # of an image, at most
@@ -61,7 +61,7 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class MotionEstimate:
     """The pose of the left camera at time 1 in that of time 0, p0 = R p1 + t, of M matches."""
 
     pose: RelativePose
@@ -84,7 +84,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class RelativeMotion(Estimate):
+class RelativeMotion(MotionEstimate):
     """An estimate and what it was found from: M circles of matches through all four images."""
 
     uv0: Array  # (M, 4), u, v left and right at time 0, px
@@ -101,7 +101,7 @@ def relative_motion(
     after: Pair,
     *,
     rng: np.random.Generator,
-    settings: Settings | None = None,
+    settings: MotionSettings | None = None,
     estimator: str | None = None,
 ) -> RelativeMotion:
     """Motion of a stereo rig between two pairs of images without distortion.
@@ -132,7 +132,7 @@ def relative_motion(
     ConsensusError, DegenerateError, ConvergenceError
         The matches do not agree on a motion, or do not fix one; all are InputErrors.
     """
-    settings = settings or Settings()
+    settings = settings or MotionSettings()
     frames = [
         stereo_features(rig, *pair, settings=settings, name=name)
         for pair, name in ((before, "before"), (after, "after"))
@@ -144,7 +144,7 @@ def relative_motion(
 
 
 def stereo_features(
-    rig: StereoRig, left: Array, right: Array, settings: Settings | None = None, name: str = "pair"
+    rig: StereoRig, left: Array, right: Array, settings: MotionSettings | None = None, name: str = "pair"
 ) -> StereoFeatures:
     """Features and stereo matches of a pair of images (h, w): what a sequence keeps for the next motion.
 
@@ -153,7 +153,7 @@ def stereo_features(
     InputError
         As :func:`relative_motion`.
     """
-    settings = settings or Settings()
+    settings = settings or MotionSettings()
     images = [grey(image, f"{name} {side}") for image, side in ((left, "left"), (right, "right"))]
     for image, side in zip(images, ("left", "right"), strict=True):
         if image.shape[::-1] != rig.image_size:
@@ -170,12 +170,12 @@ def motion_between(
     after: StereoFeatures,
     *,
     rng: np.random.Generator,
-    settings: Settings | None = None,
+    settings: MotionSettings | None = None,
     estimator: str | None = None,
     names: tuple[str, str] = ("before", "after"),
 ) -> RelativeMotion:
     """:func:`relative_motion` from features that are there already; errors call the pairs by ``names``."""
-    settings = settings or Settings()
+    settings = settings or MotionSettings()
     if estimator is not None:
         settings = replace(settings, estimator=estimator)
     rows = circular_matches(before, after, settings.ratio)
@@ -206,8 +206,14 @@ def motion_between(
 
 
 def estimate_motion(
-    rig: StereoRig, uv0: Array, uv1: Array, sigma0: Array, sigma1: Array, settings: Settings, rng: np.random.Generator
-) -> Estimate:
+    rig: StereoRig,
+    uv0: Array,
+    uv1: Array,
+    sigma0: Array,
+    sigma1: Array,
+    settings: MotionSettings,
+    rng: np.random.Generator,
+) -> MotionEstimate:
     """Pose and covariance of N matches, some of which may be wrong.
 
     What is an inlier is asked again of each refined pose; a match whose point the images do not fix is dropped.
@@ -238,14 +244,14 @@ def estimate_motion(
         far = np.sqrt(C_before[:, 2, 2]) > FIRST_ORDER * before[:, 2]
         variance = np.trace(C_before, axis1=1, axis2=2)
         far_share = float(variance[far].sum() / variance.sum())
-        return Estimate(pose, S, inliers, chi2, 3 * len(before) - 6, far_share=far_share)
+        return MotionEstimate(pose, S, inliers, chi2, 3 * len(before) - 6, far_share=far_share)
     for _ in range(REFITS):
         refined, used = _refined(rig, uv0, uv1, S0, S1, pose, inliers)
         pose = refined.pose
         inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, pose), settings.gate, used)
         if (inliers == used).all():
             break
-    return Estimate(pose, refined.covariance, used, refined.chi2, refined.dof)
+    return MotionEstimate(pose, refined.covariance, used, refined.chi2, refined.dof)
 
 
 def _refined(

@@ -11,13 +11,13 @@ from consistency.referee.geometry.groups import carried
 from consistency.referee.terminal.progress import progress
 from consistency.referee.types import Array
 from consistency.stereo.vision.bridging import bridged
-from consistency.stereo.vision.motion import RelativeMotion, Settings, motion_between, stereo_features
+from consistency.stereo.vision.motion import MotionSettings, RelativeMotion, motion_between, stereo_features
 from consistency.stereo.vision.pose import angular, cross_matrix
 from consistency.stereo.vision.sequence import Sequence
 
 
 def visual_odometry(
-    sequence: Sequence, *, rng: np.random.Generator, settings: Settings | None = None
+    sequence: Sequence, *, rng: np.random.Generator, settings: MotionSettings | None = None
 ) -> list[RelativeMotion]:
     """The motion from each stereo pair to the next, one less than pairs; features are found once a pair.
 

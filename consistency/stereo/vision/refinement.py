@@ -19,7 +19,7 @@ from consistency.stereo.vision.propagation import implicit_covariance
 from consistency.stereo.vision.registration import matched, register_svd
 from consistency.stereo.vision.rig import StereoRig, triangulate
 from consistency.stereo.vision.robust import Robust, loss, threshold
-from consistency.stereo.vision.twoframe import Derivatives, Pixels, Points, TwoFrames, derivatives
+from consistency.stereo.vision.twoframe import Derivatives, PixelMatches, PointMatches, TwoFrames, derivatives
 
 STEPS = 100  # of Levenberg and Marquardt, at most; ten do for honest matches
 DECREMENT = 1e-12  # twice the predicted decrease of the cost in the last step: 1e-6 standard deviations
@@ -77,7 +77,7 @@ def register_weighted(
     """
     p1, p2 = matched(p1, p2)
     S1, S2 = checks.covariances("S1", S1, len(p1), 3), checks.covariances("S2", S2, len(p1), 3)
-    frames = TwoFrames(Points(), p1, p2, _weights("S1", S1), _weights("S2", S2))
+    frames = TwoFrames(PointMatches(), p1, p2, _weights("S1", S1), _weights("S2", S2))
     return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2, robust)
 
 
@@ -117,7 +117,7 @@ def refine_reprojection(
     S2 = S1 if S_uv2 is None else checks.covariances("S_uv2", S_uv2, len(uv1), 4)
     _, q = matched(triangulate(rig, uv1), triangulate(rig, uv2))
     rig.project(pose.apply(q))
-    frames = TwoFrames(Pixels(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
+    frames = TwoFrames(PixelMatches(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
     return _refined(frames, S1, S2, pose, q, robust)
 
 

@@ -17,7 +17,7 @@ from consistency.stereo.vision.features import opencv
 from consistency.stereo.vision.pose import RelativePose
 from consistency.stereo.vision.propagation import triangulation_covariance
 from consistency.stereo.vision.rig import StereoRig, triangulate
-from consistency.stereo.vision.twoframe import Pixels
+from consistency.stereo.vision.twoframe import PixelMatches
 
 ROUND = 32  # draws at once
 MOST = 1024  # draws at most; finds CONFIDENCE from a share of inliers of 19 % on
@@ -86,7 +86,7 @@ def squared_reprojections(
 
     Infinite where ``pose``, p0 = R p1 + t, puts a point behind a camera.
     """
-    camera = Pixels(rig)
+    camera = PixelMatches(rig)
     seen = (triangulate(rig, uv0) - pose.t) @ pose.R
     residual, J = uv1 - camera.value(seen), camera.jacobian(seen) @ pose.R.T
     C0 = triangulation_covariance(rig, uv0, sigma0[:, :, None] ** 2 * np.eye(4))
@@ -128,7 +128,7 @@ def _search(
         if not len(R):
             continue
         seen = ((p0 - t[:, None]) @ R).reshape(-1, 3)
-        residual = uv1 - Pixels(rig).value(seen).reshape(len(R), -1, 4)
+        residual = uv1 - PixelMatches(rig).value(seen).reshape(len(R), -1, 4)
         squared = np.nan_to_num((residual**2 / variance).sum(axis=2), nan=np.inf)
         cost = np.minimum(squared, gate**2).sum(axis=1)
         k = int(np.argmin(cost))

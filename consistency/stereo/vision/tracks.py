@@ -40,7 +40,7 @@ def linked(links: Sequence[Indices]) -> list[Indices]:
 
 
 @dataclass(frozen=True)
-class Selection:
+class TrackSelection:
     """Which observations become those of landmarks."""
 
     slots: int  # landmarks seen at once, at most
@@ -50,7 +50,7 @@ class Selection:
     width: float  # of the image, px
 
 
-def thinned(rows: pd.DataFrame, rule: Selection) -> pd.DataFrame:
+def thinned(rows: pd.DataFrame, rule: TrackSelection) -> pd.DataFrame:
     """Rows (step, landmark, z0, z1, z2) of at most ``rule.slots`` landmarks at once.
 
     A free slot goes to the emptiest column of the image, there to the piece with the longest life ahead,
@@ -89,7 +89,7 @@ def thinned(rows: pd.DataFrame, rule: Selection) -> pd.DataFrame:
     return table[["step", "landmark", *PIXELS]].reset_index(drop=True)
 
 
-def _next_landmarks(candidates: pd.DataFrame, crowd: Indices, free: int, rule: Selection) -> list[tuple[int, int]]:
+def _next_landmarks(candidates: pd.DataFrame, crowd: Indices, free: int, rule: TrackSelection) -> list[tuple[int, int]]:
     """(piece, life) of the next landmarks, one column of the image after the other."""
     order = candidates.assign(life=candidates["left"].clip(upper=rule.max_age)).sort_values(
         ["life", "z2", "piece"], ascending=[False, False, True]
@@ -109,6 +109,6 @@ def staggered(landmark: int, max_age: int) -> int:
     return max_age if landmark % 2 else max_age // 2
 
 
-def band_of(u: Array, rule: Selection) -> Indices:
+def band_of(u: Array, rule: TrackSelection) -> Indices:
     """Column of the image, 0..bands-1 from the left, of pixels ``u`` (N,) from its middle."""
     return np.clip((u + rule.width / 2) * rule.bands // rule.width, 0, rule.bands - 1).astype(np.int64)

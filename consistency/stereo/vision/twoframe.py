@@ -108,7 +108,7 @@ def _frame(measure: Measure, z: Array, W: Array, p: Array, exact: bool) -> tuple
     return -(We[:, None] @ J)[:, 0], f_pp, -JtW, We
 
 
-class Points:
+class PointMatches:
     """The measurement of a point is the point."""
 
     def value(self, p: Array) -> Array:
@@ -124,7 +124,7 @@ class Points:
         return np.zeros((len(p), 3, 3))
 
 
-class Pixels:
+class PixelMatches:
     """The measurement of a point is u, v, u', v' of eq. 2.1 and 2.2; NaN at or behind a camera.
 
     With u = a / w, a and w linear in p: u_p = (a_p - u w_p) / w and u_pp = -(u_p w_p' + w_p u_p') / w.

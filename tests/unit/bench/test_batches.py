@@ -14,14 +14,14 @@ from misbehaving import Still
 
 import consistency as cs
 from consistency.bench.runs.backends import remote
-from consistency.bench.runs.backends.batches import Batch, Batches, Event, Lost, failed, in_batches
+from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, failed, in_batches
 from consistency.bench.runs.backends.choosing import backend_for
-from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.runs.work import Outcomes, Simulated, Work
-from consistency.bench.store.results import Outcome, open_results
+from consistency.bench.runs.work import Outcomes, Simulated, TrialWork
+from consistency.bench.store.results import RunOutcome, open_results
 from consistency.referee.system.machine import this_machine
 
 RUNS = 40
@@ -32,7 +32,7 @@ class Counted:
     """Trials that leave nothing but their number."""
 
     def part(self, runs: Sequence[int], refusal: str = "", seconds: float = 0.0) -> Part:
-        outcomes = [Outcome(run, {}, None, ()) for run in runs]
+        outcomes = [RunOutcome(run, {}, None, ()) for run in runs]
         pickled = remote.pickle.dumps(outcomes)
         return Part(pickled, seconds, "host", HERE, remote.versions_here(), refusal)
 
@@ -63,24 +63,24 @@ class Fake:
         if self.killers & set(batch.left):
             dead = [batch, *(self.waiting if self.shares else [])]
             self.waiting = [] if self.shares else self.waiting
-            return [(each, Lost("killed")) for each in dead]
+            return [(each, WorkerLost("killed")) for each in dead]
         done = batch.left[: self.most]
         return [(batch, Counted().part(done, seconds=self.per_run * len(done))), (batch, None)]
 
 
 @pytest.fixture(scope="module")
-def work(xyz: cs.Scenario) -> Work:
-    return Work(Simulated(xyz, 0), Isolation([Still("still")], xyz.belief))
+def work(xyz: cs.Scenario) -> TrialWork:
+    return TrialWork(Simulated(xyz, 0), Isolation([Still("still")], xyz.belief))
 
 
-def done(engine: Fake, work: Work, retries: int = 0, seconds: float = 1.0) -> dict[int, Outcome]:
+def done(engine: Fake, work: TrialWork, retries: int = 0, seconds: float = 1.0) -> dict[int, RunOutcome]:
     """What came of the runs; each came once."""
     outcomes = list(in_batches(engine, Batches(range(RUNS), seconds, retries, engine.shares), work))
     assert sorted(outcome.run for outcome in outcomes) == list(range(RUNS))
     return {outcome.run: outcome for outcome in outcomes}
 
 
-def test_batches_grow_to_so_much_work_and_shrink_at_the_end(work: Work) -> None:
+def test_batches_grow_to_so_much_work_and_shrink_at_the_end(work: TrialWork) -> None:
     engine = Fake(per_run=0.2)
     outcomes = done(engine, work)
     sizes = [len(runs) for runs in engine.sent]
@@ -92,19 +92,19 @@ def test_batches_grow_to_so_much_work_and_shrink_at_the_end(work: Work) -> None:
     assert all(outcome.machine == HERE and not outcome.failures for outcome in outcomes.values())
 
 
-def test_a_batch_has_a_run_at_least(work: Work) -> None:
+def test_a_batch_has_a_run_at_least(work: TrialWork) -> None:
     engine = Fake(per_run=100.0)
     done(engine, work)
     assert {len(runs) for runs in engine.sent} == {1}
 
 
-def test_without_a_length_there_are_equal_shares(work: Work) -> None:
+def test_without_a_length_there_are_equal_shares(work: TrialWork) -> None:
     engine = Fake()
     list(in_batches(engine, Batches(range(RUNS)), work))
     assert engine.sent == [tuple(range(first, first + 10)) for first in range(0, RUNS, 10)]
 
 
-def test_what_a_batch_leaves_is_done_next(work: Work) -> None:
+def test_what_a_batch_leaves_is_done_next(work: TrialWork) -> None:
     engine = Fake(most=2, per_run=0.2)
     done(engine, work)
     assert max(len(runs) for runs in engine.sent) == 5
@@ -114,7 +114,7 @@ def test_what_a_batch_leaves_is_done_next(work: Work) -> None:
 @pytest.mark.parametrize("retries", [0, 1])
 @pytest.mark.parametrize("killers", [(0,), (17, 18), (3, 39)])
 def test_a_run_that_kills_has_failed_and_no_other(
-    work: Work, shares: bool, retries: int, killers: tuple[int, ...]
+    work: TrialWork, shares: bool, retries: int, killers: tuple[int, ...]
 ) -> None:
     engine = Fake(killers, shares)
     outcomes = done(engine, work, retries)
@@ -124,7 +124,7 @@ def test_a_run_that_kills_has_failed_and_no_other(
         assert outcomes[run].truth is not None
 
 
-def test_a_batch_is_sent_again_before_it_is_split(work: Work) -> None:
+def test_a_batch_is_sent_again_before_it_is_split(work: TrialWork) -> None:
     for retries in (0, 1, 2):
         engine = Fake([20], shares=False, per_run=0.2)
         done(engine, work, retries)
@@ -134,7 +134,7 @@ def test_a_batch_is_sent_again_before_it_is_split(work: Work) -> None:
         assert engine.sent.count((20,)) == 1  # once more
 
 
-def test_a_suspect_runs_alone_where_workers_share_their_fate(work: Work) -> None:
+def test_a_suspect_runs_alone_where_workers_share_their_fate(work: TrialWork) -> None:
     engine = Fake([20], per_run=0.2)
     done(engine, work)
     assert all(
@@ -162,7 +162,7 @@ def test_a_loss_after_progress_is_no_second_loss() -> None:
     assert [suspect.runs for suspect in batches.take(9)] == [(2,), (3,), (4,), (5,)]
 
 
-def test_bad_input_keeps_what_is_finished(work: Work) -> None:
+def test_bad_input_keeps_what_is_finished(work: TrialWork) -> None:
     class Refusing(Fake):
         def events(self) -> list[Event]:
             batch = self.waiting.pop(0)
@@ -174,7 +174,7 @@ def test_bad_input_keeps_what_is_finished(work: Work) -> None:
         next(outcomes)
 
 
-def test_what_comes_twice_is_kept_once(work: Work) -> None:
+def test_what_comes_twice_is_kept_once(work: TrialWork) -> None:
     class Twice(Fake):
         def events(self) -> list[Event]:
             part, end = super().events()
@@ -184,7 +184,7 @@ def test_what_comes_twice_is_kept_once(work: Work) -> None:
 
 
 @pytest.mark.parametrize("name", ["numpy", "filter-consistency", "Python"])
-def test_other_versions_are_refused(work: Work, name: str) -> None:
+def test_other_versions_are_refused(work: TrialWork, name: str) -> None:
     class Older(Fake):
         def events(self) -> list[Event]:
             batch = self.waiting.pop()
@@ -220,7 +220,7 @@ def test_sources_that_the_bits_depend_on_count_and_others_do_not(
     assert own() == seen[-1]
 
 
-def test_differing_machines_are_said_once(work: Work, capsys: pytest.CaptureFixture[str]) -> None:
+def test_differing_machines_are_said_once(work: TrialWork, capsys: pytest.CaptureFixture[str]) -> None:
     class Mixed(Fake):
         def events(self) -> list[Event]:
             batch = self.waiting.pop()
@@ -238,8 +238,8 @@ def test_differing_machines_are_said_once(work: Work, capsys: pytest.CaptureFixt
 
 
 def test_a_desk_does_what_local_workers_do(linear: cs.Scenario) -> None:
-    work = Work(Simulated(linear, 5), Isolation([Still("still"), cs.get_filter("kf")], linear.belief))
-    expected = {outcome.run: outcome for outcome in Local(1).outcomes(work, range(4))}
+    work = TrialWork(Simulated(linear, 5), Isolation([Still("still"), cs.get_filter("kf")], linear.belief))
+    expected = {outcome.run: outcome for outcome in LocalThreads(1).outcomes(work, range(4))}
     worker = Worker(pickled_work(work))
     try:
         whole = list(worker.parts([3, 1], 1000.0))
@@ -256,13 +256,13 @@ def test_a_desk_does_what_local_workers_do(linear: cs.Scenario) -> None:
 
 
 def test_bad_input_ends_a_desk(linear: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: Work, run: int) -> Outcome:
+    def refuse(_: TrialWork, run: int) -> RunOutcome:
         if run == 2:
             raise cs.InputError("no")
-        return Outcome(run, {}, None, ())
+        return RunOutcome(run, {}, None, ())
 
-    monkeypatch.setattr(Work, "__call__", refuse)
-    worker = Worker(pickled_work(Work(Simulated(linear, 0), Isolation([Still("still")], linear.belief))))
+    monkeypatch.setattr(TrialWork, "__call__", refuse)
+    worker = Worker(pickled_work(TrialWork(Simulated(linear, 0), Isolation([Still("still")], linear.belief))))
     (part,) = worker.parts([0, 1, 2, 3], 1000.0)
     assert [outcome.run for outcome in part.outcomes()] == [0, 1]
     assert part.refusal == "no"
@@ -270,7 +270,7 @@ def test_bad_input_ends_a_desk(linear: cs.Scenario, monkeypatch: pytest.MonkeyPa
     assert (part.outcomes(), part.refusal) == ([], "no")
 
 
-def test_a_failed_run_has_truth_and_a_reason_for_each_filter(work: Work) -> None:
+def test_a_failed_run_has_truth_and_a_reason_for_each_filter(work: TrialWork) -> None:
     outcome = failed(work, 7, "lost")
     assert outcome.run == 7
     assert [(f.filter, f.run, f.step, f.reason) for f in outcome.failures] == [("still", 7, 1, "lost")]
@@ -286,11 +286,11 @@ class Elsewhere:
     most: int = 1000
     prepared: list[int] = field(default_factory=list)
 
-    def prepare(self, work: Work, run: int, /) -> None:
+    def prepare(self, work: TrialWork, run: int, /) -> None:
         self.prepared.append(run)
 
-    def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
-        for outcome in Local(1).outcomes(work, runs[: self.most]):
+    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
+        for outcome in LocalThreads(1).outcomes(work, runs[: self.most]):
             yield replace(outcome, machine=self.machine)
         if len(runs) > self.most:
             raise KeyboardInterrupt
@@ -319,7 +319,7 @@ def test_the_manifest_has_the_machines_that_did_runs(
 
 
 def test_a_backend_is_chosen_by_name() -> None:
-    assert backend_for("local", 3) == Local(3)
+    assert backend_for("local", 3) == LocalThreads(3)
     for options, sentence in (
         ({"name": "ray"}, "--backend must be one of local, dask, slurm, got 'ray'"),
         ({"scheduler": "tcp://a:1"}, "--scheduler goes with --backend dask, not with local"),

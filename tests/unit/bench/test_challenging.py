@@ -17,12 +17,12 @@ import pytest
 
 import consistency as cs
 from consistency.bench.challenging import bench as scoring
-from consistency.bench.challenging.bench import WORST, Bench, Done, score_of_run
-from consistency.bench.challenging.challenge import BASES, Campaign, Plan, base_of, challenge, is_overconfident
+from consistency.bench.challenging.bench import WORST, ChallengeScorer, Done, score_of_run
+from consistency.bench.challenging.challenge import BASES, ChallengePhases, Plan, base_of, challenge, is_overconfident
 from consistency.bench.challenging.search import BATCH, RUNGS, Budget, Candidate, ranked, search, standard_error
 from consistency.bench.challenging.shrink import changed, shrink
 from consistency.bench.challenging.wording import as_data, lines, write_scenario
-from consistency.bench.challenging.worlds import Choice, Point, Scale, Space, space_of
+from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space, space_of
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.path import lap_length, planned_path
@@ -85,12 +85,12 @@ def test_a_base_elsewhere_keeps_its_centre_and_a_circle_is_a_circle() -> None:
 
 
 def test_values_are_rounded_and_their_places_are_right() -> None:
-    scale = Scale("range", 4.0, 2.0, 12.0, " m")
+    scale = LogScale("range", 4.0, 2.0, 12.0, " m")
     assert (scale.at(0.0), scale.at(1.0)) == (2.0, 12.0)
     assert scale.at(0.37) == 3.9
     assert scale.where(scale.at(0.37)) == pytest.approx(0.37, abs=0.01)
     assert scale.between(12.0) == 6.9  # half the way to 4 on a logarithmic scale
-    steps = Scale("steps", 500, 100, 1000, whole=True)
+    steps = LogScale("steps", 500, 100, 1000, whole=True)
     assert isinstance(steps.at(0.5), int)
     choice = Choice("path", "circle", ("circle", "figure-of-eight"))
     assert [choice.at(choice.where(value)) for value in choice.values] == list(choice.values)
@@ -459,7 +459,7 @@ class Constant:
         self.seeds.append(seed)
         return [Done((self.score,) * len(runs), 0.0) for _, runs in jobs]
 
-    split = Bench.split
+    split = ChallengeScorer.split
 
 
 @pytest.mark.parametrize(
@@ -468,7 +468,7 @@ class Constant:
 )
 def test_what_a_smaller_world_has_to_keep(score: float, limit: float | None) -> None:
     bench: Any = Constant(score)
-    campaign = Campaign(bench, space_of(STEREO), Plan(minutes=None, trials=250))
+    campaign = ChallengePhases(bench, space_of(STEREO), Plan(minutes=None, trials=250))
     worst, kept = campaign.search()
     assert kept == (None if limit is None else pytest.approx(limit))
     assert worst in campaign.tried
@@ -479,7 +479,7 @@ def test_what_a_smaller_world_has_to_keep(score: float, limit: float | None) -> 
 
 def test_worlds_whose_confirmation_takes_too_long_are_passed_over() -> None:
     bench: Any = Constant(1.0)
-    campaign = Campaign(bench, space_of(STEREO), Plan(minutes=1.0))
+    campaign = ChallengePhases(bench, space_of(STEREO), Plan(minutes=1.0))
     slow, fast = Candidate(campaign.space.plain), Candidate(point_with(campaign.space, density=0.5))
     assert campaign.slowest == pytest.approx(0.2 * 60.0 / 61)
     campaign.evaluate([fast], 2)
@@ -528,7 +528,7 @@ class Ends(Invariant):
 def test_a_filter_that_crashes_or_hangs_fails_its_trials_alone(hangs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scoring, "PATIENCE", 0.3)
     filter_: Any = Ends(hangs)
-    with Bench(filter_, jobs=2) as bench:
+    with ChallengeScorer(filter_, jobs=2) as bench:
         done = bench([(STEREO, [0]), (STEREO, [1])], 0, until=time.monotonic() + 0.5)
     assert [each.scores for each in done if each is not None] == [(WORST,), (WORST,)]
 
@@ -542,7 +542,7 @@ def test_worlds_that_show_nothing_are_left_out() -> None:
 
 def test_no_trial_begins_after_the_time() -> None:
     short = STEREO.variant("short", truth__steps=20)
-    with Bench(cs.get_filter("ekf-uvd"), 1) as bench:
+    with ChallengeScorer(cs.get_filter("ekf-uvd"), 1) as bench:
         (late,), (done,) = bench([(short, range(3))], 0, until=0.0), bench([(short, range(3))], 0)
     assert late is not None
     assert done is not None

@@ -22,7 +22,7 @@ from consistency.bench.filters.kernel import arrays, jit
 from consistency.bench.filters.kernel.inference import remembered_types
 from consistency.bench.filters.kernel.shortcuts import shortcuts
 from consistency.bench.runs.isolating import Isolation
-from consistency.bench.runs.work import Simulated, Work
+from consistency.bench.runs.work import Simulated, TrialWork
 from consistency.bench.simulation.world import World
 
 Counts = list[Any]
@@ -217,7 +217,7 @@ def test_the_first_trial_is_simulated_once(monkeypatch: pytest.MonkeyPatch) -> N
     world = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
     trials = Simulated(world, 3)
     made = counted(monkeypatch, World, "trial")
-    work = Work(trials, Isolation([], world.belief))
+    work = TrialWork(trials, Isolation([], world.belief))
     work.room_for(1, 1)
     first = trials.ahead(1)
     assert made == [(1, 3)]

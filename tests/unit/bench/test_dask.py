@@ -15,11 +15,11 @@ from misbehaving import KINDS, Still
 import consistency as cs
 from consistency.bench.runs.backends import dask
 from consistency.bench.runs.backends.dask import Dask
-from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.work import Outcomes, Simulated, Work
-from consistency.bench.store.results import Outcome, StoredResults
+from consistency.bench.runs.work import Outcomes, Simulated, TrialWork
+from consistency.bench.store.results import RunOutcome, StoredResults
 from consistency.bench.types import Trial
 from consistency.referee.system.machine import this_machine
 
@@ -69,10 +69,10 @@ class Disturbed:
     after: int
     disturb: Callable[[], object]
 
-    def prepare(self, work: Work, run: int, /) -> None:
+    def prepare(self, work: TrialWork, run: int, /) -> None:
         self.backend.prepare(work, run)
 
-    def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
+    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
         for number, outcome in enumerate(self.backend.outcomes(work, runs)):
             if number == self.after:
                 self.disturb()
@@ -105,7 +105,7 @@ def test_a_worker_that_is_killed_loses_nothing(
 
 
 def test_a_result_that_died_with_the_last_worker_is_not_waited_for(world: cs.Scenario, tmp_path: Path) -> None:
-    work = Work(Simulated(world, SEED), Isolation([cs.get_filter("kf")], world.belief))
+    work = TrialWork(Simulated(world, SEED), Isolation([cs.get_filter("kf")], world.belief))
     with Cluster(tmp_path, workers=1) as cluster:
         engine = dask._Engine({"address": cluster.address}, work, 20.0)
         engine._wait = 1.0  # from here on: the worker has been found
@@ -136,12 +136,14 @@ class Deadly:
 @pytest.mark.slow
 def test_runs_that_kill_their_workers_have_failed(world: cs.Scenario) -> None:
     trials, isolation = Simulated(world, SEED), Isolation([cs.get_filter("kf")], world.belief)
-    work = Work(Deadly(trials, (0, 20), os.getpid()), isolation)
+    work = TrialWork(Deadly(trials, (0, 20), os.getpid()), isolation)
     outcomes = {outcome.run: outcome for outcome in Dask(jobs=2).outcomes(work, range(30))}
     assert sorted(outcomes) == list(range(30))
     assert {run for run, outcome in outcomes.items() if outcome.failures} == {0, 20}
     assert "its worker died" in outcomes[20].failures[0].reason
-    expected: dict[int, Outcome] = {o.run: o for o in Local(1).outcomes(Work(trials, isolation), range(30))}
+    expected: dict[int, RunOutcome] = {
+        o.run: o for o in LocalThreads(1).outcomes(TrialWork(trials, isolation), range(30))
+    }
     for run in set(outcomes) - {0, 20}:
         for column, values in outcomes[run].estimates["kf"].items():
             assert values.tobytes() == expected[run].estimates["kf"][column].tobytes()
@@ -155,7 +157,7 @@ def test_bad_input_of_a_worker_is_said_here(world: cs.Scenario, cluster: Cluster
 
     isolation = Isolation([Still("still")], world.belief)
     with pytest.raises(cs.InputError, match=r"^run 5 is not to be$"):
-        list(Dask(cluster.address).outcomes(Work(Refusing(), isolation), [5]))
+        list(Dask(cluster.address).outcomes(TrialWork(Refusing(), isolation), [5]))
 
 
 def test_an_error_of_a_worker_is_an_error_here(world: cs.Scenario, cluster: Cluster) -> None:
@@ -166,7 +168,7 @@ def test_an_error_of_a_worker_is_an_error_here(world: cs.Scenario, cluster: Clus
 
     isolation = Isolation([Still("still")], world.belief)
     with pytest.raises(RuntimeError, match=r"^a worker of dask failed: OSError: no such luck$"):
-        list(Dask(cluster.address).outcomes(Work(Broken(), isolation), [5]))
+        list(Dask(cluster.address).outcomes(TrialWork(Broken(), isolation), [5]))
 
 
 def test_nobody_at_the_address(world: cs.Scenario, tmp_path: Path) -> None:

@@ -17,10 +17,10 @@ from consistency.bench.filters.kernel.loop import _make_memory
 from consistency.bench.filters.kernel.slam import Data, Slam, make_local
 from consistency.bench.runs import footprint as module
 from consistency.bench.runs import touched
-from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.footprint import footprint, memory_here, trial_bytes, workers_that_fit
 from consistency.bench.runs.isolating import Isolation
-from consistency.bench.runs.work import Recorded, Work
+from consistency.bench.runs.work import Recorded, TrialWork
 from consistency.referee.errors import InputError
 
 GIB = 2**30
@@ -101,24 +101,24 @@ def test_all_runs_of_a_log_are_looked_at(linear: cs.Scenario, has: Callable[[flo
     filters = [compiled("kf")]
     wide = linear.variant("wide", truth__sensor__range=(0.0, 50.0), truth__steps=5)
     small, large = cs.simulate(linear.variant("short", truth__steps=2)), cs.simulate(wide, 1)
-    work = Work(Recorded({0: small, 1: large}), Isolation(filters, linear.belief))
+    work = TrialWork(Recorded({0: small, 1: large}), Isolation(filters, linear.belief))
     has(2 * trial_bytes(filters, large, linear.belief))
     assert work.room_for(0, 8) == 2
     has(trial_bytes(filters, small, linear.belief))
     with pytest.raises(InputError, match="fewer landmarks"):
-        Local().prepare(work, 0)
+        LocalThreads().prepare(work, 0)
 
 
 def test_jobs_that_were_asked_for_are_not_made_fewer(
     linear: cs.Scenario, has: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Work, "compile", lambda *_: None)
+    monkeypatch.setattr(TrialWork, "compile", lambda *_: None)
     monkeypatch.setattr("consistency.bench.runs.backends.local.joblib.cpu_count", lambda: 8)
     trial, filters = cs.simulate(linear), [compiled("kf")]
     has(2.5 * trial_bytes(filters, trial, linear.belief))
     for jobs, workers in ((-1, 2), (4, 4)):
-        local = Local(jobs)
-        local.prepare(Work(Recorded({0: trial}), Isolation(filters, linear.belief)), 0)
+        local = LocalThreads(jobs)
+        local.prepare(TrialWork(Recorded({0: trial}), Isolation(filters, linear.belief)), 0)
         assert local._room == workers
 
 

@@ -23,10 +23,10 @@ import consistency as cs
 from consistency.bench.runs import gather, work
 from consistency.bench.runs.backends import local
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.runs.work import Work
+from consistency.bench.runs.work import TrialWork
 from consistency.bench.simulation import World
 from consistency.bench.store import parquet
-from consistency.bench.store.results import Outcome, StoredResults, open_results, outcome_of
+from consistency.bench.store.results import RunOutcome, StoredResults, open_results, outcome_of
 from consistency.bench.types import Trial
 from consistency.referee.document.verdict import document
 from consistency.referee.show.json import render
@@ -161,13 +161,13 @@ def test_memory_does_not_grow_with_the_runs(uvd: cs.Scenario, tmp_path: Path, mo
 
 
 def test_few_outcomes_wait_for_their_turn(uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alive: weakref.WeakSet[Outcome] = weakref.WeakSet()
+    alive: weakref.WeakSet[RunOutcome] = weakref.WeakSet()
     most: list[int] = []
 
-    class Counted(Outcome):
+    class Counted(RunOutcome):
         __hash__ = object.__hash__
 
-    def counted(*arguments: Any) -> Outcome:
+    def counted(*arguments: Any) -> RunOutcome:
         outcome = Counted(**vars(outcome_of(*arguments)))
         alive.add(outcome)
         most.append(len(alive))
@@ -342,13 +342,13 @@ def test_a_run_that_takes_long_keeps_no_other_from_the_journal(
         assert run or ahead or kept.wait(60.0), "the others wait for the first"
         return trial(self, run, seed)
 
-    def counted(self: gather.Gathered, outcome: Outcome) -> None:
+    def counted(self: gather.Gathered, outcome: RunOutcome) -> None:
         add(self, outcome)
         if self.finished == set(range(1, 9)):
             kept.set()
 
     monkeypatch.setattr(World, "trial", last)
-    monkeypatch.setattr(Work, "compile", lambda self, run, jobs: None)
+    monkeypatch.setattr(TrialWork, "compile", lambda self, run, jobs: None)
     monkeypatch.setattr(gather.Gathered, "add", counted)
     cs.run_trials(uvd, FILTERS, runs=9, seed=3, jobs=2, out=tmp_path / "out")
     assert content(tmp_path / "out") == content(written)
@@ -365,7 +365,7 @@ def test_what_ends_together_with_an_error_counts(monkeypatch: pytest.MonkeyPatch
 
     wait = local.wait
     monkeypatch.setattr(local, "wait", lambda futures, *_: wait(futures))
-    outcomes = local.Local(2).outcomes(Fails(), range(4))  # type: ignore[arg-type]
+    outcomes = local.LocalThreads(2).outcomes(Fails(), range(4))  # type: ignore[arg-type]
     assert {next(outcomes), next(outcomes)} == {1, 3}
     with pytest.raises(RuntimeError, match="out of ideas"):
         next(outcomes)

@@ -27,7 +27,7 @@ from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.simulation import World
 from consistency.bench.store import journal as journals
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.store.results import Outcome, open_results
+from consistency.bench.store.results import RunOutcome, open_results
 from consistency.referee.system import folders, stopping
 from consistency.referee.system.stopping import Stop, stoppable
 from consistency.referee.terminal.progress import progress, say
@@ -329,7 +329,7 @@ def test_killed_before_the_journal_was_removed(uvd: cs.Scenario, whole: Path, tm
 def test_outcomes_in_any_order_give_the_same_bytes(
     uvd: cs.Scenario, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    outcomes: list[Outcome] = []
+    outcomes: list[RunOutcome] = []
     add, results = Gathered.add, Gathered.results
 
     def backwards(self: Gathered, *rest: Any) -> Any:

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.backends.local import Local
-from consistency.bench.runs.work import Work as Runs
+from consistency.bench.runs.backends.local import LocalThreads
+from consistency.bench.runs.work import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal
-from consistency.bench.store.results import Outcome
+from consistency.bench.store.results import RunOutcome
 from consistency.bench.sweeps import cell as cells
 from consistency.bench.sweeps import running
 from consistency.bench.sweeps.cell import cost_of
-from consistency.bench.sweeps.folder import SweepFolder, Work
+from consistency.bench.sweeps.folder import CellWork, SweepFolder
 from consistency.bench.sweeps.plan import Sweep, load_sweep
 from consistency.bench.sweeps.running import run_sweep
 
@@ -58,7 +58,7 @@ def stop_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException]
     def arm(count: int, error: BaseException) -> list[int]:
         one, done = Runs.__call__, list[int]()
 
-        def stopped(self: Runs, number: int) -> Outcome:
+        def stopped(self: Runs, number: int) -> RunOutcome:
             if len(done) == count:
                 raise error
             done.append(number)
@@ -149,7 +149,7 @@ def test_what_the_system_refuses_is_no_result(at: Path, monkeypatch: pytest.Monk
     assert content(at / "out") == content(at / "whole")
 
 
-def others_cell(at: Path, place: int) -> tuple[SweepFolder, Work]:
+def others_cell(at: Path, place: int) -> tuple[SweepFolder, CellWork]:
     """A cell, by its place in the order in which they are done."""
     folder = SweepFolder(grid(at), at / "out")
     folder.begin()
@@ -211,11 +211,11 @@ def test_the_backend_does_the_runs(at: Path) -> None:
 
     class Backend:
         def prepare(self, work: Runs, run: int, /) -> None:
-            Local(1).prepare(work, run)
+            LocalThreads(1).prepare(work, run)
 
-        def outcomes(self, work: Runs, runs: Sequence[int], /) -> Iterator[Outcome]:
+        def outcomes(self, work: Runs, runs: Sequence[int], /) -> Iterator[RunOutcome]:
             done.extend(runs)
-            yield from Local(1).outcomes(work, runs)
+            yield from LocalThreads(1).outcomes(work, runs)
 
     run_sweep(grid(at), at / "out", backend=Backend())
     assert done == [*range(14)] * 3

@@ -16,9 +16,9 @@ import consistency as cs
 from consistency.bench.runs import gather, sequential
 from consistency.bench.runs.montecarlo import Interrupted, run_log, simulate_log
 from consistency.bench.runs.sequential import run_until_decided
-from consistency.bench.runs.work import Work
+from consistency.bench.runs.work import TrialWork
 from consistency.bench.store.log import read_log
-from consistency.bench.store.results import Outcome, StoredResults, open_results
+from consistency.bench.store.results import RunOutcome, StoredResults, open_results
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import Record
 from consistency.referee.document.verdict import document
@@ -45,15 +45,15 @@ def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], l
     """What is raised in the place of a run; gives the list of the runs that are done."""
 
     def arm(run: int, error: BaseException) -> list[int]:
-        one, done = Work.__call__, list[int]()
+        one, done = TrialWork.__call__, list[int]()
 
-        def stopped(self: Work, number: int) -> Outcome:
+        def stopped(self: TrialWork, number: int) -> RunOutcome:
             if number == run:
                 raise error
             done.append(number)
             return one(self, number)
 
-        monkeypatch.setattr(Work, "__call__", stopped)
+        monkeypatch.setattr(TrialWork, "__call__", stopped)
         return done
 
     return arm
@@ -209,7 +209,7 @@ def test_a_look_holds_one_filter_and_no_outcome(
     outcomes: weakref.WeakSet[Any] = weakref.WeakSet()
     most, read, add = [0, 0], sequential.record_of, gather.Gathered.add
 
-    class Counted(Outcome):
+    class Counted(RunOutcome):
         __hash__ = object.__hash__
 
     class Held(Record):
@@ -221,7 +221,7 @@ def test_a_look_holds_one_filter_and_no_outcome(
         most[0] = max(most[0], len(records))
         return record
 
-    def counted(self: gather.Gathered, outcome: Outcome) -> None:
+    def counted(self: gather.Gathered, outcome: RunOutcome) -> None:
         known = Counted(**vars(outcome))
         outcomes.add(known)
         most[1] = max(most[1], len(outcomes))

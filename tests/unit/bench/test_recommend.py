@@ -226,7 +226,7 @@ def test_runs_of_the_rig_confirm_or_contradict(short: str, capsys: pytest.Captur
 ])  # fmt: skip
 def test_how_sure(inside: bool, alike: bool, status: str | None, sure: str) -> None:
     verdict: Any = None if status is None else type("Said", (), {"status": status})()
-    candidate = advising.Candidate("f", result(), 4, 4)
+    candidate = advising.NearFilter("f", result(), 4, 4)
     judged = advising._judged(candidate, {"f": verdict} if status else {}, inside, alike)
     assert judged.sure == sure
     split = advising._judged(replace(candidate, agreeing=3), {"f": verdict} if status else {}, inside, alike)
@@ -235,7 +235,7 @@ def test_how_sure(inside: bool, alike: bool, status: str | None, sure: str) -> N
 
 
 def test_a_contradicted_filter_is_not_taken(regime: Regime) -> None:
-    wrong, right, plain = (advising.Candidate(name, result(), 1, 1, sure=sure) for name, sure in (
+    wrong, right, plain = (advising.NearFilter(name, result(), 1, 1, sure=sure) for name, sure in (
         ("wrong", "no"), ("right", "sure"), ("plain", "")))  # fmt: skip
     assert [c.filter for c in advising._sorted([plain, wrong, right])] == ["right", "wrong", "plain"]
     advice = replace(advise(regime), candidates=(wrong, plain), runs=24)

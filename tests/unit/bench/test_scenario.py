@@ -296,3 +296,10 @@ def test_unknown_name_with_a_suggestion() -> None:
         cs.load_scenario("herath2007-stero")
     with pytest.raises(cs.InputError, match="unknown scenario 'zzz'; known: esde-xy, herath2007-bias, "):
         cs.load_scenario("zzz")
+
+
+def test_effects_are_told_the_search_range_of_a_stereo_sensor_alone() -> None:
+    stereo, xyz = (cs.load_scenario(name).truth.sensor for name in ("herath2007-stereo", "herath2007-xyz"))
+    assert stereo.search_range == stereo.disparity
+    assert stereo.search_range[0] < stereo.search_range[1]
+    assert xyz.search_range is None

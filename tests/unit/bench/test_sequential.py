@@ -113,10 +113,10 @@ def test_runs_are_those_of_a_plain_run_and_the_plan_is_kept() -> None:
 
 
 def test_an_interrupted_plan_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    from consistency.bench.runs.work import Work
+    from consistency.bench.runs.work import TrialWork
 
     scenario = cs.load_scenario("linear-gaussian").variant("short", **SHORT)
-    one, calls = Work.__call__, []
+    one, calls = TrialWork.__call__, []
 
     def stop_late(*arguments: object) -> object:
         calls.append(1)
@@ -125,9 +125,9 @@ def test_an_interrupted_plan_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
         return one(*arguments)
 
     options = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "jobs": 1}
-    monkeypatch.setattr(Work, "__call__", stop_late)
+    monkeypatch.setattr(TrialWork, "__call__", stop_late)
     with pytest.raises(Interrupted) as stopped:
         run_until_decided(scenario, ["kf"], **options)
-    monkeypatch.setattr(Work, "__call__", one)
+    monkeypatch.setattr(TrialWork, "__call__", one)
     results, _ = run_until_decided(scenario, ["kf"], previous=stopped.value.results, **options)
     assert results.estimates.equals(cs.run_trials(scenario, ["kf"], runs=20).estimates)

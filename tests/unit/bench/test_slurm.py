@@ -13,11 +13,11 @@ import pytest
 
 import consistency as cs
 from consistency.bench.runs.backends import slurm
-from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.backends.slurm import Slurm, options_of
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.work import Outcomes, Simulated, Work
+from consistency.bench.runs.work import Outcomes, Simulated, TrialWork
 from consistency.bench.types import Trial
 
 pytestmark = [
@@ -78,18 +78,18 @@ def test_a_job_that_dies_once_is_done_again(
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
     fuse = tmp_path / "fuse"
     fuse.touch()
-    work = Work(Deadly(trials, (4,), os.getpid(), str(fuse)), isolation)
+    work = TrialWork(Deadly(trials, (4,), os.getpid(), str(fuse)), isolation)
     outcomes = Slurm(tmp_path / "jobs", LOCAL, 2).outcomes(work, range(RUNS))
-    same(outcomes, Local(1).outcomes(Work(trials, isolation), range(RUNS)))
+    same(outcomes, LocalThreads(1).outcomes(TrialWork(trials, isolation), range(RUNS)))
     assert f"consistency: 1 jobs died; their logs are in {tmp_path / 'jobs'}\n" == capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_a_run_that_kills_its_job_has_failed(linear: cs.Scenario, tmp_path: Path) -> None:
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
-    work = Work(Deadly(trials, (1,), os.getpid()), isolation)
+    work = TrialWork(Deadly(trials, (1,), os.getpid()), isolation)
     outcomes = Slurm(tmp_path / "jobs", LOCAL, 2).outcomes(work, range(4))
-    same(outcomes, Local(1).outcomes(Work(trials, isolation), range(4)), but=[1])
+    same(outcomes, LocalThreads(1).outcomes(TrialWork(trials, isolation), range(4)), but=[1])
 
 
 def test_an_end_in_the_middle_leaves_nothing(
@@ -105,7 +105,7 @@ def test_an_end_in_the_middle_leaves_nothing(
         return jobs
 
     monkeypatch.setattr(slurm.submitit.AutoExecutor, "map_array", noted)
-    work = Work(Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief))
+    work = TrialWork(Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief))
     outcomes = Slurm(tmp_path / "jobs", LOCAL, 1).outcomes(work, range(100_000))
     assert next(outcomes).run == 0
     outcomes.close()

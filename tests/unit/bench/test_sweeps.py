@@ -20,7 +20,7 @@ from consistency.bench.sweeps import cell as cells
 from consistency.bench.sweeps import folder as folders
 from consistency.bench.sweeps import running
 from consistency.bench.sweeps.cell import CellResult, cost_of, run_cell
-from consistency.bench.sweeps.folder import SweepFolder, Work, open_sweep
+from consistency.bench.sweeps.folder import CellWork, SweepFolder, open_sweep
 from consistency.bench.sweeps.plan import Sweep, load_sweep, sweep_names
 from consistency.bench.sweeps.regime import Regime, ranked, read_regime, regime_of, write_regime
 from consistency.bench.sweeps.running import run_sweep
@@ -183,7 +183,7 @@ def test_a_cell_has_the_verdict_of_a_run_until_decided(at: Path) -> None:
     assert found.ratio == pytest.approx(verdict.inflation, rel=1e-4)
     assert verdict.accuracy is not None
     assert found.rmse_position == pytest.approx(verdict.accuracy.rmse_position, rel=1e-4)
-    runs = pd.read_csv(folder.place(Work(cell, "kf")) / "runs.csv")
+    runs = pd.read_csv(folder.place(CellWork(cell, "kf")) / "runs.csv")
     assert list(runs["run"]) == list(range(verdict.runs))
     nees = results.estimates.groupby("run")["nees"].mean().to_numpy()
     np.testing.assert_allclose(runs["nees"], nees, rtol=1e-4)
@@ -203,7 +203,7 @@ def test_a_stopped_sweep_goes_on(at: Path, monkeypatch: pytest.MonkeyPatch, insi
         calls.append(arguments)
         return run_cell(*arguments, **options)
 
-    def stops_while_writing(self: SweepFolder, work: Work, outcome: Any, wall: float) -> None:
+    def stops_while_writing(self: SweepFolder, work: CellWork, outcome: Any, wall: float) -> None:
         if len(list((at / "out").rglob("runs.csv"))) == 2:
             with monkeypatch.context() as patch:
                 patch.setattr(pd.DataFrame, "to_csv", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))

@@ -22,7 +22,7 @@ from consistency.bench.filters.stepping import run_filter, step_through
 from consistency.bench.store.log import Log
 from consistency.bench.tuning import tune as tuning_module
 from consistency.bench.tuning.balance import balanced, directions, nearest
-from consistency.bench.tuning.bench import Bench
+from consistency.bench.tuning.bench import BeliefScorer
 from consistency.bench.tuning.groups import groups_of, rounded, scaled, sigma_by_channel
 from consistency.bench.tuning.parts import part_of, parts_of
 from consistency.bench.tuning.result import Tuning, factor_text, lines
@@ -177,7 +177,7 @@ def test_what_cannot_be_scored_is_refused(uvd: cs.Scenario) -> None:
 
 
 def test_a_run_that_fails_makes_the_setting_impossible(uvd: cs.Scenario) -> None:
-    with Bench(Broken(), [cs.simulate(uvd, seed=SEED)], uvd.belief, "nees", 1) as bench:
+    with BeliefScorer(Broken(), [cs.simulate(uvd, seed=SEED)], uvd.belief, "nees", 1) as bench:
         scores = bench(uvd.belief)
     assert scores.total == -np.inf
     assert scores.failures[0].startswith("run 0, step 1: ")
@@ -185,7 +185,7 @@ def test_a_run_that_fails_makes_the_setting_impossible(uvd: cs.Scenario) -> None
 
 def test_the_same_trials_are_scored_alike_by_any_number_of_workers(uvd: cs.Scenario) -> None:
     trials = [cs.simulate(uvd, run, SEED) for run in range(4)]
-    benches = [Bench(cs.get_filter("ekf-uvd"), trials, uvd.belief, "innovations", jobs) for jobs in (1, 2)]
+    benches = [BeliefScorer(cs.get_filter("ekf-uvd"), trials, uvd.belief, "innovations", jobs) for jobs in (1, 2)]
     with benches[0] as alone, benches[1] as together:
         assert np.array_equal(alone(uvd.belief).log_density, together(uvd.belief).log_density)
 
@@ -201,7 +201,7 @@ class Believer(Silent):
 def test_a_filter_keeps_its_process_and_takes_each_belief(uvd: cs.Scenario) -> None:
     trials = [cs.simulate(uvd, run, SEED) for run in range(2)]
     said = set()
-    with Bench(Believer(), trials, uvd.belief, "nees", 1) as bench:
+    with BeliefScorer(Believer(), trials, uvd.belief, "nees", 1) as bench:
         for factor in (1.0, 2.0, 3.0):
             belief = scaled(uvd.belief, groups_of("Q", uvd.belief), np.log([factor**2]))
             for trial in trials:

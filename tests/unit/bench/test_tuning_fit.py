@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.bench.tuning.fit import LIMIT, Fit, _derivatives, _Search, maximise
+from consistency.bench.tuning.fit import LIMIT, FactorFit, _derivatives, _Search, maximise
 from consistency.bench.tuning.profile import UNITS, Profile, _guess
 from consistency.referee.types import Array
 
@@ -21,7 +21,7 @@ def gaussian(z: Array) -> Callable[[Array], Array]:
     return lambda x: -0.5 * (z**2 * np.exp(-x[0]) + x[0])
 
 
-def fitted(score: Callable[[Array], Array | None], *starts: float, p: int = 1) -> Fit:
+def fitted(score: Callable[[Array], Array | None], *starts: float, p: int = 1) -> FactorFit:
     fit = maximise(score, [np.full(p, start) for start in starts or (0.0,)])
     assert fit is not None
     return fit

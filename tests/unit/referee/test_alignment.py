@@ -36,7 +36,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.sources.alignment import ALL_BUT_SCALE, FREE, Aligned, aligned, clocks_and_frames
 from consistency.referee.sources.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.sources.frames import Frame, moved
+from consistency.referee.sources.frames import WorldTransform, moved
 from consistency.referee.sources.poses import Poses
 from consistency.referee.sources.sheet import Places
 from consistency.referee.types import Array
@@ -44,9 +44,9 @@ from consistency.referee.types import Array
 STEPS = 30
 SIGMA = {"planar": np.array([0.1, 0.2, 0.02]), "spatial": np.array([0.1, 0.2, 0.15, 0.01, 0.02, 0.03])}
 WORLD = {
-    "planar": Frame.about_z(2.2, np.array([30.0, -7.0])),
-    "spatial": Frame(Rotation.from_rotvec([0.3, -0.4, 2.0]), np.array([30.0, -7.0, 4.0])),
-    "yaw": Frame.about_z(-2.9, np.array([30.0, -7.0, 4.0])),
+    "planar": WorldTransform.about_z(2.2, np.array([30.0, -7.0])),
+    "spatial": WorldTransform(Rotation.from_rotvec([0.3, -0.4, 2.0]), np.array([30.0, -7.0, 4.0])),
+    "yaw": WorldTransform.about_z(-2.9, np.array([30.0, -7.0, 4.0])),
 }
 KINDS = [("planar", c) for c in ("so2", "left", "right")] + [
     ("spatial", c) for c in ("so3", "so3-body", "left", "right")
@@ -118,7 +118,7 @@ def test_a_frame_is_found_and_undone(kind: str, convention: str, rng: np.random.
 
 def test_a_turn_about_z_of_each_run_is_found(rng: np.random.Generator) -> None:
     runs = [run_of(rng, "spatial", "so3", noise=0.0) for _ in range(3)]
-    worlds = [Frame.about_z(rng.uniform(-3, 3), rng.uniform(-50, 50, 3)) for _ in runs]
+    worlds = [WorldTransform.about_z(rng.uniform(-3, 3), rng.uniform(-50, 50, 3)) for _ in runs]
     found = aligned("est", [moved(p, f) for p, f in zip(runs, worlds, strict=True)], "posyaw", range(6))
     for back in found.runs:
         np.testing.assert_allclose(back.errors(), 0.0, atol=1e-8)
@@ -137,13 +137,15 @@ def test_the_nees_of_a_frame_is_least(kind: str, convention: str, rng: np.random
     slopes = np.einsum("knd,kn->d", A, sound.whitened) / np.linalg.norm(A.reshape(-1, len(free)), axis=0)
     np.testing.assert_allclose(slopes, 0.0, atol=2e-3)  # standard deviations
     assert np.square(sound.whitened).sum() <= np.square(sound_of(p, judged).whitened).sum()
-    off = moved(p, Frame(Rotation.from_rotvec(0.01 * free[:, 3:].sum(axis=0)), 0.05 * free[:, :3].sum(axis=0)))
+    off = moved(p, WorldTransform(Rotation.from_rotvec(0.01 * free[:, 3:].sum(axis=0)), 0.05 * free[:, :3].sum(axis=0)))
     found, step = sound_of(off, judged), 1e-4
     A = tangent(off, found, free, judged)
     for motion, column in zip(free, np.moveaxis(A, -1, 0), strict=True):
         sizes = [
             np.square(
-                sound_of(moved(off, Frame(Rotation.from_rotvec(s * motion[3:]), s * motion[:3])), judged).whitened
+                sound_of(
+                    moved(off, WorldTransform(Rotation.from_rotvec(s * motion[3:]), s * motion[:3])), judged
+                ).whitened
             )
             for s in (step, -step)
         ]
@@ -477,7 +479,7 @@ def tables(folder: Path, rng: np.random.Generator, runs: int, ratio: float, worl
     frame = WORLD["planar"]
     for run in range(runs):
         p = run_of(rng, "planar", "so2", np.sqrt(ratio), steps)
-        frame = Frame.about_z(rng.uniform(-3, 3), rng.uniform(-20, 20, 2)) if world == "each" else frame
+        frame = WorldTransform.about_z(rng.uniform(-3, 3), rng.uniform(-20, 20, 2)) if world == "each" else frame
         q = moved(p, frame)
         P = {f"P_{a}{b}": q.covariance[:, i, j] for i, a in enumerate("xyh") for j, b in enumerate("xyh") if i <= j}
         for table, poses, further in ((own, q.estimate, P), (true, p.truth, {})):

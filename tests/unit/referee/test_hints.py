@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error, spatial_error
-from consistency.referee.sources.fits import FACTOR, Fit, fit_of
-from consistency.referee.sources.frames import Frame, carried, fitted_frame, moved
+from consistency.referee.sources.fits import FACTOR, ReadingFit, fit_of
+from consistency.referee.sources.frames import WorldTransform, carried, fitted_frame, moved
 from consistency.referee.sources.hints import _ned, decades, hints, turns
 from consistency.referee.sources.poses import Poses
 from consistency.referee.sources.sheet import Places
@@ -132,7 +132,7 @@ MIXED: dict[str, tuple[Make, Mess, str]] = {
     ),
     "deviations": (lambda rng: spatial(rng, plain=True), deviations, "its diagonal holds standard deviations"),
     "information": (spatial, lambda p: replace(p, covariance=np.linalg.inv(p.covariance)), "information matrix"),
-    "turned world": (spatial, lambda p: moved(p, Frame.about_z(-np.pi / 4.5, FAR)), "turned by 40."),
+    "turned world": (spatial, lambda p: moved(p, WorldTransform.about_z(-np.pi / 4.5, FAR)), "turned by 40."),
     "headings in degrees": (
         planar, lambda p: replace(p, estimate=p.estimate * ANGLES), "the headings of the estimates are in degrees",
     ),
@@ -141,7 +141,7 @@ MIXED: dict[str, tuple[Make, Mess, str]] = {
     ),
     "planar deviations": (lambda rng: planar(rng, plain=True), deviations, "its diagonal holds standard deviations"),
     "shifted world": (
-        planar, lambda p: moved(p, Frame.about_z(0.0, FAR[:2])), "the world of the estimates is shifted by (-",
+        planar, lambda p: moved(p, WorldTransform.about_z(0.0, FAR[:2])), "the world of the estimates is shifted by (-",
     ),
 }  # fmt: skip
 
@@ -168,7 +168,7 @@ def test_one_world_is_named_with_its_size_before_a_world_of_each_run(name: str) 
 
 
 def test_worlds_of_each_run_are_named(rng: np.random.Generator) -> None:
-    runs = [moved(p, Frame.about_z(0.7 * i, FAR)) for i, p in enumerate(spatial(rng))]
+    runs = [moved(p, WorldTransform.about_z(0.7 * i, FAR)) for i, p in enumerate(spatial(rng))]
     (said,) = hints("est", SIX, runs)
     assert said.endswith("each run is turned about z and shifted by itself to meet the truth; add --align posyaw")
 
@@ -204,7 +204,7 @@ def test_both_worlds_of_north_and_east_are_named(rng: np.random.Generator) -> No
     north = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     down = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     for both in (False, True):
-        turned = [moved(p, Frame(north, np.zeros(3))) for p in spatial(rng, plain=True)]
+        turned = [moved(p, WorldTransform(north, np.zeros(3))) for p in spatial(rng, plain=True)]
         for p in turned:
             if both:
                 p.estimate[:, 3:] = (Rotation.from_quat(p.estimate[:, 3:]) * down).as_quat()
@@ -225,7 +225,7 @@ def test_a_body_that_is_turned_over_takes_its_covariance_along(convention: str, 
     """NEES of a log whose estimates are undone is what it was before."""
     north = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     p = replace(spatial(rng)[0], convention=convention)
-    there = moved(p, Frame(north, np.zeros(3)))
+    there = moved(p, WorldTransform(north, np.zeros(3)))
     there.estimate[:, 3:] = (
         Rotation.from_quat(there.estimate[:, 3:]) * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     ).as_quat()
@@ -305,7 +305,7 @@ def test_what_is_right_and_what_is_not() -> None:
     assert fit(2.0 * w).fault() == pytest.approx(0.5 * 2 * (4.0 - np.log(4.0) - 1.0), rel=1e-2)
 
 
-def fit(*whitened: Array, P: Array | None = None) -> Fit:
+def fit(*whitened: Array, P: Array | None = None) -> ReadingFit:
     """Errors of runs with these whitened errors (k, n) and a covariance (n, n), I where None."""
     n = whitened[0].shape[1]
     P = np.eye(n) if P is None else P
@@ -333,7 +333,7 @@ def test_the_frame_is_found(angle: float, rng: np.random.Generator) -> None:
         runs = make(rng)
         for p in runs:
             p.truth[:, : len(shift)] = p.estimate[:, : len(shift)]
-        frame = Frame.about_z(angle, shift)
+        frame = WorldTransform.about_z(angle, shift)
         found = fitted_frame([moved(p, frame) for p in runs])
         assert found is not None
         assert found.heading == pytest.approx(-angle, abs=1e-9)
@@ -346,7 +346,7 @@ def test_the_frame_is_found(angle: float, rng: np.random.Generator) -> None:
 def test_errors_in_space_are_carried_over(convention: str) -> None:
     """To first order: the change of the error by small errors of each kind, in the moved world, is the matrix."""
     own = np.array([[3.0, -1.0, 2.0, *Rotation.from_euler("ZYX", [0.7, 0.2, -0.3]).as_quat()]])
-    step, world = 1e-6, Frame(Rotation.from_rotvec([0.2, -0.5, 0.9]), FAR)
+    step, world = 1e-6, WorldTransform(Rotation.from_rotvec([0.2, -0.5, 0.9]), FAR)
     found = np.zeros((6, 6))
     for i, xi in enumerate(step * np.eye(6)):
         true = np.zeros((1, 7))
@@ -365,7 +365,7 @@ def test_errors_in_space_are_carried_over(convention: str) -> None:
 
 @pytest.mark.parametrize("convention", ["so2", "left", "right"])
 def test_errors_in_the_plane_are_carried_over(convention: str) -> None:
-    own, step, world = np.array([[3.0, -1.0, 0.4]]), 1e-6, Frame.about_z(0.9, FAR[:2])
+    own, step, world = np.array([[3.0, -1.0, 0.4]]), 1e-6, WorldTransform.about_z(0.9, FAR[:2])
     change, found = np.zeros((3, 3)), np.zeros((3, 3))
     for i, xi in enumerate(step * np.eye(3)):
         pair = [poses(np.zeros(1), each, np.eye(3), each, "planar", convention) for each in (own, own + xi)]

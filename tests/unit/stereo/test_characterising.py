@@ -22,7 +22,7 @@ from consistency.stereo.characterising.basis import octaves
 from consistency.stereo.characterising.bias import estimate_bias, grid_of, shrunken
 from consistency.stereo.characterising.characterise import Characterisation, characterise
 from consistency.stereo.characterising.coordinate import Levels
-from consistency.stereo.characterising.likelihood import Fit, Parameters, Rows, fit, regress
+from consistency.stereo.characterising.likelihood import LikelihoodFit, Parameters, Rows, fit, regress
 from consistency.stereo.characterising.residuals import Residuals, residuals_of, select
 from consistency.stereo.characterising.tails import rate, ratios, tails
 
@@ -317,7 +317,7 @@ def test_the_test_for_a_bias_pays_for_offsets_of_tracks(rng: np.random.Generator
     zero = Rows(rows.r - rows.r.mean(), *list(vars(rows).values())[1:])
     ideal = np.zeros((2000, 3))
     grid = grid_of(Residuals(ideal, ideal, rows.track, np.arange(2000), np.ones(2000, bool)), *[np.zeros(1)] * 2)
-    found: list[Fit] = [fit(zero, 1.0)] * 3
+    found: list[LikelihoodFit] = [fit(zero, 1.0)] * 3
     bias = estimate_bias(found, grid, LEVEL, LEVEL)
     assert not bias.shown.any()
     # 1 / sqrt(40) from the offsets, not 1 / sqrt(2000)

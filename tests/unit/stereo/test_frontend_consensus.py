@@ -10,7 +10,7 @@ from consistency.referee.types import Array
 from consistency.stereo.vision import ConsensusError, RelativePose, StereoRig, register_ransac, triangulate
 from consistency.stereo.vision.bridging import bridged
 from consistency.stereo.vision.errors import MatchError
-from consistency.stereo.vision.motion import RelativeMotion, Settings, estimate_motion
+from consistency.stereo.vision.motion import MotionSettings, RelativeMotion, estimate_motion
 from consistency.stereo.vision.resection import inliers_within, resect_ransac, squared_reprojections
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
@@ -32,7 +32,7 @@ def matches(rng: np.random.Generator, depths: tuple[float, float] = (8.0, 120.0)
 def estimated(uv0: Array, uv1: Array, rng: np.random.Generator, **settings: object) -> tuple[float, Array]:
     """Mahalanobis distance of the pose from the true one, and the inliers."""
     sigma = np.full_like(uv0, SIGMA)
-    found = estimate_motion(RIG, uv0, uv1, sigma, sigma, Settings(**settings), rng)  # type: ignore[arg-type]
+    found = estimate_motion(RIG, uv0, uv1, sigma, sigma, MotionSettings(**settings), rng)  # type: ignore[arg-type]
     error = found.pose.vector - TRUE.vector
     return float(np.sqrt(error @ np.linalg.solve(found.covariance, error))), found.inliers
 
@@ -76,7 +76,7 @@ def test_noise_that_is_stated_far_too_small_does_not_hide_the_motion(rng: np.ran
     """By 30 times: no pose of three points would have others within its gate if the search had no slack."""
     uv0, uv1 = matches(rng)
     sigma = np.full_like(uv0, SIGMA / 30.0)
-    found = estimate_motion(RIG, uv0, uv1, sigma, sigma, Settings(), rng)
+    found = estimate_motion(RIG, uv0, uv1, sigma, sigma, MotionSettings(), rng)
     assert found.inliers.mean() > 0.95
     assert np.abs(found.pose.t - TRUE.t).max() < 0.1
     assert found.chi2 > 500.0 * found.dof
@@ -132,7 +132,7 @@ def test_unweighted_estimators_say_when_far_points_dominate(rng: np.random.Gener
     for name, depths in {"near": (4.0, 8.0), "far": (8.0, 120.0)}.items():
         uv0, uv1 = matches(rng, depths)
         for estimator in ("svd", "horn", "reprojection"):
-            found = estimate_motion(RIG, uv0, uv1, sigma, sigma, Settings(estimator=estimator), rng)
+            found = estimate_motion(RIG, uv0, uv1, sigma, sigma, MotionSettings(estimator=estimator), rng)
             doubts[name, estimator] = found.doubt
     assert "take estimator reprojection" in doubts["far", "svd"]
     assert "take estimator reprojection" in doubts["far", "horn"]

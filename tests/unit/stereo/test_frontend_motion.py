@@ -18,12 +18,12 @@ from consistency.bench.store.log import read_log
 from consistency.referee.sources import spatial_error
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.types import Array
-from consistency.stereo.frontend import Options, write_frontend_log
+from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.planar import OPTICAL, in_robot_axes, planar_motions, planar_path, robot_axes
 from consistency.stereo.frontend.planar_log import relative
 from consistency.stereo.frontend.truth import read_truth
 from consistency.stereo.vision import ConsensusError, RelativePose, relative_motion
-from consistency.stereo.vision.motion import ESTIMATORS, RelativeMotion, Settings
+from consistency.stereo.vision.motion import ESTIMATORS, MotionSettings, RelativeMotion
 from consistency.stereo.vision.odometry import trajectory, visual_odometry
 from consistency.stereo.vision.sequence import read_sequence
 from consistency.stereo.vision.tracks import linked
@@ -49,7 +49,7 @@ def images(tmp_path_factory: pytest.TempPathFactory, wall: Array) -> Path:
 @pytest.fixture(scope="module")
 def log(images: Path) -> Path:
     out = images.parent / "log"
-    write_frontend_log(images, out, Options(max_landmarks=30))
+    write_frontend_log(images, out, FrontendOptions(max_landmarks=30))
     return out
 
 
@@ -93,7 +93,7 @@ def test_unusable_images(wall: Array, rng: np.random.Generator) -> None:
         relative_motion(rig, pair[::-1], later[::-1], rng=rng)
     low, later_low = ((left, np.roll(right, 1, axis=0)) for left, right in (pair, later))
     with pytest.raises(ConsensusError, match="cameras swapped or badly calibrated, or is sigma_per_scale too small"):
-        relative_motion(rig, low, later_low, rng=rng, settings=Settings(sigma_per_scale=0.02))
+        relative_motion(rig, low, later_low, rng=rng, settings=MotionSettings(sigma_per_scale=0.02))
     elsewhere = scene.pair(scene.drive(1)[0], scene.texture(rng))
     with pytest.raises(cs.InputError, match="before to after: "):
         relative_motion(rig, pair, elsewhere, rng=rng)
@@ -105,7 +105,7 @@ def test_unusable_images(wall: Array, rng: np.random.Generator) -> None:
 )
 def test_unusable_settings(settings: dict[str, object], said: str) -> None:
     with pytest.raises(cs.InputError, match=said):
-        Settings(**settings)  # type: ignore[arg-type]
+        MotionSettings(**settings)  # type: ignore[arg-type]
 
 
 def test_without_opencv(monkeypatch: pytest.MonkeyPatch, wall: Array, rng: np.random.Generator) -> None:
@@ -121,7 +121,7 @@ def test_a_dark_frame_is_bridged(wall: Array, tmp_path: Path) -> None:
     scene.write_kitti(folder, scene.drive(14), wall)
     dark = sorted((folder / "image_0").iterdir())[6]
     cv2.imwrite(str(dark), np.zeros(scene.SIZE[::-1], np.uint8))
-    summary = write_frontend_log(folder, tmp_path / "log", Options(max_landmarks=30))
+    summary = write_frontend_log(folder, tmp_path / "log", FrontendOptions(max_landmarks=30))
     assert len(summary.faults) == 2
     assert "2 of 13 motions could not be measured and are bridged" in "\n".join(summary.lines(tmp_path / "log"))
     assert list(read_manifest(tmp_path / "log")["bridged"]) == ["5", "6"]
@@ -226,14 +226,14 @@ def test_trajectory_and_truth_are_read_as_recordings(log: Path) -> None:
 
 def test_fewer_landmarks_than_one_at_once(images: Path, tmp_path: Path) -> None:
     with pytest.raises(cs.InputError, match="--max-landmarks 0"):
-        write_frontend_log(images, tmp_path / "out", Options(max_landmarks=0))
+        write_frontend_log(images, tmp_path / "out", FrontendOptions(max_landmarks=0))
     assert not list(tmp_path.iterdir())
 
 
 def test_nothing_is_left_of_a_log_that_fails(images: Path, tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text("1 2 3\n")
     with pytest.raises(cs.InputError, match=r"poses\.txt"):
-        write_frontend_log(images, tmp_path / "out", Options(truth=tmp_path / "poses.txt"))
+        write_frontend_log(images, tmp_path / "out", FrontendOptions(truth=tmp_path / "poses.txt"))
     assert [path.name for path in tmp_path.iterdir()] == ["poses.txt"]
 
 

@@ -20,7 +20,7 @@ from consistency.bench.store.log import read_log
 from consistency.bench.types import Trial
 from consistency.referee.geometry import rotation
 from consistency.referee.sources.kitti import drive_poses
-from consistency.stereo.frontend import Options, write_frontend_log
+from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.planar_log import plane_of
 from consistency.stereo.frontend.truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.vision import RelativePose
@@ -79,13 +79,13 @@ def test_a_drive_of_kitti_raw_becomes_a_log(day: Path, tmp_path: Path) -> None:
         shutil.copytree(folder / name, other / name)
     lost = other.parent / "calib_imu_to_velo.txt"
     lost.rename(tmp_path / lost.name)
-    summary = write_frontend_log(other, tmp_path / "log", Options(max_landmarks=30))
+    summary = write_frontend_log(other, tmp_path / "log", FrontendOptions(max_landmarks=30))
     assert summary.timed
     assert summary.distance == pytest.approx(np.linalg.norm(drive(8)[-1].t), rel=0.02)
     said = "no truth found: that of oxts takes calib_imu_to_velo.txt too; --truth FILE takes one"
     assert said in summary.lines(tmp_path / "log")
     (tmp_path / lost.name).rename(lost)
-    summary = write_frontend_log(other, tmp_path / "true", Options(max_landmarks=30))
+    summary = write_frontend_log(other, tmp_path / "true", FrontendOptions(max_landmarks=30))
     assert summary.truth == other
     assert f"truth from {other}; next: consistency analyse" in "\n".join(summary.lines(tmp_path / "true"))
     R, t = read_truth(other, read_sequence(other))

@@ -31,7 +31,7 @@ from consistency.stereo.imaging.correspondence import (
     KnownDisparity,
     SemiGlobal,
 )
-from consistency.stereo.imaging.filtering import Evidence, LeftRightCheck, TrackResidual, dissimilarity, patches
+from consistency.stereo.imaging.filtering import LeftRightCheck, PairObservations, TrackResidual, dissimilarity, patches
 from consistency.stereo.imaging.protocols import Stops, pose_at, stand, wall_texture
 from consistency.stereo.imaging.render import film
 from consistency.stereo.imaging.scene import Layer, Scene
@@ -117,7 +117,9 @@ def test_left_right_check_finds_what_only_one_image_sees() -> None:
     shares = []
     for uv in (hidden, open_):
         d = BlockMatching().measure(left, right, uv)
-        shares.append(LeftRightCheck().keep(Evidence(left, right, uv, d, np.zeros(len(uv)), BlockMatching())).mean())
+        shares.append(
+            LeftRightCheck().keep(PairObservations(left, right, uv, d, np.zeros(len(uv)), BlockMatching())).mean()
+        )
     assert shares[0] < 0.5 < 0.9 < shares[1]
 
 
@@ -131,7 +133,7 @@ def test_dissimilarity_is_small_for_one_place_at_two_depths() -> None:
     )
     assert dissimilarity(first, first).max() < 1e-5
     assert np.median(zoomed) < 0.5 * np.median(same) < np.median(not_zoomed)
-    evidence = Evidence(image, image, uv, one, np.where(np.arange(len(uv)) % 2, 0.7, 0.5), BlockMatching())
+    evidence = PairObservations(image, image, uv, one, np.where(np.arange(len(uv)) % 2, 0.7, 0.5), BlockMatching())
     assert TrackResidual(0.6).keep(evidence).tolist() == [bool(k % 2 == 0) for k in range(len(uv))]
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.types import Array
 from consistency.stereo.vision import StereoRig, triangulate, triangulation_covariance
-from consistency.stereo.vision.motion import ESTIMATORS, Settings, disparities, estimate_motion, usable
+from consistency.stereo.vision.motion import ESTIMATORS, MotionSettings, disparities, estimate_motion, usable
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
 EQUATIONS = {"reprojection": 5, "svd": 3, "horn": 3}  # of a point: eight pixels less its position, or three coordinates
@@ -30,7 +30,7 @@ def matches(rng: np.random.Generator, points: int, outliers: int = 0) -> tuple[A
 @pytest.mark.parametrize("outliers", [0, 7])
 def test_six_degrees_of_freedom_are_the_pose(rng: np.random.Generator, estimator: str, outliers: int) -> None:
     """Of the inliers' equations six are used up; an inlier is outside the gate of 10 sigma with probability 1e-21."""
-    found = estimate_motion(RIG, *matches(rng, 30, outliers), Settings(gate=10.0, estimator=estimator), rng)
+    found = estimate_motion(RIG, *matches(rng, 30, outliers), MotionSettings(gate=10.0, estimator=estimator), rng)
     assert not found.inliers[:outliers].any()
     assert found.inliers.sum() > 20
     assert found.dof == EQUATIONS[estimator] * found.inliers.sum() - 6
@@ -41,7 +41,7 @@ def test_residuals_have_their_degrees_of_freedom(rng: np.random.Generator) -> No
 
     Without the six of each pose these would be 7 sigma away.
     """
-    found = [estimate_motion(RIG, *matches(rng, 8), Settings(gate=10.0), rng) for _ in range(120)]
+    found = [estimate_motion(RIG, *matches(rng, 8), MotionSettings(gate=10.0), rng) for _ in range(120)]
     assert all(f.inliers.all() for f in found)
     chi2, dof = sum(f.chi2 for f in found), sum(f.dof for f in found)
     assert abs(chi2 - dof) < 4.5 * np.sqrt(2.0 * dof)
@@ -50,7 +50,7 @@ def test_residuals_have_their_degrees_of_freedom(rng: np.random.Generator) -> No
 @pytest.mark.parametrize("estimator", ["svd", "horn"])
 def test_chi2_of_a_registration_by_hand(rng: np.random.Generator, estimator: str) -> None:
     uv0, uv1, sigma0, sigma1 = matches(rng, 20, 3)
-    found = estimate_motion(RIG, uv0, uv1, sigma0, sigma1, Settings(gate=10.0, estimator=estimator), rng)
+    found = estimate_motion(RIG, uv0, uv1, sigma0, sigma1, MotionSettings(gate=10.0, estimator=estimator), rng)
     chi2 = 0.0
     for i in np.flatnonzero(found.inliers):
         (p0,), (p1,) = (triangulate(RIG, uv[[i]]) for uv in (uv0, uv1))

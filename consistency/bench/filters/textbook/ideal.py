@@ -14,7 +14,7 @@ import numpy as np
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.filters.textbook.sensors import view
-from consistency.bench.protocols import Problem, Truth
+from consistency.bench.protocols import Problem, TrialTruth
 from consistency.bench.types import Control, Info, Observation
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -25,7 +25,7 @@ class IdealState:
     """The state of the EKF, and the step that the truth is taken of."""
 
     slam: SlamState
-    truth: Truth
+    truth: TrialTruth
     step: int
 
 
@@ -64,7 +64,7 @@ class IdealKalman(basics.WrappedFilter):
         return replace(state, slam=basics.without(state.slam, landmark))
 
 
-def truth_of(problem: Problem) -> Truth:
+def truth_of(problem: Problem) -> TrialTruth:
     """The truth that a problem carries.
 
     Raises

@@ -7,11 +7,11 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from consistency.bench.filters.record import Record
+from consistency.bench.filters.record import RunRecord
 from consistency.bench.filters.stepping import error_of, name_of, rejects
 from consistency.bench.runs.backends.remote import Part, require_same_versions
-from consistency.bench.runs.work import Outcomes, Work
-from consistency.bench.store.results import Outcome, outcome_of
+from consistency.bench.runs.work import Outcomes, TrialWork
+from consistency.bench.store.results import RunOutcome, outcome_of
 from consistency.referee.errors import InputError
 from consistency.referee.system.machine import in_words
 from consistency.referee.terminal.progress import say
@@ -35,13 +35,13 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Lost:
+class WorkerLost:
     """Who did a batch is dead, and why."""
 
     reason: str
 
 
-Event = tuple[Batch, Part | Lost | None]  # some runs of a batch; its loss; its end
+Event = tuple[Batch, Part | WorkerLost | None]  # some runs of a batch; its loss; its end
 
 
 class Engine(Protocol):
@@ -135,7 +135,7 @@ class Batches:
         return []
 
 
-def in_batches(engine: Engine, batches: Batches, work: Work) -> Outcomes:
+def in_batches(engine: Engine, batches: Batches, work: TrialWork) -> Outcomes:
     """What each run leaves, in the order in which batches come back.
 
     Raises
@@ -150,7 +150,7 @@ def in_batches(engine: Engine, batches: Batches, work: Work) -> Outcomes:
             match what:
                 case None:
                     batches.ended(batch)
-                case Lost(reason):
+                case WorkerLost(reason):
                     for run in batches.lost(batch):
                         yield failed(work, run, reason)
                 case Part():
@@ -163,10 +163,10 @@ def in_batches(engine: Engine, batches: Batches, work: Work) -> Outcomes:
                         raise InputError(what.refusal)
 
 
-def failed(work: Work, run: int, reason: str) -> Outcome:
+def failed(work: TrialWork, run: int, reason: str) -> RunOutcome:
     """What a run leaves that could not be done: all filters have failed in step 1."""
     trial = work.trials(run)
-    record = Record.empty(trial.steps, len(trial.landmark))
+    record = RunRecord.empty(trial.steps, len(trial.landmark))
     return outcome_of(
         trial,
         [record.estimates(name_of(f), trial.run, error_of(f), reason=reason, guarded=rejects(f)) for f in work.filters],

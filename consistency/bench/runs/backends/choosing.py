@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from consistency.bench.runs.backends.local import Local
+from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.work import Backend
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
@@ -47,7 +47,7 @@ def backend_for(
         if is_given and name != owner:
             raise InputError(f"{option} goes with --backend {owner}, not with {name}")
     if name == "local":
-        return Local(jobs)
+        return LocalThreads(jobs)
     try:
         if name == "dask":
             from consistency.bench.runs.backends.dask import Dask

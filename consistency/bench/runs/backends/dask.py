@@ -24,11 +24,11 @@ from dask.config import set as set_config
 from distributed import Client, Future, KilledWorker, LocalCluster, Security, WorkerPlugin
 
 from consistency.bench.filters.stepping import reason_of
-from consistency.bench.runs.backends.batches import Batch, Batches, Event, Lost, in_batches
+from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, in_batches
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
 from consistency.bench.runs.isolating import ONE_THREAD
-from consistency.bench.runs.work import Outcomes, Work
+from consistency.bench.runs.work import Outcomes, TrialWork
 from consistency.referee.errors import InputError
 
 TARGET = 1.5  # s of work in a batch
@@ -79,12 +79,12 @@ class Dask:
                 f"scheduler '{self.scheduler}' is neither an address, such as tcp://host:8786, nor a scheduler file"
             )
 
-    def prepare(self, work: Work, run: int, /) -> None:
+    def prepare(self, work: TrialWork, run: int, /) -> None:
         """See :class:`consistency.runs.work.Backend`."""
         if self.scheduler is None:
             work.compile(run)
 
-    def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
+    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
         """See :class:`consistency.runs.work.Backend`.
 
         Raises
@@ -120,7 +120,7 @@ class Dask:
 class _Engine:
     """See :class:`consistency.runs.backends.batches.Engine`."""
 
-    def __init__(self, address: dict[str, Any], work: Work, wait: float) -> None:
+    def __init__(self, address: dict[str, Any], work: TrialWork, wait: float) -> None:
         self._address, self._pickled, self._wait = address, pickled_work(work), wait
         self._is_ours = isinstance(address.get("address"), LocalCluster)
         self._name = f"consistency-{uuid4().hex}"  # of the work; of nobody else's, as its end takes it from the workers
@@ -186,7 +186,7 @@ class _Engine:
             return []
         del self._sent[key]
         if part is None:
-            return [(batch, Lost("its worker died, and so did those that tried it again"))]
+            return [(batch, WorkerLost("its worker died, and so did those that tried it again"))]
         return [(batch, part), (batch, None)]
 
     def _count(self) -> None:

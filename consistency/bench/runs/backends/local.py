@@ -11,8 +11,8 @@ from itertools import islice
 import joblib
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.runs.work import Outcomes, Work
-from consistency.bench.store.results import Outcome
+from consistency.bench.runs.work import Outcomes, TrialWork
+from consistency.bench.store.results import RunOutcome
 from consistency.referee.errors import InputError
 
 AHEAD = 2  # runs that wait for each worker, so that none waits for them
@@ -20,7 +20,7 @@ GLANCE = 0.1  # s between looks, for a signal that another thread was given
 
 
 @dataclass
-class Local:
+class LocalThreads:
     """Threads: compiled filters release the GIL, and who waits for the process of another filter does.
 
     Parameters
@@ -40,7 +40,7 @@ class Local:
     def __post_init__(self) -> None:
         worker_count(self.jobs)
 
-    def prepare(self, work: Work, run: int, /) -> None:
+    def prepare(self, work: TrialWork, run: int, /) -> None:
         """See :class:`consistency.runs.work.Backend`.
 
         Raises
@@ -53,7 +53,7 @@ class Local:
         self._room = fitting if self.jobs == -1 else workers
         work.compile(run, workers)
 
-    def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
+    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
         """See :class:`consistency.runs.work.Backend`."""
         workers = min(worker_count(self.jobs), len(runs), self._room)
         with one_blas_thread():
@@ -64,11 +64,11 @@ class Local:
                     yield from map(work, runs)
 
 
-def _in_threads(work: Work, runs: Sequence[int], workers: int) -> Outcomes:
+def _in_threads(work: TrialWork, runs: Sequence[int], workers: int) -> Outcomes:
     pool, todo = ThreadPoolExecutor(workers), iter(runs)
     try:
         with work.isolation:  # left first, so that no thread waits for a process that hangs
-            waiting: set[Future[Outcome]] = set()
+            waiting: set[Future[RunOutcome]] = set()
             while True:
                 waiting |= {pool.submit(work, run) for run in islice(todo, AHEAD * workers - len(waiting))}
                 if not waiting:
@@ -82,7 +82,7 @@ def _in_threads(work: Work, runs: Sequence[int], workers: int) -> Outcomes:
         pool.shutdown(cancel_futures=True)
 
 
-def _failed(future: Future[Outcome]) -> bool:
+def _failed(future: Future[RunOutcome]) -> bool:
     return future.exception() is not None
 
 

@@ -20,8 +20,8 @@ from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.runs.isolating import dismiss
-from consistency.bench.runs.work import Work
-from consistency.bench.store.results import Outcome
+from consistency.bench.runs.work import TrialWork
+from consistency.bench.store.results import RunOutcome
 from consistency.referee.errors import InputError
 from consistency.referee.system.machine import this_machine
 
@@ -50,8 +50,8 @@ class Part:
     versions: dict[str, str]
     refusal: str = ""
 
-    def outcomes(self) -> list[Outcome]:
-        outcomes: list[Outcome] = pickle.loads(self.pickled)
+    def outcomes(self) -> list[RunOutcome]:
+        outcomes: list[RunOutcome] = pickle.loads(self.pickled)
         return [replace(outcome, machine=self.machine) for outcome in outcomes]
 
 
@@ -81,7 +81,7 @@ def require_same_versions(part: Part) -> None:
             )
 
 
-def pickled_work(work: Work) -> bytes:
+def pickled_work(work: TrialWork) -> bytes:
     """Work as it is sent; classes from ``__main__`` go with it."""
     return bytes(dumps(work))
 
@@ -91,12 +91,12 @@ class Worker:
 
     def __init__(self, pickled: bytes) -> None:
         self._pickled = pickled
-        self._work: Work | None = None
+        self._work: TrialWork | None = None
         self._open, self._lock = ExitStack(), threading.Lock()
 
     def parts(self, runs: Sequence[int], seconds: float) -> Generator[Part, None, None]:
         """Do runs one after the other, and give what they left every so many seconds; bad input ends them."""
-        work, outcomes, refusal = self._ready_for(runs[0]), list[Outcome](), ""
+        work, outcomes, refusal = self._ready_for(runs[0]), list[RunOutcome](), ""
         with one_blas_thread():
             begun = time.monotonic()
             for run in runs:
@@ -111,12 +111,12 @@ class Worker:
             if outcomes or refusal:
                 yield _part(outcomes, time.monotonic() - begun, refusal)
 
-    def _ready_for(self, run: int) -> Work:
+    def _ready_for(self, run: int) -> TrialWork:
         """The work, with all that is made once."""
         with self._lock:
             if self._work is None:
                 current_process().daemon = False  # so that it may start processes: they end with it, whatever ends it
-                work: Work = pickle.loads(self._pickled)
+                work: TrialWork = pickle.loads(self._pickled)
                 self._open.enter_context(work.isolation)
                 with one_blas_thread():
                     work.compile(run)
@@ -129,6 +129,6 @@ class Worker:
         dismiss()
 
 
-def _part(outcomes: list[Outcome], seconds: float, refusal: str = "") -> Part:
+def _part(outcomes: list[RunOutcome], seconds: float, refusal: str = "") -> Part:
     pickled = pickle.dumps(outcomes, pickle.HIGHEST_PROTOCOL)  # one buffer: an engine would send each array by itself
     return Part(pickled, seconds, socket.gethostname(), this_machine(), versions_here(), refusal)

@@ -21,10 +21,10 @@ from typing import Any
 import submitit
 
 from consistency.bench.filters.stepping import reason_of
-from consistency.bench.runs.backends.batches import Batch, Batches, Event, Lost, in_batches
+from consistency.bench.runs.backends.batches import Batch, Batches, Event, WorkerLost, in_batches
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
-from consistency.bench.runs.work import Outcomes, Work
+from consistency.bench.runs.work import Outcomes, TrialWork
 from consistency.referee.errors import InputError
 from consistency.referee.terminal.progress import say
 
@@ -59,10 +59,10 @@ class Slurm:
     def __post_init__(self) -> None:
         worker_count(self.jobs)
 
-    def prepare(self, work: Work, run: int, /) -> None:
+    def prepare(self, work: TrialWork, run: int, /) -> None:
         """See :class:`consistency.runs.work.Backend`: the jobs compile."""
 
-    def outcomes(self, work: Work, runs: Sequence[int], /) -> Outcomes:
+    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
         """See :class:`consistency.runs.work.Backend`.
 
         Raises
@@ -105,7 +105,7 @@ class _Job:
 class _Engine:
     """See :class:`consistency.runs.backends.batches.Engine`."""
 
-    def __init__(self, folder: Path, options: Mapping[str, Any], room: int, work: Work) -> None:
+    def __init__(self, folder: Path, options: Mapping[str, Any], room: int, work: TrialWork) -> None:
         self.room, self.folder = room, folder.absolute()
         self._jobs: list[_Job] = []
         self._names, self._lost, self._is_local = itertools.count(), 0, options.get("cluster") == "local"
@@ -178,7 +178,7 @@ class _Engine:
             return []
         self._jobs.remove(job)
         self._lost += 1
-        return [(job.batch, Lost("its job died, and so did those that tried it again"))]
+        return [(job.batch, WorkerLost("its job died, and so did those that tried it again"))]
 
     def close(self) -> None:
         """Cancel what is not done; logs stay where a job has died."""

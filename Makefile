@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: docs tutorial reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-quick test-all bench lint format clean
+.PHONY: docs house house-write tutorial reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-quick test-all bench lint format clean
 
 # matrices are small and work is divided among processes: further threads of BLAS would wait for each other
 export OPENBLAS_NUM_THREADS ?= 1
@@ -48,18 +48,20 @@ docs: .venv/.done
 	$(BIN)/python -m sphinx -q -E -W --keep-going -d docs/_build/doctrees docs docs/_build/html
 	$(BIN)/python docs/check.py docs/_build/html
 
+house:
+	$(PYTHON) docs/house.py
+
+house-write:
+	$(PYTHON) docs/house.py --write
+
 tutorial: .venv/.done
 	$(BIN)/python docs/tutorial.py
 
 bench: .venv/.done
 	$(BIN)/python benchmarks/bench.py
 
-# what the core is, whose types are also checked for Python 3.10
-CORE := $(addprefix consistency/,defaults.py errors.py extras.py types.py testing.py pytest_plugin.py reading geometry diagnostics recording gating \
-	notebook terminal document reporting/plain.py \
-	$(addprefix show/,__init__.py json.py junit.py markdown.py static.py terminal.py text.py) \
-	$(addprefix cli/,app.py commands.py comparing.py files.py judging.py listing.py monitoring.py options.py) \
-	$(addprefix verdicts/,files.py options.py baselines.py comparison.py monitoring.py))
+# the types of the core are also checked for Python 3.10
+CORE := $(addprefix consistency/,referee doors.py testing.py pytest_plugin.py)
 lint: .venv/.done
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

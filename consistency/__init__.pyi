@@ -9,7 +9,6 @@ from .bench.scenario import Scenario as Scenario
 from .bench.scenario import load_scenario as load_scenario
 from .bench.scenario import scenario_names as scenario_names
 from .bench.simulation import simulate as simulate
-from .referee.verdicts.judge import analyse as analyse
 from .bench.store.log import Log as Log
 from .bench.store.log import read_log as read_log
 from .bench.store.results import Results as Results
@@ -32,3 +31,4 @@ from .referee.diagnostics.records import Verdict as Verdict
 from .referee.errors import InputError as InputError
 from .referee.notebook.records import judge as judge
 from .referee.notebook.records import read as read
+from .referee.verdicts.judge import analyse as analyse

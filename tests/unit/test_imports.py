@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence, Set
@@ -33,7 +34,8 @@ RANKS = {
         "types": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,
         "store.parquet": 3, "store.storage": 4, "store.soundness": 4, "store.tables": 4, "store.journal": 5,
         "store.results": 5, "store.log": 6,
-        "runs.streams": 4, "runs.finding": 4, "runs.supervising": 5, "runs.touched": 5, "runs.footprint": 6, "runs.gather": 6,
+        "runs.finding": 4,
+        "runs.streams": 4, "runs.supervising": 5, "runs.touched": 5, "runs.footprint": 6, "runs.gather": 6,
         "runs.isolating": 6, "runs.resuming": 6, "runs.compiling": 6, "runs.work": 7, "runs.backends": 8,
         "runs.campaign": 8, "runs.montecarlo": 9, "runs.records": 6, "runs.by_run": 7, "runs.pilots": 10,
         "runs.sequential": 10, "runs.ahead": 10, "runs.findings": 11,
@@ -155,7 +157,9 @@ def test_no_two_modules_import_each_other() -> None:
     graph = {name: imported_modules(path.read_text(encoding="utf-8"), paths.keys()) for name, path in paths.items()}
     graph["consistency.referee.diagnostics.records"].remove("consistency.referee.diagnostics.export")
     assert acyclic(graph)
-    assert not acyclic(graph | {"consistency.bench.types": {"consistency.bench.scenario.view"}})  # negative control
+    assert not acyclic(
+        graph | {"consistency.bench.scenario.tables": {"consistency.bench.scenario.view"}}
+    )  # negative control
 
 
 @pytest.mark.parametrize(("module", "path"), modules(), ids=[name for name, _ in modules()])
@@ -215,6 +219,15 @@ def test_a_forbidden_import_is_caught(module: str, source: str) -> None:
 @pytest.mark.parametrize("name", OUTSIDE)
 def test_what_the_referee_calls_by_name_is_there(name: str) -> None:
     assert callable(outside(name))
+
+
+def test_the_page_of_the_house_has_its_table() -> None:
+    """``make house-write`` writes it."""
+    house = runpy.run_path(str(PACKAGE.parent / "docs/house.py"))
+    table = house["table"](exact=False)
+    assert table in house["PAGE"].read_text(encoding="utf-8")
+    assert "| `referee` |" in table
+    assert "| none |" in table.splitlines()[2]
 
 
 # --- experiments and benchmarks ----------------------------------------------------------------

@@ -16,9 +16,9 @@ import pandas as pd
 from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.bench.filters import get_filter
-from consistency.bench.runs.finding import findings_table
 from consistency.bench.runs.backends.local import worker_count
 from consistency.bench.runs.compiling import compile_all, first_trials
+from consistency.bench.runs.finding import findings_table
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.records import record_of
 from consistency.bench.scenario import Scenario, data_folder, load_scenario

@@ -26,7 +26,7 @@ OF_ADVICE = (
 
 
 def by_verdict(regime: Regime) -> tuple[list[str], list[tuple[Cell, ...]]]:
-    """Statuses that occur, and for each filter its name, the cells with each, and the median cost of a step."""
+    """Statuses that occur; for each filter its name, the number of cells with each, and the median cost."""
     by_filter = {name: [r for (_, n), r in regime.results.items() if n == name] for name in regime.sweep.filters}
     counts = {name: Counter(r.status for r in results) for name, results in by_filter.items()}
     statuses = [status for status in STATUSES if any(count[status] for count in counts.values())]

@@ -24,14 +24,25 @@ POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors and the names of their components; N runs, T steps, n components."""
+    """Whitened errors of a record and the names of their components; N runs, T steps, n components."""
 
-    error: Array  # (N, T, n)
-    covariance: Symmetric  # (N, T, n, n)
+    record: Record  # with errors and covariances
     whitened: Array  # (N, T, n), NaN where nothing counts
     names: tuple[str, ...]
     groups: Mapping[str, list[int]]  # components, named groups and subsets
     centre: Centre | None = None  # where ``whitened`` is of the errors about it
+
+    @property
+    def error(self) -> Array:
+        """(N, T, n)."""
+        assert self.record.error is not None
+        return self.record.error
+
+    @property
+    def covariance(self) -> Symmetric:
+        """(N, T, n, n)."""
+        assert self.record.covariance is not None
+        return entries(self.record.covariance)
 
 
 class Centre(NamedTuple):
@@ -148,7 +159,7 @@ def sample_of(evidence: Record, settings: Settings) -> Sample | None:
         nees[here] = np.where(counted, squared_length(w), np.nan)
         w[~np.isfinite(nees[here])] = np.nan
         whitened[here] = w
-    return Sample(nees, n, Errors(e.error, P, whitened, names, groups))
+    return Sample(nees, n, Errors(e, whitened, names, groups))
 
 
 def groups_of(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:

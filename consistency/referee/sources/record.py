@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,14 @@ class Track:
     nis_dof: Array | None = None  # (k,)
     nees: Array | None = None  # (k,)
     t: Array | None = None  # (k,), s; of windows, of their beginnings
+
+    def part(self, index: Sequence[int]) -> Track:
+        """Track of some components of the error."""
+        assert self.error is not None
+        assert self.covariance is not None
+        if len(index) == self.error.shape[1]:
+            return self
+        return replace(self, error=self.error[:, index], covariance=self.covariance[:, index][:, :, index])
 
 
 def assemble(

@@ -56,13 +56,21 @@ class Stretch:
 class Windows:
     """The windows of one run, W of them."""
 
-    run: int
-    place: Places  # (W,)
+    track: Track  # with the times of their beginnings
     t: Array  # (W,), s, at the end of each
-    start: Array  # (W,), s, at the beginning of each
-    error: Array  # (W, n), NaN where the estimate is
-    covariance: Array  # (W, n, n)
     left_out: int
+
+    @property
+    def error(self) -> Array:
+        """(W, n), NaN where the estimate is."""
+        assert self.track.error is not None
+        return self.track.error
+
+    @property
+    def covariance(self) -> Array:
+        """(W, n, n)."""
+        assert self.track.covariance is not None
+        return self.track.covariance
 
 
 def windows_of(stretch: Stretch, relative: Relative) -> Windows:
@@ -93,7 +101,8 @@ def windows_of(stretch: Stretch, relative: Relative) -> Windows:
         first, last = np.append(first, max(sound - 1, 0)), np.append(last, sound)
         error = np.concatenate([error, np.full((1, error.shape[1]), 0.0 if finite else np.nan)])
         covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
-    return Windows(s.run, s.place.at(last), s.t[last], s.t[first], error, covariance, left_out)
+    track = Track(s.run, np.arange(len(last)), s.place.at(last), error, covariance, t=s.t[first])
+    return Windows(track, s.t[last], left_out)
 
 
 def _sound(s: Stretch, relative: Relative) -> int:
@@ -158,14 +167,11 @@ def relative_recording(
     """
     found = [windows_of(stretch, relative) for stretch in stretches]
     times = [one.t for one in found]
-    columns, t = [np.arange(len(each)) for each in times], np.full(max(map(len, times)), np.nan)
+    part = list(judged)
+    tracks, t = [one.track.part(part) for one in found], np.full(max(map(len, times)), np.nan)
     if np.isfinite(np.concatenate(times)).all():
         columns, t = common_times(times)
-    part = list(judged)
-    tracks = [
-        Track(one.run, column, one.place, one.error[:, part], one.covariance[:, part][:, :, part], t=one.start)
-        for one, column in zip(found, columns, strict=True)
-    ]
+        tracks = [replace(track, column=column) for track, column in zip(tracks, columns, strict=True)]
     notes = _notes(name, found, axes, stretches[0].convention, relative)
     of = _independence(found)
     notes += _doubt(name, of, relative) if relative.independent else []

@@ -19,7 +19,6 @@ from consistency.referee.sources.matching import common_times
 from consistency.referee.sources.poses import Poses
 from consistency.referee.sources.record import Track, assemble
 from consistency.referee.sources.relative import Stretch, relative_recording
-from consistency.referee.sources.sheet import Places
 from consistency.referee.sources.windows import Relative
 from consistency.referee.types import Array
 
@@ -45,10 +44,8 @@ class TrajectorySource:
 class Match:
     """The estimates of one run that have truth and covariance."""
 
-    place: Places  # (k,)
+    track: Track
     t: Array  # (k,)
-    error: Array  # (k, 6)
-    P: Array  # (k, 6, 6)
     left_out: int
     angle: float  # rad, median of the rotation error
     bent: float  # sigma, median of what the interpolated truth may be off by
@@ -90,12 +87,11 @@ def recordings_of(
         return [relative_recording(source.path.stem, str(source.covariance), stretches, AXES, judged, relative)]
     shift, clocks, moved = clocks_and_frames(source.path.name, poses, r.time_offset, r.align, judged)
     poses = moved.runs
-    matches = [_match(one, *files, shift) for one, files in zip(poses, source.files, strict=True)]
-    columns, t = common_times([run.t for run in matches])
-    tracks = [
-        Track(i, c, run.place, run.error, run.P, t=run.t)
-        for i, (c, run) in enumerate(zip(columns, matches, strict=True))
+    matches = [
+        _match(run, one, *files, shift) for run, (one, files) in enumerate(zip(poses, source.files, strict=True))
     ]
+    columns, t = common_times([each.t for each in matches])
+    tracks = [replace(each.track, column=column) for each, column in zip(matches, columns, strict=True)]
     kind = poses[0].convention
     notes = [
         *_notes(source.path, matches, poses[0].max_dt),
@@ -107,22 +103,14 @@ def recordings_of(
     recordings = []
     for title, whole in parts.items():
         if part := [i for i in judged if i in whole]:
-            some = [_part(track, part) for track in tracks]
+            some = [track.part(part) for track in tracks]
             names, name = tuple(AXES[i] for i in part), f"{source.path.stem}{title}"
             recordings.append(moved.on(assemble(name, some, t, names, str(source.covariance), kind, notes)))
             notes = []
     return recordings
 
 
-def _part(track: Track, part: list[int]) -> Track:
-    if len(part) == len(AXES):
-        return track
-    assert track.error is not None
-    assert track.covariance is not None
-    return replace(track, error=track.error[:, part], covariance=track.covariance[:, part][:, :, part])
-
-
-def _match(poses: Poses, path: Path | str, truth: Path | str, shift: float) -> Match:
+def _match(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: float) -> Match:
     """The estimates of a run that have truth and covariance."""
     known = poses.known(shift)
     if not len(known.rows):
@@ -134,7 +122,9 @@ def _match(poses: Poses, path: Path | str, truth: Path | str, shift: float) -> M
     error = poses.error_of(rows, known.truth[kept])
     P = poses.covariance if len(rows) == len(poses.t) else poses.covariance[rows]
     doubts = _doubts(error, P, known.bend[kept])
-    return Match(poses.place.at(rows), poses.t[rows], error, P, len(poses.t) - len(rows), *doubts)
+    t = poses.t[rows]
+    track = Track(run, np.arange(len(rows)), poses.place.at(rows), error, P, t=t)
+    return Match(track, t, len(poses.t) - len(rows), *doubts)
 
 
 def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: float, relative: Relative) -> Stretch:

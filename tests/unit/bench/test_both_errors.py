@@ -19,12 +19,13 @@ from consistency.bench.runs.records import record_of
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.store.results import open_results
 from consistency.referee.cli import main
-from consistency.referee.diagnostics import Interval, Settings, map_score, sequential_design
+from consistency.referee.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.diagnostics.judging import judge_runs, with_map
 from consistency.referee.diagnostics.records import MapScore
 from consistency.referee.diagnostics.scale import ratio_interval
 from consistency.referee.document.map import map_text
 from consistency.referee.document.verdict import document
+from consistency.referee.gating.checks import of_results
 from consistency.referee.reading.columns import OWN_COVARIANCE
 from consistency.referee.show.json import render
 from consistency.referee.show.terminal import show
@@ -172,7 +173,18 @@ def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results: cs.Re
 def test_run_means_and_baselines_are_of_the_own_error(results: cs.Results) -> None:
     c = record_of(results, "right")
     np.testing.assert_allclose(run_means(c), np.nanmean(c.nees, axis=1), rtol=1e-12)
-    np.testing.assert_allclose(baseline(results).filters["right"].nees, run_means(c) / 3.0, rtol=1e-12)
+    of = baseline(results).filters["right"]
+    np.testing.assert_allclose(of.nees, run_means(c) / 3.0, rtol=1e-12)
+    world, counted = c.in_world, np.isfinite(c.nees)[..., None]
+    square = np.nanmean(np.where(counted, np.square(world.error), np.nan), axis=1)
+    np.testing.assert_allclose(of.squared, square, rtol=1e-12)
+
+
+def test_a_gate_has_the_own_error_alone(results: cs.Results) -> None:
+    record = of_results(results, "right")
+    verdict = judge(record)
+    assert (verdict.world, verdict.map, verdict.convention) == (None, None, None)
+    assert verdict.scale.mean_anees == analyse(results)["right"].scale.mean_anees
 
 
 def test_a_null_where_the_own_covariance_should_be(results: cs.Results) -> None:
@@ -199,6 +211,9 @@ def test_a_look_scores_the_maps_of_its_own_runs(results: cs.Results) -> None:
     record, design = record_of(results, "ekf-uvd"), sequential_design(3, max_runs=12)
     v = with_map(judge_runs(record, Settings(), design), record.ends, Settings(), design)
     assert (v.runs, v.map.runs) == (12, 12)
+    planned = replace(results, manifest=results.manifest | {"until_decided": {"dof": 3, "max_runs": 12}})
+    assert analyse(planned, ["ekf-uvd"])["ekf-uvd"].runs == 12
+    assert analyse(planned, ["ekf-uvd"], settings=Settings())["ekf-uvd"].runs == RUNS
 
 
 # --- the map ----------------------------------------------------------------------------------------

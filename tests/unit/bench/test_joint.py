@@ -253,3 +253,10 @@ def test_landmarks_that_only_some_runs_saw_count_in_the_joint_nees_alone(results
     assert label in whole.landmarks
     assert label not in part.landmarks
     assert part.joint.dof[0] == part.joint.dof[1] + 3
+
+
+def test_the_pose_beside_a_map_is_that_of_its_own_run(results: cs.Results) -> None:
+    later = replace(results, map=results.map[results.map["run"] > 1])
+    whole, part = (_evidence(r, "ekf-uvd") for r in (results, later))
+    np.testing.assert_array_equal(part.run_numbers, [2, 3, 4, 5])
+    np.testing.assert_array_equal(part.joint.pose, whole.joint.pose[2:])

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json as standard
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 
-from consistency.referee.diagnostics import Evidence, judge
+from consistency.referee.diagnostics import Comparison, Evidence, Interval, MapScore, judge
+from consistency.referee.diagnostics.comparison import Difference
+from consistency.referee.diagnostics.questions import ABOUT, ALONE
+from consistency.referee.diagnostics.records import JointScore, RejectionScore
+from consistency.referee.diagnostics.wording import reasons
 from consistency.referee.document.blocks import (
     Answer,
     Bullets,
@@ -28,14 +33,19 @@ from consistency.referee.document.blocks import (
     Text,
     table,
 )
+from consistency.referee.document.comparison import comparison_table
+from consistency.referee.document.guard import rejection_cells, rejection_text
 from consistency.referee.document.looks import style
+from consistency.referee.document.map import COLUMNS, map_cells, map_lines, map_text
+from consistency.referee.document.plan import plan_lines
 from consistency.referee.document.verdict import FURTHER, TERMINAL, cells, document, page, with_values
 from consistency.referee.document.wording import PLAIN, PRINTED, written
-from consistency.referee.show import FORMATS, json, junit, markdown, rendered, static, text
+from consistency.referee.show import FORMATS, json, junit, markdown, rendered, static, terminal, text
 
 INF, NAN = float("inf"), float("nan")
 GOOD = Reason("ekf", "consistent: no fault found", ("mean NEES 3.0",))
 BAD = Reason("a<b>", "overconfident: covariance too small & skewed\x1b", ("x | y", "z"), None, False, "tests/t.py::t")
+OTHER = Reason("p|q <i>", "consistent: as well")
 HEADS = (Column("filter"), Column("verdict"), Column("n", number=True), Column(""))
 TREE = Document(
     "Two `filters`",
@@ -45,7 +55,7 @@ TREE = Document(
         table(HEADS, [("ekf", Status("consistent"), Quantity(2.0), "")], "T"),
         table((Column("gate"), Column("why")), [("g", BAD)], "Gates"),
         Text("a paragraph", "Lead."),
-        Reasons((GOOD,)),
+        Reasons((GOOD, OTHER)),
     ),
     {"a": np.array([1.0, NAN]), "b": (np.int64(2), INF)},
 )  # fmt: skip
@@ -82,13 +92,13 @@ def test_a_cell_is_written_with_the_signs_of_its_medium(cell: Cell, plain: str, 
 
 
 def test_what_was_judged_is_found_wherever_it_stands() -> None:
-    assert list(TREE.reasons) == [BAD, GOOD]
+    assert list(TREE.reasons) == [BAD, GOOD, OTHER]
 
 
 def test_junit_has_a_case_for_each_verdict() -> None:
     suite = ET.fromstring(junit.render(TREE))[0]
-    assert suite.attrib == {"name": "Two `filters`", "tests": "2", "failures": "1", "errors": "0", "skipped": "0"}
-    bad, good = suite
+    assert suite.attrib == {"name": "Two `filters`", "tests": "3", "failures": "1", "errors": "0", "skipped": "0"}
+    bad, good, _ = suite
     assert (bad.attrib, good.attrib) == (
         {"classname": "tests/t.py::t", "name": "a<b>"},
         {"classname": "Two `filters`", "name": "ekf"},
@@ -105,9 +115,8 @@ def test_markdown_escapes_what_would_be_markup() -> None:
     assert said.startswith("## Two \\`filters\\`\n\nOne of them is honest.\n\n| filter | verdict | n |  |\n| --- | ---")
     assert "| ekf | consistent | 2.00 |  |" in said
     assert "| g | overconfident: covariance too small &amp; skewed |" in said
-    assert (
-        "Lead. a paragraph\n\n**ekf** is consistent: no fault found\n\n### A chapter\n\nin short\n\n#### More" in said
-    )
+    assert "Lead. a paragraph\n\n**ekf** is consistent: no fault found\n\n**p\\|q &lt;i>** is consistent" in said
+    assert "\n\n### A chapter\n\nin short\n\n#### More\n\n" in said
     assert said.endswith("- runs: 2\n\n- one\n- two\n\n")
 
 
@@ -187,3 +196,66 @@ def test_a_verdict_prints_itself_by_the_renderers() -> None:
     v = verdict_of(2.0)
     assert str(v).splitlines()[0] == f"f is {v.reasons[0]}"
     assert v._repr_html_().startswith(f"<div><p><strong>f</strong> is {v.reasons[0]}</p><table>")
+
+
+def test_a_terminal_has_words_of_verdicts_in_colour(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    terminal.show(*TREE.opening)
+    said = capsys.readouterr().out
+    assert said.splitlines()[1].split() == ["ekf", "consistent", "2.00"]
+    assert "\n\nekf is consistent: no fault found\n  - mean NEES 3.0\n\np|q <i> is" in said
+    assert terminal._cell(Status("consistent", " [x]")) == "[green]consistent[/green] \\[x]"
+
+
+# --- what else is put into rows ---------------------------------------------------------------------
+
+
+def test_the_score_of_a_map_in_every_view() -> None:
+    bare = MapScore(Interval(1.2, 0.9, 1.6), 5, 40, 2)
+    assert [written(cell) for cell in map_cells(bare)] == ["not judged", "1.20 [0.90, 1.60]", "–", "–", "5", "40", "2"]
+    assert map_text(bare) == "1.20 [0.90, 1.60] (2 of 42 landmarks left out)"
+    joint = JointScore(*(Interval(x, x / 2, 2 * x) for x in (1.0, 2.0, 3.0)), 5, 80)
+    judged = replace(bare, verdict=replace(verdict_of(1.0), joint=joint))
+    shown = dict(zip((column.head for column in COLUMNS), map(written, map_cells(judged)), strict=True))
+    assert shown["Pose and map together, NEES / dof"] == "1.00 [0.50, 2.00]"
+    assert shown["Map given the pose, NEES / dof"] == "3.00 [1.50, 6.00]"
+    assert map_lines({"a": bare, "b": judged, "c": replace(bare, landmarks=0)}) == [
+        f"map after the last step, mean NEES / 3: a {map_text(bare)}; b {judged.verdict.status}, {map_text(bare)} "
+        "(together with the pose 1.00)"
+    ]
+    assert map_lines({}) == []
+
+
+def test_what_a_guard_rejected() -> None:
+    share = Interval(0.5, 0.25, 0.75)
+    score = RejectionScore(share, Interval(0.9, 0.8, 1.0), Interval(0.01, 0.0, 0.02), 5, 200, 10, 20)
+    shown = [written(cell) for cell in rejection_cells(score)]
+    assert shown == ["200", "10", "20", "50.0 [25.0, 75.0]", "90.0 [80.0, 100]", "1.00 [0, 2.00]"]
+    assert "10 of them spurious: precision 50 [25, 75] %, recall 90" in rejection_text(score)
+    clean = replace(score, spurious=0)
+    assert [written(cell) for cell in rejection_cells(clean)][1:5] == ["–", "20", "–", "–"]
+    assert rejection_text(clean) == "20 of 200 observations (1 [0, 2] %)"
+
+
+PLAN = {"runs": 9, "false_alarm": 0.05, "power": 0.95, "detect": 1.5, "one_step": 30, "looks": [12, 24], "dof": 3}
+
+
+def test_heads_of_a_comparison_and_lines_of_a_plan() -> None:
+    c = Comparison(9, True, (Difference("mean NEES", 3.0, 4.0, 0.75, 0.5, 1.1),), 0.1, 0.1, 0.5, 0.05)
+    one, two = (comparison_table(*names, c) for names in (("a", "b"), ("a", "a")))
+    assert [column.head for column in one.columns][1:3] == ["a", "b (reference)"]
+    assert [column.head for column in two.columns][1:3] == ["now", "reference"]
+    assert list(one.rows) == [("mean NEES", "3", "4", "x0.75", "", "0.5 to 1.1")]
+    lost = plan_lines(PLAN | {"lost": 0.05, "lost_runs": 3})
+    assert lost[1] == "3 runs, none of them lost, show that at most 5 % of all are"
+    assert len(plan_lines(PLAN)) == 2
+    assert "too large by x2 " in plan_lines(PLAN | {"detect": 0.5})[0]
+
+
+def test_a_fault_of_one_question_alone_has_its_sentence() -> None:
+    v = verdict_of(1.0)
+    answers = tuple(replace(a, found=a.question == "distribution") for a in v.answers)
+    alone = replace(v, answers=answers, status="inconsistent")
+    assert reasons(alone)[0] == f"inconsistent: {ALONE['distribution']}"
+    both = tuple(replace(a, found=a.question in ("distribution", "outliers")) for a in v.answers)
+    assert ALONE["distribution"] not in reasons(replace(alone, answers=both))[0]
+    assert set(ALONE) <= set(ABOUT)

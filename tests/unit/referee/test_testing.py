@@ -17,6 +17,7 @@ import pytest
 
 import consistency as cs
 from consistency.referee.diagnostics import gate_runs
+from consistency.referee.gating.checks import checked, planned_dof
 from consistency.referee.types import Array
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
@@ -366,3 +367,10 @@ def test_results_need_a_filter_and_bring_the_rest(stereo: cs.Results) -> None:
         assert_consistent(stereo, filter="kf")
     with pytest.raises(ValueError, match="dof: results bring their own"):
         assert_consistent(stereo, filter="ekf-xyz", dof=3)
+
+
+def test_a_run_is_planned_for_the_fewest_degrees_of_freedom() -> None:
+    nis_dof = np.array([[2, 2, 0], [2, 2, 2]])
+    record = checked("f", nis=np.where(nis_dof, 2.0, np.nan), nis_dof=nis_dof, optimal_gain=True)
+    assert planned_dof(record) == 4
+    assert planned_dof(checked("f", nis=np.ones((2, 3)), nis_dof=2, nees=np.ones((2, 3)), dof=5)) == 5

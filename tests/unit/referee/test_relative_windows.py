@@ -18,7 +18,7 @@ from consistency.referee.geometry.groups import adjoint, composed, inverse, log,
 from consistency.referee.sources.relative import windows_of
 from consistency.referee.sources.windows import Relative, relative_of, windows
 from consistency.referee.types import Array
-from consistency.referee.verdicts.files import analyse_recordings
+from consistency.referee.verdicts.judge import analyse
 
 GROUPS = tuple(world.SIGMA)
 
@@ -133,7 +133,7 @@ def test_rows_without_truth_change_no_other_window(rng: np.random.Generator) -> 
     stretch, size = motion_stretch(drive(rng, "SE(2)", 12)), Relative(2, "step", True, True)
     there = np.delete(np.arange(13), 3)
     whole, some = windows_of(stretch, size), windows_of(replace(stretch, rows=there, truth=stretch.truth[there]), size)
-    same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.start[:, None] == some.start))
+    same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.track.t[:, None] == some.track.t))
     assert len(here) >= 4
     np.testing.assert_array_equal(some.error[here], whole.error[same])
     np.testing.assert_array_equal(some.covariance[here], whole.covariance[same])
@@ -171,8 +171,8 @@ def test_a_broken_row_is_a_failed_window(row: int, rng: np.random.Generator) -> 
     record = recorded([stretch], "5", True)
     assert [f.reason for f in record.failures] == [f"estimate is not finite (row {row})"]
     found = windows_of(stretch, Relative(5, "step", True))
-    assert (found.start[-1], found.t[-1]) == (stretch.t[row - 1], stretch.t[row])
-    verdict = analyse_recordings([record])["log"]
+    assert (found.track.t[-1], found.t[-1]) == (stretch.t[row - 1], stretch.t[row])
+    verdict = analyse([record])["log"]
     assert verdict.runs == (row - 1) // 5 + 1
     assert verdict.status != "consistent"
     assert any(f"1 of {verdict.runs} windows failed, first window {verdict.runs}: " in r for r in verdict.reasons)
@@ -193,8 +193,8 @@ def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
         stretch.estimate[0] = np.nan
         record = recorded([stretch], "1", False)
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
-        assert windows_of(stretch, Relative(1, "step")).start.tolist() == [stretch.t[0]]
-        assert analyse_recordings([record])["log"].status == "failed"
+        assert windows_of(stretch, Relative(1, "step")).track.t.tolist() == [stretch.t[0]]
+        assert analyse([record])["log"].status == "failed"
 
 
 def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None:
@@ -204,6 +204,10 @@ def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None
     truth = composed(np.concatenate([np.eye(3)[None], biased]))
     notes = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True).notes
     assert any("neighbouring windows go the same way" in note for note in notes)
+    steps = replace(relative_of("1", True), independent=False)  # type: ignore[type-var]
+    stretch = motion_stretch(replace(simulated, truth=truth))
+    undeclared = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), steps)
+    assert not any("neighbouring" in note for note in undeclared.notes)
     jitter = simulated.truth @ exp(rng.normal(size=(201, 3)) * [0.3, 0.3, 0.0])
     notes = recorded([motion_stretch(replace(simulated, truth=jitter))], "1", True).notes
     assert any("neighbouring windows go opposite ways" in note for note in notes)
@@ -223,7 +227,7 @@ def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng: np.random.Ge
     truth = composed(np.concatenate([np.eye(3)[None], moved]))
     record = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True)
     assert any("errors of neighbouring windows are of like size" in note for note in record.notes)
-    verdict = analyse_recordings([record])["log"]
+    verdict = analyse([record])["log"]
     assert verdict.reasons[0].endswith("the motions do not seem to be independent, on which this rests")
     plain_one = recorded([motion_stretch(drive(rng, "SE(2)", 19))], "1", True)
     assert (plain_one.caption, plain_one.unshown) == ("", "")
@@ -252,7 +256,7 @@ def test_a_broken_estimate_has_no_error(rng: np.random.Generator) -> None:
     stretch = motion_stretch(drive(rng, "SE(2)", 9))
     stretch.estimate[7, 1] = np.nan
     found = windows_of(stretch, Relative(3, "step", True))
-    assert (found.start.tolist(), found.t.tolist()) == (stretch.t[[0, 3, 6]].tolist(), stretch.t[[3, 6, 7]].tolist())
+    assert (found.track.t.tolist(), found.t.tolist()) == (stretch.t[[0, 3, 6]].tolist(), stretch.t[[3, 6, 7]].tolist())
     assert np.isfinite(found.error[:2]).all()
     assert np.isnan(found.error[2]).all()
     assert np.isnan(found.covariance[2]).all()
@@ -275,6 +279,22 @@ def test_poses_need_a_cross_covariance_of_the_very_next_row(rng: np.random.Gener
         windows_of(stretch, relative_of("2"))  # type: ignore[arg-type]
     with pytest.raises(cs.InputError, match="poses: --relative: covariances of two poses do not tell"):
         windows_of(replace(stretch, cross=None), Relative(1, "step"))
+
+
+def test_runs_have_windows_by_their_times_where_those_are_known(rng: np.random.Generator) -> None:
+    """The second run has no truth before its fifth row, and so no first two windows."""
+    first, second = (motion_stretch(drive(rng, "SE(2)", 12), run) for run in range(2))
+    late = replace(second, rows=second.rows[4:], truth=second.truth[4:])
+    record = recorded([first, late], "2", True)
+    np.testing.assert_allclose(record.t, first.t[[2, 4, 6, 8, 10, 12]])
+    assert record.error is not None
+    np.testing.assert_array_equal(np.isnan(record.error[:, :, 0]).sum(axis=1), [0, 2])
+    assert np.isnan(record.error[1, :2]).all()
+    timeless = [replace(each, t=np.full(13, np.nan)) for each in (first, late)]
+    record = recorded(timeless, "2", True)
+    assert np.isnan(record.t).all()
+    assert record.error is not None
+    assert np.isnan(record.error[1, 4:]).all()
 
 
 # --- notes ---------------------------------------------------------------------------------------------
@@ -338,6 +358,7 @@ def test_few_windows_that_are_only_declared_decide_nothing(rng: np.random.Genera
         "steps of their run, however they depend on each other"
     )
     assert enough.unshown == ""
+    assert "log: errors of different windows are declared to be independent: each window is a run" in few.notes
     assert declared(rng, 1).unshown.startswith("1 window is too few windows")
 
 

@@ -15,7 +15,7 @@ from recorded import read_recordings
 import consistency as cs
 from consistency.referee.cli import main as command
 from consistency.referee.diagnostics import Record
-from consistency.referee.diagnostics.skipping import Skip, skip_of
+from consistency.referee.diagnostics.skipping import Skip, Skipped, skip_of, without_first
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -148,6 +148,16 @@ def test_a_run_of_which_nothing_is_left_is_named(errors: Array, tmp_path: Path) 
     verdict = cs.judge(cs.read(tmp_path / "short.npz"), skip=FIRST)
     assert verdict.statistics["skipped_runs"] == 1
     assert any("nothing is left of 1 run;" in reason for reason in verdict.reasons)
+
+
+def test_a_run_that_had_nothing_has_lost_nothing() -> None:
+    """Of a whole run, one of two steps and one without a value, the second alone is emptied."""
+    nees = np.ones((3, 5))
+    nees[1, 2:] = nees[2] = np.nan
+    left, lost = without_first(Skip(2), {"nees": nees, "nis_dof": np.full((3, 5), 4)}, "mine")
+    assert lost == Skipped(Skip(2), steps=2, empty=1)
+    np.testing.assert_array_equal(np.isfinite(left["nees"]), [[False] * 2 + [True] * 3, [False] * 5, [False] * 5])
+    assert left["nis_dof"].tolist() == [[0, 0, 4, 4, 4]] * 3
 
 
 def test_refusals(archive: Path, tmp_path: Path, errors: Array) -> None:

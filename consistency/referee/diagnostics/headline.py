@@ -162,15 +162,16 @@ def _contradicted(settings: Settings, sample: Sample, tests: Tests) -> bool:
     """Does an axis err in the other direction than the whole?
 
     Any does where the whole is too large, because nothing is too small in a conservative covariance. Where it is too
-    small, one that is farther from 1 than the whole; or all that err, so that correlations make the whole too small.
+    small, one that is farther from 1 than the whole, or all together, so that correlations make the whole too small.
     """
     if settings.one_sided or sample.errors is None:
         return False
     whole = float(np.log(max(tests.main.ratio, TINY)))
     ratios = {axis: tests.axes[axis].ratio for axis in sample.errors.names}
     wrong = [ratios[axis] for axis in ratios if tests.axes[axis].p_value * len(tests.axes) <= settings.false_alarm]
+    farther = -np.log(max(min(ratios.values()), TINY)) > whole
     if whole > 0.0 and wrong and max(wrong) < 1.0:
-        return True
+        return bool(farther or len(wrong) == len(ratios))
     if _by_axis(settings, tests) != "inconsistent":
         return False
-    return whole < 0.0 or -np.log(max(min(ratios.values()), TINY)) > whole
+    return bool(whole < 0.0 or farther)

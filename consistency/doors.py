@@ -13,7 +13,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 DOORS = {
-    "diagnostics": "referee",
+    **dict.fromkeys(("diagnostics", "errors"), "referee"),
     **dict.fromkeys(
         ("challenging", "filters", "protocols", "runs", "scenario", "simulation", "store", "sweeps", "tuning", "types"),
         "bench",

@@ -30,11 +30,11 @@ highlight_language = "none"  # an indented block is a command or what it prints
 nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!consistency[.:]).*"),  # types and modules of others, or an alias of arrays
-    (
-        r"py:class",
-        r"consistency\..*\.(Backend|DisparityGrowth|Group|Lens|Moments|Observations|Parts|Space|Sweep|Tables)",
-    ),  # in signatures, not public
-    (r"py:class", r"consistency\.imaging\.\w+\.(Correspondence|Filter|Selection|Tracking)"),  # stages of the chain
+    # in signatures, not public
+    (r"py:class", r"consistency\..*\.(Backend|DisparityGrowth|Lens|Moments|NoiseGroup|Observations|Parts)"),
+    (r"py:class", r"consistency\..*\.(Results|Source|Space|Sweep|Tables)"),
+    # stages of the chain
+    (r"py:class", r"consistency\.stereo\.imaging\.\w+\.(Correspondence|FeatureSelection|ObservationFilter|Tracking)"),
 ]
 
 # pages

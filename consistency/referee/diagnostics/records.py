@@ -341,7 +341,7 @@ class Verdict:
     landmarks: Indices | None = None  # (steps,), of the verdict on a map: what stands in the place of steps
     joint: JointScore | None = None  # of the verdict on a map
     rejection: RejectionScore | None = None  # of a filter with a guard
-    unit: str = "run"  # what a run is called, as in :class:`~consistency.diagnostics.record.Record`
+    unit: str = "run"  # what a run is called, as in :class:`~consistency.diagnostics.Record`
     lost: Lost | None = None  # where there is a NEES
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
     skipped: Skipped | None = None  # first steps of each run that were left out
@@ -443,8 +443,6 @@ class Verdict:
         return f"<Verdict {self.filter}: {self.status}, {self.runs} runs x {self.steps} steps; print() shows it>"
 
     def _repr_html_(self) -> str:
-        return _shown(self, "static")
-
         return _shown(self, "static") + ("" if self.record is None else shown_by("picture_html", self.record, self))
 
     def plot(self, path: str | Path | None = None) -> Any:

@@ -40,7 +40,7 @@ def render_pdf(document: blocks.Document) -> bytes:
             "chapters": [_chapter(chapter, folder) for chapter in document.chapters],
         }
         (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
-        template = resources.files("consistency.referee.show").joinpath("templates", TEMPLATE)
+        template = resources.files("consistency.referee.show").joinpath("templates").joinpath(TEMPLATE)
         (folder / TEMPLATE).write_text(template.read_text(encoding="utf-8"), encoding="utf-8")
         pdf: bytes = typst.compile(str(folder / TEMPLATE), root=str(folder), ignore_system_fonts=True)
         return pdf

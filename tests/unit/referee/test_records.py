@@ -12,6 +12,7 @@ from draws import identities, independent, verdict_on
 from consistency.referee.diagnostics import Answer, Equivalence, Evidence, Interval, Settings, Verdict, judge, records
 from consistency.referee.diagnostics.questions import ABOUT, MAIN, OF_MAP, SHARES, answers
 from consistency.referee.diagnostics.records import Innovations
+from consistency.referee.diagnostics.skipping import Skip, Skipped
 from consistency.referee.types import Array
 
 # --- settings ------------------------------------------------------------------------------------------
@@ -203,3 +204,16 @@ def test_nothing_that_is_given_is_changed() -> None:
     judge(Evidence("f", error, covariance, nees=nees), Settings(subsets={"two": [0, 2]}))
     for old, new in zip(before, [error, covariance, nees], strict=True):
         np.testing.assert_array_equal(old, new)
+
+
+# --- evidence ------------------------------------------------------------------------------------------
+
+
+def test_steps_without_full_rank_are_counted_from_one(rng: np.random.Generator) -> None:
+    error, nees = independent(rng, 3, 6, 2), np.ones((3, 6))
+    nees[0, :2] = nees[1, 3] = nees[2, 5] = np.nan
+    error[2, 5] = np.nan  # a run that has ended
+    evidence = Evidence("f", error, nees=nees)
+    assert evidence.left_out_steps == [1, 2, 4]
+    assert replace(evidence, skipped=Skipped(Skip(1.0), 1)).left_out_steps == [2, 4]
+    assert Evidence("f", nees=nees, dof=2).left_out_steps == []

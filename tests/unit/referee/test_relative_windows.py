@@ -204,7 +204,7 @@ def test_neighbours_that_go_together_are_named(rng: np.random.Generator) -> None
     truth = composed(np.concatenate([np.eye(3)[None], biased]))
     notes = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True).notes
     assert any("neighbouring windows go the same way" in note for note in notes)
-    steps = replace(relative_of("1", True), independent=False)  # type: ignore[type-var]
+    steps = Relative(1, "step", True)
     stretch = motion_stretch(replace(simulated, truth=truth))
     undeclared = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), steps)
     assert not any("neighbouring" in note for note in undeclared.notes)
@@ -276,7 +276,7 @@ def test_the_first_row_of_motions_is_only_where_they_start(rng: np.random.Genera
 def test_poses_need_a_cross_covariance_of_the_very_next_row(rng: np.random.Generator) -> None:
     stretch = pose_stretch(rng, "SE(2)", 9, 5, 1.0, 0)
     with pytest.raises(cs.InputError, match=r"^row 2: --relative 2: the window spans 2 rows, .* reaches one row back"):
-        windows_of(stretch, relative_of("2"))  # type: ignore[arg-type]
+        windows_of(stretch, Relative(2, "step"))
     with pytest.raises(cs.InputError, match="poses: --relative: covariances of two poses do not tell"):
         windows_of(replace(stretch, cross=None), Relative(1, "step"))
 
@@ -324,7 +324,7 @@ def test_windows_that_are_left_out_are_counted(rng: np.random.Generator) -> None
     there = np.delete(np.arange(13), 3)
     some = [replace(stretch, rows=there, truth=stretch.truth[there]) for stretch in stretches]
     size = "0.1s"
-    found = [windows_of(stretch, relative_of(size, True)) for stretch in some]  # type: ignore[arg-type]
+    found = [windows_of(stretch, Relative(0.1, "s", True, True)) for stretch in some]
     assert [each.left_out for each in found] == [1, 1]
     said = "log: 2 windows left out, too long because rows or truth are missing"
     assert said in recorded(some, size, True).notes

@@ -191,12 +191,13 @@ def test_the_camera_before_rectification_is_where_its_calibration_puts_it(tmp_pa
 def test_images_of_kitti_raw_before_rectification(tmp_path: Path) -> None:
     """x_i = R_i x_0 + T_i, so that x_1 = R x_0' + T of the left camera's axes; the size of the images decides."""
     path = tmp_path / "calib_cam_to_cam.txt"
-    path.write_text(cam_to_cam())
+    path.write_text(cam_to_cam(D_01="-0.2 0.05 0.003 0.004 -0.01"))
     c = read_calibration(path, "image_00", "image_01", FULL)
     np.testing.assert_allclose(c.R, R_1 @ R_0.T, atol=1e-9)
     np.testing.assert_allclose(c.T, T_1, atol=1e-9)
     assert c.K_left[0, 0] == pytest.approx(1.1 * K[0, 0])
-    assert c.D_right.tolist() == pytest.approx([-0.3, 0.1, 0.001, 0.002, -0.05])
+    assert c.D_left.tolist() == pytest.approx([-0.3, 0.1, 0.001, 0.002, -0.05])
+    assert c.D_right.tolist() == pytest.approx([-0.2, 0.05, 0.003, 0.004, -0.01])
     assert rectify(c, FULL).rig.baseline == pytest.approx(np.linalg.norm(T_1))
     assert not read_calibration(path, "image_00", "image_01", SIZE).D_left.any()
     with pytest.raises(

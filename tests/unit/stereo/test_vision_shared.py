@@ -95,6 +95,7 @@ def test_a_late_clock_errs_by_the_change_of_the_motion(rng: np.random.Generator)
     """The motions grow by 0.1 m a frame of 0.1 s: 10 ms are 10 mm."""
     J = sensitivities(TURNED, drive(rng), 0.1 * np.arange(4.0))
     np.testing.assert_allclose(0.01 * J[:, 2, -1], 0.01, rtol=0.01)
+    assert not sensitivities(TURNED, drive(rng, 1), 0.1 * np.arange(2.0))[:, :, -1].any()  # nothing to change from
 
 
 def test_a_bridge_errs_as_its_neighbours_do(rng: np.random.Generator) -> None:

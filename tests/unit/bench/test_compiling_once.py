@@ -120,7 +120,7 @@ def variables() -> list[list[str]]:
     a, b, c, d = (numba_ir.Var(None, name, loc) for name in "abcd")
     call = numba_ir.Expr.call(a, (b, c), (("key", d), ("other", a)), loc, vararg=b)
     mapping = numba_ir.Expr.build_map([(a, b), (c, d)], 2, {"key": c}, [], loc)
-    assigned = [call, mapping, b, numba_ir.Const(1.0, loc)]
+    assigned = [call, mapping, b, numba_ir.Const(1.0, loc), numba_ir.Yield(c, loc, 1)]
     others = [call, numba_ir.Print([a, b], None, loc), numba_ir.SetItem(a, b, c, loc), numba_ir.Jump(1, loc)]
     instructions = [*(numba_ir.Assign(value, a, loc) for value in assigned), *others, numba_ir.Return(d, loc)]
     return [[each.name for each in instruction.list_vars()] for instruction in instructions]

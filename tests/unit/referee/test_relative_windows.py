@@ -193,6 +193,7 @@ def test_a_log_that_is_broken_from_the_start(rng: np.random.Generator) -> None:
         stretch.estimate[0] = np.nan
         record = recorded([stretch], "1", False)
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
+        assert not any("first order" in note for note in record.notes)
         assert windows_of(stretch, Relative(1, "step")).track.t.tolist() == [stretch.t[0]]
         assert analyse([record])["log"].status == "failed"
 

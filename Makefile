@@ -1,7 +1,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: docs house house-write tutorial reproduce calibrate calibrate-quick calibrate-alignment calibrate-alignment-quick regime test test-quick test-all bench lint format clean
+.PHONY: docs house house-write tutorial case-studies case-studies-rates reproduce calibrate calibrate-quick calibrate-alignment \
+	calibrate-alignment-quick regime test test-quick test-all bench lint format clean
 
 # matrices are small and work is divided among processes: further threads of BLAS would wait for each other
 export OPENBLAS_NUM_THREADS ?= 1
@@ -44,6 +45,12 @@ regime: .venv/.done
 	$(BIN)/consistency sweep regime $(addprefix --filter ,$(RECURSIVE)) --out reports/regime
 	cp reports/regime/map.json reports/reference/regime.json
 
+case-studies:
+	$(PYTHON) docs/case-studies/run.py $(ONLY)
+
+case-studies-rates:
+	$(PYTHON) docs/case-studies/run.py --rates $(ONLY)
+
 docs: .venv/.done
 	$(BIN)/python -m sphinx -q -E -W --keep-going -d docs/_build/doctrees docs docs/_build/html
 	$(BIN)/python docs/check.py docs/_build/html
@@ -73,4 +80,4 @@ format: .venv/.done
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf .venv dist build docs/_build docs/generated .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .env-new .env-old dist build docs/_build docs/generated .pytest_cache .mypy_cache .ruff_cache

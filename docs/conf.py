@@ -25,7 +25,8 @@ extensions = [
     "outside",
 ]
 root_doc = "index"
-exclude_patterns = ["_build", "examples/README.md", "gallery", "generated/gallery/*.ipynb", "generated/gallery/*.json"]
+exclude_patterns = ["_build", "case-studies", "examples/README.md", "gallery"]
+exclude_patterns += ["generated/gallery/*.ipynb", "generated/gallery/*.json"]
 highlight_language = "none"  # an indented block is a command or what it prints
 nitpicky = True
 nitpick_ignore_regex = [

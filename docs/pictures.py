@@ -1,4 +1,4 @@
-"""Draws the pictures of README.md from scripts of the gallery: `python docs/pictures.py`, about ten seconds."""
+"""Draws pictures of README.md and of the case studies by scripts of the gallery: `python docs/pictures.py`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ sys.path.insert(0, str(DOCS / "_extensions"))
 
 from figures import plain_look, save  # noqa: E402 - in the folder above
 
-PICTURES = ("gtsam_imu", "nine_centimetres", "regime", "own_file", "ellipses")
+PICTURES = ("gtsam_imu", "case_studies", "nine_centimetres", "regime", "own_file", "ellipses")
 
 if __name__ == "__main__":
     for name in PICTURES:

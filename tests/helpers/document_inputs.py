@@ -29,7 +29,7 @@ DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 STUDY = "takes from half a minute to hours even with two runs; tests of its experiment run its parts"
 REAL = "needs real drives; tests that look for CONSISTENCY_DATA run it"
 NOT_RUN = [
-    ("docs/case-studies.md", "python docs/case-studies", "needs gtsam; tests/oracle/test_gtsam_imu.py runs it"),
+    ("docs/case-studies.md", "python docs/case-studies", "needs the libraries; tests/oracle/test_case_studies_live.py"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
     ("docs/cluster.md", "", "needs a cluster; tests/smoke/test_dask_cli.py and unit/bench/test_slurm.py stand in"),
     ("docs/compiling.md", "consistency compile", "compiles many filters; tests/smoke/test_compile_cli.py compiles one"),

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.reading.options import Reading
 from consistency.referee.sources import read_recordings
+from consistency.referee.sources.archive import record_of_arrays
 from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import settings_of, skip_asked
 
@@ -78,11 +81,29 @@ def read(
     return named[name]
 
 
-def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | None = None, **settings: Any) -> Verdict:
-    """Judge a record: consistent, overconfident, conservative, undecided, ..., with reasons.
+def judge(
+    record: Record | str | Path | ArrayLike,
+    covariances: ArrayLike | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    independent: bool = False,
+    name: str = "estimator",
+    optimal_gain: bool = False,
+    skip: str | float | None = None,
+    **settings: Any,
+) -> Verdict:
+    """Judge a record, a file, or arrays: consistent, overconfident, conservative, undecided, ..., with reasons.
 
     Parameters
     ----------
+    record : of :func:`read`; or a path, which is read without options; or errors (runs, steps, n), truth minus
+        estimate. A run whose error is not finite, or whose covariance is not positive definite, has failed in that
+        step: it is counted, and the others are judged. Steps in which the covariance of a run is singular, as at a
+        start that is known exactly, are left out up to the first of full rank.
+    covariances : (runs, steps, n, n), beside errors
+    axes : (n,) names of the components of errors
+    independent : errors are (N, n) and covariances (N, n, n), and each row is an independent run of one step
+    name : of the estimator, in messages; arrays alone
     optimal_gain : True if the filter has an optimal gain and gates nothing away: its innovations are then judged
     skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
     settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow``, ``lost`` of
@@ -91,8 +112,15 @@ def judge(record: Record, *, optimal_gain: bool = False, skip: str | float | Non
     Raises
     ------
     InputError
-        A setting out of its range, or nothing is left.
+        A setting out of its range, or nothing is left; shapes that do not fit, a covariance that is not symmetric, a
+        step that is not finite in any run.
     """
+    if covariances is not None:
+        record = record_of_arrays(cast(ArrayLike, record), covariances, axes, name, independent)
+    elif isinstance(record, (str, Path)):
+        record = read(record)
+    elif not isinstance(record, Record):
+        raise InputError("covariances: needed beside errors, (runs, steps, n, n)")
     record = record.without_first(skip_asked(skip))
     verdict = analyse([record], settings=settings_of(**settings), optimal_gain=optimal_gain)[record.name]
     return replace(verdict, record=record)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics import Evidence, Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.reading import is_file, reading, require_name, require_room
@@ -34,7 +37,45 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
     (runs,), the number of steps of each run, where they differ. With ``relative`` estimates and truth are planar
     poses, or estimates are motions; ``cross_covariances`` (runs, steps, 3, 3) are those with the step before.
     """
-    arrays = load_arrays(path)
+    return [_of_arrays(path, load_arrays(path), convention, relative)]
+
+
+def record_of_arrays(
+    errors: ArrayLike, covariances: ArrayLike, axes: Sequence[str] | None, name: str, independent: bool
+) -> Record:
+    """Errors and covariances in memory as a record, like those of an archive; see :func:`consistency.judge`."""
+    arrays: dict[str, Array] = {}
+    for key, value in (("errors", errors), ("covariances", covariances)):
+        arrays[key] = _in_memory(key, value)[:, None] if independent else _in_memory(key, value)
+    shape = arrays["errors"].shape
+    if len(shape) == 2:
+        raise InputError(
+            f"errors has shape {shape}, needs (runs, steps, n): errors[None] and covariances[None] are one run of many "
+            "steps; independent=True says that each row is a run of its own, which the steps of a log are not"
+        )
+    for key, array in arrays.items():
+        never = ~np.isfinite(array).reshape(*array.shape[:2], -1).all(axis=-1).any(axis=0)
+        if never.any():
+            step = int(np.argmax(never)) + 1
+            raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
+    if axes is not None:
+        arrays["axes"] = np.asarray(axes, str)
+    record = _of_arrays(Path("arrays"), arrays)
+    failures = tuple(replace(failure, filter=name) for failure in record.failures)
+    return replace(record, name=require_name(name, "name"), failures=failures)
+
+
+def _in_memory(key: str, value: ArrayLike) -> Array:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{key}: not an array of numbers with as many steps in each run; pad runs with NaN") from None
+
+
+def _of_arrays(
+    path: Path, arrays: dict[str, Array], convention: str | None = None, relative: Relative | None = None
+) -> Record:
+    """The record of arrays by key; ``path`` names it in messages."""
     kind = next((keys for keys in NEEDED if set(keys) <= set(arrays)), None)
     if kind is None:
         raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(arrays)) or 'nothing'}")
@@ -46,7 +87,7 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
     if relative is not None and kind != NEEDED[1]:
         raise InputError(f"{path}: --relative needs the keys {', '.join(NEEDED[1])}, of poses or motions")
     if kind == NEEDED[2]:
-        return [_of_nees(path, arrays)]
+        return _of_nees(path, arrays)
     covariances = _array(path, arrays, "covariances", 4)
     if kind == NEEDED[0]:
         error, error_kind = _array(path, arrays, "errors", 3), ""
@@ -61,7 +102,7 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
             raise InputError(f"--error {error_kind}: here it is 'vector', or so2, left or right for x, y, heading")
         _require_truth(path, truth, estimates)
         if relative is not None:
-            return [_relative(path, arrays, estimates, truth, covariances, convention or "so2", relative)]
+            return _relative(path, arrays, estimates, truth, covariances, convention or "so2", relative)
         error = planar_error(truth, estimates, error_kind) if n == 3 else truth - estimates
     runs, steps, n = error.shape
     if covariances.shape != (runs, steps, n, n):
@@ -82,7 +123,7 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
     if given == "vector":
         remedy = "add --error so2, if these are x, y, heading" if error_kind and n == 3 else "wrap it to [-pi, pi]"
         notes += turns(path.stem, axes, error, covariances, remedy)
-    return [assemble(path.stem, tracks, step_times(path, arrays, steps), axes, str(path), error_kind, notes)]
+    return assemble(path.stem, tracks, step_times(path, arrays, steps), axes, str(path), error_kind, notes)
 
 
 def _poses(place: Places, estimate: Array, covariance: Array, truth: Array, convention: str) -> Poses:

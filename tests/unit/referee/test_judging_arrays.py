@@ -1,0 +1,100 @@
+"""``cs.judge`` of arrays and files: failed runs are counted, misuse is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from draws import identities, independent
+
+import consistency as cs
+from consistency.referee.types import Array
+
+RUNS, STEPS = 60, 20
+SURE = 1e-6  # false-alarm rate of a verdict
+
+
+@pytest.fixture
+def error(rng: np.random.Generator) -> Array:
+    return independent(rng, RUNS, STEPS, 2)
+
+
+def test_arrays_are_judged(error: Array, tmp_path: Path) -> None:
+    verdict = cs.judge(error, identities(error), axes=["x", "y"], name="my.filter", false_alarm=SURE)
+    assert (verdict.status, verdict.filter, verdict.runs, verdict.steps) == ("consistent", "my.filter", RUNS, STEPS)
+    assert verdict.axes is not None
+    assert verdict.axes.names == ("x", "y")
+    assert cs.judge(2.0 * error, identities(error), false_alarm=SURE).status == "overconfident"
+    assert verdict.record is not None
+    np.testing.assert_array_equal(verdict.record.error, error)
+    np.savez(tmp_path / "mine.npz", errors=error, covariances=identities(error), axes=["x", "y"])
+    read = cs.judge(str(tmp_path / "mine.npz"), false_alarm=SURE)
+    assert read.reasons == verdict.reasons
+    assert cs.judge(tmp_path / "mine.npz").filter == "mine"
+
+
+def test_failed_runs_are_counted_and_the_others_judged(error: Array) -> None:
+    P = identities(error).copy()
+    error[3, 12:] = np.nan
+    P[7, 4] = -np.eye(2)
+    P[9, 0, 0, 0] = np.inf
+    verdict = cs.judge(error, P, name="mine", false_alarm=SURE)
+    assert verdict.status == "failed"
+    assert [(f.filter, f.run, f.step) for f in verdict.failures] == [("mine", 3, 13), ("mine", 7, 5), ("mine", 9, 1)]
+    assert [f.reason.partition(" (")[0] for f in verdict.failures] == [
+        "estimate is not finite", "covariance is not positive definite", "covariance is not finite",
+    ]  # fmt: skip
+    assert verdict.reasons[0].startswith("failed: 3 of 60 runs failed, first run 3 in step 13")
+    assert verdict.scale is not None
+    assert verdict.scale.alive.tolist() == [59] * 4 + [58] * 8 + [57] * 8
+    fault = cs.judge(3.0 * error, P, false_alarm=SURE)
+    assert fault.status == "overconfident"
+    assert "3 of 60 runs failed" in fault.reasons[1]
+
+
+def test_a_known_start_is_left_out_by_name(error: Array) -> None:
+    P = identities(error).copy()
+    P[:, 0], P[:, 1, 1] = 0.0, 0.0
+    verdict = cs.judge(error, P, false_alarm=SURE)
+    assert verdict.left_out_steps == (1, 2)
+    assert not verdict.failures
+
+
+def test_rows_are_runs_only_where_that_is_said(rng: np.random.Generator) -> None:
+    error = independent(rng, 300, 1, 2)[:, 0]
+    P = np.broadcast_to(np.eye(2), (300, 2, 2))
+    verdict = cs.judge(error, P, independent=True, false_alarm=SURE)
+    assert (verdict.status, verdict.runs, verdict.steps) == ("consistent", 300, 1)
+    with pytest.raises(cs.InputError, match=r"errors\[None\] and covariances\[None\] are one run of many"):
+        cs.judge(error, P)
+    assert cs.judge(error[None], P[None]).runs == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda e, P: (e, P[:, :, :1]), "key 'covariances' has shape"),
+        (lambda e, P: (e, P + np.array([[0.0, 0.1], [0.0, 0.0]])), "not symmetric"),
+        (lambda e, P: (e, 0.0 * P), "zero in every step"),
+        (lambda e, P: ([[1.0, 2.0], [3.0]], P), "^errors: not an array of numbers"),
+        (lambda e, P: (e, [["a"]]), "^covariances: not an array of numbers"),
+        (lambda e, P: (np.where(np.arange(STEPS)[:, None] >= 11, np.nan, e), P), "^errors, step 12: not finite in any"),
+        (
+            lambda e, P: (e, np.where(np.arange(STEPS)[:, None, None] == 4, np.inf, P)),
+            "^covariances, step 5: not finite",
+        ),
+        (lambda e, P: (e, None), "^covariances: needed beside errors"),
+    ],
+)
+def test_misuse_is_refused(error: Array, change: Callable[..., tuple[Array, Array]], why: str) -> None:
+    with pytest.raises(cs.InputError, match=why):
+        cs.judge(*change(error, identities(error)))
+
+
+def test_names_are_checked(error: Array) -> None:
+    with pytest.raises(cs.InputError, match="'axes' names 1 components, the error has 2"):
+        cs.judge(error, identities(error), axes=["x"])
+    with pytest.raises(cs.InputError, match=r"^name"):
+        cs.judge(error, identities(error), name="a\nb")

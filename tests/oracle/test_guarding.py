@@ -190,7 +190,7 @@ def agree(name: str, scenario: cs.Scenario, rng: np.random.Generator) -> None:
     assert ours.rejected.tolist() == twin.rejected.tolist()
     assert (ours.rejected & trial.spurious).any()
     assert ours.rejected[first_sightings(trial)].any()  # of landmarks that began anew
-    assert difference(ours, twin) < 1e-8  # rounding, which what is wrong and accepted amplifies
+    assert difference(ours, twin) < 1e-7  # rounding, which what is wrong and accepted amplifies; 2e-8 on one processor
     assert ours.nis_dof.tolist() == twin.nis_dof.tolist()
     assert ours.map is not None
     assert twin.map is not None

@@ -217,8 +217,8 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, name: str) -> None:
     code = f"""
 import signal, sys
 from consistency.referee.cli import main
-from consistency.bench.runs.work import Work
-one, count = Work.__call__, []
+from consistency.bench.runs.work import TrialWork
+one, count = TrialWork.__call__, []
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell runs in the background
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup
 def interrupt(work, run):
@@ -226,7 +226,7 @@ def interrupt(work, run):
     if len(count) == 4:
         signal.raise_signal(signal.{name})
     return one(work, run)
-Work.__call__ = interrupt
+TrialWork.__call__ = interrupt
 main({["run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--jobs", "1", "--out", "out"]!r})
 """
     stopped = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)

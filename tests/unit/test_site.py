@@ -152,10 +152,10 @@ def test_every_public_name_stands_in_the_reference() -> None:
     gates = [name for name, value in vars(testing).items() if getattr(value, "__module__", "") == testing.__name__]
     public = {f"consistency.{name}" for name in consistency.__all__}
     public |= {f"consistency.testing.{name}" for name in gates if not name.startswith("_")}
-    public |= {f"consistency.stereo.vision.{name}" for name in vision.__all__}
+    public |= {f"consistency.vision.{name}" for name in vision.__all__}
     at_top = {id(getattr(consistency, name)) for name in consistency.__all__}
     public |= {
-        f"consistency.referee.diagnostics.{name}"
+        f"consistency.diagnostics.{name}"
         for name in diagnostics.__all__
         if id(getattr(diagnostics, name)) not in at_top
     }
@@ -252,9 +252,9 @@ def test_a_script_stands_by_itself_and_leaves_a_figure(script: Path) -> None:
     modules = re.findall(r"^(?:from|import) (consistency\S*)", text, re.MULTILINE)
     public = {
         "consistency",
-        "consistency.referee.diagnostics",
-        "consistency.stereo.vision",
-        "consistency.bench.sweeps.regime",
+        "consistency.diagnostics",
+        "consistency.sweeps.regime",
+        "consistency.vision",
     }
     assert set(modules) <= public
 

@@ -209,14 +209,14 @@ def test_sources_that_the_bits_depend_on_count_and_others_do_not(
     assert remote.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
     monkeypatch.setattr(remote, "PACKAGE", tmp_path)
     seen = [own()]
-    for room in ("geometry", "models", "scenario", "simulation", "filters"):
+    for room in ("referee/geometry", "bench/models", "bench/scenario", "bench/simulation", "bench/filters"):
         (tmp_path / room / "inner").mkdir(parents=True)
         (tmp_path / room / "inner" / "source.py").write_text(f"x = '{room}'")
         seen.append(own())
     assert len(set(seen)) == len(seen)
     assert re.search(r"\(sources [0-9a-f]{12}\)$", own())
-    (tmp_path / "reporting").mkdir()
-    (tmp_path / "reporting" / "source.py").write_text("x = 1")
+    (tmp_path / "bench" / "pages").mkdir()
+    (tmp_path / "bench" / "pages" / "source.py").write_text("x = 1")
     assert own() == seen[-1]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import operator
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -10,7 +9,6 @@ from typing import Any, ClassVar, NamedTuple
 import numba
 import numpy as np
 import pytest
-from llvmlite import ir as llvm
 from numba import types
 from numba.core import compiler, ir, targetconfig
 from numba.core.registry import cpu_target
@@ -20,7 +18,6 @@ from numba.core.types import functions
 import consistency as cs
 from consistency.bench.filters.kernel import arrays, jit
 from consistency.bench.filters.kernel.inference import remembered_types
-from consistency.bench.filters.kernel.shortcuts import shortcuts
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.work import Simulated, TrialWork
 from consistency.bench.simulation.world import World
@@ -112,68 +109,6 @@ def test_what_has_no_type_is_looked_for_again(asked: Counts) -> None:
             with pytest.raises(numba.TypingError):
                 type_of(types.float64, types.none)
     assert len(asked) == 2
-
-
-def variables() -> list[list[str]]:
-    """Variables of instructions of Numba that hold them in lists, pairs, dictionaries and expressions."""
-    loc = numba_ir.Loc("file", 1)
-    a, b, c, d = (numba_ir.Var(None, name, loc) for name in "abcd")
-    call = numba_ir.Expr.call(a, (b, c), (("key", d), ("other", a)), loc, vararg=b)
-    mapping = numba_ir.Expr.build_map([(a, b), (c, d)], 2, {"key": c}, [], loc)
-    assigned = [call, mapping, b, numba_ir.Const(1.0, loc), numba_ir.Yield(c, loc, 1)]
-    others = [call, numba_ir.Print([a, b], None, loc), numba_ir.SetItem(a, b, c, loc), numba_ir.Jump(1, loc)]
-    instructions = [*(numba_ir.Assign(value, a, loc) for value in assigned), *others, numba_ir.Return(d, loc)]
-    return [[each.name for each in instruction.list_vars()] for instruction in instructions]
-
-
-def test_variables_of_instructions_are_those_of_numba() -> None:
-    alone = variables()
-    assert alone[:2] == [list("abcdaba"), list("abcdca")]
-    with shortcuts():
-        assert [variables() for _ in range(2)] == [alone] * 2
-
-
-def references(kind: Any) -> tuple[list[Any], int]:
-    """Counted references in a value of a type: type and place of each; and how many instructions find them."""
-    context: Any = cpu_target.target_context
-    context.refresh()
-    module = context.codegen()._create_empty_module("module")
-    types_of: Any = llvm.FunctionType(llvm.VoidType(), [context.get_value_type(kind)])
-    function: Any = llvm.Function(module, types_of, "function")
-    block = function.append_basic_block()
-    found = context.nrt.get_meminfos(llvm.IRBuilder(block), kind, function.args[0])
-    return [(each, place(value)) for each, value in found], len(block.instructions)
-
-
-def place(value: Any) -> list[int]:
-    """Indices that lead to what was extracted from an argument."""
-    return [*place(value.operands[0]), *value.indices] if hasattr(value, "indices") else []
-
-
-def test_references_in_a_value_are_those_of_numba() -> None:
-    array = types.Array(types.float64, 2, "C")
-    mixed = types.Tuple([types.float64, array, types.UniTuple(array, 2), types.int64])
-    numbers = types.UniTuple(types.float64, 9)
-    for kind, count, needed in ((array, 1, 1), (mixed, 3, 7), (numbers, 0, 0), (types.float64, 0, 0)):
-        alone, _ = references(kind)
-        assert len(alone) == count
-        with shortcuts():
-            assert [references(kind) for _ in range(2)] == [(alone, needed)] * 2
-
-
-def test_shortcuts_end_with_compiling() -> None:
-    def state() -> Any:
-        return numba_ir.Inst._rec_list_vars, Runtime.get_meminfos, gc.get_threshold()
-
-    def interrupted() -> None:
-        with shortcuts():
-            assert all(now != was for now, was in zip(state(), before, strict=True))
-            raise KeyboardInterrupt
-
-    before = state()
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert state() == before
 
 
 def test_arguments_of_other_types_are_other_kinds() -> None:

@@ -27,8 +27,7 @@ from consistency.bench.filters.kernel.dispatch import OPTIONS, bodies_of, is_par
 VERSIONED = ("numba", "llvmlite", "numpy", "scipy")
 FOREIGN = sys.stdlib_module_names | set(VERSIONED)  # covered by their versions
 # decide how code is made
-COMPILING = ("blas.py", "content.py", "dispatch.py", "inference.py", "jit.py", "by_reference.py", "shortcuts.py",
-             "whole.py")  # fmt: skip
+COMPILING = ("blas.py", "content.py", "dispatch.py", "inference.py", "jit.py", "by_reference.py", "whole.py")
 SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "LLVM_REFPRUNE_PASS", "LLVM_REFPRUNE_FLAGS", "BOUNDSCHECK",
             "DEBUGINFO_DEFAULT", "ENABLE_AVX", "USING_SVML")  # fmt: skip
 _SCALARS = (type(None), bool, int, float, complex, str, bytes)

@@ -18,7 +18,6 @@ from numba.core import codegen, compiler_lock, config
 from numba.core.registry import cpu_target
 
 from consistency.bench.filters.kernel.inference import remembered_types
-from consistency.bench.filters.kernel.shortcuts import shortcuts
 
 TESTED = ("0.61", "0.68")  # lowest and highest series of Numba in which this was tried
 INNER_OPTIMISATION = 1  # level of the passes over a function by itself; the whole is optimised at Numba's level
@@ -66,7 +65,7 @@ class _Part(_Library):  # type: ignore[misc]
             return
         module.data_layout = self._codegen._data_layout
         level = min(INNER_OPTIMISATION, _config.OPT)
-        for function in (each for each in module.functions if not each.is_declaration):
+        for function in module.functions:
             passes, builder = self._codegen._function_pass_manager(opt=level)
             passes.run(function, builder)
 
@@ -135,7 +134,7 @@ def one_program(callable_too: Collection[str]) -> Iterator[None]:
 
         code._library_class, code.set_env = library_class, set_later
         try:
-            with remembered_types(), shortcuts():
+            with remembered_types():
                 yield
         finally:
             del code._library_class, code.set_env

@@ -13,19 +13,18 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from consistency.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.diagnostics.validity import Validity, classify
-from consistency.types import Failure
+import consistency as cs
+from consistency import Verdict
 
 SEED, LARGEST_ARCHIVE = 20070, 100_000  # bytes
-SETTINGS = Settings(false_alarm=0.01, detect=1.5, power=0.95)
+SETTINGS = {"false_alarm": 0.01, "detect": 1.5, "power": 0.95}
 Rows = dict[str, tuple[Any, Any]]  # name -> errors (runs, [steps,] n), their covariances or variances
 
 
@@ -153,19 +152,13 @@ def verdict(name: str, errors: Any, covariances: Any, axes: Sequence[str], share
 
     A run with an impossible value fails from there on.
     """
-    e, P = np.asarray(errors, float), np.asarray(covariances, float)
-    P = 0.5 * (P + np.swapaxes(P, -1, -2))
-    bad = ~np.isfinite(e).all(axis=-1) | np.isin(classify(P), (Validity.NOT_FINITE, Validity.INDEFINITE))
-    failures = tuple(
-        Failure(name, int(run), int(bad[run].argmax()) + 1, "not finite, or not positive definite")
-        for run in np.flatnonzero(bad.any(axis=1))
-    )
-    lost = np.logical_or.accumulate(bad, axis=1)
-    e, P = np.where(lost[..., None], np.nan, e), np.where(lost[..., None, None], np.nan, P)
-    whole = Evidence(name, error=e, covariance=P, failures=failures, axes=tuple(axes))
+    P = np.asarray(covariances, float)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        return judge(whole, replace(SETTINGS, false_alarm=SETTINGS.false_alarm / share))
+        return cs.judge(
+            errors, 0.5 * (P + np.swapaxes(P, -1, -2)), axes=axes, name=name,
+            **{**SETTINGS, "false_alarm": SETTINGS["false_alarm"] / share},
+        )  # fmt: skip
 
 
 def told(found: Verdict) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from consistency.bench.store.results import (
     rejections_table,
     truth_table,
 )
-from consistency.bench.store.storage import put_in_place
+from consistency.bench.store.storage import with_tables
 from consistency.referee.errors import InputError
 from consistency.referee.reading.columns import COLUMNS
 from consistency.referee.system.folders import NewFolder
@@ -167,7 +167,9 @@ class Gathered:
                 write_table(new.path / "landmarks.parquet", "landmarks", landmarks)
             if (rejections := self._all_rejections()) is not None:
                 write_table(new.path / "rejections.parquet", "rejections", rejections)
-        return StoredResults(new.folder, failures, landmarks, put_in_place(new, manifest), rejections)
+        manifest = with_tables(new, manifest)
+        new.put_in_place(manifest)
+        return StoredResults(new.folder, failures, landmarks, manifest, rejections)
 
     def _write(
         self, new: NewFolder, table: str, of: Callable[[str], Iterator[Columns]], columns: Sequence[str] = ()

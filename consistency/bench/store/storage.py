@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from consistency.referee.errors import InputError
 from consistency.referee.reading.columns import COLUMNS
+from consistency.referee.system import folders
 from consistency.referee.system.folders import NewFolder
-from consistency.referee.system.stopping import undisturbed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,37 +26,26 @@ def write_folder(
     overwrite: bool = False,
     keep_others: bool = False,
 ) -> None:
-    """Tables as Parquet, the manifest, and whatever ``extra`` writes, as a :class:`NewFolder`.
+    """Tables as Parquet, the manifest, and whatever ``extra`` writes, as :func:`folders.write_folder`."""
 
-    The manifest says what ``kind`` of folder it is.
-    """
-    with undisturbed(), NewFolder(folder, manifest["kind"], overwrite, keep_others) as new:
-        with new.writing():
-            for name, table in tables.items():
-                from consistency.bench.store.parquet import write_table
+    def contents(at: Path) -> None:
+        for name, table in tables.items():
+            from consistency.bench.store.parquet import write_table
 
-                write_table(new.path / f"{name}.parquet", name, table)
-            if extra is not None:
-                extra(new.path)
-        put_in_place(new, manifest)
+            write_table(at / f"{name}.parquet", name, table)
+        if extra is not None:
+            extra(at)
+
+    folders.write_folder(folder, manifest, contents, overwrite, keep_others, with_tables)
 
 
-def put_in_place(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:
-    """Complete the manifest with what tables there are, and move the folder to its place as a whole.
-
-    Of results, the manifest has the rows and digests of the tables. Logs are inputs, which may be edited.
-
-    Raises
-    ------
-    InputError
-        As :meth:`NewFolder.put_in_place`.
-    """
+def with_tables(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:
+    """The manifest with what tables there are; of results also their rows and digests. Logs may be edited."""
     tables = sorted(COLUMNS.keys() & {file.stem for file in new.path.iterdir() if file.suffix in TABLES})
     manifest = manifest | {"tables": tables}
     if new.kind == "results":
         with new.writing():
             manifest["contents"] = {name: _content_of(new.path, name) for name in tables}
-    new.put_in_place(manifest)
     return manifest
 
 

@@ -66,7 +66,9 @@ def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = Tr
         first_step=first + 1 if first is not None and faulty else None,
         since=since,
         lasting=lasting,
-        subset=_subset(sample, late, answers) if sample.errors is not None and _any(answers, SCALE) else None,
+        subset=chief_axes(sample, late, _any(answers, (MAIN,)))
+        if sample.errors is not None and _any(answers, SCALE)
+        else None,
         until=until(sample, band, detect) if ordered and _any(answers, (*SCALE, *BIAS)) else None,
     )
 
@@ -133,32 +135,28 @@ def _splits(sample: Sample) -> tuple[Indices, Array, Array]:
     return ends, before[both] / many[both] / sample.dof, after[both] / fewer[both] / sample.dof
 
 
-def _subset(sample: Sample, steps: slice, answers: Answers) -> str | None:
-    """Axes that carry the fault, None where they err in the other direction than a whole that is at fault."""
-    chief, whole = chief_axes(sample, steps), sample.means(steps).mean()
-    if not chief or not _any(answers, (MAIN,)):
-        return ", ".join(chief) or None
-    own = [sample.group_means([_errors(sample).names.index(name)], steps).mean() for name in chief]
-    return ", ".join(name for name, ratio in zip(chief, own, strict=True) if (ratio > 1.0) == (whole > 1.0)) or None
-
-
-def chief_axes(sample: Sample, steps: slice = slice(None)) -> list[str]:
+def chief_axes(sample: Sample, steps: slice, as_whole: bool) -> str | None:
     """Axes that carry the fault: those farther from 1 than the others together, beyond chance.
 
     With Y_ij the mean NEES of axis j alone in run i and O_ij that of the other axes, each over its mean over runs,
     D_i = Y_ij - O_ij has the standard error of log mean Y_j - log mean O_j to first order; Student's t, two-sided,
-    Bonferroni over axes. Empty where no axis stands out, or all do, or with fewer than 8 runs.
+    Bonferroni over axes. None where no axis stands out, or all do, or with fewer than 8 runs. Where the whole is at
+    fault (``as_whole``), an axis that errs in the other direction does not carry it.
     """
     assert sample.errors is not None
     names, n = sample.errors.names, sample.dof
     if n == 1 or np.isfinite(sample.nees[:, steps]).any(axis=1).sum() < FEWEST:
-        return []
+        return None
     Y = np.stack([sample.group_means([j], steps) for j in range(n)], axis=-1)
-    if not (Y.mean(axis=0) > 0).all():  # an axis without any error
-        chief = [name for name, mean in zip(names, Y.mean(axis=0), strict=True) if not mean > 0]
-        return chief if len(chief) < n else []
-    chief = [name for j, name in enumerate(names) if _stands_out(Y[:, j], (Y.sum(axis=1) - Y[:, j]) / (n - 1), n)]
-    return chief if len(chief) < n else []
+    mean = Y.mean(axis=0)
+    chief = mean == 0.0  # axes without any error
+    if not chief.any():
+        chief = np.array([_stands_out(Y[:, j], (Y.sum(axis=1) - Y[:, j]) / (n - 1), n) for j in range(n)])
+    if chief.all():
+        return None
+    if as_whole:
+        chief &= (mean > 1.0) == (sample.means(steps).mean() > 1.0)
+    return ", ".join(name for name, is_chief in zip(names, chief, strict=True) if is_chief) or None
 
 
 def _stands_out(own: Array, others: Array, axes: int) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -437,13 +436,13 @@ class Verdict:
         return flat(self)
 
     def __str__(self) -> str:
-        return _shown(self, "text")
+        return str(shown_by("verdict_text", self))
 
     def __repr__(self) -> str:
         return f"<Verdict {self.filter}: {self.status}, {self.runs} runs x {self.steps} steps; print() shows it>"
 
     def _repr_html_(self) -> str:
-        return _shown(self, "static") + ("" if self.record is None else shown_by("picture_html", self.record, self))
+        return str(shown_by("verdict_html", self))
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Errors with their bounds, NEES with its band, and coverage; arguments as those of :meth:`Record.plot`.
@@ -456,10 +455,3 @@ class Verdict:
         if self.record is None:
             raise InputError(f"{self.filter}: the record was not kept with the verdict; draw record.plot() of it")
         return shown_by("plot", self.record, self, path)
-
-
-def _shown(verdict: Verdict, renderer: str) -> str:
-    """Summary by a renderer; both stand above the diagnostics, which find them by name and work without them."""
-    blocks = import_module("consistency.referee.document.verdict").summary(verdict)
-    text: str = import_module(f"consistency.referee.show.{renderer}").fragment(*blocks)
-    return text

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.wording import plural
 from consistency.referee.document.blocks import Bullets, Facts
+from consistency.referee.document.verdict import summary
 from consistency.referee.extras import require
-from consistency.referee.show.static import block
+from consistency.referee.show import static, text
 from consistency.referee.system.atomic import write_whole
 
 if TYPE_CHECKING:
@@ -30,14 +31,21 @@ def record_html(record: Record) -> str:
         ("runs", str(len(record.run_numbers))), ("steps", str(len(record.t))), ("error", record.convention or "-"),
         ("components", ", ".join(record.axes)), ("failed runs", str(len(record.failures))),
     )  # fmt: skip
-    return f"<div><strong>{escape(record.name)}</strong>{block(Facts(rows))}{block(Bullets(record.notes))}</div>"
+    table, notes = (static.block(each) for each in (Facts(rows), Bullets(record.notes)))
+    return f"<div><strong>{escape(record.name)}</strong>{table}{notes}</div>"
 
 
-def picture_html(record: Record, verdict: Verdict) -> str:
-    """Picture below the table of a verdict; "" where none can be drawn."""
+def verdict_text(verdict: Verdict) -> str:
+    """The sentence and a short table."""
+    return text.fragment(*summary(verdict))
+
+
+def verdict_html(verdict: Verdict) -> str:
+    """The sentence, the table, and below it the picture where the record is kept and one can be drawn."""
     from consistency.referee.pages.plain import picture
 
-    return "".join(map(block, picture(record, verdict)))
+    pictures = () if verdict.record is None else picture(verdict.record, verdict)
+    return static.fragment(*summary(verdict)) + "".join(map(static.block, pictures))
 
 
 def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Drawn:

@@ -133,12 +133,17 @@ def write_folder(
     manifest: dict[str, Any],
     contents: Callable[[Path], None],
     overwrite: bool = False,
+    keep_others: bool = False,
+    complete: Callable[[NewFolder, dict[str, Any]], dict[str, Any]] = lambda _, manifest: manifest | {"tables": []},
 ) -> None:
-    """The manifest, which says what ``kind`` of folder it is, and what ``contents`` writes, as a :class:`NewFolder`."""
-    with undisturbed(), NewFolder(folder, manifest["kind"], overwrite) as new:
+    """The manifest, which says what ``kind`` of folder it is, and what ``contents`` writes, as a :class:`NewFolder`.
+
+    ``complete`` gives the manifest with what is known of the files when they are written.
+    """
+    with undisturbed(), NewFolder(folder, manifest["kind"], overwrite, keep_others) as new:
         with new.writing():
             contents(new.path)
-        new.put_in_place(manifest | {"tables": []})
+        new.put_in_place(complete(new, manifest))
 
 
 def _put_in_place(partial: Path, folder: Path, keep_others: bool, within: Path | None) -> None:

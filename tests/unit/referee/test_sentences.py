@@ -171,7 +171,8 @@ def test_a_wrong_correlation_of_axes_that_are_too_large_is_inconsistent(
     assert verdict.status == "inconsistent"
     found = re.match(
         r"inconsistent: covariance too large by x([\d.]+) .* in [xy], too large by .* in [xy], "
-        r"but too small by x([\d.]+) in one direction; covariance of the wrong shape: correlation ([+-][\d.]+), stated ([+-][\d.]+)",
+        r"but too small by x([\d.]+) in one direction; covariance of the wrong shape: "
+        r"correlation ([+-][\d.]+), stated ([+-][\d.]+)",
         verdict.reasons[0],
     )
     assert found, verdict.reasons[0]

@@ -13,7 +13,7 @@ from bench_trials import SEED, Work, interleaved
 
 from consistency.bench.runs.findings import sibling
 from consistency.referee.errors import InputError
-from consistency.referee.reading.shipped import data_folder
+from consistency.referee.shipped import data_folder
 from consistency.stereo.vision import register_svd, registration_covariance, triangulate, triangulation_covariance
 from consistency.stereo.vision.odometry import visual_odometry
 from consistency.stereo.vision.registration import rigid_motions

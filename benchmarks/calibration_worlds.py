@@ -28,8 +28,8 @@ from calibration_gates import (
 from scipy import special
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.sources import planar_error
-from consistency.referee.sources.record import Track, assemble, symmetric
+from consistency.referee.readers import planar_error
+from consistency.referee.readers.record import Track, assemble, symmetric
 from consistency.referee.types import Array
 
 AXES = ("x", "y", "heading")

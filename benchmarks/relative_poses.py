@@ -24,9 +24,9 @@ from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.planning import power_of
 from consistency.referee.diagnostics.questions import MAIN, SHARES
 from consistency.referee.geometry.groups import carried, composed, to_left
-from consistency.referee.sources.relative import Stretch, relative_recording
-from consistency.referee.sources.sheet import Places
-from consistency.referee.sources.windows import relative_of
+from consistency.referee.readers.relative import Stretch, relative_recording
+from consistency.referee.readers.sheet import Places
+from consistency.referee.readers.windows import relative_of
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge import analyse
 

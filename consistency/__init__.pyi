@@ -27,7 +27,7 @@ from .referee.diagnostics import anees as anees
 from .referee.diagnostics import anees_interval as anees_interval
 from .referee.diagnostics import nees as nees
 from .referee.diagnostics.record import Record as Record
-from .referee.diagnostics.records import Verdict as Verdict
+from .referee.diagnostics.verdict_parts import Verdict as Verdict
 from .referee.errors import InputError as InputError
 from .referee.notebook.records import judge as judge
 from .referee.notebook.records import read as read

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import consistency as cs
-from consistency.bench.runs.by_run import run_means, wins
 from consistency.bench.runs.findings import script
+from consistency.bench.runs.run_scores import run_means, wins
 
 FINDINGS = ("fig11b", "fig13a", "fig13b", "consistent-stereo")
 

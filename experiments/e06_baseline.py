@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import consistency as cs
-from consistency.bench.runs.by_run import run_means
 from consistency.bench.runs.findings import script
+from consistency.bench.runs.run_scores import run_means
 
 FINDINGS = ("baseline-reduces-nonlinearity",)
 KERNELS = {"herath2007-stereo": ("ekf-xyz", "ekf-uvd")}

@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 from scipy.stats import bootstrap
 
 import consistency as cs
-from consistency.bench.runs.by_run import run_means
 from consistency.bench.runs.findings import OURS, script
+from consistency.bench.runs.run_scores import run_means
 from consistency.bench.scenario.effects.distortion import Distortion
 from consistency.referee.types import Array
 

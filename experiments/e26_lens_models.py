@@ -19,8 +19,8 @@ import pandas as pd
 from scipy.stats import ttest_rel
 
 import consistency as cs
-from consistency.bench.runs.by_run import run_means
 from consistency.bench.runs.findings import OURS, script
+from consistency.bench.runs.run_scores import run_means
 from consistency.bench.sweeps.rig import Request, read_rig
 from consistency.referee.errors import InputError
 from consistency.referee.terminal.progress import each

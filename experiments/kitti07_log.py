@@ -17,7 +17,7 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, M
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
-from consistency.referee.reading import reading
+from consistency.referee.parsing import reading
 from consistency.referee.types import Array
 from consistency.stereo.vision import tracks
 from consistency.stereo.vision.common_motion import screened

@@ -37,7 +37,7 @@ class Slow(BaseException):
 def outcome(read: Any, folder: Path) -> tuple[int, str, str, str]:
     """Exit status, stdout, stderr, and what is wrong with them whatever the file held."""
     from consistency.referee.errors import InputError
-    from consistency.referee.reading import one_line
+    from consistency.referee.parsing import one_line
 
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():

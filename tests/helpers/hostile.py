@@ -24,7 +24,7 @@ import consistency as cs
 from consistency.bench.store.log import read_log
 from consistency.bench.store.results import Rejected, failures_table, rejections_table
 from consistency.referee.cli import main
-from consistency.referee.sources.kitti import read_drive
+from consistency.referee.readers.kitti import read_drive
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Failure
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from consistency.referee import sources as recording
+from consistency.referee import readers as recording
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.reading.options import Reading
+from consistency.referee.parsing.options import Reading
 
 
 def read_recordings(

@@ -14,10 +14,10 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import SPATIAL, se3_log, spatial_error
-from consistency.referee.reading.options import Reading
-from consistency.referee.sources import read_recordings
-from consistency.referee.sources.hints import hints
-from consistency.referee.sources.sheet import read_sheet
+from consistency.referee.parsing.options import Reading
+from consistency.referee.readers import read_recordings
+from consistency.referee.readers.hints import hints
+from consistency.referee.readers.sheet import read_sheet
 from consistency.referee.verdicts.baselines import _known
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import consistency
-from consistency.referee.reading.outside import OUTSIDE, outside
+from consistency.referee.outside import OUTSIDE, outside
 
 PACKAGE = Path(consistency.__file__).parent
 SCRIPTS = [path for folder in ("experiments", "benchmarks") for path in sorted((PACKAGE.parent / folder).glob("*.py"))]
@@ -25,9 +25,9 @@ RANKS = {
     "referee": {
         "types": 0, "errors": 0, "defaults": 0, "system.atomic": 0, "system.machine": 0, "system.stopping": 0,
         "terminal": 0,
-        "extras": 1, "system.ending": 1, "system.provenance": 1, "geometry": 1, "reading": 1,
-        "system.folders": 2,
-        "diagnostics": 2, "sources": 3, "verdicts": 4, "document": 3, "show": 4, "pages": 5, "gating": 6, "notebook": 6,
+        "extras": 1, "system.ending": 1, "system.provenance": 1, "geometry": 1, "outside": 1, "shipped": 1,
+        "parsing": 1, "system.folders": 2,
+        "diagnostics": 2, "readers": 3, "verdicts": 4, "document": 3, "show": 4, "pages": 5, "gating": 6, "notebook": 6,
         "cli": 7,
     },
     "bench": {
@@ -35,10 +35,10 @@ RANKS = {
         "store.parquet": 3, "store.storage": 4, "store.soundness": 4, "store.tables": 4, "store.journal": 5,
         "store.results": 5, "store.log": 6,
         "runs.finding": 4,
-        "runs.streams": 4, "runs.supervising": 5, "runs.touched": 5, "runs.footprint": 6, "runs.gather": 6,
+        "runs.streams": 4, "runs.supervising": 5, "runs.touched_memory": 5, "runs.footprint": 6, "runs.gather": 6,
         "runs.isolating": 6, "runs.resuming": 6, "runs.compiling": 6, "runs.work": 7, "runs.backends": 8,
-        "runs.campaign": 8, "runs.montecarlo": 9, "runs.records": 6, "runs.by_run": 7, "runs.pilots": 10,
-        "runs.sequential": 10, "runs.ahead": 10, "runs.findings": 11,
+        "runs.campaign": 8, "runs.montecarlo": 9, "runs.records": 6, "runs.run_scores": 7, "runs.pilots": 10,
+        "runs.sequential": 10, "runs.compiling_ahead": 10, "runs.findings": 11,
         "sweeps": 12, "challenging": 12, "tuning": 12, "pages": 13, "cli": 14,
     },
     "stereo": {"vision": 0, "imaging": 1, "frontend": 2, "characterising": 3, "pages": 4, "cli": 5},
@@ -155,7 +155,7 @@ def test_no_two_modules_import_each_other() -> None:
     paths = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")}
     paths = {name.removesuffix(".__init__"): path for name, path in paths.items()}
     graph = {name: imported_modules(path.read_text(encoding="utf-8"), paths.keys()) for name, path in paths.items()}
-    graph["consistency.referee.diagnostics.records"].remove("consistency.referee.diagnostics.export")
+    graph["consistency.referee.diagnostics.verdict_parts"].remove("consistency.referee.diagnostics.export")
     assert acyclic(graph)
     assert not acyclic(
         graph | {"consistency.bench.scenario.tables": {"consistency.bench.scenario.view"}}
@@ -191,9 +191,9 @@ FORBIDDEN = [
     ("referee.diagnostics", "import pandas as pd"),
     ("referee.diagnostics", "from matplotlib.axes import Axes"),
     ("referee.diagnostics", "from consistency.bench.scenario import Belief"),
-    ("referee.diagnostics", "from consistency.referee.sources import read_recordings"),
+    ("referee.diagnostics", "from consistency.referee.readers import read_recordings"),
     ("referee.cli.judging", "def f():\n    from consistency.bench.store.results import open_results"),
-    ("referee.sources.bags", "import consistency.stereo.vision"),
+    ("referee.readers.bags", "import consistency.stereo.vision"),
     ("bench.runs.montecarlo", "from consistency.bench.pages import write_reports"),
     ("bench.runs.montecarlo", "import matplotlib.pyplot as plt"),
     ("referee.gating", "from consistency.testing import assert_consistent"),

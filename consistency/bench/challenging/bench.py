@@ -21,7 +21,7 @@ from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
 from consistency.bench.store.results import outcome_of
 from consistency.referee.errors import InputError
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing.columns import POSE
 
 WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not
 PATIENCE = 60.0  # s beyond the end of the search, after which a trial of a filter that is not compiled is killed

@@ -23,7 +23,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.diagnostics import Settings, Verdict, gate_runs
 from consistency.referee.diagnostics.questions import SCALE
 from consistency.referee.errors import InputError
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing.columns import POSE
 from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import refused
 

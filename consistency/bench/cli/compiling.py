@@ -35,7 +35,7 @@ def compile_(
     from consistency.bench.filters.kernel.processor import aim_at
 
     environment = {} if cpu is None else aim_at(cpu)
-    from consistency.bench.runs.ahead import compile_ahead
+    from consistency.bench.runs.compiling_ahead import compile_ahead
 
     ahead = compile_ahead(filters or (), scenario, into, jobs)
     count, of = (f"{n} {what}{'s' * (n != 1)}" for n, what in ((ahead.kernels, "kernel"), (ahead.filters, "filter")))

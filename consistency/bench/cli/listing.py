@@ -15,7 +15,7 @@ def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")]
     """Scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
     from consistency.bench.filters.guard.settings import KINDS
-    from consistency.referee.reading.shipped import summaries
+    from consistency.referee.shipped import summaries
 
     shipped, filters = summaries(), filter_summaries()
     if missing("bench"):

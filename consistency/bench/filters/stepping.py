@@ -16,7 +16,7 @@ from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Gaussian, Info, Map, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
-from consistency.referee.reading import one_line
+from consistency.referee.parsing import one_line
 from consistency.referee.types import Array
 
 SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands

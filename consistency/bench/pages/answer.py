@@ -7,7 +7,7 @@ from typing import Any
 
 from consistency.bench.pages.model import Study, Track
 from consistency.bench.types import outcome
-from consistency.referee.diagnostics.records import STATUSES
+from consistency.referee.diagnostics.verdict_parts import STATUSES
 from consistency.referee.diagnostics.wording import plural
 from consistency.referee.document.wording import listed
 

@@ -12,9 +12,9 @@ import numpy as np
 from consistency.bench.pages.answer import answer
 from consistency.bench.pages.contents import SECTIONS
 from consistency.bench.pages.model import Report, Study, Track
-from consistency.bench.runs.by_run import nis_ratio
 from consistency.bench.runs.findings import read_findings
 from consistency.bench.runs.records import design_of, record_of, steps_of
+from consistency.bench.runs.run_scores import nis_ratio
 from consistency.bench.store.results import open_results
 from consistency.referee.diagnostics import Settings
 from consistency.referee.diagnostics.judging import judge_runs, with_map

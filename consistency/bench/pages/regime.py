@@ -13,7 +13,7 @@ from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell as GridCell
 from consistency.bench.sweeps.printing import by_verdict
 from consistency.bench.sweeps.regime import Regime
-from consistency.referee.diagnostics.records import STATUSES
+from consistency.referee.diagnostics.verdict_parts import STATUSES
 from consistency.referee.document.blocks import (
     Block,
     Cell,

@@ -10,7 +10,7 @@ import pandas as pd
 
 from consistency.bench.store.parquet import read_frame
 from consistency.referee.errors import InputError
-from consistency.referee.reading import one_line, reading
+from consistency.referee.parsing import one_line, reading
 
 
 def extra_table(

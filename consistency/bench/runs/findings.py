@@ -28,7 +28,7 @@ from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.errors import InputError
-from consistency.referee.reading import read_json, reading
+from consistency.referee.parsing import read_json, reading
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of

@@ -22,7 +22,7 @@ from consistency.bench.filters.kernel.slam import (
     robot_width,
     spare_width,
 )
-from consistency.bench.runs.touched import NUMBER, touched
+from consistency.bench.runs.touched_memory import NUMBER, touched
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError

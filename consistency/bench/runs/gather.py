@@ -33,7 +33,7 @@ from consistency.bench.store.results import (
 )
 from consistency.bench.store.storage import with_tables
 from consistency.referee.errors import InputError
-from consistency.referee.reading.columns import COLUMNS
+from consistency.referee.parsing.columns import COLUMNS
 from consistency.referee.system.folders import NewFolder
 from consistency.referee.system.machine import this_machine
 from consistency.referee.system.stopping import undisturbed

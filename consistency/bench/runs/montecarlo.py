@@ -27,7 +27,7 @@ from consistency.bench.store.log import Log, write_log
 from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.bench.store.tables import require_format
 from consistency.referee.errors import InputError
-from consistency.referee.reading import require_name
+from consistency.referee.parsing import require_name
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.bench.runs.by_run import run_means
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.records import records_of
+from consistency.bench.runs.run_scores import run_means
 from consistency.bench.scenario import load_scenario
 from consistency.bench.store.results import Tables, open_results
 from consistency.referee.diagnostics import Record
 from consistency.referee.diagnostics.scale import FEW
 from consistency.referee.errors import InputError
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing.columns import POSE
 from consistency.referee.types import Array
 
 

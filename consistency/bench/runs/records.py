@@ -23,9 +23,9 @@ from consistency.referee.diagnostics.blocks import by_runs
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, planar_error
-from consistency.referee.reading import LARGEST_NUMBER, one_line
-from consistency.referee.reading.columns import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
-from consistency.referee.sources.nis import NisLog, checked_dof, choose
+from consistency.referee.parsing import LARGEST_NUMBER, one_line
+from consistency.referee.parsing.columns import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
+from consistency.referee.readers.nis import NisLog, checked_dof, choose
 from consistency.referee.types import Array, Failure, Indices
 from consistency.referee.verdicts.sources import Source
 

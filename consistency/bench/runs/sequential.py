@@ -21,7 +21,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import Design, Record, Verdict, look, sequential_design, speaks
 from consistency.referee.diagnostics.judging import of_look, with_map
 from consistency.referee.errors import InputError
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing.columns import POSE
 from consistency.referee.terminal.progress import say
 from consistency.referee.verdicts.options import refused
 

@@ -48,7 +48,7 @@ from consistency.bench.scenario.truth import (
 )
 from consistency.bench.scenario.view import PLANAR_SENSORS, Mount
 from consistency.bench.scenario.writing import scenario_text, toml_text
-from consistency.referee.reading.shipped import data_folder
+from consistency.referee.shipped import data_folder
 
 __all__ = [
     "PLANAR_SENSORS",

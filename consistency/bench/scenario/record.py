@@ -14,8 +14,8 @@ from consistency.bench.scenario.belief import Belief
 from consistency.bench.scenario.tables import Table, read_table
 from consistency.bench.scenario.truth import Truth
 from consistency.referee.errors import InputError
-from consistency.referee.reading import is_folder, one_line
-from consistency.referee.reading.shipped import data_folder
+from consistency.referee.parsing import is_folder, one_line
+from consistency.referee.shipped import data_folder
 
 
 class Scenario(Table):

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import HUGE, one_line, read_toml, reading
+from consistency.referee.parsing import HUGE, one_line, read_toml, reading
 
 T = TypeVar("T", bound="Table")
 

@@ -30,8 +30,8 @@ from consistency.bench.store.storage import write_folder
 from consistency.bench.store.tables import read_table_file, require_format, table_file
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.reading import reading
-from consistency.referee.reading.columns import COLUMNS, POSE
+from consistency.referee.parsing import reading
+from consistency.referee.parsing.columns import COLUMNS, POSE
 from consistency.referee.types import Array, Indices
 
 STRAY = 0.05  # share of pixels that gross errors may put outside the image; other units put more there

@@ -25,8 +25,8 @@ from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import pose_error
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error, planar_map_error
-from consistency.referee.reading import LARGEST_NUMBER
-from consistency.referee.reading.columns import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
+from consistency.referee.parsing import LARGEST_NUMBER
+from consistency.referee.parsing.columns import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.types import Array, Failure, Indices
 

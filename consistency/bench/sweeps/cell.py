@@ -15,9 +15,9 @@ from consistency.bench.filters import get_filter
 from consistency.bench.filters.compiled import Compiled, one_blas_thread
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.protocols import Filter, WholeTrial
-from consistency.bench.runs.by_run import run_means
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.records import record_of
+from consistency.bench.runs.run_scores import run_means
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.runs.work import Backend
 from consistency.bench.scenario import Scenario

@@ -20,7 +20,7 @@ from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep
 from consistency.referee.errors import InputError
-from consistency.referee.reading import reading
+from consistency.referee.parsing import reading
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.system.provenance import manifest_of

@@ -24,8 +24,8 @@ from consistency.bench.sweeps.axes import QUANTITIES, Axis, leaves, require_key,
 from consistency.referee.defaults import DETECT, POWER
 from consistency.referee.diagnostics import Settings
 from consistency.referee.errors import InputError
-from consistency.referee.reading import HUGE
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing import HUGE
+from consistency.referee.parsing.columns import POSE
 
 MOST_CELLS = 20_000  # each is a scenario in memory, and a folder
 LONGEST = 150  # characters of a folder's name

@@ -11,7 +11,7 @@ from consistency.bench.sweeps.cell import CellResult, plain_numbers
 from consistency.bench.sweeps.recommend import OPEN, Advice, NearFilter
 from consistency.bench.sweeps.regime import Regime
 from consistency.referee.diagnostics.export import plain
-from consistency.referee.diagnostics.records import STATUSES
+from consistency.referee.diagnostics.verdict_parts import STATUSES
 from consistency.referee.diagnostics.wording import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Status, Table, Text, table
 from consistency.referee.document.wording import NONE

@@ -14,7 +14,7 @@ from consistency.bench.store.log import SensorFile
 from consistency.bench.sweeps.axes import QUANTITIES, Axis, Changes, density_of, leaves, say_value, with_changes
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.referee.errors import InputError
-from consistency.referee.reading import read_toml
+from consistency.referee.parsing import read_toml
 
 AT = 0.05  # of a grid step: nearer to a value of the grid than that is at it
 ALIKE = 0.02  # relative: an end of the map, or a baseline, that differs less is the same

@@ -15,7 +15,7 @@ from consistency.bench.tuning.groups import NoiseGroup, sigma_by_channel
 from consistency.bench.tuning.parts import Parts, with_belief
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import Verdict
-from consistency.referee.diagnostics.records import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.diagnostics.wording import short
 
 TITLE = {"innovations": "the likelihood of the innovations", "nees": "the errors (NEES)"}

@@ -12,7 +12,7 @@ from consistency.bench.protocols import Filter
 from consistency.bench.store.results import outcome_of
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing.columns import POSE
 from consistency.referee.types import Array
 
 BY = ("innovations", "nees")

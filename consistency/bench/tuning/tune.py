@@ -24,7 +24,7 @@ from consistency.bench.tuning.result import Factor, Setting, Tuning
 from consistency.bench.tuning.scores import require_scorable
 from consistency.bench.tuning.why import Probe, is_at_fault, reasons_of
 from consistency.referee.diagnostics import Settings, Verdict
-from consistency.referee.diagnostics.records import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.terminal.progress import quiet, say
 from consistency.referee.types import Array

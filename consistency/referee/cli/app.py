@@ -107,7 +107,7 @@ def _show_help(arguments: list[str] | None) -> bool:
 
 
 def _line(sentence: str) -> str:
-    from consistency.referee.reading import one_line
+    from consistency.referee.parsing import one_line
 
     return one_line(sentence, 4000)
 

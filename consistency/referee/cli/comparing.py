@@ -11,7 +11,7 @@ from consistency.referee.cli.files import are_files, read_files, reads_files, te
 from consistency.referee.cli.options import FalseAlarm, Judged, Skip
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.errors import InputError
-from consistency.referee.reading.options import Reading, flag_of
+from consistency.referee.parsing.options import Reading, flag_of
 
 
 @reads_files

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from consistency.referee.reading.options import Reading, flag_of
+from consistency.referee.parsing.options import Reading, flag_of
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics import Evidence
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 
 def are_files(path: Path, files: Reading) -> bool:
     """Whether a path is files of another estimator, and no folder of ``consistency run``."""
-    from consistency.referee.sources import is_recording
+    from consistency.referee.readers import is_recording
 
     return is_recording(path, files)
 
 
 def read_files(path: Path, files: Reading) -> list[Evidence]:
     """Files of another estimator."""
-    from consistency.referee.sources import read_recordings
+    from consistency.referee.readers import read_recordings
 
     return read_recordings(path, files)
 
 
 def tell_notes(*read: list[Evidence]) -> None:
     """What was assumed and left out, to standard error; said when nothing is refused any more."""
-    from consistency.referee.reading import one_line
+    from consistency.referee.parsing import one_line
 
     for note in dict.fromkeys(note for recordings in read for one in recordings for note in one.notes):
         print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)

@@ -24,8 +24,8 @@ from consistency.referee.cli.options import (
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
-from consistency.referee.reading.options import Reading
-from consistency.referee.reading.outside import outside
+from consistency.referee.outside import outside
+from consistency.referee.parsing.options import Reading
 
 
 @reads_files

@@ -51,7 +51,7 @@ def monitor(
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
     from consistency.referee.document.monitor import monitor_document
     from consistency.referee.pages import require_plot, write_monitor_plot
-    from consistency.referee.reading import one_line
+    from consistency.referee.parsing import one_line
     from consistency.referee.show import json, terminal
     from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
 

@@ -9,8 +9,8 @@ from consistency.referee.diagnostics.comparison import Comparison, Difference, R
 from consistency.referee.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.referee.diagnostics.credibility import noncredibility
 from consistency.referee.diagnostics.direction import Largest, largest_direction
-from consistency.referee.diagnostics.distribution import Pit, pit
-from consistency.referee.diagnostics.ends import EarlyEnds, early_ends
+from consistency.referee.diagnostics.early_ends import EarlyEnds, early_ends
+from consistency.referee.diagnostics.early_stopping import Design, follow, look, sequential_design, speaks
 from consistency.referee.diagnostics.eprocess import EProcess, e_process, ever
 from consistency.referee.diagnostics.equivalence import equivalence
 from consistency.referee.diagnostics.independence import Independence, independence
@@ -21,6 +21,7 @@ from consistency.referee.diagnostics.landmarks import map_score
 from consistency.referee.diagnostics.lost import lost_bound
 from consistency.referee.diagnostics.monitor import Alarm, Monitor
 from consistency.referee.diagnostics.nees import anees, nees
+from consistency.referee.diagnostics.nees_distribution import Pit, pit
 from consistency.referee.diagnostics.normality import Normality, normality
 from consistency.referee.diagnostics.outliers import Outlier, outliers
 from consistency.referee.diagnostics.planning import (
@@ -34,7 +35,10 @@ from consistency.referee.diagnostics.planning import (
 )
 from consistency.referee.diagnostics.questions import answers
 from consistency.referee.diagnostics.record import Evidence, JointNees, MapRecord, Record, Rejections
-from consistency.referee.diagnostics.records import (
+from consistency.referee.diagnostics.rejection import clustered_share, rejection_score
+from consistency.referee.diagnostics.scale import MeanTest, mean_test, ratio_interval
+from consistency.referee.diagnostics.shape import identity_statistic, mean_shape, sphericity
+from consistency.referee.diagnostics.verdict_parts import (
     Answer,
     Equivalence,
     Interval,
@@ -43,10 +47,6 @@ from consistency.referee.diagnostics.records import (
     Settings,
     Verdict,
 )
-from consistency.referee.diagnostics.rejection import clustered_share, rejection_score
-from consistency.referee.diagnostics.scale import MeanTest, mean_test, ratio_interval
-from consistency.referee.diagnostics.sequential import Design, follow, look, sequential_design, speaks
-from consistency.referee.diagnostics.shape import identity_statistic, mean_shape, sphericity
 from consistency.referee.diagnostics.whitening import spread_steps, standardise, whiten
 
 __all__ = [

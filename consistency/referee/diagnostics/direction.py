@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from consistency.referee.diagnostics.blocks import by_runs
-from consistency.referee.diagnostics.records import Interval
 from consistency.referee.diagnostics.scale import UNKNOWN, ratio_interval, scale_test
 from consistency.referee.diagnostics.shape import second_moments
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.diagnostics.whitening import all_finite
 from consistency.referee.types import Array
 

@@ -9,8 +9,8 @@ from consistency.referee.diagnostics.eprocess import e_process, ever
 from consistency.referee.diagnostics.innovations import NisTest
 from consistency.referee.diagnostics.planning import LARGEST
 from consistency.referee.diagnostics.questions import MAIN, SHARES
-from consistency.referee.diagnostics.records import Equivalence, Settings
 from consistency.referee.diagnostics.scale import FEW, MeanTest, scale_test
+from consistency.referee.diagnostics.verdict_parts import Equivalence, Settings
 from consistency.referee.types import Array
 
 

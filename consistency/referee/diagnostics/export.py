@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records import Equivalence, Verdict, Within
+    from consistency.referee.diagnostics.verdict_parts import Equivalence, Verdict, Within
 
 
 def flat(v: Verdict) -> dict[str, Any]:

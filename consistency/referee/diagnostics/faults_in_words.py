@@ -9,7 +9,7 @@ import numpy as np
 from consistency.referee.diagnostics.location import VISIBLE
 from consistency.referee.diagnostics.numbers_in_words import UNCERTAIN, off_by, plain, short
 from consistency.referee.diagnostics.questions import AXIS, DIRECTION, MAIN, STEP
-from consistency.referee.diagnostics.records import TINY, Answer, Axes, Interval, JointScore, Scale, Verdict
+from consistency.referee.diagnostics.verdict_parts import TINY, Answer, Axes, Interval, JointScore, Scale, Verdict
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 MOST = 3  # axes that a sentence names with their figures

@@ -21,9 +21,9 @@ from consistency.referee.diagnostics.questions import (
     STEP,
     answers,
 )
-from consistency.referee.diagnostics.records import TINY, Settings, Verdict
 from consistency.referee.diagnostics.sample import Sample
 from consistency.referee.diagnostics.scale import scale_test, spreads_more, spreads_more_in_steps
+from consistency.referee.diagnostics.verdict_parts import TINY, Settings, Verdict
 from consistency.referee.types import Array
 
 CERTAIN = 0.999  # false-alarm rate, at most

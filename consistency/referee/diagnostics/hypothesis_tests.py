@@ -10,13 +10,13 @@ import numpy as np
 from consistency.referee.diagnostics.band import Band, simultaneous_band
 from consistency.referee.diagnostics.bias import Moments, hotelling, moments, t_squared
 from consistency.referee.diagnostics.direction import Largest, largest_direction
-from consistency.referee.diagnostics.distribution import Pit, pit
+from consistency.referee.diagnostics.nees_distribution import Pit, pit
 from consistency.referee.diagnostics.outliers import Outlier, outliers
 from consistency.referee.diagnostics.questions import AXIS, DIRECTION, MAIN, STEP, answers
-from consistency.referee.diagnostics.records import Settings
 from consistency.referee.diagnostics.sample import Sample
 from consistency.referee.diagnostics.scale import MeanTest, scale_test
 from consistency.referee.diagnostics.shape import mean_shape, sphericity
+from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.diagnostics.whitening import mean_of_runs
 from consistency.referee.types import Array
 

@@ -8,12 +8,12 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.distribution import kolmogorov
 from consistency.referee.diagnostics.landmarks import POSE
+from consistency.referee.diagnostics.nees_distribution import kolmogorov
 from consistency.referee.diagnostics.questions import JOINT, JOINT_DISTRIBUTION
 from consistency.referee.diagnostics.record import JointNees
-from consistency.referee.diagnostics.records import JointScore, Settings
 from consistency.referee.diagnostics.scale import ratio_interval
+from consistency.referee.diagnostics.verdict_parts import JointScore, Settings
 from consistency.referee.types import Array, Indices
 
 SURE = 0.04  # false-alarm rate of naming a landmark that does not stand out

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from consistency.referee.diagnostics.early_stopping import Design, follow
 from consistency.referee.diagnostics.landmarks import map_score
 from consistency.referee.diagnostics.questions import SHARES
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.records import Settings, Verdict
 from consistency.referee.diagnostics.rejection import rejection_score
-from consistency.referee.diagnostics.sequential import Design, follow
 from consistency.referee.diagnostics.verdict import DEFAULT, judge_alone
+from consistency.referee.diagnostics.verdict_parts import Settings, Verdict
 from consistency.referee.diagnostics.wording import plain
 
 POSES = {"heading", "yaw", "pitch", "roll"}  # components that a pose has beside its position

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from consistency.referee.diagnostics.records import MapScore
 from consistency.referee.diagnostics.scale import ratio_interval
+from consistency.referee.diagnostics.verdict_parts import MapScore
 from consistency.referee.types import Array, Indices
 
 POSE, POINT = 3, 3  # degrees of freedom of a pose in the plane, and of a landmark in space

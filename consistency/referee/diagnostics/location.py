@@ -16,7 +16,11 @@ from consistency.referee.diagnostics.credibility import noncredibility
 from consistency.referee.diagnostics.hypothesis_tests import Tests
 from consistency.referee.diagnostics.nees import anees
 from consistency.referee.diagnostics.questions import BIAS, MAIN, SCALE, SHAPE, STEP
-from consistency.referee.diagnostics.records import (
+from consistency.referee.diagnostics.reported_scale import pointwise_band
+from consistency.referee.diagnostics.sample import ATTITUDE, POSITION, Errors, Sample
+from consistency.referee.diagnostics.scale import ratio_interval, run_means
+from consistency.referee.diagnostics.symmetric import Symmetric
+from consistency.referee.diagnostics.verdict_parts import (
     Accuracy,
     Answer,
     Axes,
@@ -28,10 +32,6 @@ from consistency.referee.diagnostics.records import (
     Tails,
     Until,
 )  # fmt: skip
-from consistency.referee.diagnostics.sample import ATTITUDE, POSITION, Errors, Sample
-from consistency.referee.diagnostics.scale import ratio_interval, run_means
-from consistency.referee.diagnostics.scaling import pointwise_band
-from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.whitening import mean_of_runs, standardise
 from consistency.referee.types import Array, Indices
 

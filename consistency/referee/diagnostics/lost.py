@@ -8,8 +8,8 @@ from scipy import special
 from consistency.referee.diagnostics.eprocess import ever
 from consistency.referee.diagnostics.planning import lost_runs, share_limit
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.records import Lost, Settings
 from consistency.referee.diagnostics.scale import run_means
+from consistency.referee.diagnostics.verdict_parts import Lost, Settings
 from consistency.referee.types import Array
 
 PARTS = np.array([0.0, 0.125, 0.25, 0.5])  # of the share in question: what the bet takes the true share to be

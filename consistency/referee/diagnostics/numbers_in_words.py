@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from consistency.referee.diagnostics.records import TINY, Interval
+from consistency.referee.diagnostics.verdict_parts import TINY, Interval
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from consistency.referee.diagnostics.records import Answer
+from consistency.referee.diagnostics.verdict_parts import Answer
 
 MAIN, STEP, AXIS, DIRECTION = "scale", "scale in some step", "scale of an axis", "scale in some direction"
 SCALE = (MAIN, STEP, AXIS, DIRECTION)

@@ -7,7 +7,7 @@ from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.intervals import binomial_interval
-from consistency.referee.diagnostics.records import Interval, RejectionScore
+from consistency.referee.diagnostics.verdict_parts import Interval, RejectionScore
 from consistency.referee.types import Array, Indices
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from consistency.referee.diagnostics.blocks import by_runs, by_steps, of_runs
 from consistency.referee.diagnostics.innovations import nis_of
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.records import Settings
 from consistency.referee.diagnostics.scale import means_and_counts, run_means
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.validity import negative
+from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.diagnostics.whitening import all_finite, entries, squared_length, subset, whiten
 from consistency.referee.types import Array
 

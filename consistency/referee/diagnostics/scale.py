@@ -9,7 +9,7 @@ from scipy import special, stats
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.blocks import by_runs, by_steps
-from consistency.referee.diagnostics.records import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.types import Array
 
 FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete

@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import wording
 from consistency.referee.diagnostics.band import simultaneous_band
-from consistency.referee.diagnostics.ends import early_ends
+from consistency.referee.diagnostics.early_ends import early_ends
 from consistency.referee.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.referee.diagnostics.headline import at_share, status_of
 from consistency.referee.diagnostics.hypothesis_tests import Tests, ask
@@ -29,10 +29,10 @@ from consistency.referee.diagnostics.questions import (
     answers,
 )
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.records import Answer, Equivalence, Innovations, Settings, Verdict
+from consistency.referee.diagnostics.reported_scale import scale_of
 from consistency.referee.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.referee.diagnostics.sample import shape_of as shape_of_arrays
-from consistency.referee.diagnostics.scaling import scale_of
+from consistency.referee.diagnostics.verdict_parts import Answer, Equivalence, Innovations, Settings, Verdict
 from consistency.referee.diagnostics.whitening import entries
 
 DEFAULT = Settings()
@@ -40,7 +40,7 @@ DEFAULT = Settings()
 
 @dataclass(frozen=True)
 class Look:
-    """One of several looks at growing evidence; see :mod:`consistency.diagnostics.sequential`."""
+    """One of several looks at growing evidence; see :mod:`consistency.diagnostics.early_stopping`."""
 
     spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
     # None where nothing but the scale is asked

@@ -15,7 +15,7 @@ from consistency.referee.diagnostics.faults_in_words import (
 )
 from consistency.referee.diagnostics.numbers_in_words import UNCERTAIN, off_by, p_text, percent, plain, plural, short
 from consistency.referee.diagnostics.questions import ALONE, BIAS, JOINT, SCALE, SHAPE
-from consistency.referee.diagnostics.records import Equivalence, Verdict
+from consistency.referee.diagnostics.verdict_parts import Equivalence, Verdict
 
 __all__ = ["UNCERTAIN", "off_by", "p_text", "percent", "plain", "plural", "question_text", "reasons", "short"]
 

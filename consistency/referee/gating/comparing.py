@@ -13,7 +13,7 @@ from consistency.referee.diagnostics import Comparison, Record, RunSummary, comp
 from consistency.referee.diagnostics.comparison import FailedRuns
 from consistency.referee.diagnostics.skipping import Skip
 from consistency.referee.gating.checks import checked, of_results, planned_dof
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing.columns import POSE
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline

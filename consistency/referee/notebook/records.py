@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.errors import InputError
-from consistency.referee.reading.options import Reading
-from consistency.referee.sources import read_recordings
-from consistency.referee.sources.archive import record_of_arrays
+from consistency.referee.parsing.options import Reading
+from consistency.referee.readers import read_recordings
+from consistency.referee.readers.archive import record_of_arrays
 from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import settings_of, skip_asked
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import one_line, read_json
+from consistency.referee.parsing import one_line, read_json
 from consistency.referee.system.atomic import make_durable
 from consistency.referee.system.provenance import SCHEMA_VERSION
 from consistency.referee.system.stopping import undisturbed

@@ -15,8 +15,8 @@ from consistency.referee.diagnostics import Record, RunSummary, summary
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.skipping import Skip
 from consistency.referee.errors import InputError
-from consistency.referee.reading import HUGE, read_json, reading
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing import HUGE, read_json, reading
+from consistency.referee.parsing.columns import POSE
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 from consistency.referee.verdicts.options import skip_asked

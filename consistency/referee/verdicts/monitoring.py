@@ -12,9 +12,9 @@ import numpy as np
 
 from consistency.referee.diagnostics import Alarm, Monitor
 from consistency.referee.errors import InputError
-from consistency.referee.reading.outside import outside
-from consistency.referee.sources.nis import NisLog, read_nis, stream_nis
-from consistency.referee.sources.ulog import SUFFIX, read_ulog
+from consistency.referee.outside import outside
+from consistency.referee.readers.nis import NisLog, read_nis, stream_nis
+from consistency.referee.readers.ulog import SUFFIX, read_ulog
 from consistency.referee.types import Array
 
 OPTIMAL = "optimal"

@@ -9,7 +9,7 @@ from typing import Any
 from consistency.referee.diagnostics import Design, Settings, gate_runs, lost_runs, pilot_plan, required_runs
 from consistency.referee.diagnostics.skipping import Skip, skip_of
 from consistency.referee.errors import InputError
-from consistency.referee.reading.columns import POSE
+from consistency.referee.parsing.columns import POSE
 from consistency.referee.types import Array
 
 OPTION = {

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from consistency.referee.diagnostics import Design, Record
 from consistency.referee.errors import InputError
-from consistency.referee.reading.outside import outside
+from consistency.referee.outside import outside
 
 
 class Results(Protocol):

@@ -16,7 +16,7 @@ from consistency.bench.store.tables import table_file
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
-from consistency.referee.sources.tum import read_trajectory
+from consistency.referee.readers.tum import read_trajectory
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
 from consistency.stereo.characterising.landmarks import SHORTEST, Seen

@@ -8,11 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import is_file, reading
-from consistency.referee.reading.kitti import NANO, place_of, read_times
-from consistency.referee.sources.kitti import BODIES, drive_poses, is_drive
-from consistency.referee.sources.matching import associate
-from consistency.referee.sources.tum import UNIT, read_trajectory
+from consistency.referee.parsing import is_file, reading
+from consistency.referee.parsing.kitti import NANO, place_of, read_times
+from consistency.referee.readers.kitti import BODIES, drive_poses, is_drive
+from consistency.referee.readers.matching import associate
+from consistency.referee.readers.tum import UNIT, read_trajectory
 from consistency.referee.types import Array
 from consistency.stereo.vision.cameras import CAMERA_0, EUROC_BODY
 from consistency.stereo.vision.sequence import RAW_CALIBRATION, Sequence, read_table

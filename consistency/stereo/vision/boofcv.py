@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import one_line
+from consistency.referee.parsing import one_line
 from consistency.referee.types import Array
 from consistency.stereo.vision.cameras import Calibration, checked, sized
 from consistency.stereo.vision.yaml_file import matrix, read_yaml

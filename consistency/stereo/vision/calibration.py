@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import read_text, reading
+from consistency.referee.parsing import read_text, reading
 from consistency.referee.types import Array
 from consistency.stereo.vision.boofcv import read_boofcv
 from consistency.stereo.vision.cameras import EUROC_BODY, Calibration, checked, distortion, sized

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading.kitti import numbers, read_keys, turn
+from consistency.referee.parsing.kitti import numbers, read_keys, turn
 from consistency.referee.types import Array
 from consistency.stereo.vision.cameras import CAMERA_0, Calibration, checked
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import HUGE, is_file, read_text, reading
-from consistency.referee.reading.kitti import NANO, place_of, read_times
+from consistency.referee.parsing import HUGE, is_file, read_text, reading
+from consistency.referee.parsing.kitti import NANO, place_of, read_times
 from consistency.referee.types import Array
 from consistency.stereo.vision.calibration import read_calibration
 from consistency.stereo.vision.cameras import Calibration

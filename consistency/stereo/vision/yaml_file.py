@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
-from consistency.referee.reading import HUGE, read_text, reading
+from consistency.referee.parsing import HUGE, read_text, reading
 from consistency.referee.types import Array
 from consistency.stereo.vision.features import opencv
 

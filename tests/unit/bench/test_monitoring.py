@@ -20,10 +20,10 @@ from consistency.referee.document.monitor import monitor_document
 from consistency.referee.errors import InputError
 from consistency.referee.pages import require_plot, write_monitor_plot
 from consistency.referee.pages.monitor import POINTS, averaged, monitor_plot, sheet
+from consistency.referee.readers.nis import NisLog
 from consistency.referee.show import paper
 from consistency.referee.show.json import render
 from consistency.referee.show.terminal import show
-from consistency.referee.sources.nis import NisLog
 from consistency.referee.verdicts.monitoring import Watched, make_monitor, read_innovations, watch, watch_lines
 
 NIS = [1.0, 2.5, math.nan, 0.25, 7.0]

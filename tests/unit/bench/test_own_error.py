@@ -20,7 +20,7 @@ from consistency.bench.store.log import read_log
 from consistency.bench.store.results import OWN_NUMBERS, joined, open_results, outcome_of
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.reading.columns import OWN_COVARIANCE, POINT_COVARIANCE
+from consistency.referee.parsing.columns import OWN_COVARIANCE, POINT_COVARIANCE
 from consistency.referee.types import Array, Failure
 
 FILTERS = ["ekf-uvd", Invariant()]

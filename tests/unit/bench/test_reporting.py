@@ -37,7 +37,7 @@ from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.results import read_results
 from consistency.referee.diagnostics import Answer, Evidence, Interval, Settings, judge
 from consistency.referee.diagnostics.questions import DIRECTION, STEP
-from consistency.referee.diagnostics.records import STATUSES
+from consistency.referee.diagnostics.verdict_parts import STATUSES
 from consistency.referee.diagnostics.wording import short
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.drawing import Figure, Intervals, Line, Points, Span
@@ -46,7 +46,7 @@ from consistency.referee.document.verdict import FURTHER, factor, page, shown_in
 from consistency.referee.document.wording import written
 from consistency.referee.pages import axes, questions, verdicts
 from consistency.referee.pages.clock import clock_of
-from consistency.referee.reading.columns import COVARIANCE
+from consistency.referee.parsing.columns import COVARIANCE
 from consistency.referee.show import html, pdf
 from consistency.referee.show.static import STYLE
 from consistency.referee.types import Failure

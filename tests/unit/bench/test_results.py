@@ -20,7 +20,7 @@ import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.runs.records import record_of
 from consistency.bench.types import Control, Gaussian, Observation
-from consistency.referee.reading.columns import COLUMNS
+from consistency.referee.parsing.columns import COLUMNS
 from consistency.referee.system.folders import require_free
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")

@@ -34,11 +34,11 @@ from consistency.referee.diagnostics.fitted import (
 from consistency.referee.diagnostics.questions import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.sources.alignment import ALL_BUT_SCALE, FREE, Aligned, aligned, clocks_and_frames
-from consistency.referee.sources.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.sources.frames import WorldTransform, moved
-from consistency.referee.sources.poses import Poses
-from consistency.referee.sources.sheet import Places
+from consistency.referee.readers.alignment import ALL_BUT_SCALE, FREE, Aligned, aligned, clocks_and_frames
+from consistency.referee.readers.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
+from consistency.referee.readers.frames import WorldTransform, moved
+from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array
 
 STEPS = 30
@@ -593,7 +593,7 @@ def test_clock_and_frame_are_found_in_turn_until_the_clock_settles(
     shifts: list[float], said: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To 0.1 ms, or five times."""
-    module, then = "consistency.referee.sources.alignment", iter(shifts)
+    module, then = "consistency.referee.readers.alignment", iter(shifts)
     monkeypatch.setattr(f"{module}.frames_of", lambda *_: [])
     monkeypatch.setattr(f"{module}.clock_shift", lambda *_: (next(then), []))
     monkeypatch.setattr(f"{module}.aligned", lambda *_: Aligned([]))

@@ -21,7 +21,7 @@ from consistency.referee import extras
 from consistency.referee.cli.app import app, main
 from consistency.referee.cli.commands import COMMANDS
 from consistency.referee.extras import EXTRAS, MissingPackageError, explained, missing, packages, remedy, require
-from consistency.referee.reading.shipped import summaries
+from consistency.referee.shipped import summaries
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]

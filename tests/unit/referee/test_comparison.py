@@ -15,7 +15,7 @@ from scipy import optimize, special, stats
 
 import consistency as cs
 from consistency.referee.diagnostics import Comparison, RunSummary, compare, summary
-from consistency.referee.diagnostics.contrast import Contrast, contrast, margin
+from consistency.referee.diagnostics.log_ratio import Contrast, contrast, margin
 from consistency.referee.gating.session import needed_at
 from consistency.referee.gating.watch import Watch, watching
 from consistency.referee.types import Array

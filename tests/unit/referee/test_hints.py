@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error, spatial_error
-from consistency.referee.sources.fits import FACTOR, ReadingFit, fit_of
-from consistency.referee.sources.frames import WorldTransform, carried, fitted_frame, moved
-from consistency.referee.sources.hints import _ned, decades, hints, turns
-from consistency.referee.sources.poses import Poses
-from consistency.referee.sources.sheet import Places
+from consistency.referee.readers.fits import FACTOR, ReadingFit, fit_of
+from consistency.referee.readers.frames import WorldTransform, carried, fitted_frame, moved
+from consistency.referee.readers.hints import _ned, decades, hints, turns
+from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array
 
 RUNS, STEPS = 3, 60

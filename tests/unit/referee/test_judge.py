@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from consistency.bench.runs.by_run import run_means, wins
+from consistency.bench.runs.run_scores import run_means, wins
 from consistency.referee.diagnostics import Record
 from consistency.referee.types import Array, Failure
 

@@ -14,9 +14,9 @@ import pytest
 
 from consistency.referee.diagnostics.blocks import FEWER as ROWS
 from consistency.referee.errors import InputError
-from consistency.referee.sources import text
-from consistency.referee.sources.record import symmetric
-from consistency.referee.sources.sheet import Block, read_numbers, read_sheet
+from consistency.referee.readers import text
+from consistency.referee.readers.record import symmetric
+from consistency.referee.readers.sheet import Block, read_numbers, read_sheet
 
 LAYOUT = "t and two numbers"
 

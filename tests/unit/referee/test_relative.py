@@ -20,8 +20,8 @@ from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.independence import ENOUGH
 from consistency.referee.geometry.groups import carried, composed, matrices, to_left
-from consistency.referee.sources.relative import Stretch, windows_of
-from consistency.referee.sources.windows import Relative
+from consistency.referee.readers.relative import Stretch, windows_of
+from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 from consistency.referee.verdicts.baselines import baseline
 from consistency.referee.verdicts.comparison import compare_with

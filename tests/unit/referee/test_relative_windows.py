@@ -15,8 +15,8 @@ from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.independence import ENOUGH
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error, spatial_error
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, to_left
-from consistency.referee.sources.relative import windows_of
-from consistency.referee.sources.windows import Relative, relative_of, windows
+from consistency.referee.readers.relative import windows_of
+from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge import analyse
 

@@ -15,7 +15,7 @@ from draws import fully_dependent, identities, independent, verdict_on
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.diagnostics.faults_in_words import bias_text, scale_text, shape_text
-from consistency.referee.diagnostics.records import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.diagnostics.wording import reasons
 from consistency.referee.document.verdict import document
 from consistency.referee.show.terminal import show

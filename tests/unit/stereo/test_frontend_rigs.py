@@ -19,7 +19,7 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor
 from consistency.bench.store.log import read_log
 from consistency.bench.types import Trial
 from consistency.referee.geometry import rotation
-from consistency.referee.sources.kitti import drive_poses
+from consistency.referee.readers.kitti import drive_poses
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.planar_log import plane_of
 from consistency.stereo.frontend.truth import find_truth, missing_of_drive, read_truth

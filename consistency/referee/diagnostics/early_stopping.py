@@ -10,9 +10,9 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.eprocess import e_process, ever
 from consistency.referee.diagnostics.questions import MAIN, SHARES
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.records import Settings, Verdict
 from consistency.referee.diagnostics.sample import sample_of
 from consistency.referee.diagnostics.verdict import Look, judge_alone
+from consistency.referee.diagnostics.verdict_parts import Settings, Verdict
 
 FIRST = 12  # runs at the first look; with fewer hardly anything but a failed run would be found
 PARTS = 4  # times that the scale is looked at from one look to the next

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import HUGE, one_line, read_text, reading
+from consistency.referee.parsing import HUGE, one_line, read_text, reading
 from consistency.referee.types import Array
 
 STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")

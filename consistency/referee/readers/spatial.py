@@ -11,15 +11,15 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.reading.options import Reading
-from consistency.referee.sources.alignment import clocks_and_frames
-from consistency.referee.sources.hints import hints
-from consistency.referee.sources.interpolation import truth_at
-from consistency.referee.sources.matching import common_times
-from consistency.referee.sources.poses import Poses
-from consistency.referee.sources.record import Track, assemble
-from consistency.referee.sources.relative import Stretch, relative_recording
-from consistency.referee.sources.windows import Relative
+from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.alignment import clocks_and_frames
+from consistency.referee.readers.hints import hints
+from consistency.referee.readers.interpolation import truth_at
+from consistency.referee.readers.matching import common_times
+from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.record import Track, assemble
+from consistency.referee.readers.relative import Stretch, relative_recording
+from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 
 AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import consistency as cs
-from consistency.referee.reading import one_line, read_json, read_text, read_toml, reading, require_room
+from consistency.referee.parsing import one_line, read_json, read_text, read_toml, reading, require_room
 
 
 @pytest.mark.parametrize(

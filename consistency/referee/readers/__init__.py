@@ -12,16 +12,16 @@ from pathlib import Path
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
-from consistency.referee.reading import require_name
-from consistency.referee.reading.options import Reading, flag_of
-from consistency.referee.sources.alignment import ALIGNMENTS, require_alignment
-from consistency.referee.sources.archive import read_archive
-from consistency.referee.sources.bags import is_bag, read_bags
-from consistency.referee.sources.kitti import BODIES, is_drive
-from consistency.referee.sources.relative import MARGINAL
-from consistency.referee.sources.table import read_tables
-from consistency.referee.sources.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
-from consistency.referee.sources.windows import Relative, relative_of
+from consistency.referee.parsing import require_name
+from consistency.referee.parsing.options import Reading, flag_of
+from consistency.referee.readers.alignment import ALIGNMENTS, require_alignment
+from consistency.referee.readers.archive import read_archive
+from consistency.referee.readers.bags import is_bag, read_bags
+from consistency.referee.readers.kitti import BODIES, is_drive
+from consistency.referee.readers.relative import MARGINAL
+from consistency.referee.readers.table import read_tables
+from consistency.referee.readers.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
+from consistency.referee.readers.windows import Relative, relative_of
 
 __all__ = [
     "ALIGNMENTS",

@@ -11,11 +11,11 @@ from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.fitted import ENOUGH, inflation_of_mean, left_covariances
 from consistency.referee.diagnostics.questions import BIAS, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.referee.errors import InputError
-from consistency.referee.sources.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.sources.frames import WorldTransform, moved
-from consistency.referee.sources.offset import clock_shift
-from consistency.referee.sources.origin import frame_of_first_pose, from_first_pose
-from consistency.referee.sources.poses import Poses
+from consistency.referee.readers.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
+from consistency.referee.readers.frames import WorldTransform, moved
+from consistency.referee.readers.offset import clock_shift
+from consistency.referee.readers.origin import frame_of_first_pose, from_first_pose
+from consistency.referee.readers.poses import Poses
 
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them

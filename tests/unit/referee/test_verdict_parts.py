@@ -9,10 +9,19 @@ import numpy as np
 import pytest
 from draws import identities, independent, verdict_on
 
-from consistency.referee.diagnostics import Answer, Equivalence, Evidence, Interval, Settings, Verdict, judge, records
+from consistency.referee.diagnostics import (
+    Answer,
+    Equivalence,
+    Evidence,
+    Interval,
+    Settings,
+    Verdict,
+    judge,
+    verdict_parts,
+)
 from consistency.referee.diagnostics.questions import ABOUT, MAIN, OF_MAP, SHARES, answers
-from consistency.referee.diagnostics.records import Innovations
 from consistency.referee.diagnostics.skipping import Skip, Skipped
+from consistency.referee.diagnostics.verdict_parts import Innovations
 from consistency.referee.types import Array
 
 # --- settings ------------------------------------------------------------------------------------------
@@ -154,7 +163,7 @@ def test_scale_counts_the_steps_that_are_judged() -> None:
 
 
 def test_every_status_has_a_meaning_and_every_question_a_share() -> None:
-    assert list(records.STATUSES) == [
+    assert list(verdict_parts.STATUSES) == [
         "consistent", "overconfident", "conservative", "biased", "heavy-tailed", "inconsistent", "undecided", "failed",
     ]  # fmt: skip
     assert set(SHARES) == set(ABOUT)

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.sources.fitting import Sound, sound_of, tangent
-from consistency.referee.sources.frames import WorldTransform
-from consistency.referee.sources.poses import Poses
+from consistency.referee.readers.fitting import Sound, sound_of, tangent
+from consistency.referee.readers.frames import WorldTransform
+from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 

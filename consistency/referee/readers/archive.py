@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike
 from consistency.referee.diagnostics import Evidence, Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
-from consistency.referee.reading import is_file, reading, require_name, require_room
-from consistency.referee.sources.hints import hints, turns
-from consistency.referee.sources.interpolation import Manifold
-from consistency.referee.sources.poses import Poses
-from consistency.referee.sources.record import Track, assemble, symmetric
-from consistency.referee.sources.relative import Stretch, relative_recording
-from consistency.referee.sources.sheet import Places, are_dof, bounded
-from consistency.referee.sources.windows import Relative
+from consistency.referee.parsing import is_file, reading, require_name, require_room
+from consistency.referee.readers.hints import hints, turns
+from consistency.referee.readers.interpolation import Manifold
+from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.record import Track, assemble, symmetric
+from consistency.referee.readers.relative import Stretch, relative_recording
+from consistency.referee.readers.sheet import Places, are_dof, bounded
+from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Failure
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"

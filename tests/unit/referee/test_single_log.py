@@ -13,7 +13,7 @@ from scipy import stats
 from single_log import errors
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
-from consistency.referee.diagnostics.within import correlation_time, within
+from consistency.referee.diagnostics.single_log import correlation_time, within
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge import analyse
 

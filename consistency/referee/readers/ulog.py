@@ -13,10 +13,10 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
-from consistency.referee.reading import is_file, reading
-from consistency.referee.sources.matching import associate
-from consistency.referee.sources.nis import NisLog, choose
-from consistency.referee.sources.record import count
+from consistency.referee.parsing import is_file, reading
+from consistency.referee.readers.matching import associate
+from consistency.referee.readers.nis import NisLog, choose
+from consistency.referee.readers.record import count
 from consistency.referee.types import Array, Indices
 
 TOPICS = ("estimator_innovations", "estimator_innovation_variances")

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.sources.interpolation import Manifold
-from consistency.referee.sources.poses import Poses
+from consistency.referee.readers.interpolation import Manifold
+from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 

@@ -10,10 +10,10 @@ from consistency.referee.diagnostics.intervals import anees_interval
 from consistency.referee.diagnostics.nees import anees
 from consistency.referee.diagnostics.planning import detectable_ratio
 from consistency.referee.diagnostics.questions import MAIN, SHARES
-from consistency.referee.diagnostics.records import Equivalence, Location, Scale, Settings
 from consistency.referee.diagnostics.sample import Sample
 from consistency.referee.diagnostics.scale import acceptance, ratio_interval
-from consistency.referee.diagnostics.within import within
+from consistency.referee.diagnostics.single_log import within
+from consistency.referee.diagnostics.verdict_parts import Equivalence, Location, Scale, Settings
 from consistency.referee.types import Array, Indices
 
 NOTHING = (float("nan"), float("nan"))

@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import reading
+from consistency.referee.parsing import reading
 from consistency.referee.types import Array, Indices
 
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much

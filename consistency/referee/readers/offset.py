@@ -10,7 +10,7 @@ from scipy import optimize, stats
 
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
-from consistency.referee.sources.poses import Poses
+from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 REACH = 1.0  # s, the largest offset that is looked for

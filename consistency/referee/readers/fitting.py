@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
-from consistency.referee.sources.frames import IDENTITY, WorldTransform, fitted_frame, moved, turned_frame
-from consistency.referee.sources.interpolation import Known
-from consistency.referee.sources.poses import Poses
+from consistency.referee.readers.frames import IDENTITY, WorldTransform, fitted_frame, moved, turned_frame
+from consistency.referee.readers.interpolation import Known
+from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array, Indices
 
 STEP = 1e-6  # m or rad, over which the change of an error is taken

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.sources.sheet import Lines, read_numbers
+from consistency.referee.readers.sheet import Lines, read_numbers
 from consistency.referee.types import Array
 
 CAMERAS, CALIBRATION = 18, 15  # column with the number of cameras, and numbers of each one's calibration

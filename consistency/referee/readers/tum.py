@@ -10,15 +10,15 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.reading.options import Reading
-from consistency.referee.sources.kitti import is_drive, read_drive
-from consistency.referee.sources.matching import associate
-from consistency.referee.sources.openvins import FULL as STATES
-from consistency.referee.sources.openvins import LAYOUT, States, as_states, read_deviations
-from consistency.referee.sources.poses import Poses
-from consistency.referee.sources.record import symmetric
-from consistency.referee.sources.sheet import Lines, Places, read_numbers
-from consistency.referee.sources.spatial import (
+from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.kitti import is_drive, read_drive
+from consistency.referee.readers.matching import associate
+from consistency.referee.readers.openvins import FULL as STATES
+from consistency.referee.readers.openvins import LAYOUT, States, as_states, read_deviations
+from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.record import symmetric
+from consistency.referee.readers.sheet import Lines, Places, read_numbers
+from consistency.referee.readers.spatial import (
     BLOCKS,
     SINGLE,
     WHOLE,
@@ -27,7 +27,7 @@ from consistency.referee.sources.spatial import (
     recordings_of,
     require_axes,
 )
-from consistency.referee.sources.windows import Relative
+from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")

@@ -13,13 +13,13 @@ from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.reading import reading
-from consistency.referee.reading.options import Reading
-from consistency.referee.sources.poses import Poses
-from consistency.referee.sources.record import symmetric
-from consistency.referee.sources.sheet import Places
-from consistency.referee.sources.spatial import WHOLE, TrajectorySource, recordings_of, require_axes
-from consistency.referee.sources.tum import UNIT
+from consistency.referee.parsing import reading
+from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.record import symmetric
+from consistency.referee.readers.sheet import Places
+from consistency.referee.readers.spatial import WHOLE, TrajectorySource, recordings_of, require_axes
+from consistency.referee.readers.tum import UNIT
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance

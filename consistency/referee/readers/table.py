@@ -13,18 +13,18 @@ from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error
-from consistency.referee.reading.columns import COVARIANCE, OWN_COVARIANCE
-from consistency.referee.reading.options import Reading
-from consistency.referee.sources.alignment import Aligned, clocks_and_frames
-from consistency.referee.sources.hints import hints
-from consistency.referee.sources.interpolation import Manifold, truth_at
-from consistency.referee.sources.kitti import drive_sheet, is_drive
-from consistency.referee.sources.matching import common_steps, common_times
-from consistency.referee.sources.poses import Poses
-from consistency.referee.sources.record import Track, assemble, count, listed, symmetric
-from consistency.referee.sources.relative import Stretch, relative_recording
-from consistency.referee.sources.sheet import Places, TableRows, are_dof, read_sheet
-from consistency.referee.sources.windows import Relative
+from consistency.referee.parsing.columns import COVARIANCE, OWN_COVARIANCE
+from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.alignment import Aligned, clocks_and_frames
+from consistency.referee.readers.hints import hints
+from consistency.referee.readers.interpolation import Manifold, truth_at
+from consistency.referee.readers.kitti import drive_sheet, is_drive
+from consistency.referee.readers.matching import common_steps, common_times
+from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.record import Track, assemble, count, listed, symmetric
+from consistency.referee.readers.relative import Stretch, relative_recording
+from consistency.referee.readers.sheet import Places, TableRows, are_dof, read_sheet
+from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
 POSE = ("x", "y", "heading")

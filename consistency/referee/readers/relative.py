@@ -17,10 +17,10 @@ from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.diagnostics.wording import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
-from consistency.referee.sources.matching import common_times
-from consistency.referee.sources.record import Track, assemble, count
-from consistency.referee.sources.sheet import Places
-from consistency.referee.sources.windows import Relative, windows
+from consistency.referee.readers.matching import common_times
+from consistency.referee.readers.record import Track, assemble, count
+from consistency.referee.readers.sheet import Places
+from consistency.referee.readers.windows import Relative, windows
 from consistency.referee.types import Array, Indices
 
 KIND = "left"

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.referee.geometry.conventions import planar_error, spatial_error
-from consistency.referee.sources.interpolation import Known, Manifold, truth_at
-from consistency.referee.sources.sheet import Places
+from consistency.referee.readers.interpolation import Known, Manifold, truth_at
+from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array, Indices
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.reading import read_text, reading
-from consistency.referee.reading.kitti import NANO, numbers, place_of, read_keys, read_times, turn
-from consistency.referee.sources.sheet import Lines, TableRows
+from consistency.referee.parsing import read_text, reading
+from consistency.referee.parsing.kitti import NANO, numbers, place_of, read_keys, read_times, turn
+from consistency.referee.readers.sheet import Lines, TableRows
 from consistency.referee.types import Array
 
 EARTH = 6378137.0  # m, radius at the equator (WGS 84)

@@ -8,8 +8,8 @@ from scipy import special, stats
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.equivalence import deciding_runs
 from consistency.referee.diagnostics.planning import MARGIN
-from consistency.referee.diagnostics.records import Interval, Settings, Within
 from consistency.referee.diagnostics.scale import FEW, LEAST, MeanTest
+from consistency.referee.diagnostics.verdict_parts import Interval, Settings, Within
 from consistency.referee.types import Array
 
 REACH = 5.0  # correlation times over which autocorrelations are summed: Sokal (1997), sec. 3

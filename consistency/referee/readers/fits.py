@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.diagnostics.validity import Validity, classify
-from consistency.referee.sources.poses import Poses
+from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 FACTOR = 6.0  # by which a wrong filter's covariance is off without a mix-up: the table of benchmarks/hints.py has 4

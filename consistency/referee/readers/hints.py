@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
-from consistency.referee.sources.fits import ReadingFit, fit_of
-from consistency.referee.sources.frames import WorldTransform, fitted_frame, moved, spread
-from consistency.referee.sources.poses import Poses
+from consistency.referee.readers.fits import ReadingFit, fit_of
+from consistency.referee.readers.frames import WorldTransform, fitted_frame, moved, spread
+from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 MOST = 4000  # estimates that are looked at, of all runs together
@@ -51,7 +51,7 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
 
     Where the NEES of a median estimate is off by a decade or more, the guess that brings it nearest to a right one is
     named. Where it is off by less, a guess is named if all errors then agree with the covariance, and no simple fault
-    of a filter explains as much (:mod:`consistency.referee.sources.fits`).
+    of a filter explains as much (:mod:`consistency.referee.readers.fits`).
     """
     if not runs:
         return []

@@ -9,7 +9,7 @@ from consistency.referee.diagnostics.comparison import Comparison, Difference, R
 from consistency.referee.diagnostics.coverage import coverage, coverage_interval, rmse
 from consistency.referee.diagnostics.credibility import noncredibility
 from consistency.referee.diagnostics.direction import Largest, largest_direction
-from consistency.referee.diagnostics.early_ends import EarlyEnds, early_ends
+from consistency.referee.diagnostics.early_ending import EarlyEnds, early_ends
 from consistency.referee.diagnostics.early_stopping import Design, follow, look, sequential_design, speaks
 from consistency.referee.diagnostics.eprocess import EProcess, e_process, ever
 from consistency.referee.diagnostics.equivalence import equivalence

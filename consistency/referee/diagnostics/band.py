@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
 from consistency.referee.defaults import FALSE_ALARM
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.blocks import blocks
 from consistency.referee.diagnostics.nees import anees
 from consistency.referee.diagnostics.scale import FEW
@@ -73,11 +74,11 @@ def simultaneous_band(
 
     c = float(optimize.brentq(lambda x: exceedance(x) - min(false_alarm, 0.999 * exceedance(0.0)), 0.0, 38.0))
     curve, k = anees(nees), alive[judged] * dof
-    upper, lower = stats.chi2.sf(alive[judged] * curve[judged], k), stats.chi2.cdf(alive[judged] * curve[judged], k)
+    upper, lower = laws.chi2.sf(alive[judged] * curve[judged], k), laws.chi2.cdf(alive[judged] * curve[judged], k)
     smallest = float(upper.min() if sides == 1 else min(upper.min(), lower.min()))
     p_value = min(1.0, exceedance(max(float(-special.ndtri(smallest)), 0.0))) if smallest > 0 else 0.0
-    low[judged] = 0.0 if sides == 1 else stats.chi2.ppf(special.ndtr(-c), k) / alive[judged]
-    high[judged] = stats.chi2.isf(special.ndtr(-c), k) / alive[judged]
+    low[judged] = 0.0 if sides == 1 else laws.chi2.ppf(special.ndtr(-c), k) / alive[judged]
+    high[judged] = laws.chi2.isf(special.ndtr(-c), k) / alive[judged]
     with np.errstate(invalid="ignore"):
         return Band(low, high, p_value, curve > high, curve < low)
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.blocks import blocks
 from consistency.referee.diagnostics.whitening import all_finite
 from consistency.referee.types import Array, Indices
@@ -37,7 +38,7 @@ def hotelling(sample: Array, confidence: float = CONFIDENCE) -> Hotelling:
         raise ValueError(f"needs more finite rows than columns, got shape {x.shape}")
     (statistic,), (p_value,) = t_squared(x[:, None, :])
     N, n = x.shape
-    half = stats.t.isf(0.5 * (1.0 - confidence) / n, N - 1) * x.std(axis=0, ddof=1) / np.sqrt(N)
+    half = laws.t.isf(0.5 * (1.0 - confidence) / n, N - 1) * x.std(axis=0, ddof=1) / np.sqrt(N)
     mean = x.mean(axis=0)
     return Hotelling(mean, np.stack([mean - half, mean + half], axis=-1), float(statistic), float(p_value))
 

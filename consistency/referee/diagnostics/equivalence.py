@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.eprocess import e_process, ever
 from consistency.referee.diagnostics.innovations import NisTest
 from consistency.referee.diagnostics.planning import LARGEST
@@ -64,7 +65,7 @@ def equivalence_of_innovations(test: NisTest, settings: Settings, factor: float 
     factor, total = settings.factor if factor is None else factor, test.ratio * test.dof
     if not test.dof:
         return Equivalence(factor, float("nan"), 1.0 - settings.power, None)
-    below, above = float(stats.chi2.cdf(total / factor, test.dof)), float(stats.chi2.sf(total * factor, test.dof))
+    below, above = float(laws.chi2.cdf(total / factor, test.dof)), float(laws.chi2.sf(total * factor, test.dof))
     return _result(below, above, factor, settings, None)
 
 

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, linalg, optimize, stats
+from scipy import fft, linalg, optimize
 
+from consistency.referee.diagnostics import laws
 from consistency.referee.types import Array
 
 ENOUGH = 20  # runs that show how their errors depend on each other
@@ -102,7 +103,7 @@ def _oscillate(seen: Array, expected: Array, pairs: Array) -> bool:
     for each in (off, off.sum(axis=1)):
         mean, spread = each.mean(axis=0), each.std(axis=0, ddof=1) / np.sqrt(N)
         t = mean[spread > 0] / spread[spread > 0]
-        if (stats.t.cdf(t, N - 1) * mean.size <= 0.5 * DOUBT).any():
+        if (laws.t.cdf(t, N - 1) * mean.size <= 0.5 * DOUBT).any():
             return True
     return False
 

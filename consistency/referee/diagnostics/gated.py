@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
-from scipy import special, stats
+from scipy import special
 from scipy.optimize import brentq
+
+from consistency.referee.diagnostics import laws
 
 TINY = 1e-290  # below, a distribution function is taken from its series
 WIDEST = 1e3  # scale up to which one is looked for
@@ -13,7 +15,7 @@ WIDEST = 1e3  # scale up to which one is looked for
 
 def gate_limit(gate: float, dof: float) -> float:
     """Largest accepted NIS of a gate that accepts the share ``gate`` of the innovations of a right filter."""
-    return float(stats.chi2.ppf(gate, dof))
+    return float(laws.chi2.ppf(gate, dof))
 
 
 def log_chi2_cdf(x: float, dof: float) -> float:

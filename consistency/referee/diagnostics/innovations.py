@@ -6,8 +6,9 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.blocks import by_runs
 from consistency.referee.diagnostics.whitening import all_finite, whiten
 from consistency.referee.types import Array
@@ -49,7 +50,7 @@ def nis_test(nis: Array, dof: Array) -> NisTest:
     k, total = int(dof[counted].sum()), float(nis[counted].sum())
     if k == 0:
         return NisTest(float("nan"), 0, float("nan"), float("nan"))
-    return NisTest(total / k, k, float(stats.chi2.sf(total, k)), float(stats.chi2.cdf(total, k)))
+    return NisTest(total / k, k, float(laws.chi2.sf(total, k)), float(laws.chi2.cdf(total, k)))
 
 
 @dataclass(frozen=True)
@@ -133,4 +134,4 @@ def _portmanteau(u: Array, lags: int) -> Whiteness:
         statistic += pairs * float(np.square(C).sum())
     dof = lags * m * m
     bound = 1.96 / np.sqrt(pairs * m)
-    return Whiteness(correlation, float(bound), statistic, dof, float(stats.chi2.sf(statistic, dof)))
+    return Whiteness(correlation, float(bound), statistic, dof, float(laws.chi2.sf(statistic, dof)))

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import laws
 from consistency.referee.types import Array
 
 
@@ -36,7 +37,7 @@ def chi2_mean_interval(dof: float, confidence: float = CONFIDENCE) -> tuple[floa
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
     tail = 0.5 * (1.0 - confidence)
-    return float(stats.chi2.ppf(tail, dof) / dof), float(stats.chi2.isf(tail, dof) / dof)
+    return float(laws.chi2.ppf(tail, dof) / dof), float(laws.chi2.isf(tail, dof) / dof)
 
 
 def binomial_interval(count: Any, draws: Any, confidence: float = CONFIDENCE) -> tuple[Array, Array]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.landmarks import POSE
 from consistency.referee.diagnostics.nees_distribution import kolmogorov
 from consistency.referee.diagnostics.questions import JOINT, JOINT_DISTRIBUTION
@@ -51,10 +51,10 @@ def joint_test(
     Q, D = float(q.sum()), int(d.sum())
     p_values = dict.fromkeys((JOINT, JOINT_DISTRIBUTION), float("nan"))
     if len(q):
-        above, below = float(stats.chi2.sf(Q, D)), float(stats.chi2.cdf(Q, D))
+        above, below = float(laws.chi2.sf(Q, D)), float(laws.chi2.cdf(Q, D))
         p_values[JOINT] = above if settings.one_sided else min(1.0, 2.0 * min(above, below))
         if not settings.one_sided:
-            p_values[JOINT_DISTRIBUTION] = kolmogorov(stats.chi2.cdf(q, d))[1]
+            p_values[JOINT_DISTRIBUTION] = kolmogorov(laws.chi2.cdf(q, d))[1]
     least = int(d.min()) if len(d) else 2 * POSE
     score = JointScore(
         both=ratio_interval(q / d, least, CONFIDENCE),
@@ -78,7 +78,7 @@ def _chief(joint: JointNees, labels: Indices | None) -> tuple[int, ...]:
         return ()
     here = np.isfinite(parts)
     total, dof = np.where(here, parts, 0.0).sum(axis=0), np.maximum(joint.width * here.sum(axis=0), 1)
-    p = 2.0 * np.minimum(stats.chi2.sf(total, dof), stats.chi2.cdf(total, dof)) * len(labels)
+    p = 2.0 * np.minimum(laws.chi2.sf(total, dof), laws.chi2.cdf(total, dof)) * len(labels)
     return tuple(int(labels[j]) for j in np.argsort(p, kind="stable") if p[j] <= SURE and here[:, j].any())
 
 
@@ -87,5 +87,5 @@ def near(test: JointTest, settings: Settings) -> bool:
     if settings.tolerance is None or not test.score.runs:
         return False
     R, D, level = settings.tolerated, test.score.dof, 1.0 - settings.power
-    low = settings.one_sided or stats.chi2.sf(test.nees * R, D) <= level
-    return bool(low and stats.chi2.cdf(test.nees / R, D) <= level)
+    low = settings.one_sided or laws.chi2.sf(test.nees * R, D) <= level
+    return bool(low and laws.chi2.cdf(test.nees / R, D) <= level)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.band import Band
 from consistency.referee.diagnostics.bias import hotelling
 from consistency.referee.diagnostics.blocks import blocks, by_runs
@@ -89,7 +89,7 @@ def _absent_before(sample: Sample, first: int, sign: int) -> bool:
     if len(early) < FEWEST or not early.mean() > 0 or not late.mean() > 0:
         return False
     error = float(early.std(ddof=1) / (early.mean() * np.sqrt(len(early))))
-    upper = sign * np.log(early.mean()) + float(stats.t.isf(1.0 - CONFIDENCE, len(early) - 1)) * error
+    upper = sign * np.log(early.mean()) + float(laws.t.isf(1.0 - CONFIDENCE, len(early) - 1)) * error
     return bool(upper < 0.5 * sign * np.log(late.mean()))
 
 
@@ -106,7 +106,7 @@ def until(sample: Sample, band: Band, detect: float) -> Until | None:
     ends, early, late = _splits(sample)
     if len(early) < FEWEST or not len(ends):
         return None
-    bar = float(stats.t.isf(SURE / (2.0 * len(ends)), len(early) - 1)) / np.sqrt(len(early))
+    bar = float(laws.t.isf(SURE / (2.0 * len(ends)), len(early) - 1)) / np.sqrt(len(early))
     for end, a, b in zip(ends, early.T, late.T, strict=True):
         if not a.mean() > 0 or not b.mean() > 0:
             continue
@@ -168,7 +168,7 @@ def _stands_out(own: Array, others: Array, axes: int) -> bool:
         return False
     if error == 0.0:
         return gap != 0.0
-    return bool(2.0 * axes * stats.t.sf(abs(gap) / error, len(own) - 1) <= SURE)
+    return bool(2.0 * axes * laws.t.sf(abs(gap) / error, len(own) - 1) <= SURE)
 
 
 # --- records -----------------------------------------------------------------------------------------

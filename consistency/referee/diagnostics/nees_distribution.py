@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import stats
 
 from consistency.referee.defaults import FALSE_ALARM
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.whitening import spread_steps
 from consistency.referee.types import Array
 
@@ -37,7 +37,7 @@ def pit(nees: Array, dof: int, false_alarm: float = FALSE_ALARM) -> Pit:
     """
     steps = spread_steps(np.isfinite(nees))
     rows = np.flatnonzero(steps >= 0)
-    u = np.sort(stats.chi2.cdf(nees[rows, steps[rows]], dof))
+    u = np.sort(laws.chi2.cdf(nees[rows, steps[rows]], dof))
     if len(u) == 0:
         return Pit(u, float("nan"), float("nan"), float("nan"))
     return Pit(u, _half_width(false_alarm, len(u)), *kolmogorov(u))
@@ -48,9 +48,9 @@ def kolmogorov(u: Array) -> tuple[float, float]:
     u, N = np.sort(u), len(u)
     grid = np.arange(N + 1) / N
     distance = float(max((grid[1:] - u).max(), (u - grid[:-1]).max()))
-    return distance, float(stats.kstwo.sf(distance, N))
+    return distance, float(laws.kolmogorov.sf(distance, N))
 
 
 @lru_cache
 def _half_width(false_alarm: float, N: int) -> float:
-    return float(stats.kstwo.isf(false_alarm, N))
+    return float(laws.kolmogorov.isf(false_alarm, N))

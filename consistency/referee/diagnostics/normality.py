@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from consistency.referee.types import Array
 
@@ -30,6 +29,8 @@ def normality(sample: Array) -> Normality:
     ValueError
         Too few or not finite values.
     """
+    from scipy import stats  # slow to load, and no verdict needs it
+
     sample = np.asarray(sample, float)
     if sample.ndim != 1 or len(sample) < 20 or not np.isfinite(sample).all():
         raise ValueError(f"needs at least 20 finite values in one dimension, got shape {sample.shape}")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.bias import Moments, moments
 from consistency.referee.diagnostics.blocks import blocks
 from consistency.referee.types import Array
@@ -48,7 +48,7 @@ def outliers(whitened: Array, known: Moments | None = None) -> Outlier:
         rows[here], of_step[here] = d2.argmax(axis=0), d2.max(axis=0)
     count = N[usable]
     with np.errstate(invalid="ignore"):
-        p = stats.beta.sf(np.minimum(of_step * count / (count - 1.0) ** 2, 1.0), n / 2, (count - n - 1) / 2)
+        p = laws.beta.sf(np.minimum(of_step * count / (count - 1.0) ** 2, 1.0), n / 2, (count - n - 1) / 2)
     worst = int(p.argmin())
     p_value = min(1.0, float(p[worst]) * float(count.sum()))
     n_runs = float(count[worst])

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM, POWER
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.questions import MAIN, SHARES
 from consistency.referee.diagnostics.scale import FEW, scale_test
 from consistency.referee.types import Array
@@ -147,8 +148,8 @@ def power_of(dof: float, runs: int, ratio: float, false_alarm: float = FALSE_ALA
     """Chance that ``runs`` runs find a covariance wrong by ``ratio``; the complement of :func:`required_runs`."""
     tail, k = false_alarm / (2 if two_sided else 1), dof * runs
     if ratio > 1.0:
-        return float(stats.chi2.sf(stats.chi2.isf(tail, k) / ratio, k))
-    return float(stats.chi2.cdf(stats.chi2.ppf(tail, k) / ratio, k))
+        return float(laws.chi2.sf(laws.chi2.isf(tail, k) / ratio, k))
+    return float(laws.chi2.cdf(laws.chi2.ppf(tail, k) / ratio, k))
 
 
 def detectable_ratio(
@@ -157,7 +158,7 @@ def detectable_ratio(
     """Smallest ratio of true to stated covariance that ``runs`` runs find with ``power``."""
     _require(dof, false_alarm, power)
     tail = false_alarm / (2 if two_sided else 1)
-    return float(stats.chi2.isf(tail, dof * runs) / stats.chi2.ppf(1.0 - power, dof * runs))
+    return float(laws.chi2.isf(tail, dof * runs) / laws.chi2.ppf(1.0 - power, dof * runs))
 
 
 def _require(dof: float, false_alarm: float, power: float) -> None:

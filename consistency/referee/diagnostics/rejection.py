@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.intervals import binomial_interval
 from consistency.referee.diagnostics.verdict_parts import Interval, RejectionScore
 from consistency.referee.types import Array, Indices
@@ -45,7 +45,7 @@ def clustered_share(count: Array, size: Array, confidence: float = CONFIDENCE) -
     binomial = share * (1.0 - share) / draws
     between = clusters / (clusters - 1) * float(np.square(count - share * size).sum()) / draws**2
     effect = max(between / binomial, 1.0) if binomial > 0.0 else 1.0
-    quantiles = stats.t.isf(tail, clusters - 1) / stats.t.isf(tail, draws - 1)
+    quantiles = laws.t.isf(tail, clusters - 1) / laws.t.isf(tail, draws - 1)
     effective = draws / effect / quantiles**2
     low, high = binomial_interval(share * effective, effective, confidence)
     return Interval(share, float(low), float(high))

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.blocks import by_runs, by_steps
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.types import Array
@@ -131,10 +132,10 @@ def acceptance(test: MeanTest, dof: int, false_alarm: float, allow: str | None =
     """Interval of the mean NEES that :func:`mean_test` accepts at ``false_alarm``."""
     if not test.runs:
         return float("nan"), float("nan")
-    z = float(stats.t.isf(false_alarm if allow else false_alarm / 2, test.spread))
+    z = float(laws.t.isf(false_alarm if allow else false_alarm / 2, test.spread))
     k = test.runs * test.effective_dof
-    low = 0.0 if allow == "conservative" else float(stats.chi2.ppf(stats.norm.sf(z), k)) * dof / k
-    return low, float(stats.chi2.isf(stats.norm.sf(z), k)) * dof / k
+    low = 0.0 if allow == "conservative" else float(laws.chi2.ppf(special.ndtr(-z), k)) * dof / k
+    return low, float(laws.chi2.isf(special.ndtr(-z), k)) * dof / k
 
 
 def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -> Interval:
@@ -160,8 +161,8 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -
             nu = min(nu, float(np.exp(log_nu)))
     elif len(means) >= FEW:
         return Interval(ratio, ratio, ratio)
-    z, k = float(stats.t.isf(tail, spread)), len(means) * nu
-    low, high = (float(stats.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
+    z, k = float(laws.t.isf(tail, spread)), len(means) * nu
+    low, high = (float(laws.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
     return Interval(ratio, ratio * k / low, ratio * k / max(high, 1e-300))
 
 

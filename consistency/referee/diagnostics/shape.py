@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.bias import Moments, moments, t_squared
 from consistency.referee.diagnostics.blocks import by_runs
 from consistency.referee.diagnostics.whitening import all_finite
@@ -28,7 +29,7 @@ def identity_statistic(whitened: Array) -> tuple[float, float]:
         return float("inf"), 0.0
     statistic = N * (float(np.trace(S)) - float(logdet) - n)
     statistic *= 1.0 - (2 * n + 1 - 2 / (n + 1)) / (6 * N)
-    return statistic, float(stats.chi2.sf(statistic, n * (n + 1) / 2))
+    return statistic, float(laws.chi2.sf(statistic, n * (n + 1) / 2))
 
 
 def sphericity(whitened: Array, known: Moments | None = None) -> tuple[Array, Array]:
@@ -53,8 +54,8 @@ def sphericity(whitened: Array, known: Moments | None = None) -> tuple[Array, Ar
     omega = (n + 2) * (n - 1) * (n - 2) * (2 * n**3 + 6 * n**2 + 3 * n + 2) / (288 * n**2 * m**2 * rho**2)
     f = n * (n + 1) / 2 - 1
     statistic[good] = value = -m * rho * log_w
-    tail = stats.chi2.sf(value, f)
-    p_value[good] = np.clip(tail + omega * (stats.chi2.sf(value, f + 4) - tail), 0.0, 1.0)
+    tail = laws.chi2.sf(value, f)
+    p_value[good] = np.clip(tail + omega * (laws.chi2.sf(value, f + 4) - tail), 0.0, 1.0)
     return statistic, p_value
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.equivalence import deciding_runs
 from consistency.referee.diagnostics.planning import MARGIN
 from consistency.referee.diagnostics.scale import FEW, LEAST, MeanTest
@@ -48,8 +49,8 @@ def within(nees: Array, dof: int, settings: Settings, factor: float, confidence:
     doubt = 2.0 * (2.0 * reach + 1.0) / steps + max(fourth - 1.0, 0.0) * tau / steps  # variance of log(tau s^2)
     log_nu = np.log(2.0 * ratio**2 * steps / (spread * tau)) - np.sqrt(doubt)
     nu = float(np.exp(min(log_nu, np.log(dof * steps))))
-    z = float(stats.t.isf(0.5 * (1.0 - confidence), max(2.0 / doubt, LEAST)))
-    low, high = (float(stats.chi2.ppf(special.ndtr(side), nu)) / nu for side in (-z, z))
+    z = float(laws.t.isf(0.5 * (1.0 - confidence), max(2.0 / doubt, LEAST)))
+    low, high = (float(laws.chi2.ppf(special.ndtr(side), nu)) / nu for side in (-z, z))
     one_step = MeanTest(FEW, ratio, nu / steps, np.inf, np.nan, np.nan)
     least = deciding_runs(one_step, factor, settings)
     needed = None if least is None else max(int(np.ceil(MARGIN * least)), int(np.ceil(FEW * APART * tau)))

@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import wording
 from consistency.referee.diagnostics.band import simultaneous_band
-from consistency.referee.diagnostics.early_ends import early_ends
+from consistency.referee.diagnostics.early_ending import early_ends
 from consistency.referee.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.referee.diagnostics.headline import at_share, status_of
 from consistency.referee.diagnostics.hypothesis_tests import Tests, ask

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.early_ends import EarlyEnds
+from consistency.referee.diagnostics.early_ending import EarlyEnds
 from consistency.referee.diagnostics.record import Record, shown_by
 from consistency.referee.diagnostics.skipping import Skipped
 from consistency.referee.errors import InputError

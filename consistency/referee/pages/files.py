@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
-from consistency.referee.diagnostics import Evidence, Verdict
+from consistency.referee.diagnostics import Evidence, Verdict, laws
 from consistency.referee.diagnostics.wording import plural
 from consistency.referee.document.blocks import Block, Chapter, Document, Facts, Text
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
@@ -210,7 +210,7 @@ def _nees_of_windows(record: Evidence) -> Figure | None:
     if record.nees is None or not np.isfinite(record.nees).any():
         return None
     clock, window = clock_of(record.t), record.window or "a step"
-    low, high = (np.full(len(record.t), stats.chi2.ppf(q, record.dof)) for q in (0.025, 0.975))
+    low, high = (np.full(len(record.t), laws.chi2.ppf(q, record.dof)) for q in (0.025, 0.975))
     tips = ((clock.word, "@x"), ("NEES", "@y{0.000}"))
     marks: list[Mark] = [Band(clock.values, low, high, SHADE), Rule("y", float(record.dof), EXPECTED)]
     marks += [Points(clock.values, values, replace(style(0), size=3.0, alpha=0.7), tips=tips) for values in record.nees]
@@ -243,7 +243,7 @@ def observed_coverage(record: Evidence, p: Array) -> dict[str, Array]:
         for i, name in enumerate(record.axes[:MOST_PANELS]):
             found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
     if record.nees is not None and record.dof:
-        found["all together"] = _shares(record.nees, stats.chi2.ppf(p, record.dof))
+        found["all together"] = _shares(record.nees, laws.chi2.ppf(p, record.dof))
     return {name: shares for name, shares in found.items() if np.isfinite(shares).any()}
 
 
@@ -287,7 +287,7 @@ def _innovations(record: Evidence, verdict: Verdict) -> Figure | None:
     known = np.isfinite(record.nis) & (record.nis_dof > 0)
     dof = np.where(known, record.nis_dof, 0.0).sum(axis=0)
     ratio = np.where(dof > 0, np.where(known, record.nis, 0.0).sum(axis=0) / np.maximum(dof, 1.0), np.nan)
-    low, high = (stats.chi2.ppf(q, np.maximum(dof, 1.0)) / np.maximum(dof, 1.0) for q in (0.025, 0.975))
+    low, high = (laws.chi2.ppf(q, np.maximum(dof, 1.0)) / np.maximum(dof, 1.0) for q in (0.025, 0.975))
     marks = (
         Band(clock.values, np.where(dof > 0, low, np.nan), np.where(dof > 0, high, np.nan), SHADE),
         Rule("y", 1.0, EXPECTED),

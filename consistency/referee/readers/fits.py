@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
 
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.validity import Validity, classify
 from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
@@ -68,9 +68,9 @@ class ReadingFit:
         asked = n + 1 + n + len(pairs[0]) + 1
         scale = np.append(np.full(n, size), n * size) * (ratios - np.log(np.maximum(ratios, 1e-300)) - 1.0)
         products = (self.w.T @ self.w / len(self.w))[pairs]
-        below = float((np.square(self.w).sum(axis=1) < stats.chi2.median(n)).mean())
+        below = float((np.square(self.w).sum(axis=1) < laws.chi2.ppf(0.5, n)).mean())
         normal = np.concatenate([self.w.mean(axis=0), products, [2.0 * below - 1.0]]) * np.sqrt(size)
-        limit = stats.chi2.isf(ODD / asked, 1)
+        limit = laws.chi2.isf(ODD / asked, 1)
         return bool((scale <= limit).all() and (np.square(normal) <= limit).all())
 
     def fault(self) -> float:

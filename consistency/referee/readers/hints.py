@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
@@ -169,7 +169,7 @@ def decades(runs: Sequence[Poses]) -> Array:
     nees = nees[np.isfinite(nees).all(axis=1)]
     if not len(nees):
         return np.full(1 + n, np.nan)
-    right = stats.chi2.median(np.append(n, np.ones(n)))
+    right = laws.chi2.ppf(0.5, np.append(n, np.ones(n)))
     return np.asarray(np.log10(np.maximum(np.median(nees, axis=0), 1e-300) / right))
 
 

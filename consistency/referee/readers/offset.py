@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize
 
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.readers.poses import Poses
@@ -102,8 +103,8 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     if len(each) < 3:
         return None
     spread = each.std(ddof=1) / np.sqrt(len(each))
-    reach = float(stats.t.ppf(0.975, len(each) - 1) * spread)
-    p = float(stats.ttest_1samp(each, 0.0).pvalue) if spread > 0 else float(value == 0.0)
+    reach = float(laws.t.ppf(0.975, len(each) - 1) * spread)
+    p = 2.0 * float(laws.t.sf(abs(each.mean()) / spread, len(each) - 1)) if spread > 0 else float(value == 0.0)
     alone = len(some) == 1 and not (size(0.0) > GROSS and size(value) < 0.5 * size(0.0))
     return Offset(value, value - reach, value + reach, p, 1.0 - size(value) / size(0.0), alone)
 

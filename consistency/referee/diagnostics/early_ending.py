@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from consistency.referee.types import Array
 
@@ -47,7 +47,7 @@ def early_ends(nees: Array) -> EarlyEnds:
         d = int(ending.sum())
         if d == R:
             continue
-        ranks = float(stats.rankdata(nees[reached, step])[ending].sum())
+        ranks = float(_ranks(nees[reached, step])[ending].sum())
         runs += d
         above += (ranks - 0.5 * d * (d + 1)) / (R - d)
         gap += ranks - 0.5 * d * (R + 1)
@@ -55,3 +55,9 @@ def early_ends(nees: Array) -> EarlyEnds:
     if not runs:
         return EarlyEnds(0, float("nan"), float("nan"))
     return EarlyEnds(runs, above / runs, float(special.ndtr(-gap / np.sqrt(variance))))
+
+
+def _ranks(values: Array) -> Array:
+    """Ranks from 1, equal values sharing the mean of theirs."""
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(count) - 0.5 * (count - 1))[place])

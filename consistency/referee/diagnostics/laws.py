@@ -1,0 +1,154 @@
+"""Distribution functions of the tests: those of :mod:`scipy.stats`, from :mod:`scipy.special`.
+
+Loading :mod:`scipy.stats` costs as much as loading all else that a verdict needs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import optimize, special
+
+from consistency.referee.types import Array
+
+EXACT = 140  # values up to which Kolmogorov's distribution is computed here; SciPy approximates it for more
+CERTAIN = 4.0  # N d^2 from which twice the one-sided tail is the two-sided one to 14 digits
+
+Value = Any  # a number or an array; what comes back has the shape to which all arguments broadcast
+
+
+class ChiSquare:
+    """The chi-square distribution; NaN where ``dof`` is not positive."""
+
+    @staticmethod
+    def cdf(x: Value, dof: Value) -> Value:
+        """Probability of at most x."""
+        return special.chdtr(_positive(dof), np.maximum(x, 0.0))
+
+    @staticmethod
+    def sf(x: Value, dof: Value) -> Value:
+        """Probability of more than x."""
+        return special.chdtrc(_positive(dof), np.maximum(x, 0.0))
+
+    @staticmethod
+    def ppf(p: Value, dof: Value) -> Value:
+        """Inverse of :meth:`cdf`."""
+        return 2.0 * special.gammaincinv(_positive(dof) / 2.0, p)
+
+    @staticmethod
+    def isf(p: Value, dof: Value) -> Value:
+        """Inverse of :meth:`sf`."""
+        return special.chdtri(_positive(dof), p)
+
+
+class Student:
+    """Student's t distribution with ``dof`` degrees of freedom."""
+
+    @staticmethod
+    def cdf(x: Value, dof: Value) -> Value:
+        """Probability of at most x."""
+        return special.stdtr(_positive(dof), x)
+
+    @staticmethod
+    def sf(x: Value, dof: Value) -> Value:
+        """Probability of more than x."""
+        return special.stdtr(_positive(dof), np.negative(x))
+
+    @staticmethod
+    def ppf(p: Value, dof: Value) -> Value:
+        """Inverse of :meth:`cdf`."""
+        p = np.asarray(p, float)
+        ends = np.where(p > 0.0, np.inf, -np.inf)
+        return np.where((p == 0.0) | (p == 1.0), ends, special.stdtrit(_positive(dof), p))[()]
+
+    @staticmethod
+    def isf(p: Value, dof: Value) -> Value:
+        """Inverse of :meth:`sf`."""
+        return -Student.ppf(p, dof)
+
+
+class Beta:
+    """The beta distribution on [0, 1]."""
+
+    @staticmethod
+    def sf(x: Value, a: Value, b: Value) -> Value:
+        """Probability of more than x."""
+        if hasattr(special, "betaincc"):  # from SciPy 1.11
+            return special.betaincc(a, b, x)
+        return special.betainc(b, a, 1.0 - np.asarray(x))
+
+
+class Kolmogorov:
+    """Distance between the empirical distribution function of N values and the true one."""
+
+    @staticmethod
+    def sf(distance: float, N: int) -> float:
+        """Probability of a larger distance, exact to 1e-12.
+
+        Marsaglia, Tsang & Wang (2003), Evaluating Kolmogorov's distribution, J. Statistical Software 8(18); where both
+        sides cannot be exceeded together, twice the one-sided probability. Of more than 140 values by
+        :mod:`scipy.stats`.
+        """
+        if not distance > 0.5 / N:  # the least distance there is
+            return float("nan") if np.isnan(distance) else 1.0
+        if distance >= 1.0:
+            return 0.0
+        if distance >= 0.5 or N * distance**2 > CERTAIN:
+            return min(1.0, 2.0 * float(special.smirnov(N, distance)))
+        if N > EXACT:
+            from scipy import stats
+
+            return float(stats.kstwo.sf(distance, N))
+        return min(1.0, max(0.0, 1.0 - _within(distance, N)))
+
+    @staticmethod
+    def isf(p: float, N: int) -> float:
+        """Inverse of :meth:`sf`, for 0 < p < 1."""
+        if N > EXACT:
+            from scipy import stats
+
+            return float(stats.kstwo.isf(p, N))
+        outer = min(1.0, float(special.smirnovi(N, p / 2.0)))  # never smaller: both sides may exceed it
+        if Kolmogorov.sf(outer, N) >= p:
+            return outer
+        return float(optimize.brentq(lambda d: Kolmogorov.sf(d, N) - p, 0.5 / N, outer, xtol=1e-15, rtol=1e-14))
+
+
+def _within(distance: float, N: int) -> float:
+    """Probability of at most that distance: an entry of the N-th power of a matrix of transitions."""
+    k = int(N * distance) + 1
+    m, h = 2 * k - 1, k - N * distance
+    H: Array = (np.arange(m)[:, None] - np.arange(m) + 1 >= 0).astype(float)
+    H[:, 0] -= h ** np.arange(1, m + 1)
+    H[-1] -= h ** np.arange(m, 0, -1)
+    H[-1, 0] += max(2.0 * h - 1.0, 0.0) ** m
+    above = np.arange(m)[:, None] - np.arange(m) + 1
+    H /= special.gamma(np.maximum(above, 0) + 1.0)
+    power, exponent = _power(H, N)
+    steps = np.log(np.arange(1, N + 1) / N).sum()
+    return float(power[k - 1, k - 1] * np.exp(steps + exponent))
+
+
+def _power(H: Array, N: int) -> tuple[Array, float]:
+    """H to the power of N, scaled, and the logarithm of the scale."""
+    out, scale, square, of_square = np.eye(len(H)), 0.0, H, 0.0
+    while True:
+        if N & 1:
+            out, scale = out @ square, scale + of_square
+            size = out.max()
+            out, scale = out / size, scale + np.log(size)
+        N >>= 1
+        if not N:
+            return out, scale
+        square, of_square = square @ square, 2.0 * of_square
+        size = square.max()
+        square, of_square = square / size, of_square + np.log(size)
+
+
+def _positive(dof: Value) -> Value:
+    dof = np.asarray(dof, float)
+    return np.where(dof > 0.0, dof, np.nan)[()]
+
+
+chi2, t, beta, kolmogorov = ChiSquare, Student, Beta, Kolmogorov

@@ -128,6 +128,18 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
     assert ".csv" in python(copy, refusal).stdout
 
 
+def test_a_default_stands_once(copy: Path) -> None:
+    """One file: the command line, its help, Python and the gates have it."""
+    changed(copy / "consistency/referee/defaults.py", "FALSE_ALARM = 0.05", "FALSE_ALARM = 0.037")
+    (copy / "est.csv").write_text("run,step,a,P_a_a\n" + "".join(f"{r},{k},{r},1\n" for r in (3, 7) for k in (1, 2)))
+    (copy / "truth.csv").write_text("step,a\n1,0\n2,0\n")
+    asked = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a"]
+    for words in (asked, ["analyse", "--help"]):
+        assert "0.037" in python(copy, f"from consistency.referee.cli import main\nmain({words})").stdout
+    gate = "import consistency as cs\nprint(cs.judge(cs.read('est.csv', truth='truth.csv', state='a')).statistics)"
+    assert "0.037" in python(copy, gate).stdout
+
+
 def test_the_bias_of_the_document_works(copy: Path) -> None:
     """One new file, one line elsewhere, a key in a scenario; and the document's own test passes."""
     effect, line, key, test = code("Add a sensor effect")

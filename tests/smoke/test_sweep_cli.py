@@ -77,7 +77,7 @@ BAD = {
     "folder with options": (("sweep", ".", "--share", "1/2"), "only reported again"),
     "no sweep's folder": (("sweep", "."), "manifest.json: missing"),
     "no map": (("recommend", "small.toml", "--map", "none"), "none: cannot be read"),
-    "confirm": (("recommend", "small.toml", "--map", "out", "--confirm", "3"), "must be 0, 1 or 2"),
+    "confirm": (("recommend", "small.toml", "--map", "out", "--confirm", "0"), "must be at least 1"),
 }  # fmt: skip
 
 

@@ -98,13 +98,16 @@ def recommend(
     map_: Annotated[
         Path | None, typer.Option("--map", help="Folder of 'sweep', or its map.json [the shipped map].")
     ] = None,
-    runs: Annotated[int, typer.Option("--runs", help="Confirming runs of each filter; 0 for none.")] = 24,
-    confirm: Annotated[int, typer.Option("--confirm", help="Filters to confirm, at most.")] = 2,
+    runs: Annotated[
+        int | None,
+        typer.Option("--runs", help="Runs that confirm a filter; 0: the map alone [as many as the map's rule needs]."),
+    ] = None,
+    confirm: Annotated[int, typer.Option("--confirm", help="Filters to confirm, at most, one after another.")] = 4,
     seed: Seed = 0,
     jobs: Jobs = -1,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
-    """Which filters to trust on one rig: looked up in a map, and confirmed by a few runs of that rig."""
+    """Which filter to trust on one rig: looked up in a map, and confirmed by runs of that rig."""
     from consistency.bench.sweeps.printing import advice_blocks, advice_json
     from consistency.bench.sweeps.recommend import recommend_for
     from consistency.bench.sweeps.regime import read_regime

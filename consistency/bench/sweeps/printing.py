@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.sweeps.cell import CellResult, plain_numbers
-from consistency.bench.sweeps.recommend import OPEN, Advice, NearFilter
+from consistency.bench.sweeps.recommend import Advice, NearFilter
 from consistency.bench.sweeps.regime import Regime
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.verdict_parts import STATUSES
@@ -90,7 +90,7 @@ def advice_blocks(advice: Advice) -> tuple[Block, ...]:
 
 def _row(c: NearFilter) -> tuple[Cell, ...]:
     near = c.nearest
-    said = "-" if c.verdict is None else f"{'no fault found' if c.verdict.status in OPEN else c.verdict.status}"
+    said = "not run" if c.verdict is None else Status(c.verdict.status)
     return (
         c.filter, Status(near.status), f"{c.agreeing} of {c.around}", Quantity(near.rmse_position, digits=".3f"),
         Quantity(np.rad2deg(near.rmse_heading), digits=".2f"), f"×{near.cost:.2g}" if np.isfinite(near.cost) else "-",
@@ -119,10 +119,11 @@ def sentences_of(advice: Advice) -> list[str]:
     """The answer, how sure it is, and why."""
     best = advice.best
     if best is None:
-        contradicted = [c for c in advice.candidates if c.sure == "no"]
-        if contradicted:
+        if contradicted := [c for c in advice.candidates if c.sure == "no"]:
             names = ", ".join(f"{c.filter} ({c.verdict.status})" for c in contradicted if c.verdict is not None)
-            return [f"No filter to trust: the map has one, but {plural(advice.runs, 'run')} of this rig find: {names}."]
+            more = f" Not run: {', '.join(advice.untried)} (--confirm)." if advice.untried else ""
+            found = f"the map has one, but {plural(advice.runs, 'run')} of this rig find: {names}"
+            return [f"No filter to trust: {found}.{more}"]
         if advice.lacking:
             return [
                 f"No answer yet: of {advice.nearest.text} the map lacks {', '.join(advice.lacking)}. {_none_of(advice)}"
@@ -150,17 +151,22 @@ def _why(advice: Advice, best: NearFilter) -> str:
     inside = "The rig lies inside the map" if advice.inside else "The rig lies outside the map, which only hints"
     cells = f"all {best.around}" if best.agreeing == best.around else f"{best.agreeing} of the {best.around}"
     where = f"{cells} cells around it" if best.around > 1 else "the cell where it lies"
-    return f"{inside}; the filter is consistent in {where}."
+    unlike = "; no cell of it is as the rig is" if advice.unlike else ""
+    alone = " By the map alone: the filter was not run on this rig." if best.verdict is None else ""
+    return f"{inside}{unlike}; the filter is consistent in {where}.{alone}"
 
 
 def _confirmed(advice: Advice, best: NearFilter) -> str:
     """What the confirming runs said, and what they could have missed."""
     assert best.verdict is not None
-    rate = 100.0 * advice.regime.sweep.rule.false_alarm
+    rule = advice.regime.sweep.rule
+    rate = 100.0 * rule.false_alarm
     ratio, (low, high) = best.verdict.inflation, best.verdict.inflation_interval
-    found = f"{plural(advice.runs, 'run')} of this rig find no fault (a right filter would fail in {rate:g} %)"
+    runs = plural(advice.runs, "run")
+    shown = "show it consistent" if best.verdict.status == "consistent" else "find no fault, and do not decide"
+    found = f"{runs} of this rig {shown} (a right filter would fail in {rate:g} %)"
     scale = f"the ratio of true to stated covariance is {short(ratio)} [{short(low)}, {short(high)}]"
-    power = f"a covariance too small by ×{short(best.detectable)} would have been found with probability 0.95"
+    power = f"a covariance too small by ×{short(best.detectable)} would have been found with probability {rule.power:g}"
     return f"{found}; {scale}; {power}."
 
 

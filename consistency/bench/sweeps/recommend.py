@@ -1,30 +1,31 @@
-"""Which filters to trust on one rig: what the map says of the cells around it, and a few runs of the rig itself."""
+"""Which filter to trust on one rig: what the map says of the cells around it, and runs of the rig itself."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.sweeps.cell import CellResult
-from consistency.bench.sweeps.plan import Cell, text_of
+from consistency.bench.sweeps.plan import Cell, Sweep, text_of
 from consistency.bench.sweeps.regime import Regime, ranked
 from consistency.bench.sweeps.rig import ALIKE, AxisPlace, Request, Rig, differences, distance, place_on, read_rig
-from consistency.referee.diagnostics import Verdict
+from consistency.referee.diagnostics import Verdict, gate_runs
 from consistency.referee.errors import InputError
-from consistency.referee.terminal.progress import quiet
+from consistency.referee.parsing.columns import POSE
 from consistency.referee.verdicts.judge import analyse
 
-MOST = 2  # filters that are confirmed: each may have to be compiled
+CONFIRM = 4  # filters that are confirmed at most: each may have to be compiled
 OPEN = ("consistent", "undecided")  # what confirming runs say where they find no fault
 SURENESS = {
-    "sure": "the rig lies inside the map, all cells around it agree, and runs of the rig itself find no fault",
+    "sure": "the rig lies inside the map, all cells around it agree, and runs of the rig show the filter consistent",
     "fairly sure": "the nearest cell says so, but not everything else does",
     "unsure": "the map does not reach this rig",
     "no": "runs of the rig itself contradict the map",
+    "": "not consistent in the nearest cell, or not run on the rig",
 }
 
 
@@ -37,7 +38,7 @@ class NearFilter:
     agreeing: int  # cells around the rig in which it is consistent
     around: int  # cells around the rig; one that the map does not have yet does not agree
     verdict: Verdict | None = None  # of the confirming runs
-    sure: str = ""  # one of SURENESS; empty: not to be trusted by the map
+    sure: str = ""  # one of SURENESS
 
     @property
     def trusted(self) -> bool:
@@ -45,7 +46,7 @@ class NearFilter:
 
     @property
     def detectable(self) -> float:
-        """Smallest ratio of true to stated covariance that the confirming runs find with power 0.95; NaN without."""
+        """Smallest ratio of true to stated covariance that the runs find with the map's power; NaN without runs."""
         scale = None if self.verdict is None else self.verdict.scale
         return float("nan") if scale is None else scale.detectable
 
@@ -60,7 +61,7 @@ class Advice:
     nearest: Cell
     candidates: tuple[NearFilter, ...]  # the best first
     unlike: tuple[str, ...]  # keys in which no cell of the map is as the rig is
-    runs: int  # confirming runs
+    runs: int  # confirming runs of each filter; 0: the map alone was asked
     elsewhere: str  # the nearest cell with a filter to trust, where there is none here
 
     @property
@@ -72,6 +73,12 @@ class Advice:
         """Filters that the map, of a sweep that is not finished, does not have in the nearest cell."""
         there = {candidate.filter for candidate in self.candidates}
         return tuple(name for name in self.regime.sweep.filters if name not in there)
+
+    @property
+    def untried(self) -> tuple[str, ...]:
+        """Filters that the map has as consistent here and that were not run, though runs were asked for."""
+        good = [c.filter for c in self.candidates if c.nearest.status == "consistent" and c.verdict is None]
+        return tuple(good) if self.runs else ()
 
     @property
     def best(self) -> NearFilter | None:
@@ -89,43 +96,61 @@ class Advice:
 
 
 def recommend_for(
-    request: Request, regime: Regime, runs: int = 24, confirm: int = MOST, seed: int = 0, jobs: int = -1
+    request: Request, regime: Regime, runs: int | None = None, confirm: int = CONFIRM, seed: int = 0, jobs: int = -1
 ) -> Advice:
-    """Look a rig up in a map, and confirm the best filters by runs of the rig.
+    """Look a rig up in a map, and confirm filters by runs of the rig, the best first, until one is not contradicted.
 
     Parameters
     ----------
-    runs : confirming runs of each filter; 0 for none
-    confirm : filters to confirm, 0 to 2
+    runs : confirming runs of each filter, by default as many as the rule of the map needs; 0 for the
+        map alone
+    confirm : filters to confirm, at most
 
     Raises
     ------
     InputError
         An unusable rig or option, or a map without the cells around the rig.
     """
-    if not 0 <= confirm <= MOST:
-        raise InputError(f"--confirm {confirm}: must be 0, 1 or {MOST}")
+    if confirm < 1:
+        raise InputError(f"--confirm {confirm}: must be at least 1; for the map alone, without a run, give --runs 0")
+    sweep = regime.sweep
+    runs = runs_of(sweep) if runs is None else runs
     if runs < 0 or runs == 1:
         raise InputError(f"--runs {runs}: must be 0, or 2 or more")
-    sweep = regime.sweep
     rig = read_rig(request, sweep.base)
     places = tuple(place_on(axis, axis.of(rig.scenario, sweep.base)) for axis in sweep.axes)
     nearest = _cell(regime, [place.nearest for place in places])
-    around = [_cell(regime, at) for at in itertools.product(*(place.around for place in places))]
-    candidates = candidates_of(regime, nearest, around)
+    candidates = candidates_of(regime, nearest, [_cell(regime, at) for at in around(places)])
     if not candidates:
         raise InputError(f"the map has nothing of {nearest.text}; finish its sweep first")
-    good = [candidate.filter for candidate in candidates if candidate.nearest.status == "consistent"]
-    names, verdicts = good[:confirm] if runs else [], {}
-    if names:
-        with quiet():
-            results = run_trials(rig.scenario, names, runs, seed, jobs)
-        verdicts = analyse(results, names, settings=sweep.rule.settings)
     unlike = tuple(differences(rig.scenario, sweep))
     inside = all(place.inside for place in places)
-    known = tuple(_judged(candidate, verdicts, inside, not unlike) for candidate in candidates)
-    elsewhere = "" if good else _elsewhere(regime, places)
-    return Advice(rig, regime, places, nearest, _sorted(known), unlike, runs if names else 0, elsewhere)
+    left, known = confirm if runs else 0, []
+    for candidate in candidates:
+        if left and candidate.nearest.status == "consistent":
+            results = run_trials(rig.scenario, [candidate.filter], runs, seed, jobs)
+            (verdict,) = analyse(results, [candidate.filter], settings=sweep.rule.settings).values()
+            candidate = replace(candidate, verdict=verdict)
+            left = 0 if verdict.status in OPEN else left - 1
+        known.append(replace(candidate, sure=sureness(candidate, inside, not unlike, alone=runs == 0)))
+    elsewhere = "" if any(c.nearest.status == "consistent" for c in known) else _elsewhere(regime, places)
+    return Advice(rig, regime, places, nearest, _sorted(known), unlike, runs, elsewhere)
+
+
+def runs_of(sweep: Sweep) -> int:
+    """Runs that suffice for a verdict by the rule of the map: its fault is found, or its absence shown."""
+    rule = sweep.rule
+    return gate_runs(len(POSE), rule.detect, rule.false_alarm, rule.power)
+
+
+def around(places: Sequence[AxisPlace]) -> list[tuple[int, ...]]:
+    """Corners of the box in which a rig lies, and the neighbours of the nearest cell on each axis."""
+    nearest = tuple(place.nearest for place in places)
+    found = list(itertools.product(*(place.around for place in places)))
+    for k, place in enumerate(places):
+        beside = (i for i in (nearest[k] - 1, nearest[k] + 1) if 0 <= i < len(place.axis.values) and place.axis.numeric)
+        found += [(*nearest[:k], i, *nearest[k + 1 :]) for i in beside]
+    return list(dict.fromkeys(found))
 
 
 def _cell(regime: Regime, at: Sequence[int]) -> Cell:
@@ -144,25 +169,22 @@ def candidates_of(regime: Regime, nearest: Cell, around: Sequence[Cell]) -> list
     return sorted(found, key=lambda c: (c.nearest.status != "consistent", c.agreeing < c.around))
 
 
-def _judged(candidate: NearFilter, verdicts: Mapping[str, Verdict], inside: bool, alike: bool) -> NearFilter:
-    """How sure it is that the candidate is consistent on the rig."""
-    if candidate.nearest.status != "consistent":
-        return candidate
-    verdict = verdicts.get(candidate.filter)
+def sureness(candidate: NearFilter, inside: bool, alike: bool, alone: bool = False) -> str:
+    """How sure it is that the candidate is consistent on the rig; ``alone``: the map was asked without runs."""
+    verdict = candidate.verdict
+    if candidate.nearest.status != "consistent" or (verdict is None and not alone):
+        return ""
     if verdict is not None and verdict.status not in OPEN:
-        sure = "no"
-    elif not inside:
-        sure = "unsure"
-    elif verdict is not None and alike and candidate.agreeing == candidate.around:
-        sure = "sure"
-    else:
-        sure = "fairly sure"
-    return replace(candidate, verdict=verdict, sure=sure)
+        return "no"
+    if not (inside and alike):
+        return "unsure"
+    shown = verdict is not None and verdict.status == "consistent"
+    return "sure" if shown and candidate.agreeing == candidate.around else "fairly sure"
 
 
 def _sorted(candidates: Sequence[NearFilter]) -> tuple[NearFilter, ...]:
-    """Contradicted filters behind those that stand, confirmed ones before the others; else as they are."""
-    return tuple(sorted(candidates, key=lambda c: (not c.sure, c.sure == "no", c.sure != "" and c.verdict is None)))
+    """Those to be trusted first, then those that the runs contradict; else as they are."""
+    return tuple(sorted(candidates, key=lambda c: (not c.trusted, c.sure != "no")))
 
 
 def _elsewhere(regime: Regime, places: tuple[AxisPlace, ...]) -> str:

@@ -120,7 +120,13 @@ def test_the_cheaper_of_two_equally_good_filters_comes_first(regime: Regime, tmp
     assert [c.filter for c in wide.candidates] == ["ekf-uvd", "parked-ekf-uvd", "ukf-uvd"]
     near = advise(regime)
     assert [c.filter for c in near.candidates if c.trusted] == ["parked-ekf-uvd"]
-    assert [(c.agreeing, c.around) for c in near.candidates] == [(2, 2), (0, 2), (0, 2)]
+    assert [(c.agreeing, c.around) for c in near.candidates] == [(7, 7), (0, 7), (0, 7)]
+
+
+def test_cells_around_are_corners_and_neighbours_on_each_axis(regime: Regime) -> None:
+    """Between two ranges, at a value of each other axis: the odometry of the map has a value on one side alone."""
+    near = set(advising.around(advise(regime).places))
+    assert near == {(1, 2, 2, 1), (1, 1, 2, 1), (0, 2, 2, 1), (2, 2, 2, 1), (1, 3, 2, 1), (1, 2, 1, 1), (1, 2, 2, 0)}
 
 
 def test_a_filter_at_the_edge_of_its_region_comes_second(regime: Regime) -> None:
@@ -138,7 +144,7 @@ def test_a_cell_that_is_missing_does_not_agree(regime: Regime) -> None:
     other = next(c.number for c in regime.sweep.cells if c.indices == (1, 1, 2, 1))
     rest = {key: found for key, found in regime.results.items() if key[0] != other}
     best = advise(replace(regime, results=rest)).candidates[0]
-    assert (best.agreeing, best.around) == (1, 2)
+    assert (best.agreeing, best.around) == (6, 7)
 
 
 def test_outside_the_map_nothing_is_sure(regime: Regime) -> None:
@@ -212,7 +218,9 @@ def test_runs_of_the_rig_confirm_or_contradict(short: str, capsys: pytest.Captur
     assert f"a covariance too small by ×{best.detectable:.2f} would have been found with probability 0.95" in said
     assert "a right filter would fail in 1 %" in said
     show(*advice_blocks(advice))
-    assert "no fault found" in capsys.readouterr().out
+    assert best.verdict.status == "undecided"  # 12 runs show nothing
+    assert best.sure == "fairly sure"
+    assert "12 runs of this rig find no fault, and do not decide" in capsys.readouterr().out
     data = advice_json(advice)
     assert (data["take"], data["sure"], data["filters"][0]["confirmed"]["status"]) == (
         "ekf-uvd", best.sure, best.verdict.status,
@@ -220,18 +228,77 @@ def test_runs_of_the_rig_confirm_or_contradict(short: str, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(("inside", "alike", "status", "sure"), [
-    (True, True, "undecided", "sure"), (True, True, "consistent", "sure"), (True, False, "undecided", "fairly sure"),
-    (False, True, "undecided", "unsure"), (True, True, "biased", "no"), (False, False, "failed", "no"),
-    (True, True, None, "fairly sure"),
+    (True, True, "undecided", "fairly sure"), (True, True, "consistent", "sure"), (True, False, "consistent", "unsure"),
+    (False, True, "consistent", "unsure"), (True, True, "biased", "no"), (False, False, "failed", "no"),
+    (True, True, None, ""),
 ])  # fmt: skip
 def test_how_sure(inside: bool, alike: bool, status: str | None, sure: str) -> None:
     verdict: Any = None if status is None else type("Said", (), {"status": status})()
-    candidate = advising.NearFilter("f", result(), 4, 4)
-    judged = advising._judged(candidate, {"f": verdict} if status else {}, inside, alike)
-    assert judged.sure == sure
-    split = advising._judged(replace(candidate, agreeing=3), {"f": verdict} if status else {}, inside, alike)
-    assert split.sure == ("fairly sure" if sure == "sure" else sure)
-    assert advising._judged(replace(candidate, nearest=result("biased")), {}, inside, alike).sure == ""
+    candidate = advising.NearFilter("f", result(), 4, 4, verdict)
+    assert advising.sureness(candidate, inside, alike) == sure
+    split = replace(candidate, agreeing=3)
+    assert advising.sureness(split, inside, alike) == ("fairly sure" if sure == "sure" else sure)
+    assert advising.sureness(replace(candidate, nearest=result("biased")), inside, alike) == ""
+    alone = replace(candidate, verdict=None)
+    assert advising.sureness(alone, inside, alike, alone=True) == ("fairly sure" if inside and alike else "unsure")
+
+
+class Said:
+    """Verdicts by the name of the filter, in place of runs."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **statuses: str) -> None:
+        self.asked: list[tuple[str, int]] = []
+        real = cs.judge(np.random.default_rng(0).normal(size=(30, 4, 3)), np.broadcast_to(np.eye(3), (30, 4, 3, 3)))
+        monkeypatch.setattr(advising, "run_trials", lambda _, names, runs, *__: self.asked.append((names[0], runs)))
+        verdict = {name.replace("_", "-"): replace(real, status=status) for name, status in statuses.items()}
+        monkeypatch.setattr(advising, "analyse", lambda _, names, **__: {names[0]: verdict[names[0]]})
+
+
+def everywhere(regime: Regime) -> Regime:
+    """The map has every filter as consistent; the EKF is the most accurate, then the UKF, then the parked one."""
+    order = {"ekf-uvd": 0.1, "ukf-uvd": 0.2}
+    return replace(regime, results={key: result(rmse=order.get(key[1], 0.3)) for key in regime.results})
+
+
+def test_filters_are_confirmed_one_at_a_time(regime: Regime, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By as many runs as the map's rule needs; the first that is not contradicted ends it, and no other is taken."""
+    said = Said(monkeypatch, ekf_uvd="biased", ukf_uvd="consistent")
+    advice = recommend_for(Request(BASE), everywhere(regime), jobs=1)
+    assert said.asked == [("ekf-uvd", 78), ("ukf-uvd", 78)]
+    assert [(c.filter, c.sure) for c in advice.candidates] == [
+        ("ukf-uvd", "sure"), ("ekf-uvd", "no"), ("parked-ekf-uvd", "")
+    ]  # fmt: skip
+    assert advice.best is advice.candidates[0]
+    assert "78 runs of this rig show it consistent" in " ".join(sentences_of(advice))
+
+
+def test_nobody_is_taken_where_all_that_were_run_are_contradicted(
+    regime: Regime, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = Said(monkeypatch, ekf_uvd="biased", ukf_uvd="overconfident")
+    advice = recommend_for(Request(BASE), everywhere(regime), confirm=2, jobs=1)
+    assert len(said.asked) == 2
+    assert advice.best is None
+    assert sentences_of(advice) == [
+        "No filter to trust: the map has one, but 78 runs of this rig find: ekf-uvd (biased), ukf-uvd (overconfident). "
+        "Not run: parked-ekf-uvd (--confirm)."
+    ]
+
+
+def test_the_map_alone_is_said_to_be_that(regime: Regime, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = Said(monkeypatch)
+    advice = advise(regime)
+    assert said.asked == []
+    assert "By the map alone: the filter was not run on this rig." in sentences_of(advice)[0]
+    assert advice.untried == ()
+
+
+def test_a_rig_unlike_the_map_is_unsure(regime: Regime, monkeypatch: pytest.MonkeyPatch) -> None:
+    Said(monkeypatch, parked_ekf_uvd="consistent")
+    advice = recommend_for(Request(BASE, speed=1.0), regime, jobs=1)
+    assert advice.best is not None
+    assert (advice.inside, advice.unlike, advice.best.sure) == (True, ("truth.path.speed",), "unsure")
+    assert "no cell of it is as the rig is" in sentences_of(advice)[0]
 
 
 def test_a_contradicted_filter_is_not_taken(regime: Regime) -> None:
@@ -326,8 +393,8 @@ def test_bad_sensors_and_options(regime: Regime, tmp_path: Path) -> None:
     path.write_text(SENSOR.replace('"uvd"', '"xyz"').replace("sigma_px", "sigma_m"))
     with pytest.raises(InputError, match="key 'model' is 'xyz', the map is of sensors 'uvd'"):
         advise(regime, str(path))
-    with pytest.raises(InputError, match="--confirm 3"):
-        recommend_for(Request(BASE), regime, confirm=3)
+    with pytest.raises(InputError, match=r"--confirm 0: must be at least 1; for the map alone, .* --runs 0"):
+        recommend_for(Request(BASE), regime, confirm=0)
     with pytest.raises(InputError, match="--runs 1"):
         recommend_for(Request(BASE), regime, runs=1)
 

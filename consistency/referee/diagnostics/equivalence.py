@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from scipy import special
 
@@ -72,6 +75,13 @@ def equivalence_of_innovations(test: NisTest, settings: Settings, factor: float 
 def _result(below: float, above: float, factor: float, settings: Settings, runs: int | None) -> Equivalence:
     p_value = below if settings.one_sided else max(below, above)
     return Equivalence(factor, float(p_value), 1.0 - settings.power, runs, settings.one_sided)
+
+
+def worst(parts: Sequence[Equivalence]) -> Equivalence:
+    """Equivalence of all parts: shown where each of them is, by the runs that decide for each."""
+    last = max(parts, key=lambda e: np.nan_to_num(e.p_value, nan=np.inf))
+    runs = [e.runs for e in parts if not e.shown]
+    return replace(last, runs=None if None in runs else max((r for r in runs if r is not None), default=last.runs))
 
 
 def deciding_runs(test: MeanTest, factor: float, settings: Settings, low_is_fault: bool = True) -> int | None:

@@ -40,7 +40,7 @@ def status_of(verdict: Verdict, sample: Sample | None, tests: Tests | None, join
         if verdict.failures or verdict.impossible or (joint is not None and joint.score.not_definite):
             return "failed"
         shown = verdict.equivalence
-        return "consistent" if shown is not None and shown.shown and _few_lost(verdict) else "undecided"
+        return "consistent" if shown is not None and shown.shown and few_lost(verdict) else "undecided"
     if sample is None or tests is None:
         return _by_innovations(verdict, faults)
     if not faults & set(BIAS):
@@ -53,7 +53,7 @@ def status_of(verdict: Verdict, sample: Sample | None, tests: Tests | None, join
     return "inconsistent" if by_sign else status
 
 
-def _few_lost(verdict: Verdict) -> bool:
+def few_lost(verdict: Verdict) -> bool:
     """Is the share of lost runs shown to be what was asked for, if it was?"""
     asked = verdict.settings.lost
     return asked is None or (verdict.lost is not None and verdict.lost.upper <= asked)

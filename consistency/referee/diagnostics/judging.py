@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from consistency.referee.diagnostics.early_stopping import Design, follow
 from consistency.referee.diagnostics.landmarks import map_score
+from consistency.referee.diagnostics.parts import judge_parts
 from consistency.referee.diagnostics.questions import SHARES
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.rejection import rejection_score
@@ -52,7 +53,7 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
         return of_look(*follow(design, record.first_runs, len(record.run_numbers)), record, design)
     runs = replace(record.as_runs, unavailable=tuple(SHARES)) if record.unshown else record.as_runs
     world = None if record.world is None else judge_alone(record.in_world, settings)
-    return _beside(judge_alone(runs, settings), record, world)
+    return _beside((judge_parts if runs.parts else judge_alone)(runs, settings), record, world)
 
 
 def of_look(verdict: Verdict, runs: int, record: Record, design: Design) -> Verdict:

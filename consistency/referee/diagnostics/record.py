@@ -84,6 +84,9 @@ class Record:
     optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
     failures: tuple[Failure, ...] = ()  # Failure.step counts the columns from 1, as the verdict does
     axes: Sequence[str] = ()  # names of the n components, if they have any
+    # indices of components whose covariance is stated, without cross terms to the other parts, which are 0 and not
+    # used: each part is judged by itself. Of standard deviations alone each component is one. () where all is stated
+    parts: tuple[tuple[int, ...], ...] = ()
     runs: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
@@ -190,7 +193,7 @@ class Record:
         return Record(
             self.name, self.error[there][:, None], self.covariance[there][:, None], self.nees[there][:, None],
             self.dof, failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
-            axes=self.axes, runs=number[there], unit="window", skipped=self.skipped,
+            axes=self.axes, parts=self.parts, runs=number[there], unit="window", skipped=self.skipped,
         )  # fmt: skip
 
     @property

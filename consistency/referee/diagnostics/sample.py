@@ -148,9 +148,7 @@ def sample_of(evidence: Record, settings: Settings) -> Sample | None:
             raise ValueError("nees needs dof, the dimension of the error")
         return Sample(e.nees, e.dof)
     n, P = e.error.shape[-1], entries(e.covariance)
-    names = tuple(() if e.axes is None else e.axes) or tuple(f"axis {i}" for i in range(n))
-    if len(names) != n:
-        raise ValueError(f"{len(names)} names of axes for {n} components")
+    names = names_of(e)
     groups = groups_of(names, settings.subsets)
     whitened, nees = np.empty(e.error.shape), np.empty(e.error.shape[:2])
     for here in of_runs(nees):
@@ -160,6 +158,22 @@ def sample_of(evidence: Record, settings: Settings) -> Sample | None:
         w[~np.isfinite(nees[here])] = np.nan
         whitened[here] = w
     return Sample(nees, n, Errors(e, whitened, names, groups))
+
+
+def names_of(e: Record) -> tuple[str, ...]:
+    """Names of the components of the error; axis 0, axis 1, ... where they have none.
+
+    Raises
+    ------
+    ValueError
+        Other than one name for each component.
+    """
+    assert e.error is not None
+    n = e.error.shape[-1]
+    names = tuple(() if e.axes is None else e.axes) or tuple(f"axis {i}" for i in range(n))
+    if len(names) != n:
+        raise ValueError(f"{len(names)} names of axes for {n} components")
+    return names
 
 
 def groups_of(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:

@@ -344,6 +344,7 @@ class Verdict:
     lost: Lost | None = None  # where there is a NEES
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
     skipped: Skipped | None = None  # first steps of each run that were left out
+    parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
     record: Record | None = None  # what was judged, where it is kept to be drawn
 
     @property

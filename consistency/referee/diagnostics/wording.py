@@ -6,6 +6,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.coverage import TWO_SIGMA
 from consistency.referee.diagnostics.faults_in_words import (
+    MOST,
     Faults,
     bias_text,
     joint_text,
@@ -32,7 +33,8 @@ def reasons(v: Verdict) -> list[str]:
     lines: list[str] = []
     if judged:
         assert v.scale is not None
-        lines = [_sentence(v, faults), *_early_ends(v), *_level(v), *_within_one(v), *_together(v), *_coverage(v)]
+        level = _levels(v) if v.parts else _level(v)
+        lines = [_sentence(v, faults), *_early_ends(v), *level, *_within_one(v), *_together(v), *_coverage(v)]
     elif v.scale is not None:
         lines = ["no step has a covariance of full rank to judge"]
     elif v.innovations is not None and v.innovations.dof:
@@ -104,6 +106,8 @@ def _first_steps(v: Verdict) -> list[str]:
 def _sentence(v: Verdict, faults: Faults) -> str:
     if not faults:
         return _no_fault(v)
+    if v.parts:
+        return _of_parts(v)
     parts = []
     if any(q in faults for q in BIAS):
         parts.append(bias_text(v, "bias" not in faults))
@@ -127,6 +131,18 @@ def _sentence(v: Verdict, faults: Faults) -> str:
     return "; ".join(part for part in parts if part)
 
 
+def _of_parts(v: Verdict) -> str:
+    """The parts at fault, each with its sentence."""
+    named = {name: part for name, part in v.parts.items() if part.faults}
+    texts = [f"{name}: {_own_sentence(part)}" for name, part in [*named.items()][:MOST]]
+    more = f"; and {len(named) - MOST} more" if len(named) > MOST else ""
+    return f"{'; '.join(texts)}{more}"
+
+
+def _own_sentence(part: Verdict) -> str:
+    return part.reasons[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
+
+
 def _no_bias(v: Verdict) -> bool:
     """A bias was looked for and not found."""
     return any(a.question in BIAS for a in v.answers) and not set(v.faults) & set(BIAS)
@@ -138,7 +154,8 @@ def _no_fault(v: Verdict) -> str:
     shown, runs = v.scale.equivalence, plural(v.runs, v.unit)
     tolerated = [a.question for a in v.answers if a.tolerated]
     none = "no fault beyond the tolerance" if tolerated else "no fault found"
-    size, axis, lost = f"covariance ratio {plain(v.scale.inflation)}", _worst_axis(v), _lost(v)
+    size = "covariance ratio of every part" if v.parts else f"covariance ratio {plain(v.scale.inflation)}"
+    axis, lost = _worst_axis(v), _lost(v)
     if shown.shown:
         return f"{none} in {runs}, and the {size} is shown to be {_within(v, shown)}{axis}{lost}"
     advice, asked = "", 0 if v.lost is None or v.settings.lost is None else v.lost.needed or 0
@@ -198,8 +215,24 @@ def _level(v: Verdict) -> list[str]:
         where = [f"{count} {side}" for side, count in counts.items() if count]
         text += f"; {v.places} outside the simultaneous band: {' and '.join(where) if where else 'none'}"
         text += f" of {s.judged_steps}"
-    tolerated = [a.question for a in v.answers if a.tolerated]
-    lines = [text]
+    return [text, *_worst_and_lost(v), *_tolerated(v)]
+
+
+def _levels(v: Verdict) -> list[str]:
+    """Of parts whose cross terms are not stated: the mean NEES of each, and of all, which nothing is known of else."""
+    assert v.scale is not None
+    ratio, n = short(v.scale.mean_anees / v.scale.dof), v.scale.dof
+    whole = (
+        f"cross terms of {', '.join(v.parts)} are not stated: each is judged by itself, and the mean NEES over the {n} "
+        f"components, {ratio} (1 expected under any correlation), is not judged"
+    )
+    each = [f"{name}: {_level(part)[0]}" for name, part in v.parts.items() if part.location is not None]
+    return [whole, *_worst_and_lost(v), *_tolerated(v), *each]
+
+
+def _worst_and_lost(v: Verdict) -> list[str]:
+    assert v.scale is not None
+    s, lines = v.scale, []
     if v.faults and (worst := v.worst_axis) is not None:
         lines.append(f"covariance ratio of the worst axis: {worst[0]}, {plain(worst[1])}; of all {plain(s.inflation)}")
     if v.lost is not None and (v.lost.count or v.settings.lost is not None):
@@ -207,11 +240,14 @@ def _level(v: Verdict) -> list[str]:
             f"lost {v.unit}s: {v.lost.count} of {v.lost.runs} failed or have a mean NEES above {short(v.lost.bound)}; "
             f"at most {percent(v.lost.upper)} of all at a confidence of {v.lost.level:g}"
         )
-    if tolerated:
-        lines.append(
-            f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"
-        )
     return lines
+
+
+def _tolerated(v: Verdict) -> list[str]:
+    tolerated = [a.question for a in v.answers if a.tolerated]
+    if not tolerated:
+        return []
+    return [f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"]
 
 
 def _early_ends(v: Verdict) -> list[str]:

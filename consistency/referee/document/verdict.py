@@ -194,8 +194,8 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
     rows = [("evidence", f"{plural(v.runs, v.unit)}{size}")]
     if v.scale is not None and v.scale.judged_steps:
         s, shown = v.scale, v.scale.equivalence
-        low, high = s.accepted
-        rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {short(low)} to {short(high)} accepted)"))
+        accepted = "not judged" if v.parts else f"{' to '.join(map(short, s.accepted))} accepted"
+        rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {accepted})"))
         value, low, high = s.inflation
         rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], truth over stated"))
         if (worst := v.worst_axis) is not None:

@@ -85,6 +85,7 @@ def judge(
     record: Record | str | Path | ArrayLike,
     covariances: ArrayLike | None = None,
     *,
+    deviations: ArrayLike | None = None,
     axes: Sequence[str] | None = None,
     independent: bool = False,
     name: str = "estimator",
@@ -101,8 +102,11 @@ def judge(
         step: it is counted, and the others are judged. Steps in which the covariance of a run is singular, as at a
         start that is known exactly, are left out up to the first of full rank.
     covariances : (runs, steps, n, n), beside errors
+    deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
+        judged by itself, at a false-alarm rate that all share (Holm)
     axes : (n,) names of the components of errors
-    independent : errors are (N, n) and covariances (N, n, n), and each row is an independent run of one step
+    independent : errors are (N, n) and covariances (N, n, n), or deviations (N, n), and each row is an independent run
+        of one step
     name : of the estimator, in messages; arrays alone
     optimal_gain : True if the filter has an optimal gain and gates nothing away: its innovations are then judged
     skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
@@ -115,12 +119,16 @@ def judge(
         A setting out of its range, or nothing is left; shapes that do not fit, a covariance that is not symmetric, a
         step that is not finite in any run.
     """
-    if covariances is not None:
-        record = record_of_arrays(cast(ArrayLike, record), covariances, axes, name, independent)
+    given = {"covariances": covariances, "deviations": deviations}
+    stated = {key: value for key, value in given.items() if value is not None}
+    if len(stated) > 1:
+        raise InputError("covariances, deviations: give one of them beside errors")
+    if stated:
+        record = record_of_arrays(cast(ArrayLike, record), stated, axes, name, independent)
     elif isinstance(record, (str, Path)):
         record = read(record)
     elif not isinstance(record, Record):
-        raise InputError("covariances: needed beside errors, (runs, steps, n, n)")
+        raise InputError("covariances: needed beside errors, (runs, steps, n, n); or deviations, (runs, steps, n)")
     record = record.without_first(skip_asked(skip))
     verdict = analyse([record], settings=settings_of(**settings), optimal_gain=optimal_gain)[record.name]
     return replace(verdict, record=record)

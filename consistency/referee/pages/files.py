@@ -179,6 +179,8 @@ def _error_panel(record: Evidence, clock: Clock, row: int, others: list[int], i:
 def _nees(record: Evidence, verdict: Verdict) -> Figure | None:
     """NEES of one run, or its average over runs, with the bands of a right estimator."""
     scale, location = verdict.scale, verdict.location
+    if record.parts:  # of the whole no distribution is known
+        return None
     if record.independent:
         return _nees_of_windows(record)
     if has_one_step(record):
@@ -242,7 +244,7 @@ def observed_coverage(record: Evidence, p: Array) -> dict[str, Array]:
             z = np.abs(record.error) / sigma
         for i, name in enumerate(record.axes[:MOST_PANELS]):
             found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
-    if record.nees is not None and record.dof:
+    if record.nees is not None and record.dof and not record.parts:
         found["all together"] = _shares(record.nees, laws.chi2.ppf(p, record.dof))
     return {name: shares for name, shares in found.items() if np.isfinite(shares).any()}
 

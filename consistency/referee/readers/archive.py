@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Evidence, Record
+from consistency.referee.diagnostics.parts import diagonal, each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
@@ -41,11 +42,11 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
 
 
 def record_of_arrays(
-    errors: ArrayLike, covariances: ArrayLike, axes: Sequence[str] | None, name: str, independent: bool
+    errors: ArrayLike, stated: Mapping[str, ArrayLike], axes: Sequence[str] | None, name: str, independent: bool
 ) -> Record:
-    """Errors and covariances in memory as a record, like those of an archive; see :func:`consistency.judge`."""
+    """Errors and covariances or deviations in memory as a record; see :func:`consistency.judge`."""
     arrays: dict[str, Array] = {}
-    for key, value in (("errors", errors), ("covariances", covariances)):
+    for key, value in {"errors": errors, **stated}.items():
         arrays[key] = _in_memory(key, value)[:, None] if independent else _in_memory(key, value)
     shape = arrays["errors"].shape
     if len(shape) == 2:
@@ -60,7 +61,13 @@ def record_of_arrays(
             raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
     if axes is not None:
         arrays["axes"] = np.asarray(axes, str)
+    sigma = arrays.pop("deviations", None)
+    if sigma is not None:
+        if sigma.shape != shape:
+            raise InputError(f"deviations has shape {sigma.shape}, needs that of errors, {shape}")
+        arrays["covariances"] = diagonal(sigma)
     record = _of_arrays(Path("arrays"), arrays)
+    record = record if sigma is None else each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
 

@@ -1,0 +1,143 @@
+"""Components whose cross terms are not stated are judged each by itself, with one false-alarm rate.
+
+Verdicts on right estimators are at a rate of 1e-6 each, or are counted against a binomial limit whose rate is stated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from draws import independent
+from scipy import stats
+
+import consistency as cs
+from consistency.referee.diagnostics import Record, Settings, judge
+from consistency.referee.diagnostics.parts import diagonal, each_alone
+from consistency.referee.types import Array
+
+SURE = 1e-6
+RATE = 0.2  # high, so that few draws show a rate that is too high
+DRAWS = 100
+BIAS = np.array([2.0, 0.0, 0.0])
+MIX = np.linalg.cholesky(np.array([[1.0, 0.5, 0.5], [0.5, 1.0, 0.5], [0.5, 0.5, 1.0]]))
+
+
+def correlated(rng: np.random.Generator, runs: int = 60, steps: int = 12) -> Array:
+    """Errors with variances of 1 and correlations of 0.5, which deviations do not tell."""
+    return independent(rng, runs, steps, 3) @ MIX.T
+
+
+def of_deviations(error: Array, rate: float = SURE, **settings: object) -> cs.Verdict:
+    return cs.judge(error, deviations=np.ones(error.shape), axes=["x", "y", "z"], false_alarm=rate, **settings)
+
+
+def test_right_marginals_are_consistent_whatever_the_correlation(rng: np.random.Generator) -> None:
+    error = correlated(rng)
+    verdict = of_deviations(error)
+    assert verdict.status == "consistent"
+    assert [*verdict.parts] == ["x", "y", "z"]
+    assert verdict.scale is not None
+    np.testing.assert_allclose(verdict.scale.mean_anees, 3.0 * np.square(error).mean(), rtol=1e-12)
+    assert "(1 expected under any correlation), is not judged" in verdict.reasons[1]
+    whole = cs.judge(error, diagonal(np.ones(error.shape)), false_alarm=SURE)
+    assert whole.status != "consistent"  # the cross terms taken as 0 are a fault of the shape
+
+
+def test_rate_of_false_alarms(rng: np.random.Generator) -> None:
+    """A right referee exceeds the binomial limit with probability 1e-5; three axes at the whole rate each reach it."""
+    faults = sum(bool(of_deviations(correlated(rng, 20, 1), RATE).faults) for _ in range(DRAWS))
+    assert faults <= stats.binom.isf(1e-5, DRAWS, RATE)
+
+
+@pytest.mark.parametrize(
+    ("factor", "status"),
+    [
+        ((1.0, 2.0, 1.0), "overconfident"),
+        ((0.4, 0.4, 1.0), "conservative"),
+        ((0.4, 1.0, 2.5), "inconsistent"),
+    ],
+)
+def test_an_axis_is_found_by_itself(rng: np.random.Generator, factor: Array, status: str) -> None:
+    """Ratios of 4 or 1/6 in 60 runs of 12 steps are found with a probability of 1 - 1e-6."""
+    verdict = of_deviations(correlated(rng) * factor)
+    assert verdict.status == status
+    wrong = [name for name, f in zip("xyz", factor, strict=True) if f != 1.0]
+    assert {name for name, part in verdict.parts.items() if part.faults} == set(wrong)
+    sides = {name: "small" if f > 1.0 else "large" for name, f in zip("xyz", factor, strict=True)}
+    for name in wrong:
+        assert f"{name}: covariance too {sides[name]} by x" in verdict.reasons[0]
+
+
+def test_a_small_fault_is_found_at_the_rate_that_others_leave(rng: np.random.Generator) -> None:
+    """Holm: y alone is at fault at the whole rate over one part, not at that over three."""
+    parts = of_deviations(correlated(rng) * (9.0, 9.0, 1.0), RATE).parts
+    assert [round(RATE / part.settings.false_alarm) for part in parts.values()] == [3, 3, 1]
+
+
+def test_a_bias_is_named_beside_a_wrong_size(rng: np.random.Generator) -> None:
+    error = correlated(rng)
+    assert of_deviations(error + BIAS).status == "biased"
+    verdict = of_deviations(error * (1.0, 3.0, 1.0) + BIAS)
+    assert verdict.status == "overconfident"
+    assert "x: mean error" in verdict.reasons[0]
+
+
+def test_failed_runs_and_a_known_start(rng: np.random.Generator) -> None:
+    error, sigma = correlated(rng), np.ones((60, 12, 3))
+    sigma[:, 0, 1] = 0.0
+    error[5, 7:] = np.nan
+    verdict = cs.judge(error, deviations=sigma, false_alarm=SURE)
+    assert verdict.status == "failed"
+    assert [(f.run, f.step) for f in verdict.failures] == [(5, 8)]
+    assert verdict.left_out_steps == (1,)
+    assert verdict.lost is not None
+    assert (verdict.lost.count, verdict.lost.runs) == (1, 60)
+
+
+def test_parts_of_several_components_use_their_cross_terms(rng: np.random.Generator) -> None:
+    """x and y with their correlation, z by itself."""
+    error = correlated(rng)
+    P = np.broadcast_to(np.array([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.0]]), (60, 12, 3, 3))
+    record = Record("f", error, P, axes=("x", "y", "z"), parts=((0, 1), (2,)))
+    verdict = judge(record, Settings(SURE))
+    assert verdict.status == "consistent"
+    assert [*verdict.parts] == ["x, y", "z"]
+    P = np.where(np.eye(3, dtype=bool), P, -P)
+    assert "x, y: correlation of the wrong sign" in judge(replace(record, covariance=P), Settings(SURE)).reasons[0]
+
+
+def test_innovations_share_the_rate(rng: np.random.Generator) -> None:
+    nis = rng.chisquare(2, (60, 12))
+    record = each_alone(
+        Record("f", correlated(rng), diagonal(np.ones((60, 12, 3))), nis=nis, nis_dof=np.full((60, 12), 2))
+    )
+    assert [*judge(record, Settings(SURE)).parts] == ["axis 0", "axis 1", "axis 2"]
+    judged = replace(record, optimal_gain=True)
+    assert [*judge(judged, Settings(SURE)).parts][-1] == "innovations"
+    verdict = judge(replace(judged, nis=3.0 * nis), Settings(SURE))
+    assert verdict.status == "overconfident"
+    assert verdict.faults == ("innovation scale of innovations",)
+
+
+def test_one_component_has_no_cross_terms(rng: np.random.Generator) -> None:
+    error = independent(rng, 60, 12, 1)
+    one, same = cs.judge(error, deviations=2.0 + 0.0 * error), cs.judge(error, 4.0 + 0.0 * error[..., None])
+    assert one.reasons == same.reasons
+    assert not one.parts
+
+
+def test_misuse_is_refused(rng: np.random.Generator) -> None:
+    error = correlated(rng)
+    with pytest.raises(cs.InputError, match="give one of them"):
+        cs.judge(error, diagonal(error), deviations=error)
+    with pytest.raises(cs.InputError, match=r"deviations has shape \(60, 12, 2\)"):
+        cs.judge(error, deviations=error[..., :2])
+    with pytest.raises(ValueError, match="has no errors"):
+        each_alone(Record("f", nees=np.ones((3, 2)), dof=2))
+
+
+def test_rows_that_are_runs(rng: np.random.Generator) -> None:
+    error = correlated(rng, 300, 1)[:, 0]
+    assert cs.judge(error, deviations=np.ones(error.shape), independent=True, false_alarm=SURE).runs == 300

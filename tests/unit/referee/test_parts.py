@@ -88,12 +88,13 @@ def test_failed_runs_and_a_known_start(rng: np.random.Generator) -> None:
     error, sigma = correlated(rng), np.ones((60, 12, 3))
     sigma[:, 0, 1] = 0.0
     error[5, 7:] = np.nan
+    sigma[6, 3, 2] *= -1.0
     verdict = cs.judge(error, deviations=sigma, false_alarm=SURE)
     assert verdict.status == "failed"
-    assert [(f.run, f.step) for f in verdict.failures] == [(5, 8)]
+    assert [(f.run, f.step) for f in verdict.failures] == [(5, 8), (6, 4)]
     assert verdict.left_out_steps == (1,)
     assert verdict.lost is not None
-    assert (verdict.lost.count, verdict.lost.runs) == (1, 60)
+    assert (verdict.lost.count, verdict.lost.runs) == (2, 60)
 
 
 def test_parts_of_several_components_use_their_cross_terms(rng: np.random.Generator) -> None:

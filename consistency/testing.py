@@ -74,7 +74,7 @@ def assert_consistent(
     Parameters
     ----------
     errors : (runs, steps, n), truth minus estimate, angles wrapped; or the results of ``consistency.run_trials``,
-        with ``filter`` the name of one in them
+        with ``filter`` the name of one in them. Steps without a truth are masked (``numpy.ma``) and do not count
     covariances : (runs, steps, n, n), in the squared units of the errors
     nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances
     false_alarm : chance to fail a right filter; 0.001 unless an argument, marker or session sets it
@@ -101,12 +101,15 @@ def assert_consistent(
     Raises
     ------
     ConsistencyError
-        A fault at the stated false-alarm rate, however few the runs; or failed runs in results.
+        A fault at the stated false-alarm rate, however few the runs; or failed runs: of results, and those whose error
+        is not finite or whose covariance is not positive definite. Steps in which the covariance is singular, as at a
+        start that is known exactly, are left out up to the first of full rank.
     InsufficientTrials
         No fault, and too few runs to show that the ratio is in [1 / ``detect``, ``detect``], or that few runs are lost;
         :func:`consistency.diagnostics.gate_runs` gives a number that suffices for nearly every right filter.
     ValueError
-        Input that cannot be judged, named by run (from 0) and step (from 1); options that do not fit.
+        Input that cannot be judged: shapes that do not fit, a covariance that is not symmetric, a step that is not
+        finite in any run; options that do not fit.
     """
     __tracebackhide__ = True
     demand = terms(false_alarm, detect, power, allow, tolerance, lost)

@@ -46,11 +46,11 @@ def judge_parts(record: Record, settings: Settings) -> Verdict:
     """Judge each part of a record by itself; see ``Record.parts``.
 
     A part is a component, or several whose cross terms are stated. Of two parts only the marginal covariances are
-    known, and a NEES with cross terms of 0 is not chi-square unless the errors are uncorrelated. All questions are asked
-    of each part, and of the innovations if these are judged, at a false-alarm rate that Holm's procedure (1979) divides:
-    whatever the correlations, a right estimator is found at fault in any part with probability ``false_alarm`` at most.
-    It is *consistent* if every part is, each at ``power``. The mean of the whole NEES is expected to be n under any
-    correlation; it is reported and not judged.
+    known, and a NEES with cross terms of 0 is not chi-square unless the errors are uncorrelated. All questions are
+    asked of each part, and of the innovations if these are judged, at a false-alarm rate that Holm's procedure (1979)
+    divides: whatever the correlations, a right estimator is found at fault in any part with probability
+    ``false_alarm`` at most. It is *consistent* if every part is, each at ``power``. The mean of the whole NEES is
+    expected to be n under any correlation; it is reported and not judged.
 
     Raises
     ------

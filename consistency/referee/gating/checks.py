@@ -13,6 +13,7 @@ from consistency.referee.diagnostics import Record, nis_of
 from consistency.referee.diagnostics.skipping import Skip, skip_of
 from consistency.referee.diagnostics.validity import Validity, classify
 from consistency.referee.errors import InputError
+from consistency.referee.sources.archive import in_memory, record_of_arrays
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.sources import Results, source_of
 
@@ -33,41 +34,32 @@ def checked(
     skip: str | float | Skip | None = None,
 ) -> Record:
     """One estimator with checked arrays; arguments and errors as :func:`consistency.testing.assert_consistent`."""
-    arrays: dict[str, Any] = {"axes": () if axes is None else tuple(axes)}
     if (errors is None) != (covariances is None):
         there, missing = ("covariances", "errors") if errors is None else ("errors", "covariances")
         raise ValueError(f"{there} without {missing}: give both")
     if errors is not None and nees is not None:
         raise ValueError("give errors and covariances, or nees and dof, not both")
-    if errors is not None and covariances is not None:
-        arrays["error"], arrays["covariance"] = pair(errors, covariances)
-        n = arrays["error"].shape[-1]
-        if dof is not None and dof != n:
-            raise ValueError(f"dof is {dof}, but the errors have {n} components")
-        arrays["dof"] = n
-    elif nees is not None:
-        if dof is None:
-            raise ValueError("nees without dof: give dof, the dimension of the error")
-        if dof < 1:
-            raise ValueError(f"dof must be at least 1, got {dof}")
-        arrays |= {"nees": values("nees", nees), "dof": dof}
-        for key, value in (("axes", axes), ("subsets", subsets)):
-            if value is not None:
-                raise ValueError(f"{key} needs errors and covariances: the nees does not know its components")
-    arrays |= _innovations(nis, nis_dof, innovations, innovation_covariances)
-    first = next((arrays[key] for key in ("error", "nees", "nis") if key in arrays), None)
-    if first is None:
+    if nees is not None and dof is None:
+        raise ValueError("nees without dof: give dof, the dimension of the error")
+    for key, value in (("axes", axes), ("subsets", subsets)):
+        if value is not None and errors is None:
+            raise ValueError(f"{key} needs errors and covariances: the nees does not know its components")
+    record, given = Record(name), {"errors": errors, "covariances": covariances, "nees": nees}
+    stated = {key: value for key, value in given.items() if value is not None}
+    if stated:
+        record = record_of_arrays(stated if nees is None else {**stated, "dof": dof}, axes, name)
+        if dof is not None and dof != record.dof:
+            raise ValueError(f"dof is {dof}, but the errors have {record.dof} components")
+    arrays = _innovations(nis, nis_dof, innovations, innovation_covariances, _failed(record))
+    if not stated and not arrays:
         raise ValueError("nothing to judge: give errors and covariances, or nees and dof, or nis and nis_dof")
-    for key in ("nis", "innovations"):
-        if key in arrays and arrays[key].shape[:2] != first.shape[:2]:
-            raise ValueError(f"{key} has {arrays[key].shape[:2]} runs and steps, the errors have {first.shape[:2]}")
-    if "dof" not in arrays and not optimal_gain:
+    if not stated and not optimal_gain:
         raise ValueError(
             "innovations alone are judged only with optimal_gain=True: those of any other gain are not white, nor of "
             "the stated size, even if the filter is right"
         )
     try:
-        return Record(name, **arrays, optimal_gain=optimal_gain).without_first(skip_of(skip))
+        return replace(record, **arrays, optimal_gain=optimal_gain).without_first(skip_of(skip))
     except InputError as error:
         raise ValueError(str(error).removeprefix("--")) from None
 
@@ -104,59 +96,39 @@ def of_results(
 # --- arrays ----------------------------------------------------------------------------------------
 
 
-def pair(errors: ArrayLike, covariances: ArrayLike, name: str = "errors", of: str = "covariances") -> tuple[Any, Any]:
-    """Errors (runs, steps, n) and covariances (runs, steps, n, n) that can be judged.
-
-    Raises
-    ------
-    ValueError
-        Shapes do not fit; a value is not finite, a covariance not symmetric or not positive definite: named by
-        run (from 0) and step (from 1).
-    """
-    e, P = array(name, errors), array(of, covariances)
-    if e.ndim != 3 or 0 in e.shape:
-        hint = "; of a single step: errors[:, None, :]" if e.ndim == 2 else ""
-        raise ValueError(f"{name} must have shape (runs, steps, n), got {e.shape}{hint}")
-    if P.shape != (*e.shape, e.shape[-1]):
-        raise ValueError(f"{of} must have shape {(*e.shape, e.shape[-1])} to fit {name} {e.shape}, got {P.shape}")
-    require(np.isfinite(e).all(axis=-1), f"{name}: not finite")
-    covariance(P, of)
-    return e, P
+def _failed(record: Record) -> Array | None:
+    """Steps of runs from their failure on, (runs, steps) of bool; None without errors or NEES."""
+    if record.nees is None:
+        return None
+    gone = np.zeros(record.nees.shape, bool)
+    for failure in record.failures:
+        gone[failure.run, failure.step - 1 :] = True
+    return gone
 
 
-def covariance(P: Array, name: str, there: Array | None = None) -> None:
-    """Refuse covariances (runs, steps, n, n) that are none; ``there`` (runs, steps) says which to look at."""
-    there = np.ones(P.shape[:2], bool) if there is None else there
+def _without(gone: Array | None, name: str, value: ArrayLike) -> Array:
+    """Floats (runs, steps, ...) of innovations, NaN in steps that are ``gone`` with the errors."""
+    array = in_memory(name, value)
+    if gone is None:
+        return array
+    if array.shape[:2] != gone.shape:
+        raise ValueError(f"{name} has {array.shape[:2]} runs and steps, the errors have {gone.shape}")
+    return np.where(gone.reshape(*gone.shape, *(1,) * (array.ndim - 2)), np.nan, array)
+
+
+def _covariances(P: Array, name: str, there: Array) -> None:
+    """Refuse covariances (runs, steps, m, m) that are none; ``there`` (runs, steps) says which to look at."""
     kind = np.where(there, classify(P), Validity.VALID)
     for fault, what in (
         (Validity.NOT_FINITE, "not finite"),
         (Validity.ASYMMETRIC, "not symmetric"),
         (Validity.INDEFINITE, "not positive definite"),
-        (Validity.DEFICIENT, "singular; leave out steps in which a component is known exactly"),
+        (Validity.DEFICIENT, "singular"),
     ):
-        require(kind != fault, f"{name}: {what}")
+        _require(kind != fault, f"{name}: {what}")
 
 
-def values(name: str, value: ArrayLike, there: Array | None = None) -> Array:
-    """Squared norms (runs, steps): finite and not negative, where ``there``."""
-    v = array(name, value)
-    if v.ndim != 2 or 0 in v.shape:
-        raise ValueError(f"{name} must have shape (runs, steps), got {v.shape}")
-    there = np.ones(v.shape, bool) if there is None else there
-    require(np.isfinite(v) | ~there, f"{name}: not finite")
-    require((v >= 0) | ~there, f"{name}: negative")
-    return v
-
-
-def array(name: str, value: ArrayLike) -> Array:
-    """Floats, or a ValueError with the name of the argument."""
-    try:
-        return np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: not an array of numbers with as many steps in each run") from None
-
-
-def require(good: Any, what: str) -> None:
+def _require(good: Any, what: str) -> None:
     """Raise with the first run (from 0) and step (from 1) that is not good, (runs, steps) of bool."""
     if not good.all():
         run, step = (int(i) for i in np.argwhere(~good)[0])
@@ -164,34 +136,44 @@ def require(good: Any, what: str) -> None:
 
 
 def _innovations(
-    nis: ArrayLike | None, nis_dof: ArrayLike | None, vectors: ArrayLike | None, covariances: ArrayLike | None
-) -> dict[str, Any]:
+    nis: ArrayLike | None, nis_dof: ArrayLike | None, vectors: ArrayLike | None, covariances: ArrayLike | None,
+    gone: Array | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Checked innovations by their names in a record, without the steps that are ``gone``."""
     if (nis is None) != (nis_dof is None):
         raise ValueError("give nis and nis_dof together")
     if (vectors is None) != (covariances is None):
         raise ValueError("give innovations and innovation_covariances together")
     arrays: dict[str, Any] = {}
     if vectors is not None and covariances is not None:
-        v, S = array("innovations", vectors), array("innovation_covariances", covariances)
+        v, S = _without(gone, "innovations", vectors), in_memory("innovation_covariances", covariances)
         if v.ndim != 3 or 0 in v.shape or S.shape != (*v.shape, v.shape[-1]):
             raise ValueError(
                 "innovations and innovation_covariances must have shapes (runs, steps, m) and (runs, steps, m, m), "
                 f"got {v.shape} and {S.shape}"
             )
         there: Array = ~np.asarray(np.isnan(v).all(axis=-1))  # a step without a measurement has no innovation
-        require(np.isfinite(v).all(axis=-1) | ~there, "innovations: not finite")
-        covariance(S, "innovation_covariances", there)
+        _require(np.isfinite(v).all(axis=-1) | ~there, "innovations: not finite")
+        _covariances(S, "innovation_covariances", there)
         arrays |= {"innovations": v, "innovation_covariances": S}
         if nis is None:
             arrays["nis"], arrays["nis_dof"] = nis_of(v, S)
     if nis is not None and nis_dof is not None:
-        dof = array("nis_dof", nis_dof)
-        shape = np.shape(nis)
-        if dof.ndim not in (0, 2) or (dof.ndim == 2 and dof.shape != shape):
-            raise ValueError(f"nis_dof must be a number or have the shape of nis, {shape}, got {dof.shape}")
-        dof = np.broadcast_to(dof, shape)
-        if not (np.isfinite(dof).all() and (dof >= 0).all() and (dof == np.round(dof)).all()):
-            raise ValueError("nis_dof must hold whole numbers, 0 where there was no innovation")
-        counts: Indices = dof.astype(np.int64)
-        arrays |= {"nis": values("nis", nis, counts > 0), "nis_dof": counts}
+        arrays |= dict(zip(("nis", "nis_dof"), _nis(_without(gone, "nis", nis), nis_dof, gone), strict=True))
     return arrays
+
+
+def _nis(nis: Array, nis_dof: ArrayLike, gone: Array | None) -> tuple[Array, Indices]:
+    """NIS and its degrees of freedom, (runs, steps), which are 0 where it does not count."""
+    if nis.ndim != 2 or 0 in nis.shape:
+        raise ValueError(f"nis must have shape (runs, steps), got {nis.shape}")
+    dof = in_memory("nis_dof", nis_dof)
+    if dof.ndim not in (0, 2) or (dof.ndim == 2 and dof.shape != nis.shape):
+        raise ValueError(f"nis_dof must be a number or have the shape of nis, {nis.shape}, got {dof.shape}")
+    dof = np.where(False if gone is None else gone, 0.0, np.broadcast_to(dof, nis.shape))
+    if not (np.isfinite(dof).all() and (dof >= 0).all() and (dof == np.round(dof)).all()):
+        raise ValueError("nis_dof must hold whole numbers, 0 where there was no innovation")
+    counts: Indices = dof.astype(np.int64)
+    _require(np.isfinite(nis) | (counts == 0), "nis: not finite")
+    _require((nis >= 0) | (counts == 0), "nis: negative")
+    return nis, counts

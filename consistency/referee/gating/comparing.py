@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary, whiten
+from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary
 from consistency.referee.diagnostics.comparison import FailedRuns
 from consistency.referee.diagnostics.skipping import Skip
 from consistency.referee.gating.checks import checked, of_results, planned_dof
@@ -84,7 +84,8 @@ def of_arrays(name: str, candidate: Mapping[str, Any], reference: Mapping[str, A
         raise ValueError(f"the candidate has {m} runs and the reference {n}; row i of both must be one trial")
     if planned_dof(a) != planned_dof(b):
         raise ValueError(f"the errors have {planned_dof(a)} and {planned_dof(b)} components")
-    return Sides(a, row_a, row_b, "the reference", tuple(a.axes) or None, paired=True)
+    failures = FailedRuns(len(a.failures), len(b.failures))
+    return Sides(a, row_a, row_b, "the reference", tuple(a.axes) or None, paired=True, failures=failures)
 
 
 def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunSummary]:
@@ -92,10 +93,8 @@ def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunS
         case = checked(name, **arrays)
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
-    e, P = case.error, case.covariance
-    values = case.nees if e is None or P is None else np.square(whiten(e, P)).sum(axis=-1)
-    assert values is not None
-    return case, summary(values, case.dof, e, P)
+    assert case.nees is not None
+    return case, summary(case.nees, case.dof, case.error, case.covariance)
 
 
 def of_filters(

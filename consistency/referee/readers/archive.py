@@ -26,7 +26,7 @@ from consistency.referee.types import Array, Failure
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
 NEEDED = (("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof"))
-OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "cross_covariances"}
+OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances"}
 
 
 def read_archive(path: Path, convention: str | None, relative: Relative | None = None) -> list[Evidence]:
@@ -35,44 +35,65 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
     ``errors`` (runs, steps, n) with ``covariances`` (runs, steps, n, n); or ``estimates`` and ``truth``, both
     (runs, steps, n), with ``covariances``; or ``nees`` (runs, steps) with ``dof``. One run may lack the first
     dimension. Optional: ``nis`` and ``nis_dof`` (runs, steps), ``axes`` (n,), ``t`` (steps,), and ``lengths``
-    (runs,), the number of steps of each run, where they differ. With ``relative`` estimates and truth are planar
+    (runs,), the number of steps of each run, where they differ, and ``mask`` (runs, steps), true where there is no
+    truth, so that the step does not count. With ``relative`` estimates and truth are planar
     poses, or estimates are motions; ``cross_covariances`` (runs, steps, 3, 3) are those with the step before.
     """
     return [_of_arrays(path, load_arrays(path), convention, relative)]
 
 
 def record_of_arrays(
-    errors: ArrayLike, stated: Mapping[str, ArrayLike], axes: Sequence[str] | None, name: str, independent: bool
+    given: Mapping[str, ArrayLike], axes: Sequence[str] | None, name: str, independent: bool = False
 ) -> Record:
-    """Errors and covariances or deviations in memory as a record; see :func:`consistency.judge`."""
-    arrays: dict[str, Array] = {}
-    for key, value in {"errors": errors, **stated}.items():
-        arrays[key] = _in_memory(key, value)[:, None] if independent else _in_memory(key, value)
-    shape = arrays["errors"].shape
-    if len(shape) == 2:
-        raise InputError(
-            f"errors has shape {shape}, needs (runs, steps, n): errors[None] and covariances[None] are one run of many "
-            "steps; independent=True says that each row is a run of its own, which the steps of a log are not"
-        )
-    for key, array in arrays.items():
-        never = ~np.isfinite(array).reshape(*array.shape[:2], -1).all(axis=-1).any(axis=0)
-        if never.any():
-            step = int(np.argmax(never)) + 1
-            raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
-    if axes is not None:
-        arrays["axes"] = np.asarray(axes, str)
+    """Arrays in memory as a record, like those of an archive; see :func:`consistency.judge`.
+
+    Parameters
+    ----------
+    given : errors with covariances or deviations, or nees with dof; steps that are masked in a masked array of errors
+        or nees have no truth and do not count
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, a covariance that is not symmetric, a step that is not finite in any run.
+    """
+    first = next(iter(given))
+    arrays = {
+        key: in_memory(key, value)[:, None] if independent else in_memory(key, value) for key, value in given.items()
+    }
+    shape, wanted = arrays[first].shape, ("runs", "steps", "n")[: 3 if first == "errors" else 2]
+    if len(shape) != len(wanted) or 0 in shape:
+        text = f"{first} has shape {shape}, needs ({', '.join(wanted)})"
+        if len(shape) == len(wanted) - 1:
+            one, row = (" and ".join(f"{key}{at}" for key in given if key != "dof") for at in ("[None]", "[:, None]"))
+            text += f": {one} {'are' if 'and' in one else 'is'} one run of many steps; {row}, or independent=True of "
+            text += "cs.judge, says that each row is a run of its own, which the steps of a log are not"
+        raise InputError(text)
     sigma = arrays.pop("deviations", None)
     if sigma is not None:
         if sigma.shape != shape:
             raise InputError(f"deviations has shape {sigma.shape}, needs that of errors, {shape}")
         arrays["covariances"] = diagonal(sigma)
+    masked = np.ma.getmaskarray(np.ma.asarray(given[first])).reshape(arrays[first].shape)
+    mask = masked.reshape(*shape[:2], -1).any(axis=-1)
+    for key, array in arrays.items():
+        if array.ndim < 2:
+            continue
+        there = np.isfinite(array).reshape(*array.shape[:2], -1).all(axis=-1)
+        never = ~(there | mask).any(axis=0)
+        if never.any():
+            step = int(np.argmax(never)) + 1
+            raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
+    arrays |= {"mask": mask} if mask.any() else {}
+    arrays |= {} if axes is None else {"axes": np.asarray(axes, str)}
     record = _of_arrays(Path("arrays"), arrays)
     record = record if sigma is None else each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
 
 
-def _in_memory(key: str, value: ArrayLike) -> Array:
+def in_memory(key: str, value: ArrayLike) -> Array:
+    """Floats; raises InputError with the name of the argument."""
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError):
@@ -107,23 +128,26 @@ def _of_arrays(
         n = estimates.shape[-1]
         if error_kind not in PLANAR or (error_kind != "vector" and n != 3):
             raise InputError(f"--error {error_kind}: here it is 'vector', or so2, left or right for x, y, heading")
-        _require_truth(path, truth, estimates)
+        known = _known(path, arrays, *truth.shape[:2])
+        truth = np.where(known[..., None], truth, np.nan)
+        _require_truth(path, truth, estimates, known)
         if relative is not None:
             return _relative(path, arrays, estimates, truth, covariances, convention or "so2", relative)
         error = planar_error(truth, estimates, error_kind) if n == 3 else truth - estimates
     runs, steps, n = error.shape
     if covariances.shape != (runs, steps, n, n):
         raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {(runs, steps, n, n)}")
-    lengths = run_lengths(path, arrays, runs, steps)
+    known = _known(path, arrays, runs, steps)
     nis, dof = _nis(path, arrays, (runs, steps))
     given = error_kind or "vector"
     tracks, poses = [], []
-    for run, length in enumerate(lengths):
-        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
-        P = symmetric(covariances[run, :length], place.__getitem__)
-        poses.append(_poses(place, estimates[run, :length], P, truth[run, :length], given))
-        cut = (None if values is None else values[run, :length] for values in (nis, dof))
-        tracks.append(Track(run, np.arange(length), place, error[run, :length], P, *cut))
+    for run, steps_of_run in enumerate(known):
+        k = np.flatnonzero(steps_of_run)
+        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", k)  # type: ignore[misc]
+        P = symmetric(covariances[run, k], place.__getitem__)
+        poses.append(_poses(place, estimates[run, k], P, truth[run, k], given))
+        cut = (None if values is None else values[run, k] for values in (nis, dof))
+        tracks.append(Track(run, k, place, error[run, k], P, *cut))
     axes = _axes(path, arrays, n)
     notes = [f"error convention {error_kind}: {PLANAR[error_kind]}"] if error_kind else []
     notes += hints(path.stem, axes, poses)
@@ -228,11 +252,13 @@ def whole_numbers(path: Path, arrays: dict[str, Array], key: str, shape: tuple[i
         raise InputError(f"{path}: key '{key}' must be one number or of shape {shape}") from None
 
 
-def _require_truth(path: Path, truth: Array, estimates: Array) -> None:
-    bad = np.isfinite(estimates).all(axis=-1) & ~np.isfinite(truth).all(axis=-1)
+def _require_truth(path: Path, truth: Array, estimates: Array, known: Array) -> None:
+    bad = known & np.isfinite(estimates).all(axis=-1) & ~np.isfinite(truth).all(axis=-1)
     if bad.any():
         run, step = np.argwhere(bad)[0]
-        raise InputError(f"{path}: key 'truth', run {run}, step {step + 1}: not finite")
+        raise InputError(
+            f"{path}: key 'truth', run {run}, step {step + 1}: not finite; 'mask' is true where there is none"
+        )
 
 
 def run_lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> list[int]:
@@ -243,6 +269,15 @@ def run_lengths(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> 
     if lengths.shape != (runs,) or lengths.dtype.kind not in "iu" or ((lengths < 1) | (lengths > steps)).any():
         raise InputError(f"{path}: key 'lengths' must be {runs} whole numbers from 1 to {steps}")
     return [int(length) for length in lengths]
+
+
+def _known(path: Path, arrays: dict[str, Array], runs: int, steps: int) -> Array:
+    """Steps that belong to each run and have a truth, (runs, steps) of bool."""
+    known = np.arange(steps) < np.array(run_lengths(path, arrays, runs, steps))[:, None]
+    mask = arrays.get("mask", np.zeros((runs, steps), bool))
+    if mask.shape != (runs, steps) or mask.dtype.kind != "b":
+        raise InputError(f"{path}: key 'mask' must be truth values of shape {(runs, steps)}")
+    return np.asarray(known & ~mask)
 
 
 def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[Array | None, Array | None]:
@@ -294,11 +329,12 @@ def _of_nees(path: Path, arrays: dict[str, Array]) -> Evidence:
     n = int(dof)
     nis, nis_dof = _nis(path, arrays, (runs, steps))
     failures = []
-    for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
-        nees[run, length:] = np.nan
-        finite = np.isfinite(nees[run, :length])
+    known = _known(path, arrays, runs, steps)
+    nees[~known] = np.nan
+    for run in range(runs):
+        finite = np.isfinite(nees[run])
         first = int(np.argmax(finite)) if finite.any() else 0
-        broken = np.flatnonzero(~finite[first:])
+        broken = np.flatnonzero((known[run] & ~finite)[first:])
         if len(broken):
             step = first + int(broken[0])
             nees[run, step:] = np.nan

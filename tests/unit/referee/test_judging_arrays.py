@@ -62,6 +62,40 @@ def test_a_known_start_is_left_out_by_name(error: Array) -> None:
     assert not verdict.failures
 
 
+def test_a_masked_step_has_no_truth(error: Array, tmp_path: Path) -> None:
+    """It is no failure, in arrays and files of errors, of estimates and of NEES; what stands there does not count."""
+    mask = np.zeros((RUNS, STEPS), bool)
+    mask[3, 12:15] = mask[:, 4] = mask[5, -1] = True
+    spoilt = np.where(mask[..., None], np.nan, error)
+    P, nees = np.where(mask[..., None, None], np.nan, identities(error)), np.square(error).sum(axis=-1)
+    verdict = cs.judge(np.ma.masked_invalid(spoilt), P, false_alarm=SURE)
+    assert verdict.status == "consistent"
+    assert verdict.scale is not None
+    alive = (~mask).sum(axis=0)
+    assert verdict.scale.alive.tolist() == alive.tolist()
+    np.testing.assert_allclose(verdict.scale.mean_anees, np.ma.array(nees, mask=mask).mean(axis=1).mean(), rtol=1e-12)
+    assert not verdict.failures
+    assert verdict.left_out_steps == ()
+    estimates = np.where(mask[..., None], 1.0, -error)
+    truth = np.where(mask[..., None], np.nan, 0.0 * error)
+    for arrays in (
+        {"errors": spoilt, "covariances": P},
+        {"estimates": estimates, "truth": truth, "covariances": identities(error)},
+        {"nees": np.where(mask, np.nan, nees), "dof": np.array(2)},
+    ):
+        np.savez(tmp_path / "mine.npz", mask=mask, **arrays)
+        read = cs.judge(tmp_path / "mine.npz", false_alarm=SURE)
+        assert (read.status, read.failures) == ("consistent", ())
+        assert read.scale is not None
+        assert read.scale.alive.tolist() == alive.tolist()
+    np.savez(tmp_path / "mine.npz", estimates=estimates, truth=truth, covariances=identities(error))
+    with pytest.raises(cs.InputError, match="run 0, step 5: not finite; 'mask' is true where there is none"):
+        cs.judge(tmp_path / "mine.npz")
+    np.savez(tmp_path / "mine.npz", errors=spoilt, covariances=P, mask=mask[:2])
+    with pytest.raises(cs.InputError, match=r"key 'mask' must be truth values of shape \(60, 20\)"):
+        cs.judge(tmp_path / "mine.npz")
+
+
 def test_rows_are_runs_only_where_that_is_said(rng: np.random.Generator) -> None:
     error = independent(rng, 300, 1, 2)[:, 0]
     P = np.broadcast_to(np.eye(2), (300, 2, 2))

@@ -189,12 +189,13 @@ def test_errors_travel_between_processes(error: Any) -> None:
     assert (str(again), vars(again)) == (str(error), vars(error))
 
 
-# --- input that cannot be judged -------------------------------------------------------------------
+# --- failed runs, and input that cannot be judged -------------------------------------------------------
 
 
-def spoilt(what: str) -> tuple[Array, Array]:
-    errors = np.random.default_rng(0).normal(size=(6, 8, 3))
-    covariances = np.broadcast_to(np.eye(3), (6, 8, 3, 3)).copy()
+def spoilt(what: str, rng: np.random.Generator, runs: int = 6) -> tuple[Array, Array]:
+    """Right errors; run 4 is broken in step 7."""
+    errors = rng.normal(size=(runs, 8, 3))
+    covariances = np.broadcast_to(np.eye(3), (runs, 8, 3, 3)).copy()
     bad = covariances[4, 6]
     if what == "error":
         errors[4, 6, 1] = np.nan
@@ -202,36 +203,103 @@ def spoilt(what: str) -> tuple[Array, Array]:
         errors[4, 6, 1] = np.inf
     elif what == "covariance":
         bad[0, 0] = np.nan
-    elif what == "asymmetric":
-        bad[0, 1] = 1e-7
     elif what == "negative":
         bad[2, 2] = -1.0
     elif what == "indefinite":
         bad[0, 1] = bad[1, 0] = 1.5
-    else:
+    elif what == "singular":
         bad[:2, :2] = 1.0
     return errors, covariances
 
 
-@pytest.mark.parametrize(
-    ("what", "said"),
-    [
-        ("error", "errors: not finite"), ("infinite", "errors: not finite"), ("covariance", "covariances: not finite"),
-        ("asymmetric", "not symmetric"), ("negative", "not positive definite"),
-        ("indefinite", "not positive definite"), ("singular", "singular"),
-    ],
-)  # fmt: skip
-def test_unusable_input_is_named_by_run_and_step(what: str, said: str) -> None:
-    errors, covariances = spoilt(what)
-    with pytest.raises(ValueError, match=rf"{said}.* in run 4, step 7$"):
-        assert_consistent(errors, covariances)
-    with pytest.raises(ValueError, match=rf"reference b: .*{said}.* in run 4, step 7$"):
-        assert_not_worse(np.ones((6, 8, 3)), np.broadcast_to(np.eye(3), (6, 8, 3, 3)), errors, covariances)
+FAILURES = {
+    "error": "estimate is not finite", "infinite": "estimate is not finite", "covariance": "covariance is not finite",
+    "negative": "covariance is not positive definite", "indefinite": "covariance is not positive definite",
+    "singular": "covariance is not positive definite",
+}  # fmt: skip
 
 
-def test_nearly_symmetric_is_symmetric() -> None:
-    errors, covariances = spoilt("none of these")
-    covariances[4, 6] = np.eye(3)
+@pytest.mark.parametrize(("what", "reason"), FAILURES.items())
+def test_a_run_that_is_no_estimate_has_failed(what: str, reason: str, rng: np.random.Generator) -> None:
+    """It is counted, fails the gate, and the others are judged beside it; no number of runs makes up for it."""
+    errors, covariances = spoilt(what, rng, RUNS)
+    match = rf"mine is failed: 1 of {RUNS} runs failed, first run 4 in step 7: {reason}"
+    with pytest.raises(ConsistencyError, match=match) as caught:
+        assert_consistent(errors, covariances, false_alarm=RARE, name="mine")
+    verdict = caught.value.verdict
+    assert verdict is not None
+    assert [(f.filter, f.run, f.step) for f in verdict.failures] == [("mine", 4, 7)]
+    assert verdict.scale is not None
+    assert verdict.scale.alive.tolist() == [RUNS] * 6 + [RUNS - 1] * 2
+    assert verdict.lost is not None
+    assert (verdict.lost.count, verdict.lost.runs) == (1, RUNS)
+    with pytest.raises(ConsistencyError, match=r"1 runs failed, of the reference 0"):
+        assert_not_worse(errors, covariances, *spoilt("", rng, RUNS), false_alarm=RARE)
+    right = spoilt("", rng, RUNS)
+    assert not assert_not_worse(*right, *(part.copy() for part in spoilt(what, rng, RUNS)), detect=9.0).worse
+
+
+def test_a_fault_is_found_beside_failed_runs(rng: np.random.Generator) -> None:
+    errors, covariances = spoilt("error", rng, RUNS)
+    with pytest.raises(ConsistencyError, match="overconfident: covariance too small by x") as caught:
+        assert_consistent(3.0 * errors, covariances, false_alarm=RARE)
+    assert f"1 of {RUNS} runs failed" in str(caught.value)
+
+
+def test_a_known_start_is_no_failure(rng: np.random.Generator) -> None:
+    errors, covariances = spoilt("", rng, RUNS)
+    covariances[:, 0], covariances[:, 1, 2] = 0.0, 0.0
+    verdict = assert_consistent(errors, covariances, false_alarm=RARE)
+    assert verdict.left_out_steps == (1, 2)
+    assert not verdict.failures
+
+
+def test_nees_of_a_failed_run(rng: np.random.Generator) -> None:
+    nees = rng.chisquare(3, (RUNS, 8))
+    nees[4, 6:] = np.nan
+    with pytest.raises(ConsistencyError, match="first run 4 in step 7: NEES is not finite"):
+        assert_consistent(nees=nees, dof=3, false_alarm=RARE)
+
+
+def test_innovations_end_with_a_failed_run(rng: np.random.Generator) -> None:
+    """Whatever a run says after its failure does not count, nor is it refused."""
+    errors, covariances = spoilt("error", rng, RUNS)
+    nis = rng.chisquare(2, (RUNS, 8))
+    nis[4, 6:] = np.nan
+    v, S = rng.normal(size=(RUNS, 8, 2)), np.broadcast_to(np.eye(2), (RUNS, 8, 2, 2)).copy()
+    S[4, 7], v[4, 7, 0] = -1.0, np.nan
+    for arrays in ({"nis": nis, "nis_dof": 2}, {"innovations": v, "innovation_covariances": S}):
+        record = checked("f", errors, covariances, **arrays)
+        assert record.nis is not None
+        assert np.isnan(record.nis[4]).tolist() == [False] * 6 + [True] * 2
+        assert record.nis_dof is not None
+        assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
+        with pytest.raises(ConsistencyError, match="1 of"):
+            assert_consistent(errors, covariances, **arrays, false_alarm=RARE)
+        with pytest.raises(ValueError, match="not finite in run 4"):
+            assert_consistent(np.nan_to_num(errors), covariances, **arrays)
+
+
+def test_misuse_is_no_failed_run(rng: np.random.Generator) -> None:
+    errors, covariances = spoilt("", rng)
+    P = covariances.copy()
+    P[4, 6, 0, 1] = 1e-5
+    with pytest.raises(ValueError, match=r"run 4, step 7: the covariance is not symmetric"):
+        assert_consistent(errors, P)
+    with pytest.raises(ValueError, match=r"reference b: .*run 4, step 7: the covariance is not symmetric"):
+        assert_not_worse(errors, covariances, errors, P)
+    for key, arrays in {"errors": (errors.copy(), covariances), "covariances": (errors, covariances.copy())}.items():
+        arrays[key == "covariances"][:, 2] = np.nan
+        with pytest.raises(ValueError, match=f"{key}, step 3: not finite in any run"):
+            assert_consistent(*arrays)
+    with pytest.raises(ValueError, match="a run that is there twice"):
+        assert_consistent(errors[[0, 1, 1]], covariances[:3])
+    with pytest.raises(ValueError, match="not positive definite"):
+        cs.nees(errors[0, 0], -covariances[0, 0])
+
+
+def test_nearly_symmetric_is_symmetric(rng: np.random.Generator) -> None:
+    errors, covariances = spoilt("", rng)
     covariances[4, 6, 0, 1] = 1e-9
     with pytest.raises(InsufficientTrials):  # judged, that is; false-alarm rate 1e-6
         assert_consistent(errors, covariances, false_alarm=RARE)
@@ -246,17 +314,17 @@ E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3
         ({}, "nothing to judge"),
         ({"errors": E}, "errors without covariances"),
         ({"covariances": P}, "covariances without errors"),
-        ({"errors": E[0], "covariances": P[0]}, "(runs, steps, n), got (2, 3); of a single step: errors[:, None, :]"),
-        ({"errors": E, "covariances": P[..., :2]}, "(4, 2, 3, 3) to fit errors (4, 2, 3), got (4, 2, 3, 2)"),
-        ({"errors": E[:0], "covariances": P[:0]}, "must have shape (runs, steps, n)"),
+        ({"errors": E[0], "covariances": P[0]}, "errors has shape (2, 3), needs (runs, steps, n): errors[None]"),
+        ({"errors": E, "covariances": P[..., :2]}, "key 'covariances' has shape (4, 2, 3, 2), needs (4, 2, 3, 3)"),
+        ({"errors": E[:0], "covariances": P[:0]}, "errors has shape (0, 2, 3), needs (runs, steps, n)"),
         ({"errors": [[[1.0], [2.0]], [[1.0]]], "covariances": P}, "errors: not an array of numbers"),
         ({"errors": E, "covariances": P, "dof": 2}, "dof is 2, but the errors have 3 components"),
         ({"errors": E, "covariances": P, "nees": E[..., 0]}, "not both"),
         ({"nees": E[..., 0]}, "nees without dof"),
-        ({"nees": E[..., 0], "dof": 0}, "dof must be at least 1"),
-        ({"nees": E[0, :, 0], "dof": 3}, "nees must have shape (runs, steps), got (2,)"),
-        ({"nees": np.abs(E[..., 0]) - 9.0, "dof": 3}, "nees: negative in run 0, step 1"),
-        ({"nees": E[..., 0] * np.nan, "dof": 3}, "nees: not finite in run 0, step 1"),
+        ({"nees": E[..., 0], "dof": 0}, "key 'dof' must be one whole number of 1 or more"),
+        ({"nees": E[0, :, 0], "dof": 3}, "nees has shape (2,), needs (runs, steps): nees[None] is one run"),
+        ({"nees": np.abs(E[..., 0]) - 9.0, "dof": 3}, "key 'nees', run 0, step 1: "),
+        ({"nees": E[..., 0] * np.nan, "dof": 3}, "nees, step 1: not finite in any run"),
         ({"nees": E[..., 0] ** 2, "dof": 3, "axes": ["a", "b", "c"]}, "axes needs errors and covariances"),
         ({"nis": E[..., 0]}, "give nis and nis_dof together"),
         ({"nis": E[..., 0] ** 2, "nis_dof": 1.5}, "whole numbers"),
@@ -270,7 +338,7 @@ E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3
         ({"errors": E, "covariances": P, "power": 1.0}, "power must lie between 0 and 1"),
         ({"errors": E, "covariances": P, "detect": 1.0}, "detect must be a positive ratio"),
         ({"errors": E, "covariances": P, "detect": 0.5, "allow": "conservative"}, "which allow='conservative' accepts"),
-        ({"errors": E, "covariances": P, "axes": ["x"]}, "1 names of axes for 3 components"),
+        ({"errors": E, "covariances": P, "axes": ["x"]}, "key 'axes' names 1 components, the error has 3"),
         ({"errors": E, "covariances": P, "filter": "kf"}, "results"),
     ],
 )

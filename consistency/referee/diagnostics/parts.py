@@ -13,9 +13,9 @@ from consistency.referee.diagnostics.headline import few_lost
 from consistency.referee.diagnostics.lost import lost_of
 from consistency.referee.diagnostics.questions import SHARES
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.verdict_parts import Answer, Settings, Verdict
 from consistency.referee.diagnostics.sample import names_of
 from consistency.referee.diagnostics.verdict import judge_alone
+from consistency.referee.diagnostics.verdict_parts import Answer, Settings, Verdict
 from consistency.referee.diagnostics.whitening import entries, squared_length, whiten
 from consistency.referee.types import Array
 

@@ -13,7 +13,7 @@ from consistency.referee.diagnostics import Record, nis_of
 from consistency.referee.diagnostics.skipping import Skip, skip_of
 from consistency.referee.diagnostics.validity import Validity, classify
 from consistency.referee.errors import InputError
-from consistency.referee.sources.archive import in_memory, record_of_arrays
+from consistency.referee.readers.archive import in_memory, record_of_arrays
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.sources import Results, source_of
 

@@ -18,6 +18,7 @@ from consistency.referee.readers.alignment import ALIGNMENTS, require_alignment
 from consistency.referee.readers.archive import read_archive
 from consistency.referee.readers.bags import is_bag, read_bags
 from consistency.referee.readers.kitti import BODIES, is_drive
+from consistency.referee.readers.layouts import is_spatial
 from consistency.referee.readers.relative import MARGINAL
 from consistency.referee.readers.table import read_tables
 from consistency.referee.readers.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
@@ -93,12 +94,12 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evi
             estimates, r, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align"
         )
         return read_archive(estimates, r.error, over)
-    if suffix in TABLES:
+    if suffix in TABLES and (r.state is not None or not is_spatial(estimates)):
         _refuse(estimates, r, "covariance", "covariance_order", "axes")
         if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
             raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
         return _with_frame(read_tables(estimates, r, over), r)
-    if suffix not in SUFFIXES and not estimates.is_dir():
+    if suffix not in (*SUFFIXES, ".csv") and not estimates.is_dir():
         known = ", ".join((*TABLES, ".npz", ".bag", *SUFFIXES))
         raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
     _refuse(estimates, r, "state")

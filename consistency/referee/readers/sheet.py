@@ -6,7 +6,7 @@ import csv
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -111,6 +111,7 @@ class Lines:
     path: Path
     values: Array  # (N, columns), the first of which is t
     line: Indices  # (N,)
+    note: str = ""  # what they were read as
 
     @property
     def t(self) -> Array:
@@ -122,7 +123,7 @@ class Lines:
 
     def of(self, columns: slice) -> Lines:
         """Some of the columns, without holding the others in memory."""
-        return Lines(self.path, self.values[:, columns].copy(), self.line)
+        return replace(self, values=self.values[:, columns].copy())
 
 
 class Places(Sequence[str]):
@@ -303,18 +304,28 @@ def _objects(values: Array) -> Column:
 
 def read_numbers(path: Path, widths: Sequence[int], layout: str) -> Lines:
     """A text file of numbers, every line of the same one of the ``widths``, the first column increasing."""
+    return increasing(read_rows(path, widths, layout))
+
+
+def read_rows(path: Path, widths: Sequence[int], layout: str, header: int = 0) -> Lines:
+    """A text file of numbers, every line but ``header``, counted from 1, of the same one of the ``widths``."""
     values, line, width = list[Array](), list[Indices](), 0
     for block in blocks(path):
         found = block.numbers()
         if found is None or found[0].shape[1] not in widths or width not in (0, found[0].shape[1]):
-            found = _number_rows(path, block.lines(), widths, width, layout)
+            rows = [(number, text) for number, text in block.lines() if number != header]
+            found = _number_rows(path, rows, widths, width, layout)
         if len(found[1]):
             width = found[0].shape[1]
             values.append(bounded(found[0]))
             line.append(found[1])
     if not values:
         raise InputError(f"{path}: is empty; each line should be {layout}")
-    lines = Lines(path, np.concatenate(values), np.concatenate(line))
+    return Lines(path, np.concatenate(values), np.concatenate(line))
+
+
+def increasing(lines: Lines) -> Lines:
+    """Lines whose first column is finite and increases; others are refused."""
     wrong = np.flatnonzero(~np.isfinite(lines.t))
     if len(wrong):
         raise InputError(f"{lines.place(int(wrong[0]))}: the timestamp is not finite")

@@ -38,6 +38,7 @@ class TrajectorySource:
     files: Sequence[tuple[Path | str, Path | str]]  # of each run: its estimates, its truth
     covariance: Path
     why: str = ""  # the convention is what it is
+    notes: tuple[str, ...] = ()  # what the files were read as
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,8 @@ def recordings_of(
             _stretch(run, one, *files, r.shift, relative)
             for run, (one, files) in enumerate(zip(poses, source.files, strict=True))
         ]
-        return [relative_recording(source.path.stem, str(source.covariance), stretches, AXES, judged, relative)]
+        one = relative_recording(source.path.stem, str(source.covariance), stretches, AXES, judged, relative)
+        return [replace(one, notes=(*source.notes, *one.notes))]
     shift, clocks, moved = clocks_and_frames(source.path.name, poses, r.time_offset, r.align, judged)
     poses = moved.runs
     matches = [
@@ -94,6 +96,7 @@ def recordings_of(
     tracks = [replace(each.track, column=column) for each, column in zip(matches, columns, strict=True)]
     kind = poses[0].convention
     notes = [
+        *source.notes,
         *_notes(source.path, matches, poses[0].max_dt),
         *clocks,
         *moved.notes,

@@ -12,9 +12,9 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.kitti import is_drive, read_drive
+from consistency.referee.readers.layouts import FULL, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
 from consistency.referee.readers.matching import associate
-from consistency.referee.readers.openvins import FULL as STATES
-from consistency.referee.readers.openvins import LAYOUT, States, as_states, read_deviations
+from consistency.referee.readers.openvins import LAYOUT, States, read_deviations
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Lines, Places, read_numbers
@@ -31,8 +31,6 @@ from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")
-POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
-FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
 BOTH = 2 * FULL  # and a cross-covariance with the line before
 UNIT = 1e-3  # quaternions of four decimals pass
 SUFFIXES = (".txt", ".tum")
@@ -58,8 +56,11 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     runs = _runs(estimates, r.truth, r.covariance)
     parts: Mapping[str, range] = WHOLE
     poses: list[Poses] = []
+    notes: list[str] = []
     for path, true_path, P_path in runs:
         own = read_trajectory(path)
+        true = read_drive(true_path, r.body) if is_drive(true_path) else read_trajectory(true_path, true=True)
+        notes += [lines.note for lines in (own, true) if lines.note]
         if not poses:
             parts = _parts(own)
             error_kind = r.error or ("so3" if parts is WHOLE else "so3-body")
@@ -67,9 +68,10 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
             raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
         if _parts(own) is not parts:
             raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
-        poses.append(_poses(own, true_path, P_path, error_kind, order or ORDERS[0], r.tolerance, r.body))
+        poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r.tolerance))
     why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
-    source = TrajectorySource(estimates, [(path, true) for path, true, _ in runs], r.covariance or estimates, why)
+    files = [(path, true) for path, true, _ in runs]
+    source = TrajectorySource(estimates, files, r.covariance or estimates, why, tuple(dict.fromkeys(notes)))
     return recordings_of(source, poses, parts, r, relative)
 
 
@@ -111,7 +113,8 @@ def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[P
 
 def trajectory_files(folder: Path) -> list[Path]:
     """Files of a folder that may be trajectories, by name."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    return [p for p in files if p.suffix.lower() in SUFFIXES] or [p for p in files if is_spatial(p)]
 
 
 def _same_stem(folder: Path, path: Path, option: str) -> Path:
@@ -125,15 +128,13 @@ def _same_stem(folder: Path, path: Path, option: str) -> Path:
 
 def _poses(
     own: Lines,
-    truth_path: Path,
+    truth: Lines,
     covariance_path: Path | None,
     convention: str,
     order: str,
     tolerance: float,
-    body: str | None,
 ) -> Poses:
     """A run with its truth; the covariance is NaN where none is near."""
-    truth = read_drive(truth_path, body) if is_drive(truth_path) else read_trajectory(truth_path, true=True)
     covariance, source, cross = _inline(own, order), own, None
     rows = picked = np.arange(len(own.t))
     if covariance_path is not None:
@@ -185,15 +186,7 @@ def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indic
 
 def read_trajectory(path: Path, true: bool = False) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
-    widths = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
-    layout = f"t tx ty tz qx qy qz qw ({', '.join(map(str, widths))} columns)"
-    lines = read_numbers(path, (*widths, *STATES), layout)
-    columns = "5 to 8"
-    if lines.values.shape[1] not in widths:
-        states = as_states(lines)
-        if states is None:
-            raise InputError(f"{lines.place(0)}: has {lines.values.shape[1]} columns; should be {layout}")
-        lines, columns = states, "2 to 5"
+    lines = read_poses(path, true)
     pose = lines.values[:, 1:8]
     if true and not np.isfinite(pose).all():
         row = int(np.flatnonzero(~np.isfinite(pose).all(axis=1))[0])
@@ -203,10 +196,16 @@ def read_trajectory(path: Path, true: bool = False) -> Lines:
     if len(bad):
         row = int(bad[0])
         raise InputError(
-            f"{lines.place(row)}: the quaternion has length {length[row]:.4g}, not 1; columns {columns} must "
-            "be qx qy qz qw"
+            f"{lines.place(row)}: the quaternion has length {length[row]:.4g}, not 1; {_columns_of(lines)}"
         )
     return lines
+
+
+def _columns_of(lines: Lines) -> str:
+    """Where a quaternion should be."""
+    if lines.note:
+        return lines.note.partition(": ")[2]
+    return f"columns {'2 to 5' if isinstance(lines, States) else '5 to 8'} must be qx qy qz qw"
 
 
 def read_covariances(path: Path) -> Lines:

@@ -1,0 +1,452 @@
+"""Poses as the systems write them: by the names of columns, by their number, as matrices; NEES worked out afresh."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from recorded import read_recordings
+
+import consistency as cs
+from consistency.referee.cli import main
+from consistency.referee.types import Array
+
+DATA = Path(os.environ.get("CONSISTENCY_DATA", Path(__file__).parents[4] / "shared" / "data"))
+STEPS = 12
+EPOCH = 1403715273.25  # s since 1970
+UPPER = np.triu_indices(6)
+SPACE = ["x", "y", "z"]
+W_FIRST, W_LAST = ["w", "x", "y", "z"], ["x", "y", "z", "w"]
+
+
+# --- the reference: nothing here is of the package or of SciPy --------------------------------------
+
+
+def matrix(q: Array) -> Array:
+    """Rotation matrix of a unit quaternion x, y, z, w (Shuster 1993)."""
+    v, w = q[:3], q[3]
+    return (w * w - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) + 2.0 * w * skew(v)
+
+
+def skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def product(p: Array, q: Array) -> Array:
+    """Hamilton product, x, y, z, w."""
+    return np.append(p[3] * q[:3] + q[3] * p[:3] + np.cross(p[:3], q[:3]), p[3] * q[3] - p[:3] @ q[:3])
+
+
+def rotation_vector(q: Array) -> Array:
+    q = q if q[3] >= 0 else -q
+    sine = np.sqrt(q[:3] @ q[:3])
+    return q[:3] * (2.0 * np.arctan2(sine, q[3]) / sine if sine > 0 else 2.0)
+
+
+def reference(own: Array, true: Array, P: Array, body: bool = False) -> Array:
+    """NEES (N,) of poses (N, 7) with P (N, 6, 6): position and rotation about the axes of the world or of the body."""
+    out = []
+    for a, b, C in zip(own, true, P, strict=True):
+        back = a[3:] * [-1, -1, -1, 1]
+        turn = product(back, b[3:]) if body else product(b[3:], back)
+        e = np.concatenate([b[:3] - a[:3], rotation_vector(turn)])
+        out.append(e @ np.linalg.solve(C, e))
+    return np.array(out)
+
+
+class Drive(NamedTuple):
+    t: Array  # (N,), s
+    own: Array  # (N, 7), position and quaternion x, y, z, w
+    true: Array  # (N, 7)
+    P: Array  # (N, 6, 6)
+
+
+def drive(start: float = EPOCH) -> Drive:
+    """Poses with errors of their covariance, which has cross terms and differs from row to row."""
+    rng = np.random.default_rng()
+    turns = rng.normal(size=(STEPS, 4)) + np.array([0, 0, 0, 3])
+    true = np.column_stack([rng.normal(size=(STEPS, 3)), turns / np.linalg.norm(turns, axis=1)[:, None]])
+    roots = 0.1 * rng.normal(size=(STEPS, 6, 6))
+    P = roots @ np.swapaxes(roots, 1, 2) + 0.001 * np.eye(6)
+    e = np.einsum("nij,nj->ni", np.linalg.cholesky(P), rng.normal(size=(STEPS, 6)))
+    angle = np.linalg.norm(e[:, 3:], axis=1)
+    small = np.column_stack([-e[:, 3:] * (np.sin(angle / 2) / angle)[:, None], np.cos(angle / 2)])
+    own = np.array([product(a, b[3:]) for a, b in zip(small, true, strict=True)])
+    return Drive(start + 0.25 * np.arange(STEPS), np.column_stack([true[:, :3] - e[:, :3], own]), true, P)
+
+
+def lines(
+    path: str, header: str, columns: Sequence[Array | Sequence[str]], separator: str = ",", end: str = "\n"
+) -> str:
+    """A file of columns, whole numbers as such, written as text so that no digit is lost."""
+    cells = [[each if isinstance(each, str) else _text(each) for each in column] for column in columns]
+    rows = [separator.join(row) for row in zip(*cells, strict=True)]
+    Path(path).write_text("\n".join([header, *rows] if header else rows) + end, encoding="utf-8")
+    return path
+
+
+def _text(value: float | np.integer) -> str:
+    return str(int(value)) if isinstance(value, (int, np.integer)) else repr(float(value))
+
+
+def nanoseconds(t: Array) -> Array:
+    return np.array([round(each * 4) * 250_000_000 for each in t], np.int64)
+
+
+def whole(t: Array) -> list[Array]:
+    """Seconds and nanoseconds."""
+    ns = nanoseconds(t)
+    return [ns // 10**9, ns % 10**9]
+
+
+def with_w_first(pose: Array) -> list[Array]:
+    return list(pose[:, [0, 1, 2, 6, 3, 4, 5]].T)
+
+
+def matrices(pose: Array, rows: int = 3) -> list[Array]:
+    """Matrices of 3 or 4 x 4 row by row, as columns."""
+    M = np.zeros((len(pose), 4, 4))
+    M[:, 3, 3] = 1.0
+    M[:, :3, :3] = [matrix(q) for q in pose[:, 3:]]
+    M[:, :3, 3] = pose[:, :3]
+    return list(M[:, :rows].reshape(len(pose), -1).T)
+
+
+def tum(d: Drive, path: str = "est.tum") -> str:
+    return lines(path, "", [d.t, *d.own.T, *d.P.reshape(STEPS, 36).T], " ")
+
+
+# --- truth -------------------------------------------------------------------------------------------
+
+POSE = [f"p_RS_R_{a} [m]" for a in SPACE] + [f"q_RS_{a} []" for a in W_FIRST]
+ASL = "#timestamp," + ",".join(
+    [*(f" {name}" for name in POSE), *(f" v_RS_R_{a} [m s^-1]" for a in SPACE),
+     *(f" b_w_RS_S_{a} [rad s^-1]" for a in SPACE), *(f" b_a_RS_S_{a} [m s^-2]" for a in SPACE)]
+)  # fmt: skip
+REST = [np.full(STEPS, value) for value in (0.1, 0.2, 0.3, -0.002, 0.02, 0.07, -0.02, 0.1, 0.06)]
+
+
+def euroc(d: Drive) -> str:
+    return lines("data.csv", ASL, [nanoseconds(d.t), *with_w_first(d.true), *REST])
+
+
+def euroc_short(d: Drive) -> str:
+    """The header that OpenVINS gives the same columns."""
+    header = "#time(ns),px,py,pz,qw,qx,qy,qz,vx,vy,vz,bwx,bwy,bwz,bax,bay,baz"
+    return lines("truth.csv", header, [nanoseconds(d.t), *with_w_first(d.true), *REST])
+
+
+def euroc_bare(d: Drive) -> str:
+    return lines("truth.csv", "", [nanoseconds(d.t), *with_w_first(d.true), *REST])
+
+
+def tum_vi(d: Drive) -> str:
+    return lines("data.csv", f"#timestamp [ns],{','.join(POSE)}", [nanoseconds(d.t), *with_w_first(d.true)])
+
+
+def newer_college(d: Drive) -> str:
+    return lines("registered_poses.csv", "#sec,nsec,x,y,z,qx,qy,qz,qw", [*whole(d.t), *d.true.T])
+
+
+def mcd(d: Drive) -> str:
+    return lines("pose_inW.csv", "num,t,x,y,z,qx,qy,qz,qw", [np.arange(STEPS), d.t, *d.true.T])
+
+
+def mcd_spaced(d: Drive) -> str:
+    return lines(
+        "pose.csv", "num\tt\tx  y  z  qx  qy  qz  qw".replace("\t", " "), [np.arange(STEPS), d.t, *d.true.T], " "
+    )
+
+
+def hilti(d: Drive) -> str:
+    return lines("exp14.txt", "# timestamp_s tx ty tz qx qy qz qw", [d.t, *d.true.T], " ")
+
+
+def pandas_index(d: Drive) -> str:
+    """What trajectory_to_df of evo writes by to_csv: the index, which has no name, is the time."""
+    return lines("truth.csv", ",x,y,z,qw,qx,qy,qz", [d.t, *with_w_first(d.true)])
+
+
+def kitti(d: Drive) -> str:
+    lines("times.txt", "", [d.t])
+    return lines("07.txt", "", matrices(d.true), " ")
+
+
+def stamped_kitti(d: Drive) -> str:
+    return lines("07_gt.txt", "", [d.t, *matrices(d.true)], " ")
+
+
+def stamped_four(d: Drive) -> str:
+    return lines("poses.txt", "", [d.t, *matrices(d.true, 4)], " ")
+
+
+TRUTHS: dict[str, tuple[Callable[[Drive], str], str]] = {
+    "EuRoC": (euroc, "read as EuRoC truth, 17 columns, nanoseconds, quaternion w first"),
+    "EuRoC, short names": (euroc_short, "read as EuRoC truth, 17 columns, nanoseconds, quaternion w first"),
+    "EuRoC, no names": (euroc_bare, "read as EuRoC truth, 17 columns, nanoseconds, quaternion w first"),
+    "TUM-VI": (tum_vi, "read as EuRoC truth, 8 columns, nanoseconds, quaternion w first"),
+    "Newer College": (newer_college, "names of their columns, 9 columns, seconds and nanoseconds, quaternion w last"),
+    "MCD": (mcd, "by the names of their columns, 9 columns, seconds, quaternion w last"),
+    "MCD, spaces": (mcd_spaced, "by the names of their columns, 9 columns, seconds, quaternion w last"),
+    "Hilti": (hilti, ""),
+    "pandas": (pandas_index, "by the names of their columns, 8 columns, seconds, quaternion w first"),
+    "KITTI": (kitti, "read as matrices of 3 x 4, 12 columns, times from times.txt beside them"),
+    "t + 12": (stamped_kitti, "read as matrices of 3 x 4, 13 columns, the first one the time in seconds"),
+    "t + 16": (stamped_four, "read as matrices of 4 x 4, 17 columns, the first one the time in seconds"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_truth_as_it_is_written(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    write, said = TRUTHS[name]
+    truth = write(d)
+    record = cs.read(tum(d), truth=truth)
+    np.testing.assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
+    with pytest.raises(SystemExit) as end:
+        main(["analyse", "est.tum", "--truth", truth])
+    assert not end.value.code
+    assert said in capsys.readouterr().err
+
+
+def test_the_first_rows_of_euroc_judge_themselves(tmp_path: Path) -> None:
+    """Its own rows, moved by a known error, against the file as it is."""
+    path = DATA / "euroc_static" / "groundtruth_first97.csv"
+    if not path.is_file():
+        pytest.skip(f"no {path}; set CONSISTENCY_DATA to the folder that holds euroc_static")
+    rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+    t = np.array([int(row[0]) for row in rows]) * 1e-9
+    pose = np.array([[float(cell) for cell in row[1:8]] for row in rows])[:, [0, 1, 2, 4, 5, 6, 3]]
+    pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1)[:, None]
+    own = pose.copy()
+    own[:, 0] -= 0.02
+    P = np.tile((0.01**2 * np.eye(6)).ravel(), (len(t), 1))
+    np.savetxt(tmp_path / "est.txt", np.column_stack([t, own, P]), fmt="%.17g")
+    record = cs.read(tmp_path / "est.txt", truth=path)
+    assert record.nees.shape == (1, 96)
+    np.testing.assert_allclose(record.nees, 4.0, atol=2e-4)  # six digits of the quaternions: 1e-6 rad, 1e-4 of a sigma
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("ece276a_stereo_tracks/kitti07_gt.txt", 1101),
+        ("gtsam_stereo_factors/VO_camera_poses_large.txt", 26),
+        ("kitti06_f0-50/poses.txt", 51),
+    ],
+)
+def test_matrices_of_data_sets_as_they_are(name: str, count: int, tmp_path: Path) -> None:
+    path = DATA / name
+    if not path.is_file():
+        pytest.skip(f"no {path}; set CONSISTENCY_DATA to the folder that holds {name.partition('/')[0]}")
+    rows = np.loadtxt(path)
+    numbers, t = (rows[:, 1:], rows[:, 0]) if rows.shape[1] != 12 else (rows, np.loadtxt(path.parent / "times.txt"))
+    assert len(rows) == count
+    M = numbers.reshape(count, -1, 4)
+    half = [0.0, 0.0, np.sin(0.05), np.cos(0.05)]  # a turn by 0.1 rad about z of the world
+    own = []
+    for each in M:
+        w = np.sqrt(max(1.0 + np.trace(each[:3, :3]), 0.0)) / 2.0
+        q = np.array([each[2, 1] - each[1, 2], each[0, 2] - each[2, 0], each[1, 0] - each[0, 1], 4.0 * w * w]) / (
+            4.0 * w
+        )
+        own.append([*each[:3, 3], *product(np.array(half), q / np.linalg.norm(q))])
+    P = np.tile((0.05**2 * np.eye(6)).ravel(), (count, 1))
+    np.savetxt(tmp_path / "est.txt", np.column_stack([t, own, P]), fmt="%.17g")
+    record = cs.read(tmp_path / "est.txt", truth=path)
+    assert record.nees.shape == (1, count)
+    np.testing.assert_allclose(record.nees, 4.0, rtol=1e-4)
+
+
+# --- estimates ---------------------------------------------------------------------------------------
+
+
+def rostopic(d: Drive) -> str:
+    """rostopic echo -p of nav_msgs/Odometry: stamps in ns, frames as text, and a twist with its covariance."""
+    pose = [f"field.pose.pose.position.{a}" for a in SPACE] + [f"field.pose.pose.orientation.{a}" for a in W_LAST]
+    names = [
+        "%time", "field.header.seq", "field.header.stamp", "field.header.frame_id", "field.child_frame_id", *pose,
+        *(f"field.pose.covariance{i}" for i in range(36)),
+        *(f"field.twist.twist.{kind}.{a}" for kind in ("linear", "angular") for a in SPACE),
+        *(f"field.twist.covariance{i}" for i in range(36)),
+    ]  # fmt: skip
+    ns, zero = nanoseconds(d.t), np.zeros(STEPS)
+    columns = [
+        ns + 7,
+        np.arange(STEPS),
+        ns,
+        ["odom"] * STEPS,
+        ["base_link"] * STEPS,
+        *d.own.T,
+        *d.P.reshape(STEPS, 36).T,
+    ]
+    return lines("odom.csv", ",".join(names), [*columns, *[zero] * 6, *[zero + 9.0] * 36])
+
+
+def bagpy(d: Drive) -> str:
+    pose = [f"pose.pose.position.{a}" for a in SPACE] + [f"pose.pose.orientation.{a}" for a in W_LAST]
+    names = ["Time", "header.seq", "header.stamp.secs", "header.stamp.nsecs", "header.frame_id", *pose]
+    names += [f"pose.covariance_{i}" for i in range(36)]
+    columns = [d.t + 0.003, np.arange(STEPS), *whole(d.t), ["odom"] * STEPS, *d.own.T, *d.P.reshape(STEPS, 36).T]
+    return lines("odom.csv", ",".join(names), columns)
+
+
+def w_first_indexed(d: Drive) -> str:
+    names = ["t", *SPACE, "qw", "qx", "qy", "qz", *(f"cov[{i};{j}]" for i in range(6) for j in range(6))]
+    return lines("est.csv", ",".join(names), [d.t, *with_w_first(d.own), *d.P.reshape(STEPS, 36).T])
+
+
+def cnspy(d: Drive) -> str:
+    """PoseWithCovTyped of cnspy_spatial_csv_formats."""
+    names = ["t", *(f"t{a}" for a in SPACE), *(f"q{a}" for a in W_LAST)]
+    names += [f"T{'xyzabc'[i]}{'xyzabc'[j]}" for i, j in zip(*UPPER, strict=True)] + ["est_err_type"]
+    return lines("est.csv", ",".join(names), [d.t, *d.own.T, *d.P[:, UPPER[0], UPPER[1]].T, ["type1"] * STEPS])
+
+
+def named_words(d: Drive) -> str:
+    words = [*SPACE, "roll", "pitch", "yaw"]
+    names = ["timestamp_us", *SPACE, *(f"q_{a}" for a in W_LAST)]
+    names += [f"P_{words[j]}_{words[i]}" for i, j in zip(*UPPER, strict=True)]
+    columns = [nanoseconds(d.t) // 1000, *d.own.T, *d.P[:, UPPER[0], UPPER[1]].T]
+    return lines("est.csv", ";".join(names), columns, ";")
+
+
+def bare(d: Drive) -> str:
+    return lines("est.csv", "", [d.t, *d.own.T, *d.P.reshape(STEPS, 36).T])
+
+
+def kitti_with_covariance(d: Drive) -> str:
+    lines("times.txt", "", [d.t])
+    return lines("est.txt", "", [*matrices(d.own), *d.P.reshape(STEPS, 36).T], " ")
+
+
+def four_with_triangle(d: Drive) -> str:
+    return lines("est.txt", "", [d.t, *matrices(d.own, 4), *d.P[:, UPPER[0], UPPER[1]].T], " ")
+
+
+ESTIMATES: dict[str, tuple[Callable[[Drive], str], str]] = {
+    "rostopic echo -p": (rostopic, "90 columns, nanoseconds, quaternion w last, covariance in 36 columns"),
+    "bagpy": (bagpy, "48 columns, seconds and nanoseconds, quaternion w last, covariance in 36 columns"),
+    "w first, two indices": (w_first_indexed, "44 columns, seconds, quaternion w first, covariance in 36 columns"),
+    "cnspy PoseWithCovTyped": (cnspy, "30 columns, seconds, quaternion w last, covariance in 21 columns"),
+    "words": (named_words, "29 columns, microseconds, quaternion w last, covariance in 21 columns"),
+    "no names": (bare, ""),
+    "KITTI + 36": (kitti_with_covariance, "read as matrices of 3 x 4, 48 columns, times from times.txt beside them"),
+    "t + 16 + 21": (four_with_triangle, "read as matrices of 4 x 4, 38 columns, the first one the time in seconds"),
+}
+
+
+@pytest.mark.parametrize("name", ESTIMATES)
+def test_estimates_as_they_are_written(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    write, said = ESTIMATES[name]
+    path = write(d)
+    truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
+    record = cs.read(path, truth=truth)
+    np.testing.assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
+    with pytest.raises(SystemExit) as end:
+        main(["analyse", path, "--truth", truth])
+    assert not end.value.code
+    assert said in capsys.readouterr().err
+
+
+def test_steps_stand_for_times_where_both_have_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    d = drive(start=0.0)
+    Path("a").mkdir()
+    truth = lines("a/truth.txt", "", matrices(d.true), " ")
+    own = lines("a/est.txt", "", [*matrices(d.own), *d.P.reshape(STEPS, 36).T], " ")
+    np.testing.assert_allclose(cs.read(own, truth=truth).nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
+    numbered = lines("a/large.txt", "", [np.arange(STEPS), *matrices(d.true, 4)], " ")
+    record = cs.read(own, truth=numbered)
+    np.testing.assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
+    assert any("the first one the number of the step" in note for note in record.notes)
+
+
+def test_two_blocks_of_cnspy_are_judged_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """PosOrientWithCov: triangles of position and rotation; which error they are of, the format does not say."""
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    names = ["t", *(f"t{a}" for a in SPACE), *(f"q{a}" for a in W_LAST)]
+    upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    names += [f"p{SPACE[i]}{SPACE[j]}" for i, j in upper] + [f"q{'rpy'[i]}{'rpy'[j]}" for i, j in upper]
+    columns = [d.t, *d.own.T, *(d.P[:, i, j] for i, j in upper), *(d.P[:, 3 + i, 3 + j] for i, j in upper)]
+    path, truth = lines("est.csv", ",".join(names), columns), lines("truth.tum", "", [d.t, *d.true.T], " ")
+    apart = d.P.copy()
+    apart[:, :3, 3:] = apart[:, 3:, :3] = 0.0
+
+    position, rotation = read_recordings(Path(path), Path(truth), error="so3")
+    np.testing.assert_allclose(position.nees[0] + rotation.nees[0], reference(d.own, d.true, apart), rtol=1e-9)
+
+
+NAMES = "t,x,y,z,qx,qy,qz,qw"
+TWO = "t,a.position.x,a.position.y,a.position.z,b.position.x,b.position.y,b.position.z,qx,qy,qz,qw"
+
+
+def short(d: Drive) -> str:
+    lines("times.txt", "", [d.t[1:]])
+    return lines("t.txt", "", matrices(d.true), " ")
+
+
+def stretched(d: Drive) -> str:
+    return lines("t.txt", "", [d.t, *matrices(d.true * [1, 1, 1, 1.1, 1.1, 1.1, 1.1])], " ")
+
+
+REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
+    "a quaternion that is no unit": (
+        lambda d: lines("t.csv", "t,x,y,z,qw,qx,qy,qz", [d.t, *with_w_first(1.01 * d.true)]),
+        r"t\.csv, line 2: the quaternion has length 1\.01, not 1; read as .* quaternion w first",
+    ),
+    "a time that is there twice": (
+        lambda d: lines("t.csv", NAMES, [np.full(STEPS, 1.0), *d.true.T]),
+        r"t\.csv, line 3: timestamp 1 is there twice",
+    ),
+    "two poses in a row": (
+        lambda d: lines("t.csv", TWO, [d.t, *d.true.T[:3], *d.true.T]),
+        r"t\.csv: 2 columns are 'position_x'; leave one pose in the file",
+    ),
+    "a text for a number": (
+        lambda d: lines("t.csv", NAMES, [d.t, ["east"] * STEPS, *d.true.T[1:]]),
+        r"t\.csv, line 2: column 'x': not a number",
+    ),
+    "matrices that stretch": (stretched, r"t\.txt, line 1: the 12 numbers are no rotation"),
+    "another time base": (
+        lambda d: lines("t.csv", "#sec,nsec,x,y,z,qx,qy,qz,qw", [*whole(d.t - 1e9), *d.true.T]),
+        r"no estimate has a truth within 0\.01 s",
+    ),
+    "runs in one table": (
+        lambda d: lines("t.csv", f"run,{NAMES}", [np.zeros(STEPS), d.t, *d.true.T]),
+        r"t\.csv: column 'run'.*a file for each run",
+    ),
+    "fewer times than poses": (short, r"times\.txt: has 11 times, but t\.txt 12 poses"),
+    "a truth with a gap": (
+        lambda d: lines("t.csv", NAMES, [d.t, *np.where(np.arange(STEPS) == 4, np.nan, d.true.T)]),
+        r"t\.csv, line 6: the truth is not finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_read_is_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    write, said = REFUSED[name]
+    truth = write(d)
+    with pytest.raises(cs.InputError, match=said):
+        cs.read(tum(d), truth=truth)
+    with pytest.raises(SystemExit) as end:
+        main(["analyse", "est.tum", "--truth", truth])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1

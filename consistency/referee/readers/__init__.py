@@ -19,6 +19,7 @@ from consistency.referee.readers.archive import read_archive
 from consistency.referee.readers.bags import is_bag, read_bags
 from consistency.referee.readers.kitti import BODIES, is_drive
 from consistency.referee.readers.layouts import is_spatial
+from consistency.referee.readers.plane import is_plane
 from consistency.referee.readers.relative import MARGINAL
 from consistency.referee.readers.table import read_tables
 from consistency.referee.readers.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
@@ -94,7 +95,7 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evi
             estimates, r, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align"
         )
         return read_archive(estimates, r.error, over)
-    if suffix in TABLES and (r.state is not None or not is_spatial(estimates)):
+    if (suffix in TABLES and (r.state is not None or not is_spatial(estimates))) or is_plane(estimates):
         _refuse(estimates, r, "covariance", "covariance_order", "axes")
         if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
             raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")

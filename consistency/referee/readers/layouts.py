@@ -67,9 +67,12 @@ def read_poses(path: Path, true: bool = False) -> Lines:
 
 
 def is_spatial(path: Path) -> bool:
-    """Whether a table is of poses in space: by the names of its columns, or without names."""
-    if path.suffix.lower() != ".csv" or not path.is_file():
-        return False
+    """Whether a table is of poses in space."""
+    return path.suffix.lower() == ".csv" and path.is_file() and is_poses(path)
+
+
+def is_poses(path: Path) -> bool:
+    """Whether a text file is of poses in space: by the names of its columns, or without names."""
     head = head_of(path)
     if head is None:
         return begins_with_numbers(path)
@@ -78,42 +81,40 @@ def is_spatial(path: Path) -> bool:
 
 def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     """Rows under the names of their columns."""
-    if head.comment or head.spaced:
-        lines = read_rows(
-            path, [len(head.names)], f"{len(head.names)} columns as named", 0 if head.comment else head.line
-        )
-        column = lines.values.T
-    else:
-        sheet = read_sheet(path)
-        names = list(sheet.data)
-        if "run" in names or "filter" in names:
-            raise InputError(f"{path}: column 'run' or 'filter': poses in space are a file for each run and estimator")
-        column = {
-            i: sheet.numbers(names[i]) for i in (*roles.time, *roles.position, *roles.quaternion, *roles.covariance)
-        }
-        lines = Lines(path, np.empty((len(sheet), 0)), sheet.line)
-    t, unit = _seconds(lines, roles.time, [column[i] for i in roles.time], roles.unit)
-    pose = [column[i] for i in (*roles.position, *roles.quaternion)]
+    lines, columns = read_named(path, head, (*roles.time, *roles.position, *roles.quaternion, *roles.covariance))
+    t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
     of = roles.kind if true else roles.kind.replace(" truth", " poses")
     clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
     order = f"quaternion {'w first' if roles.w_first else 'w last'}"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
         note += f", covariance in {len(roles.covariance)} columns"
-    values = np.column_stack([t, *pose, *(column[i] for i in roles.covariance)])
-    return increasing(replace(lines, values=values, note=note))
+    return increasing(replace(lines, values=np.column_stack([t, *columns[len(roles.time) :]]), note=note))
+
+
+def read_named(path: Path, head: Head, places: Sequence[int]) -> tuple[Lines, list[Array]]:
+    """Some columns of a file with names, and lines that hold none of them yet."""
+    if head.comment or head.spaced:
+        layout = f"{len(head.names)} columns as named"
+        lines = read_rows(path, [len(head.names)], layout, 0 if head.comment else head.line)
+        return replace(lines, values=lines.values[:, :0]), [lines.values[:, i] for i in places]
+    sheet = read_sheet(path)
+    names = list(sheet.data)
+    if "run" in names or "filter" in names:
+        raise InputError(f"{path}: column 'run' or 'filter': write such poses to a file for each run and estimator")
+    return Lines(path, np.empty((len(sheet), 0)), sheet.line), [sheet.numbers(names[i]) for i in places]
 
 
 def _asl(lines: Lines, true: bool) -> Lines:
     """The 17 columns of EuRoC without their names."""
-    t, unit = _seconds(lines, (0,), [lines.t])
+    t, unit = times_of(lines, (0,), [lines.t])
     of = f"EuRoC {'truth' if true else 'poses'}, {ASL} columns, {UNIT_NAMES[unit]}, quaternion w first"
     note = f"{lines.path}: read as {of}"
     values = np.column_stack([t, lines.values[:, [1, 2, 3, 5, 6, 7, 4]]])
     return increasing(replace(lines, values=values, note=note))
 
 
-def _seconds(
+def times_of(
     lines: Lines, places: Sequence[int], columns: Sequence[Array], unit: int | None = None
 ) -> tuple[Array, int]:
     """Times in s, each the number nearest to what the file says, and how many of its units are a second.
@@ -188,7 +189,7 @@ def _matrices(lines: Lines) -> Lines:
 def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
     """Times of matrices: those before them, those of times.txt in the same folder, or their numbers from 0 on."""
     if before.shape[1]:
-        t, unit = _seconds(lines, (0,), [before[:, 0]])
+        t, unit = times_of(lines, (0,), [before[:, 0]])
         of = "the number of the step" if (t == np.round(t)).all() else f"the time in {UNIT_NAMES[unit]}"
         return t, f"the first one {of}"
     times = lines.path.parent / "times.txt"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.errors import InputError
+from consistency.referee.readers.text import opened
 from consistency.referee.types import Array
 
 PEEKED = 2**16  # bytes of a file that hold its header and its first row
@@ -69,8 +71,11 @@ def head_of(path: Path) -> Head | None:
     comment = line.lstrip().startswith("#")
     if not comment and len([text for _, text in lines if not text.lstrip().startswith("#")]) > 1:
         return None
-    names = fields_of(line.strip().lstrip("#") if comment else line)
-    if len(names) != len(fields_of(row)):
+    text, width = line.strip().lstrip("#") if comment else line, len(fields_of(row))
+    names = fields_of(text)
+    if len(names) != width and comment:
+        names = re.split(r"\s{2,}", text.strip())
+    if len(names) != width:
         return None
     return Head(names, number, comment, not any(mark in line for mark in ",;\t"))
 
@@ -86,9 +91,9 @@ def begins_with_numbers(path: Path) -> bool:
 def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
     """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             text = file.read(PEEKED).decode("utf-8-sig", "ignore")
-    except OSError:
+    except (OSError, EOFError, zlib.error):
         return [], None
     lines = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -159,6 +164,24 @@ def _family(plain: list[str], spellings: Sequence[str], parts: str, where: Path)
         if len(found) == len(parts):
             return tuple(found)
     return None
+
+
+def clock_of(names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:
+    """Places of the time, and how many of its units are a second, where its name says it; None without a time."""
+    return _clock([_plain(name) for name in names], names)
+
+
+def places_of(names: Sequence[str], spellings: Sequence[Sequence[str]]) -> tuple[int, ...] | None:
+    """Places of columns, the first one there of the spellings of each; a longer name may end in one of two words."""
+    plain = [_plain(name) for name in names]
+    found = []
+    for each in spellings:
+        there = [plain.index(name) for name in each if name in plain]
+        there += [i for i, name in enumerate(plain) for end in each if "_" in end and name.endswith(f"_{end}")]
+        if not there:
+            return None
+        found.append(there[0])
+    return tuple(found)
 
 
 def _clock(plain: list[str], names: Sequence[str]) -> tuple[tuple[int, ...], int | None] | None:

@@ -20,6 +20,7 @@ from consistency.referee.readers.hints import hints
 from consistency.referee.readers.interpolation import Manifold, truth_at
 from consistency.referee.readers.kitti import drive_sheet, is_drive
 from consistency.referee.readers.matching import common_steps, common_times
+from consistency.referee.readers.plane import planar_sheet
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.record import Track, assemble, count, listed, symmetric
 from consistency.referee.readers.relative import Stretch, relative_recording
@@ -39,16 +40,19 @@ def read_tables(estimates: Path, r: Reading, relative: Relative | None = None) -
     InputError
         A file, column, line or option that cannot be used, and what is allowed.
     """
-    sheet = read_sheet(estimates)
     truth, axes = r.truth, tuple(r.state) if r.state else POSE
+    sheet, note = planar_sheet(estimates, bool(r.motions)) if axes == POSE else (read_sheet(estimates), "")
     convention = _convention(r.error, axes, truth)
     if relative is not None:
         require_poses(estimates, axes, convention, truth)
     if r.align is not None and _manifold(convention) != "planar":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
-    other = None
-    if truth is not None:
-        other = drive_sheet(truth, r.body) if is_drive(truth) else read_sheet(truth)
+    other, notes = None, [note]
+    if truth is not None and is_drive(truth):
+        other = drive_sheet(truth, r.body)
+    elif truth is not None:
+        other, note = planar_sheet(truth) if axes == POSE else (read_sheet(truth), "")
+        notes.append(note)
     if other is None and not {"nis", "nis_dof"} <= set(sheet.data):
         raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
     key = _key(sheet, other, r)
@@ -59,7 +63,8 @@ def read_tables(estimates: Path, r: Reading, relative: Relative | None = None) -
     for name in names:
         own = sheet.rows(sheet.texts("filter") == name) if "filter" in sheet else sheet
         recordings.append(_recording(name, own, other, key, axes, convention, r, relative))
-    return recordings
+    said = tuple(note for note in notes if note)
+    return [replace(recordings[0], notes=(*said, *recordings[0].notes)), *recordings[1:]]
 
 
 def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | None) -> str:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import reading
+from consistency.referee.parsing import reading, require_room
 from consistency.referee.types import Array, Indices
 
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much
@@ -102,10 +103,11 @@ def blocks(path: Path) -> Iterator[Block]:
     with reading(path, REFUSAL):
         if not path.is_file():
             raise InputError(f"{path}: is {'a folder' if path.is_dir() else 'a device'}, not a file")
-        file = path.open("rb")
+        file = opened(path)
     with file:
         first, pieces = 1, [_read(path, file).removeprefix(BOM)]
         while pieces[-1]:
+            require_room(path, file.tell())
             head, end, tail = pieces[-1].rpartition(b"\n")
             if end:
                 block = Block(path, b"".join([*pieces[:-1], head, end]), first)
@@ -114,6 +116,11 @@ def blocks(path: Path) -> Iterator[Block]:
             pieces.append(_read(path, file))
     if last := b"".join(pieces):
         yield Block(path, last, first)
+
+
+def opened(path: Path) -> BinaryIO:
+    """A file for reading, unpacked where its name ends in .gz."""
+    return cast(BinaryIO, gzip.open(path, "rb")) if path.suffix.lower() == ".gz" else path.open("rb")
 
 
 def _read(path: Path, file: BinaryIO) -> bytes:

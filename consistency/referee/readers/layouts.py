@@ -31,6 +31,7 @@ from consistency.referee.types import Array, Indices
 
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
 FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
+DEVIATED = POSE + 6  # a pose and six standard deviations
 TUM = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
 ASL = 17  # columns of the truth of EuRoC: t in ns, position, quaternion w first, velocity, two biases
 MATRICES = {12: (), 13: (0,), 16: (), 17: (0,)}  # numbers of a matrix, 3 x 4 or 4 x 4, behind its time or number
@@ -52,8 +53,11 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     if head is not None and roles is not None and not (head.comment and roles.is_tum and len(head.names) in TUM):
         return _named(path, head, roles, true)
     widths = [matrix + stated for matrix in MATRICES for stated in STATED]
-    lines = read_rows(path, (*TUM, *widths, *STATES), LAYOUT)
+    lines = read_rows(path, (*TUM, DEVIATED, *widths, *STATES), LAYOUT)
     width = lines.values.shape[1]
+    if width == DEVIATED:
+        of = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
+        return increasing(replace(lines, note=f"{path}: read as {of}, {width} columns"))
     if width in TUM:
         return increasing(lines)
     if width == ASL and not _is_rigid(lines.values[:, 1:]).all():
@@ -88,7 +92,8 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     order = f"quaternion {'w first' if roles.w_first else 'w last'}"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
-        note += f", covariance in {len(roles.covariance)} columns"
+        stated = "standard deviations" if len(roles.covariance) == 6 else "covariance"
+        note += f", {stated} in {len(roles.covariance)} columns"
     return increasing(replace(lines, values=np.column_stack([t, *columns[len(roles.time) :]]), note=note))
 
 

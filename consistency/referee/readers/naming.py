@@ -28,6 +28,7 @@ EPOCHS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3))  # times since 1970 are l
 RECORDED = ("field_header_stamp",)  # names whose times are in ns: rostopic echo -p
 LABELS = (("x", "y", "z", "roll", "pitch", "yaw"), ("x", "y", "z", "rx", "ry", "rz"), ("x", "y", "z", "a", "b", "c"))
 PREFIXES = ("p_", "p", "cov_", "cov", "t")  # before two labels
+DEVIATIONS = ("sigma_{}", "std_{}", "s{}", "s_{}", "sd_{}", "sigma{}", "std{}", "stddev_{}")  # standard, not squared
 APART = {"p": ("x", "y", "z"), "q": ("r", "p", "y")}  # two triangles of cnspy: position, rotation
 NUMBERED = re.compile(r"(.*?)(?:covariance|cov)_?(\d+)(?:_(\d+))?")
 
@@ -49,7 +50,7 @@ class Roles:
     unit: int | None  # in a second; None where the name says none
     position: tuple[int, ...]  # (3,)
     quaternion: tuple[int, ...]  # (4,), x, y, z, w
-    covariance: tuple[int, ...] = ()  # 36, 21 as an upper triangle, or 12: rotation, then position
+    covariance: tuple[int, ...] = ()  # 36, 21 as an upper triangle, or 12: rotation, then position; or 6 deviations
     kind: str = "poses by the names of their columns"
 
     @property
@@ -221,6 +222,9 @@ def _covariance(plain: list[str]) -> tuple[int, ...]:
     for places in stated.values():
         if len(places) in (36, 21):
             return tuple(places[key] for key in sorted(places))
+    for spelling, labels in itertools.product(DEVIATIONS, LABELS):
+        if set(names := [spelling.format(label) for label in labels]) <= set(plain):
+            return tuple(plain.index(name) for name in names)
     return ()
 
 

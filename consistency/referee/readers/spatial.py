@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.parts import each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing.options import Reading
@@ -24,6 +25,7 @@ from consistency.referee.types import Array
 
 AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
 WHOLE = {"": range(6)}  # what is one recording, by what its name ends in
+ALONE = dict(WHOLE)  # one recording, each of whose components is judged by itself; told from WHOLE by identity
 BLOCKS = {" position": range(3), " rotation": range(3, 6)}  # their cross-covariance is not known
 SINGLE = {f" {axis}": range(i, i + 1) for i, axis in enumerate(AXES)}  # no covariance is
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
@@ -69,7 +71,7 @@ def recordings_of(
 
     Parameters
     ----------
-    parts : ``WHOLE``, ``BLOCKS`` or ``SINGLE``: components whose covariance is known, each of which is a recording
+    parts : ``WHOLE``, ``ALONE``, ``BLOCKS`` or ``SINGLE``: components whose covariance is known, each a recording
     relative : judge motions over windows in place of poses
 
     Raises
@@ -108,7 +110,8 @@ def recordings_of(
         if part := [i for i in judged if i in whole]:
             some = [track.part(part) for track in tracks]
             names, name = tuple(AXES[i] for i in part), f"{source.path.stem}{title}"
-            recordings.append(moved.on(assemble(name, some, t, names, str(source.covariance), kind, notes)))
+            record = moved.on(assemble(name, some, t, names, str(source.covariance), kind, notes))
+            recordings.append(each_alone(record) if parts is ALONE else record)
             notes = []
     return recordings
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.parts import diagonal, each_alone
 from consistency.referee.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error
@@ -20,6 +21,7 @@ from consistency.referee.readers.hints import hints
 from consistency.referee.readers.interpolation import Manifold, truth_at
 from consistency.referee.readers.kitti import drive_sheet, is_drive
 from consistency.referee.readers.matching import common_steps, common_times
+from consistency.referee.readers.naming import DEVIATIONS
 from consistency.referee.readers.plane import planar_sheet
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.record import Track, assemble, count, listed, symmetric
@@ -118,7 +120,7 @@ def _recording(
     order = row_order(sheet, runs, key)
     sheet, runs = sheet.rows(order), runs[order]
     keys = sheet.numbers(key, finite=True)
-    error = covariance = None
+    error = covariance = deviations = None
     keep = np.ones(len(runs), bool)
     notes: list[str] = []
     moved = Aligned(())
@@ -127,11 +129,16 @@ def _recording(
         error = None if not broken.any() else np.where(broken, np.nan, 0.0)[:, None]
     else:
         own = convention != ADDITIVE and axes == POSE and _has_own(sheet)
-        covariance = _covariance(sheet, axes, own)
+        deviations = None if own else _deviations(sheet, axes)
+        covariance = _covariance(sheet, axes, own) if deviations is None else diagonal(deviations)
         estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
         samples = _samples(truth, axes, key)
         shift, clocks = 0.0, list[str]()
+        if relative is not None and deviations is not None:
+            raise InputError(
+                f"{sheet.path}: --relative needs covariances; here deviations of each component are stated"
+            )
         if relative is not None:
             shift = r.shift
         elif key == "step" and r.align is None:
@@ -152,6 +159,10 @@ def _recording(
             stretches = _stretches(sheet, runs, keep, true, estimate, covariance, convention, relative)
             record = relative_recording(name, str(sheet.path), stretches, axes, range(len(axes)), relative)
             return replace(record, notes=(*notes, *record.notes))
+        if deviations is not None:
+            notes.append(
+                f"{name}: standard deviations without cross terms are stated, so each component is judged by itself"
+            )
         notes += clocks
         error = planar_error(true, estimate, convention) if axes == POSE else true - estimate
         notes.append(f"error convention {convention}: {PLANAR[convention]}")
@@ -184,7 +195,9 @@ def _recording(
         for run, rows, column in zip(numbers, members, columns, strict=True)
     ]
     record = assemble(name, tracks, t, axes, str(sheet.path), convention if truth is not None else "", notes)
-    return moved.on(record) if truth is not None else replace(record, error=None, dof=0)
+    if truth is None:
+        return replace(record, error=None, dof=0)
+    return moved.on(each_alone(record) if deviations is not None else record)
 
 
 def _stretches(
@@ -385,6 +398,23 @@ def _is_exact(covariance: Array) -> bool:
 def _has_own(sheet: TableRows) -> bool:
     """Whether the rows are of a filter of the bench that states the covariance of an error of its own."""
     return all(name in sheet and not sheet.empty(name).all() for name in OWN_COVARIANCE)
+
+
+def _deviations(sheet: TableRows, axes: tuple[str, ...]) -> Array | None:
+    """Standard deviations (N, n) of a table without cross terms: sigma_x, std_x, sx, or P_x_x alone; None of others."""
+    n = len(axes)
+    pairs = [(axes[i], axes[j]) for i, j in itertools.combinations(range(n), 2)]
+    if any(f"P_{a}_{b}" in sheet or f"P_{b}_{a}" in sheet or OWN_NAMES.get((a, b)) in sheet.data for a, b in pairs):
+        return None
+    variances = [f"P_{a}_{a}" if f"P_{a}_{a}" in sheet else OWN_NAMES.get((a, a), "") for a in axes]
+    if n > 1 and all(name in sheet for name in variances):
+        P = np.column_stack([sheet.numbers(name) for name in variances])
+        return np.sign(P) * np.sqrt(np.abs(P))
+    for spelling in DEVIATIONS:
+        names = [spelling.format(axis) for axis in axes]
+        if all(name in sheet for name in names) and not any(name in sheet for name in variances):
+            return np.column_stack([sheet.numbers(name) for name in names])
+    return None
 
 
 def _covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False) -> Array:

@@ -8,17 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.parts import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.kitti import is_drive, read_drive
-from consistency.referee.readers.layouts import FULL, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
+from consistency.referee.readers.layouts import DEVIATED, FULL, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.openvins import LAYOUT, States, read_deviations
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Lines, Places, read_numbers
 from consistency.referee.readers.spatial import (
+    ALONE,
     BLOCKS,
     SINGLE,
     WHOLE,
@@ -63,8 +65,8 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
         notes += [lines.note for lines in (own, true) if lines.note]
         if not poses:
             parts = _parts(own)
-            error_kind = r.error or ("so3" if parts is WHOLE else "so3-body")
-        if parts is not WHOLE and order == ORDERS[0]:
+            error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
+        if parts not in (WHOLE, ALONE) and order == ORDERS[0]:
             raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
         if _parts(own) is not parts:
             raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
@@ -79,11 +81,11 @@ def _parts(own: Lines) -> Mapping[str, range]:
     """Components whose covariance is known, by the layout of a file."""
     if isinstance(own, States):
         return SINGLE
-    return BLOCKS if own.values.shape[1] == SPLIT else WHOLE
+    return {SPLIT: BLOCKS, DEVIATED: ALONE}.get(own.values.shape[1], WHOLE)
 
 
 def _origin(parts: Mapping[str, range]) -> str:
-    if parts is WHOLE:
+    if parts in (WHOLE, ALONE):
         return "as in ROS messages with a covariance; declare yours with --error"
     return "written by OpenVINS" + "; --error so3 where it comes from another ROS topic" * (parts is BLOCKS)
 
@@ -221,6 +223,8 @@ def _inline(own: Lines, order: str) -> Array | None:
     numbers = own.values[:, POSE:]
     if not numbers.shape[1]:
         return None
+    if own.values.shape[1] == DEVIATED:
+        return diagonal(numbers if order == ORDERS[0] else np.roll(numbers, 3, axis=1))
     if own.values.shape[1] == SPLIT:  # rotation, then position
         rotation, position = _triangle(numbers[:, :6], 3), _triangle(numbers[:, 6:], 3)
         out = np.zeros((len(numbers), 6, 6))

@@ -402,6 +402,61 @@ def stretched(d: Drive) -> str:
     return lines("t.txt", "", [d.t, *matrices(d.true * [1, 1, 1, 1.1, 1.1, 1.1, 1.1])], " ")
 
 
+def alone(d: Drive) -> Array:
+    """Squares of errors over variances, (N, 6)."""
+    out = []
+    for a, b, C in zip(d.own, d.true, d.P, strict=True):
+        e = np.concatenate([b[:3] - a[:3], rotation_vector(product(b[3:], a[3:] * [-1, -1, -1, 1]))])
+        out.append(e**2 / np.diag(C))
+    return np.array(out)
+
+
+def deviated_tum(d: Drive) -> str:
+    return lines("est.txt", "", [d.t, *d.own.T, *np.sqrt(np.diagonal(d.P, axis1=1, axis2=2)).T], " ")
+
+
+def deviated_names(d: Drive) -> str:
+    names = ["t", *SPACE, *(f"q{a}" for a in W_LAST), *(f"std_{a}" for a in (*SPACE, "roll", "pitch", "yaw"))]
+    return lines("est.csv", ",".join(names), [d.t, *d.own.T, *np.sqrt(np.diagonal(d.P, axis1=1, axis2=2)).T])
+
+
+@pytest.mark.parametrize("write", [deviated_tum, deviated_names])
+def test_deviations_are_judged_axis_by_axis(
+    write: Callable[[Drive], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    path, truth = write(d), lines("truth.tum", "", [d.t, *d.true.T], " ")
+    record = cs.read(path, truth=truth)
+    assert record.parts == ((0,), (1,), (2,), (3,), (4,), (5,))
+    variances = np.diagonal(np.asarray(record.covariance[0]), axis1=1, axis2=2)
+    np.testing.assert_allclose(record.error[0] ** 2 / variances, alone(d), rtol=1e-9)
+    assert any("standard deviations" in note for note in record.notes)
+    assert list(cs.judge(record).parts) == [*SPACE, "roll", "pitch", "yaw"]
+    with pytest.raises(cs.InputError, match="--relative needs covariances of whole poses"):
+        cs.read(path, truth=truth, relative=2, motions=True)
+
+
+@pytest.mark.parametrize("names", ["sigma_a,sigma_b", "std_a,std_b", "sa,sb", "P_a_a,P_b_b"])
+def test_deviations_of_a_state(names: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng()
+    step, e, sigma = np.arange(1, STEPS + 1), rng.normal(size=(STEPS, 2)), 1.0 + rng.random((STEPS, 2))
+    stated = sigma**2 if names.startswith("P") else sigma
+    lines("est.csv", f"step,a,b,{names}", [step, *-e.T, *stated.T])
+    lines("truth.csv", "step,a,b", [step, *np.zeros((2, STEPS))])
+    record = cs.read("est.csv", truth="truth.csv", state=["a", "b"])
+    assert record.parts == ((0,), (1,))
+    np.testing.assert_allclose(record.nees[0], (e**2 / sigma**2).sum(axis=1), rtol=1e-9)
+    assert (
+        "est: standard deviations without cross terms are stated, so that each component is judged by itself"
+        in record.notes
+    )
+    lines("est.csv", "step,a,b,sigma_a", [step, *-e.T, sigma[:, 0]])
+    with pytest.raises(cs.InputError, match="column 'P_a_a' is missing"):
+        cs.read("est.csv", truth="truth.csv", state=["a", "b"])
+
+
 REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
     "a quaternion that is no unit": (
         lambda d: lines("t.csv", "t,x,y,z,qw,qx,qy,qz", [d.t, *with_w_first(1.01 * d.true)]),

@@ -38,6 +38,7 @@ def read(
     motions: bool = False,
     windows: str | None = None,
     align: str | None = None,
+    lever_arm: Sequence[float] | None = None,
     filter: str | None = None,
 ) -> Record:
     """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
@@ -59,6 +60,7 @@ def read(
     motions : with ``relative``: each row is a motion with a covariance of its own, not a pose
     windows : "independent" declares errors of different windows independent, so that each is a run
     align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
+    lever_arm : of a truth of positions alone: its point in the axes of the estimated body, x, y, z, m
     filter : which estimator, where the files hold several
 
     Raises
@@ -69,7 +71,7 @@ def read(
     true, stated = (None if path is None else Path(path) for path in (truth, covariance))
     reading = Reading(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
-        motions or None, windows, align,
+        motions or None, windows, align, lever_arm,
     )  # fmt: skip
     found = read_recordings(Path(estimates), reading)
     named = {recording.name: recording for recording in found}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -20,6 +21,12 @@ def _seconds(text: str) -> float | str:
         return float(text)
     except ValueError:
         return text
+
+
+def _lengths(text: str) -> list[float]:
+    """Numbers; NaN where one is none, which the readers refuse."""
+    numbers = [_seconds(part) for part in text.split(",")]
+    return [each if isinstance(each, float) else math.nan for each in numbers]
 
 
 def _shown(
@@ -82,6 +89,11 @@ class Reading:
             "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
             "MODE",
         ),
+    )
+
+    lever_arm: Sequence[float] | None = field(
+        default=None,
+        metadata=_shown("Of a truth of positions alone: its point in the axes of the body, m.", "X,Y,Z", _lengths),
     )
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:

@@ -85,18 +85,19 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evi
     if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
         raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
     if is_bag(estimates):
-        _refuse(estimates, r, "state", "covariance", "covariance_order", "truth")
+        _refuse(estimates, r, "state", "covariance", "covariance_order", "truth", "lever_arm")
         if over is not None:
             raise InputError(f"{estimates}: --relative: {MARGINAL}")
         return read_bags(estimates, r)
     _refuse(estimates, r, "topic", "truth_topic")
     if suffix == ".npz":
         _refuse(
-            estimates, r, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align"
-        )
+            estimates, r, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
+            "lever_arm",
+        )  # fmt: skip
         return read_archive(estimates, r.error, over)
     if (suffix in TABLES and (r.state is not None or not is_spatial(estimates))) or is_plane(estimates):
-        _refuse(estimates, r, "covariance", "covariance_order", "axes")
+        _refuse(estimates, r, "covariance", "covariance_order", "axes", "lever_arm")
         if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
             raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
         return _with_frame(read_tables(estimates, r, over), r)
@@ -113,6 +114,8 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
         raise InputError(f"--error {r.error}: must be one of {', '.join(CONVENTIONS)}")
     if r.max_dt is not None and not (math.isfinite(r.max_dt) and r.max_dt >= 0):
         raise InputError(f"--max-dt {r.max_dt:g}: must be 0 or more, in s")
+    if r.lever_arm is not None and not (len(r.lever_arm) == 3 and all(map(math.isfinite, r.lever_arm))):
+        raise InputError("--lever-arm: must be three numbers x,y,z, in m")
     offset = float(r.time_offset) if isinstance(r.time_offset, int) else r.time_offset
     if offset not in (None, "estimate") and not (isinstance(offset, float) and math.isfinite(offset)):
         raise InputError(f"--time-offset {offset}: must be a number of seconds, or 'estimate'")

@@ -31,6 +31,7 @@ from consistency.referee.types import Array, Indices
 
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
 FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
+POINT = 4  # columns of a truth of positions alone: t, x, y, z
 DEVIATED = POSE + 6  # a pose and six standard deviations
 TUM = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
 ASL = 17  # columns of the truth of EuRoC: t in ns, position, quaternion w first, velocity, two biases
@@ -51,10 +52,14 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     head = head_of(path)
     roles = None if head is None else roles_of(head.names, path)
     if head is not None and roles is not None and not (head.comment and roles.is_tum and len(head.names) in TUM):
+        if not (roles.quaternion or true):
+            raise InputError(f"{path}: holds no quaternion; a table of a state is read with --state x,y,z")
         return _named(path, head, roles, true)
     widths = [matrix + stated for matrix in MATRICES for stated in STATED]
-    lines = read_rows(path, (*TUM, DEVIATED, *widths, *STATES), LAYOUT)
+    lines = read_rows(path, (*(POINT,) * true, *TUM, DEVIATED, *widths, *STATES), LAYOUT)
     width = lines.values.shape[1]
+    if width == POINT:
+        return increasing(replace(lines, note=f"{path}: read as positions without orientations, {width} columns"))
     if width == DEVIATED:
         of = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
         return increasing(replace(lines, note=f"{path}: read as {of}, {width} columns"))
@@ -80,7 +85,8 @@ def is_poses(path: Path) -> bool:
     head = head_of(path)
     if head is None:
         return begins_with_numbers(path)
-    return "heading" not in head.names and roles_of(head.names, path) is not None
+    roles = roles_of(head.names, path)
+    return "heading" not in head.names and roles is not None and bool(roles.quaternion)
 
 
 def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
@@ -89,7 +95,7 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
     of = roles.kind if true else roles.kind.replace(" truth", " poses")
     clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
-    order = f"quaternion {'w first' if roles.w_first else 'w last'}"
+    order = f"quaternion {'w first' if roles.w_first else 'w last'}" if roles.quaternion else "no orientation"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
         stated = "standard deviations" if len(roles.covariance) == 6 else "covariance"

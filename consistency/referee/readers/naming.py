@@ -49,7 +49,7 @@ class Roles:
     time: tuple[int, ...]  # one, or seconds and nanoseconds
     unit: int | None  # in a second; None where the name says none
     position: tuple[int, ...]  # (3,)
-    quaternion: tuple[int, ...]  # (4,), x, y, z, w
+    quaternion: tuple[int, ...]  # (4,), x, y, z, w; none of positions alone
     covariance: tuple[int, ...] = ()  # 36, 21 as an upper triangle, or 12: rotation, then position; or 6 deviations
     kind: str = "poses by the names of their columns"
 
@@ -124,7 +124,7 @@ def _is_number(text: str) -> bool:
 
 
 def roles_of(names: Sequence[str], where: Path) -> Roles | None:
-    """Which columns make up a pose; None where there is no quaternion, or no time.
+    """Which columns make up a pose, or a position without a quaternion; None without a position or a time.
 
     Raises
     ------
@@ -135,11 +135,17 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
     quaternion = _family(plain, QUATERNIONS, "xyzw", where)
     position = _family(plain, POSITIONS, "xyz", where)
     clock = _clock(plain, names)
-    if quaternion is None or position is None or clock is None:
+    if position is None or clock is None:
         return None
     asl = plain[position[0]] == "p_rs_r_x" or (len(plain) == 17 and plain[-3:] == ["bax", "bay", "baz"])
     kind = "EuRoC truth" if asl else "poses by the names of their columns"
-    return Roles(*clock, position, quaternion, _covariance(plain), kind)
+    return Roles(
+        *clock,
+        position,
+        quaternion or (),
+        _covariance(plain),
+        kind if quaternion else kind.replace("poses", "positions"),
+    )
 
 
 def _plain(name: str) -> str:

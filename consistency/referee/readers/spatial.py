@@ -11,7 +11,7 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.parts import each_alone
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.geometry.conventions import PLANAR, SPATIAL
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.alignment import clocks_and_frames
 from consistency.referee.readers.hints import hints
@@ -79,7 +79,8 @@ def recordings_of(
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
-    judged = [i for i, axis in enumerate(AXES) if r.axes is None or axis in r.axes]
+    kind, axes = poses[0].convention, AXES[: poses[0].covariance.shape[-1]]
+    judged = [i for i, axis in enumerate(axes) if r.axes is None or axis in r.axes]
     if relative is not None:
         if parts is not WHOLE:
             raise InputError(f"{source.path}: --relative needs covariances of whole poses; here parts are stated apart")
@@ -96,15 +97,14 @@ def recordings_of(
     ]
     columns, t = common_times([each.t for each in matches])
     tracks = [replace(each.track, column=column) for each, column in zip(matches, columns, strict=True)]
-    kind = poses[0].convention
     notes = [
         *source.notes,
         *_notes(source.path, matches, poses[0].max_dt),
         *clocks,
         *moved.notes,
-        *hints(source.path.name, AXES, poses, shift),
+        *hints(source.path.name, axes, poses, shift),
     ]
-    notes.append(f"error convention {kind}: {SPATIAL[kind]}{source.why}")
+    notes.append(f"error convention {kind}: {SPATIAL.get(kind) or PLANAR[kind]}{source.why}")
     recordings = []
     for title, whole in parts.items():
         if part := [i for i in judged if i in whole]:

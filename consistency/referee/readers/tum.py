@@ -13,10 +13,11 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.kitti import is_drive, read_drive
-from consistency.referee.readers.layouts import DEVIATED, FULL, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
+from consistency.referee.readers.layouts import DEVIATED, FULL, POINT, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.openvins import LAYOUT, States, read_deviations
 from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.positions import position_source, positions
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Lines, Places, read_numbers
 from consistency.referee.readers.spatial import (
@@ -71,9 +72,15 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
         if _parts(own) is not parts:
             raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
         poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r.tolerance))
+        if true.values.shape[1] == POINT:
+            poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
     why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
     files = [(path, true) for path, true, _ in runs]
     source = TrajectorySource(estimates, files, r.covariance or estimates, why, tuple(dict.fromkeys(notes)))
+    if any(one.manifold == "vector" for one in poses):
+        source = position_source(source, poses, error_kind, r, relative)
+    elif r.lever_arm is not None:
+        raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
     return recordings_of(source, poses, parts, r, relative)
 
 
@@ -189,10 +196,12 @@ def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indic
 def read_trajectory(path: Path, true: bool = False) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
     lines = read_poses(path, true)
-    pose = lines.values[:, 1:8]
+    pose = lines.values[:, 1:POSE]
     if true and not np.isfinite(pose).all():
         row = int(np.flatnonzero(~np.isfinite(pose).all(axis=1))[0])
         raise InputError(f"{lines.place(row)}: the truth is not finite; leave such lines out")
+    if lines.values.shape[1] == POINT:
+        return lines
     length = np.linalg.norm(pose[:, 3:], axis=1)
     bad = np.flatnonzero(np.isfinite(pose).all(axis=1) & (np.abs(length - 1.0) > UNIT))
     if len(bad):

@@ -449,8 +449,7 @@ def test_deviations_of_a_state(names: str, tmp_path: Path, monkeypatch: pytest.M
     assert record.parts == ((0,), (1,))
     np.testing.assert_allclose(record.nees[0], (e**2 / sigma**2).sum(axis=1), rtol=1e-9)
     assert (
-        "est: standard deviations without cross terms are stated, so that each component is judged by itself"
-        in record.notes
+        "est: standard deviations without cross terms are stated, so each component is judged by itself" in record.notes
     )
     lines("est.csv", "step,a,b,sigma_a", [step, *-e.T, sigma[:, 0]])
     with pytest.raises(cs.InputError, match="column 'P_a_a' is missing"):

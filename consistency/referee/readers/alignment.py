@@ -21,6 +21,7 @@ ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
     ("posyaw", "spatial"): np.eye(6)[[0, 1, 2, 5]],
     ("posyaw", "planar"): np.eye(6)[[0, 1, 5]],
+    ("posyaw", "vector"): np.eye(6)[[0, 1, 2, 5]],  # of positions alone
     ("se3", "spatial"): np.eye(6),
 }
 LEAST = 0.05  # least share of its NEES that a run keeps; a run of a step or two might keep none
@@ -116,7 +117,7 @@ def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]
     base, _, shared = mode.partition("-")
     kind = runs[0].manifold
     if (base, kind) not in FREE:
-        raise InputError(f"--align {mode}: turns about x and y are for poses in space; for x, y, heading it is posyaw")
+        raise InputError(f"--align {mode}: turns about x and y are for poses in space; for others it is posyaw")
     if shared:
         return [frame_of_least_nees(name, runs, FREE[base, kind], judged)] * len(runs)
     return [frame_of_least_nees(name, [p], FREE[base, kind], judged) for p in runs]

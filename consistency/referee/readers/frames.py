@@ -36,7 +36,7 @@ class WorldTransform:
         return WorldTransform(self.turn * other.turn, self.turn.apply(other.shift) + self.shift)
 
     def placed(self, values: Array, manifold: Manifold) -> Array:
-        """Poses (k, m) of one world in the other; those that are not finite stay."""
+        """Poses or positions (k, m) of one world in the other; those that are not finite stay."""
         out: Array = values.copy()
         finite = np.isfinite(values).all(axis=1)
         if manifold == "planar":
@@ -44,7 +44,8 @@ class WorldTransform:
             out[:, 2] = wrap(values[:, 2] + self.heading)
         elif finite.any():
             out[finite, :3] = self.turn.apply(values[finite, :3]) + self.shift
-            out[finite, 3:] = (self.turn * Rotation.from_quat(values[finite, 3:])).as_quat()
+            if manifold == "spatial":
+                out[finite, 3:] = (self.turn * Rotation.from_quat(values[finite, 3:])).as_quat()
         return out
 
 
@@ -112,7 +113,7 @@ def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
     """Estimated and true positions (N, 3) of all runs, z = 0 in the plane."""
     own, true = [np.empty((0, 3))], [np.empty((0, 3))]
     for p in runs:
-        d = 3 if p.manifold == "spatial" else 2
+        d = 2 if p.manifold == "planar" else 3
         for side, values in zip((own, true), _pairs(p), strict=True):
             side.append(np.pad(values[:, :d], ((0, 0), (0, 3 - d))))
     return np.concatenate(own), np.concatenate(true)

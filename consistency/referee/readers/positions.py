@@ -29,7 +29,7 @@ def position_source(
     truth = source.files[0][1]
     if any(one.manifold != "vector" for one in poses):
         raise InputError(f"{source.path}: the truth of some runs has orientations, of others none; judge them apart")
-    if relative is not None or r.align is not None:
+    if relative is not None or r.align not in (None, "posyaw", "posyaw-all"):
         option = "--relative" if relative is not None else f"--align {r.align}"
         raise InputError(f"{option}: needs a truth with orientations; {truth} holds positions alone")
     if rotations := [axis for axis in r.axes or () if axis not in AXES[:3]]:

@@ -129,10 +129,28 @@ def test_a_broken_estimate_fails_there(tmp_path: Path, monkeypatch: pytest.Monke
     assert [failure.step for failure in record.failures] == [6]
 
 
+def test_a_frame_is_fitted_to_positions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Estimates in a world that is turned about z and shifted: the same errors, to what the fit takes of them."""
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    P = 1e-10 * d.P  # as good as no errors, so that the frame is the one put in
+    own = np.column_stack([d.true[:, :3] - 1e-5 * (d.true - d.own)[:, :3], d.true[:, 3:]])
+    turn, shift = exponential(np.array([0.0, 0.0, 0.8])), np.array([3.0, -4.0, 5.0])
+    away = np.array([[*(matrix(turn) @ pose[:3] + shift), *product(turn, pose[3:])] for pose in own])
+    C = np.kron(np.eye(2), matrix(turn))
+    truth = bare(d, d.true[:, :3])
+    record = cs.read(tum(Drive(d.t, away, d.true, C @ P @ C.T)), truth=truth, align="posyaw-all")
+    straight = cs.read(tum(Drive(d.t, own, d.true, P)), truth=truth)
+    assert record.align == "posyaw-all"
+    assert record.nees.sum() < straight.nees.sum() * (1 + 1e-6)
+    np.testing.assert_allclose(record.error[0], straight.error[0], atol=5e-5)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"align": "posyaw"}, r"--align posyaw: needs a truth with orientations; prism\.txt holds positions alone"),
+        ({"align": "se3-all"}, r"--align se3-all: needs a truth with orientations; prism\.txt"),
+        ({"align": "origin"}, r"--align origin: needs a truth with orientations; prism\.txt holds positions alone"),
         ({"relative": 2, "motions": True}, r"--relative: needs a truth with orientations; prism\.txt"),
         ({"axes": ["x", "yaw"]}, "--axes x,yaw: 'yaw' has no truth"),
         ({"lever_arm": [1.0, 2.0]}, "--lever-arm: must be three numbers x,y,z, in m"),

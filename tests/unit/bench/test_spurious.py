@@ -222,6 +222,36 @@ def test_a_track_that_has_slid_out_of_the_image_does_not_come_back() -> None:
     assert kept.sources.tolist() == [-1, -1]
 
 
+# --- what is not seen -----------------------------------------------------------------------------------------
+
+
+def test_images_come_after_so_many_steps_in_turn() -> None:
+    plain, trial = pair({"kind": "frames", "every": [1, 2, 4]})
+    images = sorted({each for k in range(0, 500, 7) for each in (k + 1, k + 3, k + 7) if each <= 500})
+    kept = np.isin(steps_of(plain), images)
+    assert set(steps_of(trial)) == set(steps_of(plain)[kept])
+    assert trial.landmark.tolist() == plain.landmark[kept].tolist()
+
+
+def test_walls_hide_what_is_behind_them_from_where_the_sensor_is() -> None:
+    wall, mount = (3.0, -2.0, 5.0, 3.0), {"position": (0.4, -0.6, 0.0), "rotation": (0.0, 0.0, 0.0)}
+    plain, trial = pair({"kind": "occlusion", "walls": [wall]}, truth__sensor__mount=mount)
+    assert plain.truth is not None
+    assert plain.landmarks is not None
+    step = steps_of(plain)
+    heading = plain.truth[step, 2]
+    c, s = np.cos(heading), np.sin(heading)
+    sensor = plain.truth[step, :2] + np.stack([c * 0.4 + s * 0.6, s * 0.4 - c * 0.6], axis=1)
+    point, (start, end) = plain.landmarks[plain.landmark, :2], np.reshape(wall, (2, 2))
+    # sensor + t (point - sensor) = start + u (end - start)
+    A = np.stack([point - sensor, np.broadcast_to(start - end, point.shape)], axis=2)
+    t, u = np.linalg.solve(A, (start - sensor)[..., None])[..., 0].T
+    hidden = (t > 0) & (t < 1) & (u > 0) & (u < 1)
+    seen = set(zip(step[~hidden], plain.landmark[~hidden], strict=True))
+    assert 20 < hidden.sum() < len(hidden) - 20
+    assert set(zip(steps_of(trial), trial.landmark, strict=True)) == seen
+
+
 # --- mistakes -------------------------------------------------------------------------------------------------
 
 GOOD: dict[str, dict[str, Any]] = {
@@ -235,6 +265,8 @@ GOOD: dict[str, dict[str, Any]] = {
         "count": 5, "forget_steps": 5, "seed": 1, "cells": [4, 3], "near_px": 6.0,
         "strength": 1.0, "stereo": 1.0, "image": 1.0, "depth": 1.0,
     },
+    "frames": {"every": [1, 2]},
+    "occlusion": {"walls_m": [[0.0, 0.0, 1.0, 1.0]]},
 }  # fmt: skip
 MISTAKES: list[tuple[str, dict[str, Any], str]] = [
     *(
@@ -256,6 +288,9 @@ MISTAKES: list[tuple[str, dict[str, Any], str]] = [
     ("selection", {"cells": [4, 0]}, r"\.cells\.1': .*greater than 0"),
     ("selection", {"strength": -1.0}, r"\.strength': .*greater than or equal to 0"),
     ("selection", {"forget_steps": 0}, r"\.forget_steps': .*greater than 0"),
+    ("frames", {"every": [1, 0]}, r"\.every\.1': .*greater than 0"),
+    ("frames", {"every": []}, r"\.every': .*at least 1 item"),
+    ("occlusion", {"walls_m": []}, r"\.walls': .*at least 1 item"),
 ]
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from consistency.bench.scenario import (
 )
 from consistency.bench.simulation.path import lap_length, planned_path
 from consistency.referee.errors import InputError
+from consistency.referee.parsing import read_toml
 from consistency.referee.types import Array
 
 Value = float | int | str
@@ -32,8 +35,10 @@ DIGITS = 2  # significant ones of a value that is not the base's: a file is read
 # bounds as factors of the base's value: twice the noise, three times the range; a denser world costs too much
 FACTORS = {
     "odometry": (0.5, 2.0), "sensor": (0.5, 2.0), "density": (0.125, 1.0), "steps": (0.2, 2.0),
-    "baseline": (1 / 3, 3.0), "range": (0.5, 3.0),
+    "baseline": (1 / 3, 3.0), "range": (0.5, 3.0), "lap": (0.1, 1.0), "dt": (0.5, 5.0),
 }  # fmt: skip
+TILTS = (0.0, 20.0, 40.0, -20.0, -40.0)  # deg, positive looks down
+HEIGHTS = (0.0, 0.5, 1.0)  # m
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,7 @@ class Choice:
     name: str
     base: Value
     values: tuple[Value, ...]
+    unit: str = ""
 
     @property
     def plain(self) -> Value:
@@ -116,7 +122,7 @@ class Choice:
 
     def within(self, text: str) -> Choice:
         """The dimension with fewer values, ``A,B``."""
-        known = {str(value): value for value in self.values}
+        known = {_text(value): value for value in self.values}
         parts = [part.strip() for part in text.split(",")]
         if unknown := [part for part in parts if part not in known]:
             some = list(known) if len(known) <= len(SHAPES) + 1 else [*list(known)[:3], "...", list(known)[-1]]
@@ -126,8 +132,12 @@ class Choice:
         return replace(self, values=tuple(known[part] for part in dict.fromkeys(parts)))
 
     def text(self, value: Value) -> str:
-        """A value."""
-        return str(value)
+        """A value with its unit."""
+        return f"{_text(value)}{self.unit}"
+
+
+def _text(value: Value) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 Dimension = LogScale | Choice
@@ -183,7 +193,8 @@ def space_of(base: Scenario, within: Sequence[str] = ()) -> Space:
 
     Parameters
     ----------
-    within : bounds of some dimensions: ``NAME=LOW:HIGH``, ``NAME=A,B`` where values have no order, or ``NAME=VALUE``
+    within : bounds of some dimensions: ``NAME=LOW:HIGH``, ``NAME=A,B`` where values have no order, or ``NAME=VALUE``;
+        or the path of a TOML file of such bounds, as ``range = [2.0, 8.0]``, ``path = "circle"``, ``tilt = 40``
 
     Raises
     ------
@@ -192,12 +203,24 @@ def space_of(base: Scenario, within: Sequence[str] = ()) -> Space:
     """
     require_right_belief(base)
     dimensions = {d.name: d for d in _dimensions(base)}
-    for text in within:
+    for text in itertools.chain.from_iterable(_bounds_of(w) if w.endswith(".toml") else [w] for w in within):
         name, separator, bounds = text.partition("=")
         if name not in dimensions or not separator:
             raise InputError(f"--within {text}: give it as NAME=LOW:HIGH with a NAME out of {', '.join(dimensions)}")
         dimensions[name] = dimensions[name].within(bounds)
     return Space(base, tuple(dimensions.values()))
+
+
+def _bounds_of(path: str) -> list[str]:
+    """Bounds of a file as they are typed: an array of two numbers that are not a choice is LOW:HIGH."""
+    bounds = []
+    for name, value in read_toml(Path(path)).items():
+        items = value if isinstance(value, list) else [value]
+        if not items or not all(isinstance(each, int | float | str) for each in items):
+            raise InputError(f"{path}: key '{name}': give a value, [LOW, HIGH], or an array of values")
+        between = name in FACTORS and len(items) == 2
+        bounds.append(f"{name}={(':' if between else ',').join(_text(each) for each in items)}")
+    return bounds
 
 
 def require_right_belief(base: Scenario) -> None:
@@ -226,8 +249,15 @@ def _dimensions(base: Scenario) -> list[Dimension]:
     if isinstance(truth.landmarks, UniformLandmarks):
         own = truth.path.shape
         found += [Choice("path", own, (own, *(shape for shape in SHAPES if shape != own)))]
+        found += [_scale("lap", 1.0, "x")] if own in SHAPES else []
         found += [_scale("density", 1.0, "x")]
+    found += [_scale("dt", truth.dt, " s")]
     if isinstance(truth.sensor, UvdSensor):
+        (_, _, z), (_, pitch, _) = truth.sensor.mount.position, truth.sensor.mount.rotation
+        found += [
+            _choice("tilt", round(float(np.rad2deg(pitch)), 6), TILTS, " deg"),
+            _choice("height", z, HEIGHTS, " m"),
+        ]
         found += [_scale("baseline", truth.sensor.B, " m")]
     return [*found, _scale("range", truth.sensor.range[1], " m")]
 
@@ -235,6 +265,10 @@ def _dimensions(base: Scenario) -> list[Dimension]:
 def _scale(name: str, base: float, unit: str = "", whole: bool = False) -> LogScale:
     low, high = (float(f"{factor * base:.{DIGITS}g}") for factor in FACTORS[name])
     return LogScale(name, base, max(1, round(low)) if whole else low, round(high) if whole else high, unit, whole)
+
+
+def _choice(name: str, base: float, values: Sequence[float], unit: str) -> Choice:
+    return Choice(name, base, (base, *(value for value in values if value != base)), unit)
 
 
 # --- from values to keys of a scenario -----------------------------------------------------------------
@@ -252,6 +286,13 @@ def _changes(base: Scenario, values: Mapping[str, Value]) -> dict[str, Any]:
         changes |= {f"{half}__sensor__sigma": sigmas for half in ("truth", "belief")}
     if "steps" in values:
         changes["truth__steps"] = int(values["steps"])
+    if "dt" in values:
+        changes["truth__dt"] = float(values["dt"])
+    if "tilt" in values or "height" in values:
+        (x, y, z), (roll, pitch, heading) = truth.sensor.mount.position, truth.sensor.mount.rotation
+        tilt = float(np.deg2rad(float(values["tilt"]))) if "tilt" in values else pitch
+        mount = {"position": (x, y, float(values.get("height", z))), "rotation": (roll, tilt, heading)}
+        changes |= {f"{half}__sensor__mount": mount for half in ("truth", "belief")}
     if "range" in values:
         changes["truth__sensor__range"] = (truth.sensor.range[0], float(values["range"]))
     if "baseline" in values and isinstance(truth.sensor, UvdSensor):
@@ -270,8 +311,8 @@ def _landmarks(truth: Truth, values: Mapping[str, Value]) -> dict[str, Any]:
     if not isinstance(landmarks, UniformLandmarks):
         return changes
     box, area = np.array([landmarks.x, landmarks.y]), 1.0
-    if "path" in values:
-        path = _path(str(values["path"]), truth)
+    if "path" in values or "lap" in values:
+        path = _path(str(values.get("path", truth.path.shape)), truth, float(values.get("lap", 1.0)))
         margin = box - _extent(truth)
         other = np.round(_extent(truth.model_copy(update={"path": path})) + margin.mean(axis=0), 1)
         area = float(np.prod(other[:, 1] - other[:, 0]) / np.prod(box[:, 1] - box[:, 0]))
@@ -282,9 +323,9 @@ def _landmarks(truth: Truth, values: Mapping[str, Value]) -> dict[str, Any]:
     return changes | ({"truth__landmarks__seed": int(values["seed"])} if "seed" in values else {})
 
 
-def _path(shape: str, truth: Truth) -> Path_:
-    """A path of another shape, as long as that of the base and about the same centre, with sides of 8 to 5."""
-    length, (x, y) = lap_length(truth.path), np.round(_extent(truth).mean(axis=1), 1)
+def _path(shape: str, truth: Truth, lap: float = 1.0) -> Path_:
+    """A path of another shape about the centre of the base, ``lap`` times as long, with sides of 8 to 5."""
+    length, (x, y) = lap * lap_length(truth.path), np.round(_extent(truth).mean(axis=1), 1)
     speed = truth.path.speed
     if shape == "circle":
         radius = round(length / (2 * np.pi), 2)

@@ -21,7 +21,11 @@ def challenge(
     ] = None,
     within: Annotated[
         list[str] | None,
-        typer.Option("--within", help="Bounds such as range=2:8 or path=circle; may be repeated.", metavar="NAME=..."),
+        typer.Option(
+            "--within",
+            help="Bounds such as range=2:8 or path=circle, or a TOML file of them; may be repeated.",
+            metavar="NAME=...",
+        ),
     ] = None,
     minutes: Annotated[float | None, typer.Option("--minutes", help="Time for all of it [5].")] = None,
     trials: Annotated[

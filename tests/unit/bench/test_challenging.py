@@ -183,7 +183,52 @@ def test_a_sensor_that_errs_as_believed_is_challenged() -> None:
 
 def test_a_scenario_with_listed_landmarks_has_fewer_dimensions() -> None:
     base = STEREO.variant("listed", truth__landmarks={"layout": "listed", "points": [(2.0, 0.0, 0.0)]})
-    assert [d.name for d in space_of(base).dimensions] == ["sensor", "odometry", "steps", "baseline", "range"]
+    assert [d.name for d in space_of(base).dimensions] == [
+        "sensor", "odometry", "steps", "dt", "tilt", "height", "baseline", "range"
+    ]  # fmt: skip
+
+
+def world_of(space: Space, **values: float | str) -> cs.Scenario:
+    return space.world(tuple(values.get(d.name, d.plain) for d in space.dimensions))
+
+
+def test_rates_mounts_and_loops_are_dimensions() -> None:
+    """A lap of a tenth of the length, with landmarks as far beyond it and as dense; mounts are believed."""
+    space = space_of(STEREO)
+    world = world_of(space, dt=0.5, tilt=40.0, height=1.0, lap=0.1)
+    assert (world.truth.dt, world.truth.steps) == (0.5, 500)
+    assert world.truth.sensor.mount == world.belief.sensor.mount
+    assert world.truth.sensor.mount.position == (0.0, 0.0, 1.0)
+    np.testing.assert_allclose(np.rad2deg(world.truth.sensor.mount.rotation), (0.0, 40.0, 0.0))
+    assert lap_length(world.truth.path) == pytest.approx(0.1 * lap_length(STEREO.truth.path), rel=0.01)
+    half = world.truth.landmarks.x[1]
+    assert half - world.truth.path.radius == pytest.approx(8.0 - 4.0, abs=0.1)
+    assert world.truth.landmarks.count == pytest.approx(120 * (half / 8.0) ** 2, abs=2)
+    short = world_of(space, lap=0.5, path="figure-of-eight")
+    assert lap_length(short.truth.path) == pytest.approx(0.5 * lap_length(STEREO.truth.path), rel=0.01)
+    tilted = STEREO.variant(
+        "tilted", **{f"{half}__sensor__mount": {"rotation": (0.1, 0.2, 0.3)} for half in ("truth", "belief")}
+    )
+    turned = world_of(space_of(tilted), height=0.5)
+    assert turned.truth.sensor.mount.rotation == (0.1, 0.2, 0.3)
+
+
+def test_bounds_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('baseline = 0.09\nrange = [2.0, 8.0]\npath = ["circle", "rounded-rectangle"]\ntilt = [0, 20]\n')
+    kept = {d.name: d for d in space_of(STEREO, [str(path), "range=3:5"]).dimensions}
+    same = {
+        d.name: d
+        for d in space_of(
+            STEREO, ["baseline=0.09", "range=3:5", "path=circle,rounded-rectangle", "tilt=0,20"]
+        ).dimensions
+    }
+    assert kept == same
+    path.write_text("baseline = {}\n")
+    with pytest.raises(InputError, match=r"rig.toml: key 'baseline': give a value, \[LOW, HIGH\], or an array"):
+        space_of(STEREO, [str(path)])
+    with pytest.raises(InputError, match=r"none\.toml"):
+        space_of(STEREO, ["none.toml"])
 
 
 # --- the search --------------------------------------------------------------------------------------

@@ -338,6 +338,8 @@ def _summary(look: _Look) -> dict[str, Any]:
     return summary | {
         "statistic": _finite(v.statistic), "threshold": [_finite(x) for x in v.threshold],
         "inflation": _finite(v.inflation), "inflation_interval": [_finite(x) for x in v.inflation_interval],
+        "axis": None if v.axis is None else v.axis[0],
+        "axis_ratio": [] if v.axis is None else [_finite(x) for x in v.axis[1]],
         "first_step": v.first_step, "subset": v.subset, "faults": list(v.faults),
     }  # fmt: skip
 

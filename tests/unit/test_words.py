@@ -447,7 +447,7 @@ def test_small_numbers_keep_their_digits() -> None:
 
 def test_factor_is_above_one_on_either_side() -> None:
     assert off_by(Interval(2.0, 1.6, 2.5)) == "too small by x2.00 [1.60, 2.50]"
-    assert off_by(Interval(0.5, 0.4, 0.625)) == "too large by x2.00 [1.60, 2.50]"
+    assert off_by(Interval(0.5, 0.4, 0.625)) == "too large by x2.00 [1.60, 2.50] (ratio 0.50)"
     assert off_by(Interval(0.0, 0.0, 0.0)) == "too large: there is hardly any error"
     assert off_by(Interval(2.0, 0.01, 20.0)) == "too small by x2.00 (known to no better than a factor of 100)"
 

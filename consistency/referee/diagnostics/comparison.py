@@ -11,6 +11,7 @@ from scipy import special
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.blocks import by_runs
 from consistency.referee.diagnostics.log_ratio import Contrast, contrast, margin
+from consistency.referee.diagnostics.record import numbered_axes
 from consistency.referee.diagnostics.scale import run_means
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.whitening import entries
@@ -172,7 +173,7 @@ def compare(
         raise ValueError(f"a comparison needs at least {FEWEST} runs{' in common' if paired else ''}, got {fewest}")
     differences = [_ratio("ANEES", a.nees * a.dof, b.nees * b.dof, 1.0, paired, confidence)]
     n = min(a.squared.shape[1], b.squared.shape[1])
-    names = axes if axes is not None and len(axes) == n else tuple(f"axis {i}" for i in range(n))
+    names = axes if axes is not None and len(axes) == n else numbered_axes(n)
     for i, axis in enumerate(names):
         differences.append(_ratio(f"RMSE {axis}", a.squared[:, i], b.squared[:, i], 0.5, paired, confidence))
     for i, axis in enumerate(names):

@@ -90,6 +90,8 @@ def _axes(v: Verdict) -> dict[str, Any]:
     }  # fmt: skip
     if (worst := v.worst_axis) is not None:
         s |= {"worst_axis": worst[0], "worst_axis_ratio": tuple(worst[1])}
+    if v.axis is not None:
+        s |= {"axis": v.axis[0], "axis_ratio": tuple(v.axis[1])}
     if a.largest is not None:
         s |= {"largest": tuple(a.largest), "largest_direction": a.direction}
     return s

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from consistency.referee.diagnostics.location import VISIBLE
-from consistency.referee.diagnostics.numbers_in_words import UNCERTAIN, off_by, plain, short
+from consistency.referee.diagnostics.numbers_in_words import UNCERTAIN, off_by, off_by_factor, plain, short
 from consistency.referee.diagnostics.questions import AXIS, DIRECTION, MAIN, STEP
 from consistency.referee.diagnostics.verdict_parts import TINY, Answer, Axes, Interval, JointScore, Scale, Verdict
 
@@ -27,7 +27,7 @@ def scale_text(v: Verdict, faults: Faults) -> str:
     assert v.location is not None
     if v.status == "inconsistent" and v.shape is not None and v.shape.alone:
         return ""
-    if (MAIN not in faults and STEP not in faults) or _opposite(v, faults):
+    if (MAIN not in faults and STEP not in faults) or opposite(v, faults):
         return _axes_text(v)
     if v.status == "inconsistent" and v.scale.inflation.value > 1.0 and _sure(v, -1):
         return _correlation_text(v)
@@ -41,12 +41,10 @@ def scale_text(v: Verdict, faults: Faults) -> str:
         return _steps_text(v)
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
-        return f"covariance {_side(SIDES[v.status])} by x{_factor(ratio)} in the mean of all {v.places}"
+        return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
     text = f"covariance{about} {off_by(inflation)}"
     if v.runs > 1 and inflation.value > TINY and not inflation.high < UNCERTAIN * inflation.low:
-        size = _factor(inflation.value)
-        text = f"covariance{about} {_side(inflation.value - 1.0)} by x{size}{_since(v)} in the mean, which a few "
-        text += f"{v.unit}s make"
+        text = f"covariance{about} {off_by_factor(inflation.value)}{_since(v)} in the mean, which a few {v.unit}s make"
     elif inflation.holds(1.0) and v.runs > 1:
         text += f"{_since(v)}, an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
     else:
@@ -72,10 +70,6 @@ def _side(sign: float) -> str:
     return "too small" if sign > 0 else "too large"
 
 
-def _factor(ratio: float) -> str:
-    return short(max(ratio, 1.0 / max(ratio, TINY)))
-
-
 def _steps_text(v: Verdict) -> str:
     """Steps above and below the band, each side with their number, the first, and on the verdict's side the largest."""
     assert v.scale is not None
@@ -89,13 +83,13 @@ def _steps_text(v: Verdict) -> str:
         if not len(steps):
             continue
         worst = ratio[steps].max() if sign > 0 else ratio[steps].min()
-        size = f" by up to x{_factor(worst)}" if sign == mine or not mine else ""
+        size = off_by_factor(worst, up_to=True) if sign == mine or not mine else _side(sign)
         total = "" if parts else f" of {v.scale.judged_steps} {v.places}"
-        parts.append(f"{_side(sign)}{size} in {len(steps)}{total}, first in {v.place(int(steps[0]) + 1)}")
+        parts.append(f"{size} in {len(steps)}{total}, first in {v.place(int(steps[0]) + 1)}")
     return f"covariance {', and '.join(parts)}" if parts else f"covariance wrong in some {v.places}"
 
 
-def _opposite(v: Verdict, faults: Faults) -> bool:
+def opposite(v: Verdict, faults: Faults) -> bool:
     """Is the verdict about axes that err in opposite directions?"""
     return v.status == "inconsistent" and AXIS in faults and all(_sure(v, sign) for sign in (1, -1))
 
@@ -130,7 +124,7 @@ def _correlation_text(v: Verdict) -> str:
     if v.shape is None:
         return text
     worst = float(np.linalg.eigvalsh(v.shape.matrix)[-1]) * v.scale.mean_anees / v.scale.dof
-    return f"{text}, but too small by x{_factor(worst)} in one direction{_since(v)}"
+    return f"{text}, but {off_by_factor(worst)} in one direction{_since(v)}"
 
 
 def _but(v: Verdict, faults: Faults) -> str:

@@ -23,7 +23,7 @@ from consistency.referee.diagnostics.questions import (
 )
 from consistency.referee.diagnostics.sample import Sample
 from consistency.referee.diagnostics.scale import scale_test, spreads_more, spreads_more_in_steps
-from consistency.referee.diagnostics.verdict_parts import TINY, Settings, Verdict
+from consistency.referee.diagnostics.verdict_parts import TINY, Interval, Settings, Verdict
 from consistency.referee.types import Array
 
 CERTAIN = 0.999  # false-alarm rate, at most
@@ -50,7 +50,26 @@ def status_of(verdict: Verdict, sample: Sample | None, tests: Tests | None, join
         status = _by_errors(at_share(verdict), rest, sample, tests) if rest else "biased"
         status = "biased" if status == "heavy-tailed" else status  # a few errors explain less than the mean of all
     by_sign = status == "overconfident" and verdict.shape is not None and verdict.shape.alone and JOINT not in faults
-    return "inconsistent" if by_sign else status
+    return "inconsistent" if by_sign or (status == "heavy-tailed" and smaller(verdict)) else status
+
+
+def smaller(v: Verdict) -> bool:
+    """Are the errors found to be smaller than stated in the mean? Then few large ones are not all that is wrong."""
+    return v.scale is not None and MAIN in v.faults and v.scale.inflation.high < 1.0
+
+
+def deciding_axis(v: Verdict) -> tuple[str, Interval] | None:
+    """The component that decides the status, with its ratio; None where the whole does.
+
+    It is the worst one where an axis is found at fault and the whole is not, or errs in the other direction.
+    """
+    whole_decides = MAIN in v.faults and v.status != "inconsistent"
+    return None if AXIS not in v.faults or whole_decides else clear(v.worst_axis)
+
+
+def clear(axis: tuple[str, Interval] | None) -> tuple[str, Interval] | None:
+    """An axis whose interval does not hold 1, or None."""
+    return None if axis is None or axis[1].holds(1.0) else axis
 
 
 def few_lost(verdict: Verdict) -> bool:

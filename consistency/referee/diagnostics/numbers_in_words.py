@@ -23,13 +23,19 @@ def short(value: float) -> str:
 
 
 def off_by(interval: Interval) -> str:
-    """Too small by x1.6 [1.4, 1.9]; of a covariance too large, the inverse."""
+    """Too small by x1.6 [1.4, 1.9]; of a covariance too large the inverse, and the ratio as tables have it."""
     ratio, low, high = interval
     if ratio >= 1.0:
         return f"too small by x{plain(interval)}"
     if ratio < TINY:
         return "too large: there is hardly any error"
-    return f"too large by x{plain(Interval(1.0 / ratio, 1.0 / high, 1.0 / max(low, TINY)))}"
+    return f"too large by x{plain(Interval(1.0 / ratio, 1.0 / high, 1.0 / max(low, TINY)))} (ratio {short(ratio)})"
+
+
+def off_by_factor(ratio: float, up_to: bool = False) -> str:
+    """Too small by x1.6; too large by x1.6 (ratio 0.62)."""
+    text = f" by {'up to ' * up_to}x{short(max(ratio, 1.0 / max(ratio, TINY)))}"
+    return f"too small{text}" if ratio > 1.0 else f"too large{text} (ratio {short(ratio)})"
 
 
 def plain(interval: Interval) -> str:

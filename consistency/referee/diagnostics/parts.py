@@ -9,9 +9,9 @@ import numpy as np
 
 from consistency.referee.diagnostics import wording
 from consistency.referee.diagnostics.equivalence import worst
-from consistency.referee.diagnostics.headline import few_lost
+from consistency.referee.diagnostics.headline import clear, few_lost
 from consistency.referee.diagnostics.lost import lost_of
-from consistency.referee.diagnostics.questions import SHARES
+from consistency.referee.diagnostics.questions import SCALE, SHARES
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.sample import names_of
 from consistency.referee.diagnostics.verdict import judge_alone
@@ -25,7 +25,7 @@ INNOVATIONS = "innovations"
 def diagonal(deviations: Array) -> Array:
     """Covariances of standard deviations without cross terms, (..., n) -> (..., n, n); indefinite of a negative one."""
     sigma = np.asarray(deviations, float)
-    return (sigma * np.abs(sigma))[..., None] * np.eye(sigma.shape[-1])
+    return np.asarray((sigma * np.abs(sigma))[..., None] * np.eye(sigma.shape[-1]))
 
 
 def each_alone(record: Record) -> Record:
@@ -65,6 +65,8 @@ def judge_parts(record: Record, settings: Settings) -> Verdict:
     whole = judge_alone(replace(record, parts=(), unavailable=tuple(SHARES), optimal_gain=False), settings)
     verdict = _with_parts(whole, parts, record, settings)
     verdict = replace(verdict, status=_status(verdict))
+    has_wrong_size = any(question in SCALE for part in parts.values() for question in part.faults)
+    verdict = replace(verdict, axis=clear(verdict.worst_axis) if has_wrong_size else None)
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 
 

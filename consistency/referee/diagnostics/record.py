@@ -234,6 +234,11 @@ class Record:
 Evidence = Record  # name of the record as input of :func:`consistency.diagnostics.judge`
 
 
+def numbered_axes(n: int) -> tuple[str, ...]:
+    """Names of components that have none: axis 0, axis 1, ..."""
+    return tuple(f"axis {i}" for i in range(n))
+
+
 def shown_by(function: str, *arguments: Any) -> Any:
     """Result of a function that draws or describes; its module is loaded here, as nothing else needs it."""
     return getattr(import_module("consistency.referee.notebook.showing"), function)(*arguments)

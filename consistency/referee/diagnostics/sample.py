@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.blocks import by_runs, by_steps, of_runs
 from consistency.referee.diagnostics.innovations import nis_of
-from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.record import Record, numbered_axes
 from consistency.referee.diagnostics.scale import means_and_counts, run_means
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.validity import negative
@@ -170,7 +170,7 @@ def names_of(e: Record) -> tuple[str, ...]:
     """
     assert e.error is not None
     n = e.error.shape[-1]
-    names = tuple(() if e.axes is None else e.axes) or tuple(f"axis {i}" for i in range(n))
+    names = tuple(() if e.axes is None else e.axes) or numbered_axes(n)
     if len(names) != n:
         raise ValueError(f"{len(names)} names of axes for {n} components")
     return names

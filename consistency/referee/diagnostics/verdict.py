@@ -12,7 +12,7 @@ from consistency.referee.diagnostics import wording
 from consistency.referee.diagnostics.band import simultaneous_band
 from consistency.referee.diagnostics.early_ending import early_ends
 from consistency.referee.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
-from consistency.referee.diagnostics.headline import at_share, status_of
+from consistency.referee.diagnostics.headline import at_share, deciding_axis, status_of
 from consistency.referee.diagnostics.hypothesis_tests import Tests, ask
 from consistency.referee.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
 from consistency.referee.diagnostics.intervals import chi2_mean_interval
@@ -80,6 +80,7 @@ def judge_alone(evidence: Record, settings: Settings = DEFAULT, look: Look | Non
         lost = lost_of(evidence, sample.nees, sample.dof, settings, any_time=look is not None)
         verdict = _with_records(replace(verdict, lost=lost), evidence, sample, tests, shown)
     verdict = replace(verdict, status=status_of(verdict, sample, tests, joint))
+    verdict = replace(verdict, axis=deciding_axis(verdict))
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 
 

@@ -344,6 +344,7 @@ class Verdict:
     lost: Lost | None = None  # where there is a NEES
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
     skipped: Skipped | None = None  # first steps of each run that were left out
+    axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does
     parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
     record: Record | None = None  # what was judged, where it is kept to be drawn
 

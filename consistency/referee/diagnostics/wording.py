@@ -10,10 +10,12 @@ from consistency.referee.diagnostics.faults_in_words import (
     Faults,
     bias_text,
     joint_text,
+    opposite,
     scale_text,
     shape_text,
     tails_text,
 )
+from consistency.referee.diagnostics.headline import smaller
 from consistency.referee.diagnostics.numbers_in_words import UNCERTAIN, off_by, p_text, percent, plain, plural, short
 from consistency.referee.diagnostics.questions import ALONE, BIAS, JOINT, SCALE, SHAPE
 from consistency.referee.diagnostics.verdict_parts import Equivalence, Verdict
@@ -117,7 +119,8 @@ def _sentence(v: Verdict, faults: Faults) -> str:
     elif v.status != "biased":
         parts += [scale_text(v, faults)] if any(q in faults for q in SCALE) else []
         parts += [shape_text(v, faults)] if any(q in faults for q in SHAPE) else []
-    if "outliers" in faults or v.status == "heavy-tailed":
+    contrary = v.status == "inconsistent" and smaller(v) and JOINT not in faults and not opposite(v, faults)
+    if "outliers" in faults or v.status == "heavy-tailed" or contrary:
         parts.insert(0 if v.status == "heavy-tailed" else len(parts), tails_text(v, faults))
     if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
         parts.append(joint_text(v, v.joint))

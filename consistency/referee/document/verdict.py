@@ -70,8 +70,13 @@ def _mean_anees(v: Verdict, digits: str = "") -> Quantity:
 
 
 def factor(v: Verdict) -> Quantity:
-    """What makes the stated covariance that of the errors."""
+    """Ratio of true to stated covariance of the whole, which makes the stated covariance that of the errors."""
     return Quantity(v.inflation, v.inflation_interval, limit=UNCERTAIN, is_factor=True)
+
+
+def true_over_stated(v: Verdict, whole: Quantity) -> Cell:
+    """Ratio of true to stated covariance: of the axis that decides, with its name, or of the whole."""
+    return whole if v.axis is None else f"{plain(v.axis[1])} in {v.axis[0]}"
 
 
 def shown_inside(v: Verdict) -> Cell:
@@ -116,12 +121,18 @@ FILTER = Column("Filter", width="1.3fr")
 BRIEF = (
     Measure(Column("Verdict"), lambda v: Status(v.status)),
     Measure(Column("Mean ANEES", "Mean\nANEES", number=True), _mean_anees),
-    Measure(Column("Covariance to multiply by", "Covariance to\nmultiply by", number=True), factor),
+    Measure(
+        Column("True / stated covariance", "True / stated\ncovariance", number=True),
+        lambda v: true_over_stated(v, factor(v)),
+    ),
 )
 TERMINAL = (
     Measure(Column("verdict"), lambda v: Status(v.status, " (NIS only)" if v.scale is None else "")),
     Measure(Column("ANEES", number=True), lambda v: _mean_anees(v, ".2f")),
-    Measure(Column("ratio", number=True), lambda v: Quantity(v.inflation, v.inflation_interval)),
+    Measure(
+        Column("true / stated", number=True),
+        lambda v: true_over_stated(v, Quantity(v.inflation, v.inflation_interval)),
+    ),
     Measure(Column("RMSE m", number=True), _rmse_position),
     Measure(Column("RMSE deg", number=True), _rmse_heading),
     Measure(Column("NIS/dof", number=True), _nis),
@@ -197,8 +208,10 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         accepted = "not judged" if v.parts else f"{' to '.join(map(short, s.accepted))} accepted"
         rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {accepted})"))
         value, low, high = s.inflation
-        rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], truth over stated"))
-        if (worst := v.worst_axis) is not None:
+        rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], true / stated"))
+        if v.axis is not None:
+            rows.append(("decided by", f"{v.axis[0]}, {plain(v.axis[1])}"))
+        elif (worst := v.worst_axis) is not None:
             rows.append(("worst axis", f"{worst[0]}, {plain(worst[1])}"))
         if s.within is not None:
             rows.append(("within the log", f"{plain(s.within.ratio)}, if errors decorrelate as within it"))
@@ -241,8 +254,8 @@ def _in_world(v: Verdict) -> str:
 def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = True) -> Document:
     """A row for each filter, what goes for all of them below, and with ``reasons`` also why; the data are all numbers.
 
-    ``ratio``: true over stated covariance, 95 % interval. A filter that is judged in an error of its own has a second
-    row, in the additive error of the world.
+    ``true / stated``: ratio of the covariances, 95 % interval; of the axis that decides, where one does. A filter that
+    is judged in an error of its own has a second row, in the additive error of the world.
     """
     blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
     if reasons:

@@ -47,7 +47,7 @@ def checked(
     record, given = Record(name), {"errors": errors, "covariances": covariances, "nees": nees}
     stated = {key: value for key, value in given.items() if value is not None}
     if stated:
-        record = record_of_arrays(stated if nees is None else {**stated, "dof": dof}, axes, name)
+        record = record_of_arrays(stated if nees is None or dof is None else {**stated, "dof": dof}, axes, name)
         if dof is not None and dof != record.dof:
             raise ValueError(f"dof is {dof}, but the errors have {record.dof} components")
     arrays = _innovations(nis, nis_dof, innovations, innovation_covariances, _failed(record))

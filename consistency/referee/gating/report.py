@@ -12,24 +12,39 @@ from consistency.referee.show import rendered
 from consistency.referee.show.text import fragment
 from consistency.referee.system.atomic import write_whole
 
-NUMBERS = {"p", "false-alarm rate", "runs", "planned", "inflation"}
+NUMBERS = {"p", "false-alarm rate", "runs", "planned", "true / stated"}
 
 
 def _cells(e: Entry) -> dict[str, Cell]:
     """Cells of a gate by their heads."""
     first, *rest = e.reasons
-    low, high = (float("inf") if end is None else end for end in e.inflation_interval or (None, None))
+    value, low, high = e.axis_ratio or (e.inflation, *(e.inflation_interval or (None, None)))
+    low, high = (float("inf") if end is None else end for end in (low, high))
     return {
         "test": e.test, "gate": e.gate, "filter": e.name, "outcome": outcome(e), "verdict": Status(e.status),
         "p": _p(e.p_value), "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs), "planned": str(e.needed),
-        "inflation": Quantity(e.inflation, (low, high), digits=".3g", is_factor=True),
+        "true / stated": Quantity(
+            value, (low, high), f" in {e.axis}" if e.axis else "", digits=".3g", is_factor=True
+        ),
         "why": Reason(f"{e.gate} {e.name}", first, tuple(rest), None, e.outcome == "passed" or wanted(e), e.test),
         "": Reason(e.name, first, has_passed=e.outcome != "fault found"),
     }  # fmt: skip
 
 
-HEADS = ("test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "planned", "inflation", "why")
-BRIEF = ("test", "gate", "outcome", "p", "runs", "planned", "inflation", "")  # on a terminal
+HEADS = (
+    "test",
+    "gate",
+    "filter",
+    "outcome",
+    "verdict",
+    "p",
+    "false-alarm rate",
+    "runs",
+    "planned",
+    "true / stated",
+    "why",
+)
+BRIEF = ("test", "gate", "outcome", "p", "runs", "planned", "true / stated", "")  # on a terminal
 
 
 def _p(value: float | None) -> str:

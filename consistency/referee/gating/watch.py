@@ -40,6 +40,8 @@ class Entry:
     threshold: list[float | None] = field(default_factory=list)
     inflation: float | None = None
     inflation_interval: list[float | None] = field(default_factory=list)
+    axis: str | None = None  # that decides the status; None where the whole does
+    axis_ratio: list[float | None] = field(default_factory=list)
     first_step: int | None = None
     subset: str | None = None
     faults: list[str] = field(default_factory=list)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Evidence, Record
 from consistency.referee.diagnostics.parts import diagonal, each_alone
+from consistency.referee.diagnostics.record import numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
@@ -84,7 +85,8 @@ def record_of_arrays(
         if never.any():
             step = int(np.argmax(never)) + 1
             raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
-    arrays |= {"mask": mask} if mask.any() else {}
+    if mask.any():
+        arrays["mask"] = np.asarray(mask)
     arrays |= {} if axes is None else {"axes": np.asarray(axes, str)}
     record = _of_arrays(Path("arrays"), arrays)
     record = record if sigma is None else each_alone(record)
@@ -309,7 +311,7 @@ def step_times(path: Path, arrays: dict[str, Array], steps: int) -> Array:
 
 def _axes(path: Path, arrays: dict[str, Array], n: int) -> tuple[str, ...]:
     if "axes" not in arrays:
-        return tuple(f"e{i + 1}" for i in range(n))
+        return numbered_axes(n)
     axes = tuple(require_name(str(axis), f"{path}: key 'axes'") for axis in np.atleast_1d(arrays["axes"]))
     if len(axes) != n:
         raise InputError(f"{path}: key 'axes' names {len(axes)} components, the error has {n}")

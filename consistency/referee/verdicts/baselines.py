@@ -13,6 +13,7 @@ import numpy as np
 
 from consistency.referee.diagnostics import Record, RunSummary, summary
 from consistency.referee.diagnostics.export import plain
+from consistency.referee.diagnostics.record import numbered_axes
 from consistency.referee.diagnostics.skipping import Skip
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading
@@ -199,6 +200,8 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
     axes = _list(table.get("axes", POSE), f"{place}.axes", HIGHEST_DOF)
     if not all(isinstance(axis, str) for axis in axes):
         raise ValueError(f"key '{place}.axes': not all are names")
+    if axes == [f"e{i + 1}" for i in range(len(axes))]:  # of components without names, in files written before
+        axes = list(numbered_axes(len(axes)))
     failures = _whole(table["failures"], f"{place}.failures", 0)
     return RunSummary(np.array(runs, np.int64), dof, *parts), failures, tuple(axes)
 

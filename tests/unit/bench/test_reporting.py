@@ -231,8 +231,8 @@ def test_verdict_cells_are_the_records(report):
     track = study.tracks[0]
     v, cells = track.verdict, row(study, track)
     assert cells["Mean ANEES"] == short(v.scale.mean_anees)
-    assert cells["Covariance to multiply by"].startswith(f"×{short(v.inflation)} [")
-    assert cells["Covariance to multiply by"].endswith(f", {short(v.inflation_interval[1])}]")
+    assert cells["True / stated covariance"].startswith(f"×{short(v.inflation)} [")
+    assert cells["True / stated covariance"].endswith(f", {short(v.inflation_interval[1])}]")
     assert cells["Shown inside [0.67,\u00a01.50]"] == f"no, p {v.scale.equivalence.p_value:.2g}"
     assert cells["Since step"] == ("–" if v.location.since is None else str(v.location.since))
     assert cells["RMSE heading (deg)"] == f"{np.rad2deg(v.accuracy.rmse_heading):.2f}"

@@ -164,8 +164,8 @@ def test_every_view_takes_its_cells_from_the_verdict() -> None:
     v = verdict_of(2.0)
     said = {m.column.head: written(m.cell(v), PLAIN) for m in (*TERMINAL, *page("[a, b]"), *FURTHER)}
     value, low, high = v.scale.inflation
-    assert said["ratio"] == f"{value:.2f} [{low:.2f}, {high:.2f}]"
-    assert said["Covariance to multiply by"] == f"x{said['ratio']}"
+    assert said["true / stated"] == f"{value:.2f} [{low:.2f}, {high:.2f}]"
+    assert said["True / stated covariance"] == f"x{said['true / stated']}"
     assert said["ANEES"] == f"{v.scale.mean_anees:.2f}"
     assert said["failed"] == "0 of 60"
     assert said["Shown inside [a, b]"].startswith("no, p ")

@@ -452,7 +452,7 @@ def test_an_angle_whose_errors_jump_by_a_turn_is_named(wrapped: bool, tmp_path: 
     np.savez(tmp_path / "errors.npz", errors=truth - estimates, covariances=P, axes=["x", "y", "yaw"])
     jumps = int((np.abs(truth - estimates)[..., 2] > np.pi).sum())
     for name, axis, remedy in (
-        ("poses", "e3", "add --error so2, if these are x, y, heading"),
+        ("poses", "axis 2", "add --error so2, if these are x, y, heading"),
         ("errors", "yaw", "wrap it to [-pi, pi]"),
     ):
         (record,) = read_recordings(tmp_path / f"{name}.npz")

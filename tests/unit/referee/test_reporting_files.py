@@ -109,7 +109,7 @@ def test_without_times_steps_are_on_the_axis(tmp_path: Path, rng: np.random.Gene
     np.savez(tmp_path / "e.npz", **errors_of(rng))
     clock = clock_of(read_recordings(tmp_path / "e.npz")[0].t)
     assert (clock.word, clock.values[0], clock.values[-1]) == ("step", 1, STEPS)
-    assert unit_of("e1") == ("", 1.0)
+    assert unit_of("axis 0") == ("", 1.0)
 
 
 def test_coverage_is_that_of_the_errors(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_coverage_is_that_of_the_errors(tmp_path: Path) -> None:
     p = np.array([0.1, 0.5, 0.9])
     found = observed_coverage(read_recordings(tmp_path / "e.npz")[0], p)
     expected = 2.0 * stats.norm.cdf(stats.norm.ppf(0.5 + 0.5 * p) / 2.0) - 1.0
-    assert set(found) == {"e1", "all together"}
+    assert set(found) == {"axis 0", "all together"}
     for shares in found.values():
         np.testing.assert_allclose(shares, expected, atol=2e-3)
 
@@ -168,7 +168,12 @@ def test_every_panel_of_a_plot_has_a_legend(steps: int, tmp_path: Path, rng: np.
         assert figure.legends
         of_panels = [axes.get_legend() for axes in figure.axes if axes.axison]
         assert [legend is not None for legend in of_panels] == [False, False, *(others * [True])]
-        assert [text.get_text() for text in of_panels[-1].get_texts()] == ["expected", "e1", "e2", "all together"]
+        assert [text.get_text() for text in of_panels[-1].get_texts()] == [
+            "expected",
+            "axis 0",
+            "axis 1",
+            "all together",
+        ]
 
 
 def test_what_is_not_there_is_not_drawn(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -12,12 +12,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from draws import fully_dependent, identities, independent, verdict_on
+from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.diagnostics.faults_in_words import bias_text, scale_text, shape_text
+from consistency.referee.diagnostics.numbers_in_words import plain, short
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.diagnostics.wording import reasons
-from consistency.referee.document.verdict import document
+from consistency.referee.document.blocks import Quantity
+from consistency.referee.document.verdict import TERMINAL, document, rows
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Array
 
@@ -96,14 +99,54 @@ def test_opposite_axes_are_inconsistent(rng: np.random.Generator, factors: tuple
     assert said is not None, sentence
     assert float(said[1]) == pytest.approx(max(factors), rel=0.1)
     assert float(said[2]) == pytest.approx(1.0 / min(factors), rel=0.1)
-    assert f"] in {large}" in sentence
+    assert float(re.search(rf"\(ratio ([\d.]+)\) in {large}", sentence)[1]) == pytest.approx(min(factors), rel=0.1)  # type: ignore[index]
+
+
+@pytest.mark.parametrize(("factors", "axis"), [((1.3, 0.5), "y"), ((0.9, 0.9, 1.25), "heading"), ((2.0, 2.0), None)])
+def test_an_axis_that_decides_stands_beside_the_status(
+    rng: np.random.Generator, factors: tuple[float, ...], axis: str | None
+) -> None:
+    """A whole that looks right hides it: status, table, facts and JSON name it with its ratio."""
+    verdict = judged(independent(rng, 200, 40, len(factors)) * np.sqrt(factors))
+    (cell,) = (m.cell(verdict) for m in TERMINAL if m.column.head == "true / stated")
+    if axis is None:
+        assert verdict.axis is None
+        assert "axis" not in verdict.statistics
+        assert "decided by" not in dict(rows(verdict))
+        assert isinstance(cell, Quantity)
+        return
+    assert verdict.axes is not None
+    interval = verdict.axes.inflation[axis]
+    assert verdict.axis == (axis, interval)
+    assert verdict.statistics["axis"] == axis
+    assert verdict.statistics["axis_ratio"] == tuple(interval)
+    assert verdict.statistics["ratio"] == verdict.inflation  # of the whole, as ever
+    assert dict(rows(verdict))["decided by"].startswith(f"{axis}, {short(interval.value)} [")
+    assert str(cell) == f"{plain(interval)} in {axis}"
+
+
+@pytest.mark.parametrize(("times", "status"), [(8.3, "inconsistent"), (12.0, "heavy-tailed")])
+def test_few_large_errors_do_not_hide_that_the_mean_is_small(times: float, status: str) -> None:
+    """Quantiles of chi-square, so that there is no chance in it: most runs are smaller than stated, 15 larger."""
+    few, most = (stats.chi2.ppf((np.arange(runs) + 0.5) / runs, 2) for runs in (15, 135))
+    nees = 0.36 * np.concatenate([most, times * few])[:, None]
+    verdict = judge(Evidence("f", nees=nees, dof=2), Settings(0.01))
+    assert verdict.scale is not None
+    assert (verdict.scale.inflation.high < 1.0) == (status == "inconsistent")
+    assert verdict.status == status
+    if status == "inconsistent":
+        assert re.search(
+            r"covariance too large by x[\d.]+ .*\(ratio 0\.\d\d\); heavy tails: the runs", verdict.reasons[0]
+        )
 
 
 def test_an_axis_nearer_to_one_than_the_whole_leaves_it_overconfident(rng: np.random.Generator) -> None:
     verdict = judged(independent(rng, 100, 60, 2) * np.sqrt([3.0, 0.7]))
     assert verdict.status == "overconfident"
     sentence = verdict.reasons[0]
-    assert re.search(r"too small by x1\.\d\d \[.*, mainly x.*, but too large by x1\.\d\d \[[^]]+\] in y", sentence)
+    assert re.search(
+        r"too small by x1\.\d\d \[.*, mainly x.*, but too large by x1\.\d\d \[[^]]+\] \(ratio 0\.\d\d\) in y", sentence
+    )
 
 
 def test_both_sides_are_named_of_many_axes(rng: np.random.Generator) -> None:
@@ -215,8 +258,9 @@ def test_steps_above_and_below_are_counted_apart(rng: np.random.Generator) -> No
     verdict = judged(error)
     assert verdict.status == "conservative"
     ratio = np.square(error).mean(axis=(0, 2))
+    least = ratio[10:14].min()
     assert verdict.reasons[0].startswith(
-        f"conservative: covariance too large by up to x{1.0 / ratio[10:14].min():.1f} in 4 of 100 steps, first in "
+        f"conservative: covariance too large by up to x{1.0 / least:.1f} (ratio {least:.2g}) in 4 of 100 steps, first in "
         "step 11, and too small in 1, first in step 41"
     )
     assert "too small by" not in verdict.reasons[0]
@@ -248,7 +292,8 @@ def test_no_factor_to_the_other_side(rng: np.random.Generator, late: float, stat
     contrary = replace(verdict, scale=replace(verdict.scale, inflation=Interval(late, 0.9 * late, 1.1 * late)))
     sentence = reasons(contrary)[0]
     ratio = verdict.scale.mean_anees / 3
-    assert f"{side} by x{max(ratio, 1 / ratio):.2f} in the mean of all steps" in sentence
+    both = f" (ratio {ratio:.2f})" if ratio < 1.0 else ""
+    assert f"{side} by x{max(ratio, 1 / ratio):.2f}{both} in the mean of all steps" in sentence
 
 
 # --- bias ------------------------------------------------------------------------------------------------------

@@ -7,14 +7,28 @@ STEPS, DT = 150, 0.01  # s
 GYRO, ACCELEROMETER = 0.01, 0.02  # densities of the noise: rad/s and m/s^2, each / sqrt(Hz)
 START = gtsam.NavState(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.zeros(3), np.array([1.0, 0.0, 0.0]))
 BIAS = gtsam.imuBias.ConstantBias()
+WALKS = 0.01, 0.003  # of the biases of both, where they walk: m/s^2 and rad/s, each * sqrt(Hz)
 PARAMS = gtsam.PreintegrationParams.MakeSharedU(9.81)
-PARAMS.setGyroscopeCovariance(GYRO**2 * np.eye(3))
-PARAMS.setAccelerometerCovariance(ACCELEROMETER**2 * np.eye(3))
-PARAMS.setIntegrationCovariance(1e-12 * np.eye(3))
+COMBINED = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
+for params in (PARAMS, COMBINED):
+    params.setGyroscopeCovariance(GYRO**2 * np.eye(3))
+    params.setAccelerometerCovariance(ACCELEROMETER**2 * np.eye(3))
+    params.setIntegrationCovariance(1e-12 * np.eye(3))
+COMBINED.setBiasAccCovariance(WALKS[0] ** 2 * np.eye(3))
+COMBINED.setBiasOmegaCovariance(WALKS[1] ** 2 * np.eye(3))
+if hasattr(COMBINED, "setBiasAccOmegaInit"):  # until 4.2: of the first bias, which is known here
+    COMBINED.setBiasAccOmegaInit(1e-12 * np.eye(6))
 
 
 def preintegrated(acceleration, rate):
-    measurements = gtsam.PreintegratedImuMeasurements(PARAMS, BIAS)
+    return integrated(gtsam.PreintegratedImuMeasurements(PARAMS, BIAS), acceleration, rate)
+
+
+def combined(acceleration, rate):
+    return integrated(gtsam.PreintegratedCombinedMeasurements(COMBINED, BIAS), acceleration, rate)
+
+
+def integrated(measurements, acceleration, rate):
     for a, w in zip(acceleration, rate, strict=True):
         measurements.integrateMeasurement(a, w, DT)
     return measurements

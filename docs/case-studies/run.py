@@ -31,7 +31,15 @@ SETS = {
     "old": ["pycolmap==3.11.1", "numpy<2", "filterpy==1.4.5", "gtsam==4.2.1", "pykalman==0.10.1", "ahrs==0.3.1",
             "opencv-python-headless==4.6.0.66"],
 }  # fmt: skip
-OLD = ("pycolmap_pose", "filterpy_linear", "gtsam_imu", "pykalman_varying", "ahrs_ekf", "opencv_calibration")
+OLD = (
+    "pycolmap_pose",
+    "filterpy_linear",
+    "gtsam_combined",
+    "gtsam_imu",
+    "pykalman_varying",
+    "ahrs_ekf",
+    "opencv_calibration",
+)
 ARCHIVED = (  # of libraries that are not in [dev]
     "ahrs_ekf", "gpr_new_target", "least_squares_scaling", "pycolmap_centre", "pycolmap_pose", "pykalman_varying",
     "stonesoup_cubature",
@@ -107,8 +115,8 @@ def main() -> None:
     if Path(sys.prefix) != ROOT / ".env-new":  # which has the core, for the progress bar
         names = [environment(name) for name in SETS]
         raise SystemExit(subprocess.run([names[0], __file__, *sys.argv[1:]], check=False).returncode)
+    from consistency.referee.system.atomic import write_whole
     from consistency.referee.terminal.progress import progress
-    from consistency.store.atomic import write_whole
 
     kept = json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else {"studies": {}, "rates": {}}
     work = [(case, name) for case in asked.only or cases() for name in SETS if name == "new" or case in OLD]

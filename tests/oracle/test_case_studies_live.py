@@ -16,7 +16,8 @@ FOLDER = ROOT / "docs/case-studies"
 STUDIES = json.loads((ROOT / "reports/reference/case-studies.json").read_text("utf-8"))["studies"]
 LIVE = {
     "filterpy_ensemble": "filterpy", "filterpy_linear": "filterpy", "forecast_fitted": "statsmodels",
-    "gtsam_imu": "gtsam", "opencv_calibration": "opencv-python-headless", "opencv_kalman": "opencv-python-headless",
+    "gtsam_combined": "gtsam", "gtsam_imu": "gtsam",
+    "opencv_calibration": "opencv-python-headless", "opencv_kalman": "opencv-python-headless",
     "statsmodels_missing": "statsmodels",
 }  # fmt: skip
 

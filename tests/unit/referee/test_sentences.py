@@ -260,8 +260,8 @@ def test_steps_above_and_below_are_counted_apart(rng: np.random.Generator) -> No
     ratio = np.square(error).mean(axis=(0, 2))
     least = ratio[10:14].min()
     assert verdict.reasons[0].startswith(
-        f"conservative: covariance too large by up to x{1.0 / least:.1f} (ratio {least:.2g}) in 4 of 100 steps, first in "
-        "step 11, and too small in 1, first in step 41"
+        f"conservative: covariance too large by up to x{1.0 / least:.1f} (ratio {least:.2g}) in 4 of 100 steps, "
+        "first in step 11, and too small in 1, first in step 41"
     )
     assert "too small by" not in verdict.reasons[0]
     turned = judged(error[:, :20])

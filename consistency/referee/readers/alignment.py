@@ -117,7 +117,7 @@ def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]
     base, _, shared = mode.partition("-")
     kind = runs[0].manifold
     if (base, kind) not in FREE:
-        raise InputError(f"--align {mode}: turns about x and y are for poses in space; for others it is posyaw")
+        raise InputError(f"--align {mode}: turns about x and y are for poses in space; for x, y, heading it is posyaw")
     if shared:
         return [frame_of_least_nees(name, runs, FREE[base, kind], judged)] * len(runs)
     return [frame_of_least_nees(name, [p], FREE[base, kind], judged) for p in runs]

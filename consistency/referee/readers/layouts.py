@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
+from consistency.referee.readers.fixes import is_solution, read_solution
 from consistency.referee.readers.naming import (
     UNIT_NAMES,
     Head,
@@ -49,6 +50,8 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     InputError
         The layout is none of those known, a row is broken, or timestamps do not increase.
     """
+    if is_solution(path):
+        return read_solution(path)
     head = head_of(path)
     roles = None if head is None else roles_of(head.names, path)
     if head is not None and roles is not None and not (head.comment and roles.is_tum and len(head.names) in TUM):

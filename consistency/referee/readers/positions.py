@@ -9,8 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing.options import Reading
+from consistency.referee.parsing.options import Reading, flag_of
+from consistency.referee.readers.fixes import Fixes
 from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.record import symmetric
+from consistency.referee.readers.sheet import Lines, Places
 from consistency.referee.readers.spatial import AXES, TrajectorySource
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
@@ -19,7 +22,7 @@ from consistency.referee.types import Array
 def position_source(
     source: TrajectorySource, poses: Sequence[Poses], convention: str, r: Reading, relative: Relative | None
 ) -> TrajectorySource:
-    """Origin of estimates whose truth is positions alone, with what is judged of them.
+    """Origin of estimates whose truth is positions alone, with what is judged of them; ``convention`` "" of fixes.
 
     Raises
     ------
@@ -36,6 +39,8 @@ def position_source(
         raise InputError(
             f"--axes {','.join(r.axes or ())}: '{rotations[0]}' has no truth; {truth} holds positions alone"
         )
+    if not convention:
+        return source
     at = "the origin of the body; --lever-arm x,y,z names another point"
     if r.lever_arm is not None:
         at = f"the point ({', '.join(f'{each:g}' for each in r.lever_arm)}) m of the body"
@@ -75,6 +80,24 @@ def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:
     return replace(
         poses, estimate=point, covariance=0.5 * (P + np.swapaxes(P, 1, 2)), truth=poses.truth[:, :3],
         manifold="vector", convention="vector", cross=None,
+    )  # fmt: skip
+
+
+def fixed(own: Fixes, true: Lines, r: Reading) -> Poses:
+    """Estimated positions without orientations beside the true ones, in one plane.
+
+    Raises
+    ------
+    InputError
+        An option needs orientations, or the covariance from elsewhere.
+    """
+    names = ("covariance", "covariance_order", "error", "lever_arm")
+    if given := r.given(names):
+        raise InputError(f"{flag_of(given[0])}: does not go with {own.path}, of positions with their own covariances")
+    P = symmetric(own.values[:, 4:].reshape(-1, 3, 3), own.place)
+    return Poses(
+        Places(own.place, np.arange(len(own.t))), own.t, own.values[:, 1:4], P, np.ones(len(own.t), bool),
+        true.t, true.values[:, 1:4], "vector", "vector", r.tolerance,
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from consistency.referee.types import Array
 AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
 WHOLE = {"": range(6)}  # what is one recording, by what its name ends in
 ALONE = dict(WHOLE)  # one recording, each of whose components is judged by itself; told from WHOLE by identity
+POINTS = {"": range(3)}  # positions without orientations
 BLOCKS = {" position": range(3), " rotation": range(3, 6)}  # their cross-covariance is not known
 SINGLE = {f" {axis}": range(i, i + 1) for i, axis in enumerate(AXES)}  # no covariance is
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see

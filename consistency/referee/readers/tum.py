@@ -12,17 +12,19 @@ from consistency.referee.diagnostics.parts import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.fixes import Fixes, is_solution, localised
 from consistency.referee.readers.kitti import is_drive, read_drive
 from consistency.referee.readers.layouts import DEVIATED, FULL, POINT, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.openvins import LAYOUT, States, read_deviations
 from consistency.referee.readers.poses import Poses
-from consistency.referee.readers.positions import position_source, positions
+from consistency.referee.readers.positions import fixed, position_source, positions
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Lines, Places, read_numbers
 from consistency.referee.readers.spatial import (
     ALONE,
     BLOCKS,
+    POINTS,
     SINGLE,
     WHOLE,
     TrajectorySource,
@@ -63,7 +65,8 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     for path, true_path, P_path in runs:
         own = read_trajectory(path)
         true = read_drive(true_path, r.body) if is_drive(true_path) else read_trajectory(true_path, true=True)
-        notes += [lines.note for lines in (own, true) if lines.note]
+        own, true, world = localised(own, true)
+        notes += [note for note in (own.note, true.note, world) if note]
         if not poses:
             parts = _parts(own)
             error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
@@ -71,21 +74,31 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
             raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
         if _parts(own) is not parts:
             raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
+        if isinstance(own, Fixes):
+            poses.append(fixed(own, true, r))
+            continue
         poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r.tolerance))
-        if true.values.shape[1] == POINT:
+        if _is_point(true):
             poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
     why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
     files = [(path, true) for path, true, _ in runs]
     source = TrajectorySource(estimates, files, r.covariance or estimates, why, tuple(dict.fromkeys(notes)))
     if any(one.manifold == "vector" for one in poses):
-        source = position_source(source, poses, error_kind, r, relative)
+        source = position_source(source, poses, "" if parts is POINTS else error_kind, r, relative)
     elif r.lever_arm is not None:
         raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
     return recordings_of(source, poses, parts, r, relative)
 
 
+def _is_point(lines: Lines) -> bool:
+    """Whether they hold positions without orientations."""
+    return lines.values.shape[1] == POINT or isinstance(lines, Fixes)
+
+
 def _parts(own: Lines) -> Mapping[str, range]:
     """Components whose covariance is known, by the layout of a file."""
+    if isinstance(own, Fixes):
+        return POINTS
     if isinstance(own, States):
         return SINGLE
     return {SPLIT: BLOCKS, DEVIATED: ALONE}.get(own.values.shape[1], WHOLE)
@@ -123,7 +136,7 @@ def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[P
 def trajectory_files(folder: Path) -> list[Path]:
     """Files of a folder that may be trajectories, by name."""
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    return [p for p in files if p.suffix.lower() in SUFFIXES] or [p for p in files if is_spatial(p)]
+    return [p for p in files if p.suffix.lower() in SUFFIXES] or [p for p in files if is_spatial(p) or is_solution(p)]
 
 
 def _same_stem(folder: Path, path: Path, option: str) -> Path:
@@ -200,7 +213,7 @@ def read_trajectory(path: Path, true: bool = False) -> Lines:
     if true and not np.isfinite(pose).all():
         row = int(np.flatnonzero(~np.isfinite(pose).all(axis=1))[0])
         raise InputError(f"{lines.place(row)}: the truth is not finite; leave such lines out")
-    if lines.values.shape[1] == POINT:
+    if _is_point(lines):
         return lines
     length = np.linalg.norm(pose[:, 3:], axis=1)
     bad = np.flatnonzero(np.isfinite(pose).all(axis=1) & (np.abs(length - 1.0) > UNIT))

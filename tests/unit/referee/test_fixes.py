@@ -1,0 +1,211 @@
+"""Solutions of RTKLIB as truth and as estimates, written as its manual describes them."""
+
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_layouts import STEPS, drive, lines, tum
+
+import consistency as cs
+from consistency.referee.cli import main
+from consistency.referee.readers.fixes import axes_at, centred, leap_seconds, read_solution
+from consistency.referee.types import Array
+
+START = dt.datetime(2024, 3, 5, 10, 0, 0)  # of GPS, 18 s ahead of UTC
+EPOCH = 1709632800.0 - 18.0
+PLACE = np.array([47.3977, 8.5456, 488.2])
+HEADER = """% program   : RTKPOST ver.2.4.3
+% pos mode  : kinematic
+%
+% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)
+%  {clock}                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio
+"""  # noqa: E501
+LOCAL = """%  GPST              e-baseline(m)  n-baseline(m)  u-baseline(m)   Q  ns   sde(m)   sdn(m)   sdu(m)  sden(m)  sdnu(m)  sdue(m) age(s)  ratio
+"""  # noqa: E501
+
+
+def signed_root(value: float) -> float:
+    return float(np.sign(value) * np.sqrt(abs(value)))
+
+
+def stamps(clock: str = "GPST", weeks: bool = False) -> list[str]:
+    ahead = {"GPST": 0.0, "UTC": -18.0, "JST": 9 * 3600 - 18.0}[clock]
+    times = [START + dt.timedelta(seconds=ahead + 0.25 * k) for k in range(STEPS)]
+    if not weeks:
+        return [f"{t:%Y/%m/%d %H:%M:%S}.{t.microsecond // 1000:03d}" for t in times]
+    since = [(t - dt.datetime(1980, 1, 6)).total_seconds() for t in times]
+    return [f"{int(s // 604800)} {s % 604800:.3f}" for s in since]
+
+
+def solution(path: str, place: Array, P: Array, clock: str = "GPST", weeks: bool = False) -> str:
+    """Geodetic places (N, 3) with covariances (N, 3, 3) of east, north, up."""
+    rows = []
+    for when, (latitude, longitude, height), C in zip(stamps(clock, weeks), place, P, strict=True):
+        stated = [C[1, 1], C[0, 0], C[2, 2], C[0, 1], C[0, 2], C[1, 2]]
+        roots = " ".join(repr(signed_root(value)) for value in stated)
+        rows.append(f"{when} {float(latitude)!r} {float(longitude)!r} {float(height)!r}   1  9 {roots} 0.00 12.3")
+    Path(path).write_text(HEADER.format(clock=clock) + "\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+def flight() -> tuple[Array, Array]:
+    """Places (N, 3) some hundred metres apart, and covariances (N, 3, 3) with cross terms of both signs."""
+    rng = np.random.default_rng()
+    place = PLACE + np.column_stack([rng.normal(size=(STEPS, 2)) * 1e-3, 20 * rng.normal(size=STEPS)])
+    root = 0.05 * rng.normal(size=(STEPS, 3, 3))
+    return place, root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(3)
+
+
+def plane(place: Array, origin: Array) -> Array:
+    """East, north, up (N, 3) from an origin, by closed formulas of WGS 84 written out again."""
+    a, b = 6378137.0, 6356752.314245179
+    out = []
+    for latitude, longitude, h in np.vstack([origin, place]):
+        p, q = np.radians([latitude, longitude])
+        n = a * a / np.sqrt((a * np.cos(p)) ** 2 + (b * np.sin(p)) ** 2)
+        out.append(
+            [(n + h) * np.cos(p) * np.cos(q), (n + h) * np.cos(p) * np.sin(q), (n * b * b / a / a + h) * np.sin(p)]
+        )
+    d = np.array(out[1:]) - out[0]
+    p, q = np.radians(origin[:2])
+    east = np.array([-np.sin(q), np.cos(q), 0.0])
+    up = np.array([np.cos(p) * np.cos(q), np.cos(p) * np.sin(q), np.sin(p)])
+    return np.column_stack([d @ east, d @ np.cross(up, east), d @ up])
+
+
+def test_the_ellipsoid() -> None:
+    """At the equator, at a pole, and orthonormal axes; a closed path in the plane is closed."""
+    np.testing.assert_allclose(centred(np.array([0.0, 90.0, 10.0])), [0.0, 6378147.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(centred(np.array([90.0, 12.0, 10.0]))[2], 6356752.314245 + 10.0, atol=1e-5)
+    turn = axes_at(PLACE)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(np.cross(turn[0], turn[1]), turn[2], atol=1e-15)
+
+
+@pytest.mark.parametrize(("clock", "weeks"), [("GPST", False), ("GPST", True), ("UTC", False), ("JST", False)])
+def test_times_are_utc(clock: str, weeks: bool, tmp_path: Path) -> None:
+    place, P = flight()
+    read = read_solution(Path(solution(str(tmp_path / "rover.pos"), place, P, clock, weeks)))
+    np.testing.assert_allclose(read.t, EPOCH + 0.25 * np.arange(STEPS), atol=1e-6)
+    np.testing.assert_array_equal(read.values[:, 1:4], place)
+    np.testing.assert_allclose(read.values[:, 4:].reshape(-1, 3, 3), P, rtol=1e-12)
+    assert "18 leap seconds less" in read.note if clock == "GPST" else f"times of {clock} as UTC" in read.note
+    assert read.note.endswith(f"{STEPS} fixed")
+
+
+def test_leap_seconds() -> None:
+    """IERS: 0 in 1980, 13 in 2000, 17 up to the end of 2016, 18 since."""
+    at = [dt.datetime(1980, 6, 1), dt.datetime(2000, 1, 1), dt.datetime(2016, 12, 31), dt.datetime(2017, 1, 2)]
+    assert [leap_seconds((day - dt.datetime(1970, 1, 1)).total_seconds()) for day in at] == [0, 13, 17, 18]
+    new_year = (dt.datetime(2017, 1, 1) - dt.datetime(1970, 1, 1)).total_seconds()
+    assert [leap_seconds(new_year + s) for s in (17.5, 18.0)] == [17, 18]
+
+
+def test_a_solution_against_a_solution(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both in the plane of the first true place; a covariance is turned from its own place into it."""
+    monkeypatch.chdir(tmp_path)
+    place, P = flight()
+    off = place + np.random.default_rng().normal(size=place.shape) * [5e-7, 5e-7, 0.05]
+    estimates, truth = solution("rover.pos", off, P), solution("base.pos", place, 1e-6 * P)
+    record = cs.read(estimates, truth=truth)
+    e = plane(place, place[0]) - plane(off, place[0])
+    nees = []
+    for each, C, at in zip(e, P, off, strict=True):
+        turn = axes_at(place[0]) @ axes_at(at).T
+        nees.append(each @ np.linalg.solve(turn @ C @ turn.T, each))
+    np.testing.assert_allclose(record.nees[0], nees, rtol=1e-6)  # places of 6e6 m hold errors of 0.05 m to 1e-8
+    with pytest.raises(SystemExit) as end:
+        main(["analyse", estimates, "--truth", truth])
+    assert not end.value.code
+    err = capsys.readouterr().err
+    assert (
+        "rover.pos: read as a solution of RTKLIB, 15 columns, times of GPS as UTC, 18 leap seconds less; 12 fixed"
+        in err
+    )
+    assert "base.pos: x is east, y north, z up from its first place" in err
+
+
+def test_a_solution_as_the_truth_of_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The position of the estimate in the same plane; where it is in another world a note names the remedy."""
+    monkeypatch.chdir(tmp_path)
+    place, P = flight()
+    d = drive(start=EPOCH)
+    d.own[:, :3] = plane(place, place[0]) - (d.true - d.own)[:, :3]
+    record = cs.read(tum(d), truth=solution("rtk.pos", place, P))
+    e, C = plane(place, place[0]) - d.own[:, :3], d.P[:, :3, :3]
+    np.testing.assert_allclose(
+        record.nees[0], [each @ np.linalg.solve(M, each) for each, M in zip(e, C, strict=True)], rtol=1e-6
+    )
+    assert any("add --align posyaw-all where est.tum is in another world" in note for note in record.notes)
+
+
+def test_a_baseline_is_local_already(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng()
+    _, P = flight()
+    true = 30 * rng.normal(size=(STEPS, 3))
+    own = true + 0.05 * rng.normal(size=(STEPS, 3))
+    rows = []
+    for when, point, C in zip(stamps(), own, P, strict=True):
+        stated = [C[0, 0], C[1, 1], C[2, 2], C[0, 1], C[1, 2], C[2, 0]]
+        rows.append(
+            " ".join(
+                [when, *(repr(float(v)) for v in point), "2", "7", *(repr(signed_root(v)) for v in stated), "0", "0"]
+            )
+        )
+    Path("enu.pos").write_text(LOCAL + "\n".join(rows))
+    truth = lines("truth.txt", "", [EPOCH + 0.25 * np.arange(STEPS), *true.T], " ")
+    record = cs.read("enu.pos", truth=truth)
+    e = true - own
+    np.testing.assert_allclose(
+        record.nees[0], [x @ np.linalg.solve(C, x) for x, C in zip(e, P, strict=True)], rtol=1e-9
+    )
+    assert any(note.endswith("12 float") for note in record.notes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("latitude(deg)", "latitude(d'\")", r"rover\.pos: holds no latitude\(deg\).*out-degform =deg"),
+        ("sdeu(m)", "other(m)", r"rover\.pos: column 'sdeu\(m\)' is missing"),
+        ("GPST", "LOCAL", r"rover\.pos, line 6: stands under no header"),
+        ("2024/03/05 10:00:00.250", "2024/13/05 10:00:00.250", r"rover\.pos, line 7: .* is no date and time"),
+        ("2024/03/05 10:00:00.250", "2024/03/05 10:00:00.000", r"rover\.pos, line 7: timestamp .* is there twice"),
+        (" 12.3\n", " 12.3 1\n", r"rover\.pos, line 6: has 16 fields; its header names a time of two and 13 more"),
+        ("   1  9 ", "   x  9 ", r"rover\.pos, line 6: a field is not a number"),
+    ],
+)
+def test_what_is_broken_is_one_line(
+    old: str, new: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    place, P = flight()
+    solution("truth.pos", place, P)
+    text = Path(solution("rover.pos", place, P)).read_text()
+    assert old in text
+    Path("rover.pos").write_text(text.replace(old, new))
+    with pytest.raises(cs.InputError, match=said):
+        cs.read("rover.pos", truth="truth.pos")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"lever_arm": [0.0, 0.0, 1.0]}, r"--lever-arm: does not go with rover\.pos, of positions with their own"),
+        ({"error": "left"}, r"--error: does not go with rover\.pos"),
+        ({"relative": 2, "motions": True}, r"--relative: needs a truth with orientations"),
+    ],
+)
+def test_options_of_orientations_are_refused(
+    options: dict[str, object], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    place, P = flight()
+    solution("truth.pos", place, P)
+    with pytest.raises(cs.InputError, match=said):
+        cs.read(solution("rover.pos", place, P), truth="truth.pos", **options)  # type: ignore[arg-type]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.errors import InputError
+from consistency.referee.parsing import is_file
 from consistency.referee.readers.text import opened
 from consistency.referee.types import Array
 
@@ -91,6 +92,8 @@ def begins_with_numbers(path: Path) -> bool:
 
 def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
     """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
+    if not is_file(path):  # a pipe would be waited for
+        return [], None
     try:
         with opened(path) as file:
             text = file.read(PEEKED).decode("utf-8-sig", "ignore")

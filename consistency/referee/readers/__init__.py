@@ -102,7 +102,7 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evi
             raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
         return _with_frame(read_tables(estimates, r, over), r)
     if suffix not in (*SUFFIXES, ".csv", ".pos") and not estimates.is_dir():
-        known = ", ".join((*TABLES, ".npz", ".bag", ".pos", *SUFFIXES))
+        known = ", ".join((*TABLES, ".npz", ".bag", ".mcap", ".db3", ".pos", *SUFFIXES))
         raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
     _refuse(estimates, r, "state")
     return _with_frame(read_tum(estimates, r, over), r)

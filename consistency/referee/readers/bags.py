@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,41 +17,50 @@ from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing import reading
 from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.fixes import Fixes, localised
+from consistency.referee.readers.layouts import POSE
 from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.positions import fixed, position_source, positions
 from consistency.referee.readers.record import symmetric
-from consistency.referee.readers.sheet import Places
-from consistency.referee.readers.spatial import WHOLE, TrajectorySource, recordings_of, require_axes
+from consistency.referee.readers.sheet import Lines, Places
+from consistency.referee.readers.spatial import (
+    ALONE,
+    AXES,
+    POINTS,
+    WHOLE,
+    TrajectorySource,
+    recordings_of,
+    require_axes,
+)
 from consistency.referee.readers.tum import UNIT
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance
-POSES = (*STATED, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped")
+FIX = "sensor_msgs/msg/NavSatFix"
+ESTIMATES = (*STATED, FIX)
+POSES = (*ESTIMATES, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped")
 TREE = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 SECOND = 1e-9  # s in a nanosecond
-
-
-class TopicPoses(NamedTuple):
-    """Poses of one topic in order of their stamps, N of them."""
-
-    t: Array  # (N,), s
-    pose: Array  # (N, 7): x, y, z and the quaternion x, y, z, w
-    covariance: Array  # (N, 6, 6), NaN where the message has none
+FILES = (".bag", ".mcap", ".db3")
+PART = re.compile(r"(.+)_\d+")  # names of the files of one recording of ROS 2
+UNKNOWN, DIAGONAL = 0, 2  # types of covariance in sensor_msgs/NavSatFix
+ENDLESS = 1e9  # a variance from which on it is not stated
 
 
 def is_bag(path: Path) -> bool:
-    """A file of ROS 1, a folder of ROS 2, or a folder that holds such."""
+    """A file of ROS 1 or 2, a folder of ROS 2, or a folder that holds such."""
     return _is_one(path) or (path.is_dir() and any(_is_one(part) for part in path.iterdir()))
 
 
 def _is_one(path: Path) -> bool:
-    return (path.suffix == ".bag" and path.is_file()) or (path.is_dir() and (path / "metadata.yaml").is_file())
+    return (path.suffix in FILES and path.is_file()) or (path.is_dir() and (path / "metadata.yaml").is_file())
 
 
 def read_bags(path: Path, r: Reading) -> list[Evidence]:
     """Evidence of one estimator: a bag, or a folder with a bag for each run.
 
-    The topic of the estimates is of PoseWithCovarianceStamped or Odometry, and need not be named where there is one;
-    that of the truth is of poses, or PARENT:CHILD, two frames of /tf that follow each other.
+    The topic of the estimates is of PoseWithCovarianceStamped, Odometry or NavSatFix, and need not be named where there
+    is one; that of the truth is of poses or NavSatFix, or PARENT:CHILD, two frames of /tf that follow each other.
 
     Raises
     ------
@@ -60,28 +71,104 @@ def read_bags(path: Path, r: Reading) -> list[Evidence]:
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     require_axes(r.axes)
     bags = [path] if _is_one(path) else sorted(part for part in path.iterdir() if _is_one(part))
-    poses = [_poses(bag, r.topic, r.truth_topic, r.error or "so3", r.tolerance) for bag in bags]
+    if twice := _parts_of_one(bags):
+        raise InputError(
+            f"{path}: {twice} and others are parts of one recording; make its metadata by 'ros2 bag reindex'"
+        )
+    found = [_bagged(bag, r) for bag in bags]
+    poses, parts = [one.poses for one in found], found[0].parts
+    if any(one.parts is not parts for one in found):
+        raise InputError(f"{path}: the covariances of some bags have cross terms, of others none; judge them apart")
     why = "" if r.error else "; as the ROS messages define it; declare yours with --error"
-    source = TrajectorySource(path, [(bag, f"{r.truth_topic} of {bag}") for bag in bags], path, why)
-    return recordings_of(source, poses, WHOLE, r)
+    files = [(bag, f"{r.truth_topic} of {bag}") for bag in bags]
+    notes = tuple(dict.fromkeys(note for one in found for note in one.notes))
+    source = TrajectorySource(path, files, path, why, notes)
+    if any(one.manifold == "vector" for one in poses):
+        source = position_source(source, poses, found[0].convention, r, None)
+    stated, said = _stated(path, poses)
+    if r.axes is None and said:
+        r, source = replace(r, axes=stated), replace(source, notes=(*source.notes, said))
+    return recordings_of(source, poses, parts, r)
 
 
-def _poses(bag: Path, topic: str | None, truth: str | None, convention: str, max_dt: float) -> Poses:
+class Bagged(NamedTuple):
+    """A bag before errors are taken."""
+
+    poses: Poses
+    parts: Mapping[str, range]
+    convention: str  # of the error whose covariance is stated; "" of positions
+    notes: list[str]
+
+
+def _bagged(bag: Path, r: Reading) -> Bagged:
     with _opened(bag) as reader:
-        topic = _chosen(bag, reader, topic)
+        topic, truth = _chosen(bag, reader, r.topic), r.truth_topic
         if truth is None:
             others = [name for name in _topics(reader, POSES) if name != topic]
             raise InputError(
                 f"{bag}: needs --truth-topic, of poses or PARENT:CHILD of /tf; there are: {_listed(others, reader)}"
             )
-        own = _track(bag, topic, _messages(reader, topic))
-        true = _track(bag, truth, _transforms(bag, reader, truth) if ":" in truth else _truth(bag, reader, truth))
-    place = Places(lambda row: f"{bag}, message {row + 1} of {topic}", np.arange(len(own.t)))
-    if not np.isfinite(true.pose).all():
+        own = _lines(bag, reader, topic)
+        true = _lines(bag, reader, truth)
+        notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
+    own, true, world = localised(own, true)
+    notes = [note for note in (own.note, true.note, world, *notes) if note]
+    if not np.isfinite(true.values[:, 1 : 4 if isinstance(true, Fixes) else POSE]).all():
         raise InputError(f"{bag}: the truth on {truth} is not finite")
-    P = symmetric(own.covariance, place.__getitem__)
+    if isinstance(own, Fixes):
+        return Bagged(fixed(own, true, r), ALONE if own.alone else POINTS, "", notes)
+    place = Places(own.place, np.arange(len(own.t)))
+    P = symmetric(own.values[:, POSE:].reshape(-1, 6, 6), place.__getitem__)
+    kind, pose = r.error or "so3", slice(1, POSE)
     stated = np.ones(len(own.t), bool)
-    return Poses(place, own.t, own.pose, P, stated, true.t, true.pose, "spatial", convention, max_dt)
+    poses = Poses(
+        place, own.t, own.values[:, pose], P, stated, true.t, true.values[:, pose], "spatial", kind, r.tolerance
+    )
+    if isinstance(true, Fixes):
+        poses = positions(poses, r.lever_arm or (0.0, 0.0, 0.0), blocks=False)
+    return Bagged(poses, WHOLE, kind, notes)
+
+
+def _parts_of_one(bags: Sequence[Path]) -> str:
+    """Name of a file of ROS 2 that has another part beside it, as drive_0.db3 and drive_1.db3; "" without any."""
+    stems = [match[1] for bag in bags if bag.is_file() and (match := PART.fullmatch(bag.stem)) and bag.suffix != ".bag"]
+    return next((bag.name for bag in bags if (match := PART.fullmatch(bag.stem)) and stems.count(match[1]) > 1), "")
+
+
+def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[str], str]:
+    """Components whose variance is stated in some step, and a note on the others, "" without any.
+
+    What a node does not know it writes as 0 in every step, as -1 in the first variance of a block, or as a huge number.
+
+    Raises
+    ------
+    InputError
+        None is stated.
+    """
+    variances = np.concatenate([np.diagonal(one.covariance, axis1=1, axis2=2) for one in poses])
+    n = variances.shape[1]
+    none = (variances == 0).all(axis=0) | (variances >= ENDLESS).all(axis=0) | np.isnan(variances).all(axis=0)
+    for first in range(0, n, 3):
+        none[first : first + 3] |= bool((variances[:, first] == -1).all())
+    left = [axis for axis, missing in zip(AXES, none, strict=False) if not missing]
+    if not left:
+        raise InputError(f"{path}: states no covariance: its variances are 0, -1 or {ENDLESS:g} in every message")
+    missing = ",".join(axis for axis in AXES[:n] if axis not in left)
+    what = f"{path}: the variances of {missing} are 0, -1 or {ENDLESS:g} in every message, so not stated and not judged"
+    return left, what if missing else ""
+
+
+def _other_frames(bag: Path, *of: tuple[str, tuple[str, str]]) -> list[str]:
+    """A note on frames of estimates and truth by other names, which may be the same."""
+    (topic, own), (truth, true) = of
+    notes = []
+    for which, a, b in zip(("world", "body"), own, true, strict=True):
+        if a and b and a != b:
+            notes.append(
+                f"{bag}: the {which} is '{a}' on {topic}, but '{b}' on {truth}; "
+                + ("add --align where they are not the same" if which == "world" else "the poses must be of one body")
+            )
+    return notes
 
 
 # --- messages ---------------------------------------------------------------------------------------
@@ -115,27 +202,38 @@ def _listed(topics: Sequence[str], reader: Any) -> str:
 
 def _chosen(bag: Path, reader: Any, topic: str | None) -> str:
     """The topic of the estimates."""
-    there = _topics(reader, STATED)
+    there = _topics(reader, STATED) or _topics(reader, (FIX,))
     if topic is None and len(there) == 1:
         return there[0]
-    if topic not in there:
+    if topic not in (there := _topics(reader, ESTIMATES)):
         asked = "needs --topic" if topic is None else f"--topic {topic}: is not there with poses and covariances"
         raise InputError(f"{bag}: {asked}; there are: {', '.join(there) or 'none that would do'}")
     return str(topic)
 
 
-def _truth(bag: Path, reader: Any, topic: str) -> Iterator[tuple[Any, Any]]:
-    if topic not in (there := _topics(reader, POSES)):
-        raise InputError(f"{bag}: --truth-topic {topic}: is not there with poses; there are: {_listed(there, reader)}")
-    return _messages(reader, topic)
+def _raw(reader: Any, topic: str) -> Iterator[Any]:
+    """Messages of a topic."""
+    connections = [connection for connection in reader.connections if connection.topic == topic]
+    for connection, _, raw in reader.messages(connections=connections):
+        yield reader.deserialize(raw, connection.msgtype)
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[Any, Any]]:
     """Header and content of the messages of a topic."""
-    connections = [connection for connection in reader.connections if connection.topic == topic]
-    for connection, _, raw in reader.messages(connections=connections):
-        message = reader.deserialize(raw, connection.msgtype)
+    for message in _raw(reader, topic):
         yield message.header, getattr(message, "pose", None) or message.transform
+
+
+def _frames(reader: Any, topic: str) -> tuple[str, str]:
+    """World and body by the first message of a topic, or of PARENT:CHILD; "" where it does not name one."""
+    if ":" in topic:
+        parent, child = topic.split(":", 1)
+        return parent.strip().lstrip("/"), child.strip().lstrip("/")
+    first = next(_raw(reader, topic), None)
+    if first is None:
+        return "", ""
+    frame, child = first.header.frame_id.lstrip("/"), getattr(first, "child_frame_id", "").lstrip("/")
+    return ("", frame) if hasattr(first, "latitude") else (frame, child)
 
 
 def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]]:
@@ -154,7 +252,36 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Iterator[tuple[Any, Any]
         raise InputError(f"{bag}: --truth-topic {frames}: is no transform of /tf; there are: {has}")
 
 
-def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> TopicPoses:
+def _lines(bag: Path, reader: Any, topic: str) -> Lines:
+    """Poses of a topic with their covariances, or positions by satellite, in order of their stamps."""
+    if ":" in topic:
+        return _track(bag, topic, _transforms(bag, reader, topic))
+    if topic not in (there := _topics(reader, POSES)):
+        raise InputError(f"{bag}: --truth-topic {topic}: is not there with poses; there are: {_listed(there, reader)}")
+    if topic in _topics(reader, (FIX,)):
+        return _fixes(bag, topic, list(_raw(reader, topic)))
+    return _track(bag, topic, _messages(reader, topic))
+
+
+def _fixes(bag: Path, topic: str, messages: Sequence[Any]) -> Fixes:
+    """Positions of NavSatFix messages, without those that have no fix; of equal stamps the first."""
+    kept = [each for each in messages if each.status.status >= 0]
+    if not kept:
+        raise InputError(f"{bag}: {topic} holds no message with a fix")
+    rows = [[_stamp(each.header), each.latitude, each.longitude, each.altitude] for each in kept]
+    kinds = {int(each.position_covariance_type) for each in kept}
+    P = np.array([np.asarray(each.position_covariance, float) for each in kept])
+    P[[each.position_covariance_type == UNKNOWN for each in kept]] = np.nan
+    if kinds <= {DIAGONAL}:
+        P *= np.eye(3).ravel()
+    values = np.column_stack([np.array(rows, float), P])
+    _, first = np.unique(values[:, 0], return_index=True)
+    note = f"{bag}: {topic} read as positions by satellite, {len(kept)} of {len(messages)} messages with a fix"
+    note += ", deviations alone" * (kinds <= {DIAGONAL})
+    return Fixes(bag, values[first], first + 1, note, f"message of {topic}", alone=kinds <= {DIAGONAL})
+
+
+def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Lines:
     """Poses in order of their stamps; of several with the same stamp only the first."""
     rows = [_row(header, content) for header, content in messages]
     if not rows:
@@ -168,7 +295,7 @@ def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> TopicP
         raise InputError(
             f"{bag}, {topic}: the quaternion at {t[first][bad[0]]:.10g} s has length {length[bad[0]]:.4g}, not 1"
         )
-    return TopicPoses(t[first], pose, covariance[first].reshape(-1, 6, 6))
+    return Lines(bag, np.column_stack([t[first], pose, covariance[first]]), first + 1, unit=f"message of {topic}")
 
 
 def _row(header: Any, content: Any) -> tuple[float, list[float], Array]:
@@ -177,6 +304,10 @@ def _row(header: Any, content: Any) -> tuple[float, list[float], Array]:
     pose = content if covariance is None else content.pose
     position = getattr(pose, "position", None) or pose.translation
     turn = getattr(pose, "orientation", None) or pose.rotation
-    t = header.stamp.sec + SECOND * header.stamp.nanosec
     values = [position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w]
-    return t, values, np.full(36, np.nan) if covariance is None else np.asarray(covariance, float)
+    return _stamp(header), values, np.full(36, np.nan) if covariance is None else np.asarray(covariance, float)
+
+
+def _stamp(header: Any) -> float:
+    """Time of a message, s."""
+    return float(header.stamp.sec + SECOND * header.stamp.nanosec)

@@ -45,6 +45,7 @@ class Fixes(Lines):
     """
 
     geodetic: bool = True
+    alone: bool = False  # deviations are stated without cross terms
 
     @property
     def origin(self) -> Array:
@@ -153,7 +154,8 @@ def read_solution(path: Path) -> Fixes:
     note = (
         f"{path}: read as a solution of RTKLIB, {len(names) + 2} columns, {_clock_note(clock, t)}; {shares or 'no Q'}"
     )
-    lines = Fixes(path, np.column_stack([t, place, P.reshape(-1, 9)]), np.array(numbers), note, kind is GEODETIC)
+    values = np.column_stack([t, place, P.reshape(-1, 9)])
+    lines = Fixes(path, values, np.array(numbers), note, geodetic=kind is GEODETIC)
     increasing(lines)
     return lines
 

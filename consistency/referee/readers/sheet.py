@@ -112,6 +112,7 @@ class Lines:
     values: Array  # (N, columns), the first of which is t
     line: Indices  # (N,)
     note: str = ""  # what they were read as
+    unit: str = "line"  # line | message
 
     @property
     def t(self) -> Array:
@@ -119,7 +120,7 @@ class Lines:
         return self.values[:, 0]
 
     def place(self, row: int) -> str:
-        return f"{self.path}, line {self.line[row]}"
+        return f"{self.path}, {self.unit} {self.line[row]}"
 
     def of(self, columns: slice) -> Lines:
         """Some of the columns, without holding the others in memory."""

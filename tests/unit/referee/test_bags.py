@@ -192,3 +192,103 @@ def test_damaged_bags_are_refused(tmp_path: Path) -> None:
     (tmp_path / "e.csv").write_text("step,x\n1,2\n")
     with pytest.raises(cs.InputError, match="--topic: does not go with"):
         read_recordings(tmp_path / "e.csv", topic="/pose")
+
+
+# --- files of ROS 2 by themselves, positions by satellite, and what is not stated ------------------------
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_file_of_ros_2_without_its_metadata(tmp_path: Path, storage: str) -> None:
+    from rosbags.rosbag2 import StoragePlugin
+
+    store, drive = get_typestore(Stores.ROS2_HUMBLE), Drive()
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Writer2(tmp_path / "drive", version=9, storage_plugin=plugin) as writer:
+        connections: dict[str, Any] = {}
+        for topic, name, at, message in messages(store, "pose", drive, False):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            writer.write(connections[topic], at, store.serialize_cdr(message, name))
+    suffix = ".mcap" if storage == "mcap" else ".db3"
+    [file] = (tmp_path / "drive").glob(f"*{suffix}")
+    alone = file.rename(tmp_path / f"flight{suffix}")
+    [r] = read_recordings(alone, truth_topic="/vicon")
+    np.testing.assert_allclose(r.error[0], drive.error, atol=1e-6)  # type: ignore[index]
+    (tmp_path / "parts").mkdir()
+    for k in range(2):
+        (tmp_path / "parts" / f"flight_{k}{suffix}").write_bytes(alone.read_bytes())
+    with pytest.raises(cs.InputError, match=rf"flight_0{suffix} and others are parts of one recording; .*reindex"):
+        read_recordings(tmp_path / "parts", truth_topic="/vicon")
+
+
+def write_fixes(path: Path, kind: int, own: Array, true: Array, C: Array, body: str = "gps", status: int = 0) -> Path:
+    """Fixes on /fix with covariances C (N, 3, 3), true ones on /rtk, at 10 Hz; the second of /fix has ``status``."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    T = store.types
+    with Writer1(path) as writer:
+        for topic, places, number in (("/fix", own, kind), ("/rtk", true, 3)):
+            connection = writer.add_connection(topic, "sensor_msgs/msg/NavSatFix", typestore=store)
+            for k, (place, stated) in enumerate(zip(places, C, strict=True)):
+                ns = START * 10**9 + k * 10**8
+                stamp = T["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
+                header = T["std_msgs/msg/Header"](seq=k, stamp=stamp, frame_id=body if topic == "/fix" else "gps")
+                fix = T["sensor_msgs/msg/NavSatStatus"](status=status if k == 1 and topic == "/fix" else 2, service=1)
+                message = T["sensor_msgs/msg/NavSatFix"](header, fix, *map(float, place), stated.ravel(), number)
+                writer.write(connection, ns, store.serialize_ros1(message, "sensor_msgs/msg/NavSatFix"))
+    return path
+
+
+def test_fixes_against_fixes(tmp_path: Path) -> None:
+    """NEES in the plane of the first true place; without a fix a message does not count."""
+    from test_fixes import flight, plane
+
+    from consistency.referee.readers.fixes import axes_at
+
+    place, C = flight()
+    off = place + np.random.default_rng().normal(size=place.shape) * [5e-7, 5e-7, 0.05]
+    bag = write_fixes(tmp_path / "a.bag", 3, off, place, C, body="base", status=-1)
+    [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk")
+    kept = np.delete(np.arange(len(place)), 1)
+    e = (plane(place, place[0]) - plane(off, place[0]))[kept]
+    turns = axes_at(place[0]) @ np.swapaxes(axes_at(off[kept]), 1, 2)
+    stated = turns @ C[kept] @ np.swapaxes(turns, 1, 2)
+    nees = [each @ np.linalg.solve(M, each) for each, M in zip(e, stated, strict=True)]
+    np.testing.assert_allclose(r.nees[0], nees, rtol=1e-6)
+    assert any("/fix read as positions by satellite, 11 of 12 messages with a fix" in note for note in r.notes)
+    assert any(
+        "the body is 'base' on /fix, but 'gps' on /rtk; the poses must be of one body" in note for note in r.notes
+    )
+
+
+def test_the_type_of_a_covariance_counts(tmp_path: Path) -> None:
+    from test_fixes import flight
+
+    place, C = flight()
+    off = place + np.array([1e-7, 1e-7, 0.01])
+    [r] = read_recordings(write_fixes(tmp_path / "a.bag", 2, off, place, C), topic="/fix", truth_topic="/rtk")
+    assert r.parts == ((0,), (1,), (2,))
+    bag = write_fixes(tmp_path / "b.bag", 0, off, place, C)
+    with pytest.raises(cs.InputError, match=r"b\.bag: states no covariance: its variances are 0, -1"):
+        read_recordings(bag, topic="/fix", truth_topic="/rtk")
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 1e9])
+def test_blocks_that_are_not_stated_are_not_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: float
+) -> None:
+    rotations = P.copy()
+    rotations[3:, 3:] = value * np.eye(3)
+    monkeypatch.setitem(globals(), "P", rotations)
+    drive = Drive()
+    bag = write(tmp_path / "a.bag", 1, "pose", drive)
+    [r] = read_recordings(bag, truth_topic="/vicon")
+    assert r.axes == ("x", "y", "z")
+    np.testing.assert_allclose(r.nees[0], (drive.error[:, :3] ** 2 / SIGMA[:3] ** 2).sum(axis=1), rtol=1e-6)
+    said = "the variances of roll,pitch,yaw are 0, -1 or 1e+09 in every message, so not stated and not judged"
+    assert any(said in note for note in r.notes)
+
+
+def test_other_frames_are_named(tmp_path: Path) -> None:
+    [r] = read_recordings(write(tmp_path / "a.bag", 1, "odometry", Drive()), truth_topic="map:body")
+    assert any("the body is 'base' on /odom, but 'body' on map:body" in note for note in r.notes)
+    assert not any("the world is" in note for note in r.notes)

@@ -6,6 +6,7 @@ Filters, scenarios and results folders of this package do not belong here.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from consistency.referee.readers.layouts import is_spatial
 from consistency.referee.readers.plane import is_plane
 from consistency.referee.readers.relative import MARGINAL
 from consistency.referee.readers.table import read_tables
+from consistency.referee.readers.text import is_cut, without_end
 from consistency.referee.readers.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
 from consistency.referee.readers.windows import Relative, relative_of
 
@@ -75,7 +77,38 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evi
     InputError
         Something cannot be used: names file, line, column or option, and what is allowed.
     """
-    r = reading or Reading()
+    cut: dict[Path, str] = {}
+    refusal: InputError | None = None
+    while True:
+        try:
+            with without_end(frozenset(cut)):
+                found = _read(estimates, reading or Reading())
+            end = next((end for one in found for failure in one.failures if (end := _cut_by(failure.reason))), None)
+            if end is None or end[0] in cut:
+                return [replace(found[0], notes=(*cut.values(), *found[0].notes)), *found[1:]] if cut else found
+        except InputError as error:
+            refusal, end = refusal or error, _cut_at(str(error))
+            if end is None or end[0] in cut:
+                raise refusal from None
+        cut[end[0]] = f"{end[0]}: the last line, {end[1]}, has no end and is left out; it seems to be cut short"
+
+
+def _cut_at(message: str) -> tuple[Path, int] | None:
+    """The file and the line of a refusal, if it is a last line that has no end."""
+    found = re.match(r"(.+?), line (\d+): ", message)
+    return (Path(found[1]), int(found[2])) if found and is_cut(Path(found[1]), int(found[2])) else None
+
+
+def _cut_by(reason: str) -> tuple[Path, int] | None:
+    """The same of a failure, unless it was written as such: NaN stays a failure."""
+    found = re.search(r"\((.+), line (\d+)\)$", reason)
+    if not found or "not finite" in reason:
+        return None
+    return _cut_at(f"{found[1]}, line {found[2]}: ")
+
+
+def _read(estimates: Path, r: Reading) -> list[Evidence]:
+    """Recordings of files as they stand, with the options given."""
     over = relative_of(r.relative, bool(r.motions), r.windows)
     r = _checked(r, over)
     if not estimates.exists():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import BinaryIO, cast
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import reading, require_room
+from consistency.referee.parsing import is_file, reading, require_room
 from consistency.referee.types import Array, Indices
 
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much
@@ -21,6 +23,7 @@ BOM = b"\xef\xbb\xbf"
 SPECIAL = b'"#\x0b\x0c\x1c\x1d\x1e'  # quotes, comments, and what str.splitlines takes for the end of a line
 IS_SPACE = np.isin(np.arange(256), np.frombuffer(b" \t\r\n", np.uint8))
 NEWLINE = ord("\n")
+_CUT: ContextVar[frozenset[Path]] = ContextVar("cut", default=frozenset())  # read without a last line that has no end
 
 
 @dataclass(frozen=True)
@@ -114,8 +117,29 @@ def blocks(path: Path) -> Iterator[Block]:
                 yield block
                 first, pieces = first + block.count, [tail]
             pieces.append(_read(path, file))
-    if last := b"".join(pieces):
+    if (last := b"".join(pieces)) and path not in _CUT.get():
         yield Block(path, last, first)
+
+
+@contextmanager
+def without_end(paths: frozenset[Path]) -> Iterator[None]:
+    """Text files that are read without their last line, where no end of line follows it."""
+    token = _CUT.set(paths)
+    try:
+        yield
+    finally:
+        _CUT.reset(token)
+
+
+def is_cut(path: Path, number: int) -> bool:
+    """Whether a line, counted from 1, is the last one of a file and has no end."""
+    if not is_file(path):
+        return False
+    with reading(path, REFUSAL), opened(path) as file:
+        lines, last = 1, b"\n"
+        while piece := file.read(BLOCK):
+            lines, last = lines + piece.count(b"\n"), piece[-1:]
+    return last != b"\n" and lines == number
 
 
 def opened(path: Path) -> BinaryIO:

@@ -504,3 +504,68 @@ def test_what_cannot_be_read_is_one_line(
         main(["analyse", "est.tum", "--truth", truth])
     assert end.value.code == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+# --- a last line that is cut short -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fields", [2, 1])
+@pytest.mark.parametrize("file", ["est.tum", "truth.tum", "t.csv"])
+def test_a_last_line_that_is_cut_short_is_left_out(
+    file: str, fields: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A field less, or the last one cut to its first digit: a variance or a part of a quaternion that is 0."""
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
+    if file == "t.csv":
+        truth = lines(file, NAMES, [d.t, *d.true.T])
+    tum(d)
+    whole, mark = Path(file).read_text(encoding="utf-8"), "," if file == "t.csv" else " "
+    at = whole.rindex(mark)
+    Path(file).write_text(whole[: at + 2 if fields == 1 else at], encoding="utf-8")
+    record = cs.read("est.tum", truth=truth)
+    assert record.notes[0].startswith(f"{file}: the last line, ")
+    assert "has no end and is left out" in record.notes[0]
+    assert not record.failures
+    np.testing.assert_allclose(record.nees[0, : STEPS - 1], reference(d.own, d.true, d.P)[:-1], rtol=1e-9)
+    with pytest.raises(SystemExit) as end:
+        main(["analyse", "est.tum", "--truth", truth])
+    assert not end.value.code
+    assert "has no end and is left out" in capsys.readouterr().err
+
+
+def test_whole_files_without_a_final_newline_are_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    lines("truth.csv", NAMES, [d.t, *d.true.T], end="")
+    Path("est.tum").write_text(Path(tum(d)).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
+    record = cs.read("est.tum", truth="truth.csv")
+    assert record.nees.shape == (1, STEPS)
+    assert not any("has no end" in note for note in record.notes)
+
+
+def test_a_last_line_of_nan_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was written so; one that is not positive definite may be cut in its last number."""
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
+    own, P = d.own.copy(), d.P.copy()
+    own[-1] = np.nan
+    Path("est.tum").write_text(
+        Path(tum(d._replace(own=own))).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8"
+    )
+    assert [failure.step for failure in cs.read("est.tum", truth=truth).failures] == [STEPS]
+    P[-1, 5, 5] = 0.0
+    Path("est.tum").write_text(Path(tum(d._replace(P=P))).read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
+    assert not cs.read("est.tum", truth=truth).failures
+    tum(d._replace(P=P))
+    assert [failure.step for failure in cs.read("est.tum", truth=truth).failures] == [STEPS]
+
+
+def test_a_file_of_one_broken_line_is_refused_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    d = drive()
+    Path("t.tum").write_text("1.0 2.0", encoding="utf-8")
+    with pytest.raises(cs.InputError, match=r"t\.tum, line 1: has 2 columns"):
+        cs.read(tum(d), truth="t.tum")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from consistency.referee.diagnostics import Record, Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading
-from consistency.referee.readers import read_recordings
+from consistency.referee.readers import read_frames, read_recordings
 from consistency.referee.readers.archive import record_of_arrays
 from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import settings_of, skip_asked
@@ -21,8 +21,8 @@ Judgement = Verdict  # name of earlier versions
 
 
 def read(
-    estimates: str | Path,
-    truth: str | Path | None = None,
+    estimates: str | Path | Any,
+    truth: str | Path | Any | None = None,
     covariance: str | Path | None = None,
     error: str | None = None,
     *,
@@ -45,7 +45,8 @@ def read(
 
     Parameters
     ----------
-    estimates : .csv, .parquet, .npz, a TUM trajectory, or a folder of these with one for each run
+    estimates : .csv, .parquet, .npz, a TUM trajectory, or a folder of these with one for each run; or a table in
+        memory, as a DataFrame, with the columns of a .csv
     truth : of the same kind, or the folder of a KITTI drive; not with .npz
     covariance : of a TUM trajectory: t and 36 or 21 numbers
     error : error that the covariance describes: so2, vector, left, right, so3 or so3-body; None is the default
@@ -68,18 +69,21 @@ def read(
     InputError
         Something cannot be used: names file, line, column or option, and what is allowed.
     """
-    true, stated = (None if path is None else Path(path) for path in (truth, covariance))
+    in_memory = any(hasattr(table, "columns") for table in (estimates, truth))
+    true = None if truth is None or in_memory else Path(truth)
+    stated = None if covariance is None else Path(covariance)
     reading = Reading(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
         motions or None, windows, align, lever_arm,
     )  # fmt: skip
-    found = read_recordings(Path(estimates), reading)
+    found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
+    where = "estimates" if in_memory else estimates
     named = {recording.name: recording for recording in found}
     if filter is None and len(named) > 1:
-        raise InputError(f"{estimates}: holds several estimators ({', '.join(named)}); choose one with filter=")
+        raise InputError(f"{where}: holds several estimators ({', '.join(named)}); choose one with filter=")
     name = next(iter(named)) if filter is None else filter
     if name not in named:
-        raise InputError(f"filter '{name}' is not in {estimates}; there are: {', '.join(named)}")
+        raise InputError(f"filter '{name}' is not in {where}; there are: {', '.join(named)}")
     return named[name]
 
 

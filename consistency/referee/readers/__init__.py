@@ -9,6 +9,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.errors import InputError
@@ -22,6 +23,7 @@ from consistency.referee.readers.kitti import BODIES, is_drive
 from consistency.referee.readers.layouts import is_spatial
 from consistency.referee.readers.plane import is_plane
 from consistency.referee.readers.relative import MARGINAL
+from consistency.referee.readers.sheet import frame_rows
 from consistency.referee.readers.table import read_tables
 from consistency.referee.readers.text import is_cut, without_end
 from consistency.referee.readers.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
@@ -41,6 +43,7 @@ __all__ = [
 ]
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *SPATIAL)))
+OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
 TABLES = (".csv", ".parquet", ".pq")
 
 
@@ -63,6 +66,27 @@ def is_recording(path: Path, reading: Reading) -> bool:
     if not recording and path.exists() and given:
         raise InputError(f"{flag_of(given[0])}: does not go with {path}, a folder of 'consistency run'")
     return recording
+
+
+def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Evidence]:
+    """Tables in memory, with columns by name: one recording for each estimator.
+
+    Parameters
+    ----------
+    estimates : a DataFrame, or anything with ``columns`` that gives a column by its name
+    truth : of the same kind, or a path; None without truth
+
+    Raises
+    ------
+    InputError
+        As :func:`read_recordings`; the tables are called "estimates" and "truth".
+    """
+    over = relative_of(reading.relative, bool(reading.motions), reading.windows)
+    sheet = frame_rows(estimates, "estimates") if hasattr(estimates, "columns") else Path(estimates)
+    true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
+    r = _checked(replace(reading, truth=cast(Any, true)), over)
+    _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, "topic", "truth_topic")
+    return read_tables(sheet, r, over)
 
 
 def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
@@ -130,7 +154,7 @@ def _read(estimates: Path, r: Reading) -> list[Evidence]:
         )  # fmt: skip
         return read_archive(estimates, r.error, over)
     if (suffix in TABLES and (r.state is not None or not is_spatial(estimates))) or is_plane(estimates):
-        _refuse(estimates, r, "covariance", "covariance_order", "axes", "lever_arm")
+        _refuse(estimates, r, *OF_TRAJECTORIES)
         if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
             raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
         return _with_frame(read_tables(estimates, r, over), r)

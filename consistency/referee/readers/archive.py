@@ -78,7 +78,7 @@ def record_of_arrays(
     masked = np.ma.getmaskarray(np.ma.asarray(given[first])).reshape(arrays[first].shape)
     mask = masked.reshape(*shape[:2], -1).any(axis=-1)
     for key, array in arrays.items():
-        if array.ndim < 2:
+        if array.ndim < 2 or array.shape[:2] != shape[:2]:  # shapes that do not fit are refused below
             continue
         there = np.isfinite(array).reshape(*array.shape[:2], -1).all(axis=-1)
         never = ~(there | mask).any(axis=0)
@@ -125,7 +125,8 @@ def _of_arrays(
     else:
         estimates, truth = (_array(path, arrays, key, 3) for key in ("estimates", "truth"))
         if estimates.shape != truth.shape:
-            raise InputError(f"{path}: key 'truth' has shape {truth.shape}, 'estimates' {estimates.shape}")
+            turned = _turned(truth.shape, estimates.shape)
+            raise InputError(f"{path}: key 'truth' has shape {truth.shape}, 'estimates' {estimates.shape}{turned}")
         error_kind = convention or "vector"
         n = estimates.shape[-1]
         if error_kind not in PLANAR or (error_kind != "vector" and n != 3):
@@ -138,7 +139,9 @@ def _of_arrays(
         error = planar_error(truth, estimates, error_kind) if n == 3 else truth - estimates
     runs, steps, n = error.shape
     if covariances.shape != (runs, steps, n, n):
-        raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {(runs, steps, n, n)}")
+        shape = runs, steps, n, n
+        turned = _turned(covariances.shape, shape)
+        raise InputError(f"{path}: key 'covariances' has shape {covariances.shape}, needs {shape}{turned}")
     known = _known(path, arrays, runs, steps)
     nis, dof = _nis(path, arrays, (runs, steps))
     given = error_kind or "vector"
@@ -297,6 +300,13 @@ def _nis(path: Path, arrays: dict[str, Array], shape: tuple[int, int]) -> tuple[
             f"{path}: keys 'nis', 'nis_dof': nis must be 0 or more, nis_dof whole numbers from 0 to below 2^31"
         )
     return nis, np.where(known, dof, 0.0)
+
+
+def _turned(found: tuple[int, ...], needed: tuple[int, ...]) -> str:
+    """What to say where two shapes differ by the order of runs and steps alone."""
+    if found != (needed[1], needed[0], *needed[2:]):
+        return ""
+    return "; runs and steps are swapped in one: the order is (runs, steps, ...), so transpose its first two axes"
 
 
 def step_times(path: Path, arrays: dict[str, Array], steps: int) -> Array:

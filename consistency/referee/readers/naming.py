@@ -160,19 +160,20 @@ def _plain(name: str) -> str:
 def _family(plain: list[str], spellings: Sequence[str], parts: str, where: Path) -> tuple[int, ...] | None:
     """Places of the columns that are spelled alike, one for each part; None without them."""
     for spelling in spellings:
-        found = []
+        found: list[list[int]] = []
         for part in parts:
             name = spelling.format(part)
             exact = [i for i, other in enumerate(plain) if other == name]
             longer = [i for i, other in enumerate(plain) if spelling in INNER and other.endswith(f"_{name}")]
-            if len(exact or longer) > 1:
-                raise InputError(
-                    f"{where}: {len(exact or longer)} columns are '{name}'; leave one pose in the file, or rename the "
-                    "others"
-                )
-            found += exact or longer
-        if len(found) == len(parts):
-            return tuple(found)
+            found.append(exact or longer)
+        if not all(found):
+            continue
+        if many := next((places for places in found if len(places) > 1), []):
+            name = spelling.format(parts[found.index(many)])
+            raise InputError(
+                f"{where}: {len(many)} columns are '{name}'; leave one pose in the file, or rename the others"
+            )
+        return tuple(places[0] for places in found)
     return None
 
 

@@ -174,6 +174,31 @@ def read_sheet(path: Path) -> TableRows:
     return sheet
 
 
+def frame_rows(frame: Any, name: str) -> TableRows:
+    """Rows of a table in memory with columns by name, as a DataFrame of pandas or polars, called ``name`` in messages.
+
+    Raises
+    ------
+    InputError
+        It holds no row, or a column is there twice.
+    """
+    names = [str(column) for column in frame.columns]
+    if twice := {column for column in names if names.count(column) > 1}:
+        raise InputError(f"{name}: column '{sorted(twice)[0]}' is there twice")
+    data = {str(column): _cells(np.asarray(frame[column])) for column in frame.columns}
+    rows = len(next(iter(data.values()), ()))
+    if not rows:
+        raise InputError(f"{name}: holds no row")
+    return TableRows(Path(name), data, np.arange(1, rows + 1), "row")
+
+
+def _cells(values: Array) -> Column:
+    """A column in memory: floats, or objects with None where a cell is empty."""
+    if values.dtype.kind in "fiu":
+        return np.asarray(values, float)
+    return np.array([None if str(cell) in EMPTY else cell for cell in values.tolist()], object)
+
+
 def _read_parquet(path: Path) -> TableRows:
     if not is_file(path):
         raise InputError(f"{path}: no such file")
@@ -227,7 +252,7 @@ def _rows(
     if not lines:
         return None
     numbers = [number for number, _ in lines]
-    return _columns(_cells(path, lines, separator, len(names)), names), np.array(numbers)
+    return _columns(_fields(path, lines, separator, len(names)), names), np.array(numbers)
 
 
 def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[str, Column], Indices] | None:
@@ -243,7 +268,7 @@ def _plain_rows(block: Block, names: list[str], separator: str) -> tuple[dict[st
     return _columns([line.split(separator) for line in block.text.splitlines()], names), numbers
 
 
-def _cells(path: Path, lines: list[tuple[int, str]], separator: str, width: int) -> list[list[str]]:
+def _fields(path: Path, lines: list[tuple[int, str]], separator: str, width: int) -> list[list[str]]:
     """The fields of lines, out of their quotes where they are in some."""
     rows = []
     for number, line in lines:

@@ -34,7 +34,7 @@ POSE = ("x", "y", "heading")
 OWN_NAMES = {(POSE[i], POSE[j]): name for name, (i, j) in COVARIANCE.items()}
 
 
-def read_tables(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
+def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | None = None) -> list[Evidence]:
     """Recordings of the estimators in a table, one for each value of its column ``filter``.
 
     Raises
@@ -43,17 +43,18 @@ def read_tables(estimates: Path, r: Reading, relative: Relative | None = None) -
         A file, column, line or option that cannot be used, and what is allowed.
     """
     truth, axes = r.truth, tuple(r.state) if r.state else POSE
-    sheet, note = planar_sheet(estimates, bool(r.motions)) if axes == POSE else (read_sheet(estimates), "")
+    sheet, note = _sheet(estimates, axes, bool(r.motions))
+    estimates = sheet.path
     convention = _convention(r.error, axes, truth)
     if relative is not None:
         require_poses(estimates, axes, convention, truth)
     if r.align is not None and _manifold(convention) != "planar":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     other, notes = None, [note]
-    if truth is not None and is_drive(truth):
+    if isinstance(truth, Path) and is_drive(truth):
         other = drive_sheet(truth, r.body)
     elif truth is not None:
-        other, note = planar_sheet(truth) if axes == POSE else (read_sheet(truth), "")
+        other, note = _sheet(truth, axes)
         notes.append(note)
     if other is None and not {"nis", "nis_dof"} <= set(sheet.data):
         raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
@@ -67,6 +68,13 @@ def read_tables(estimates: Path, r: Reading, relative: Relative | None = None) -
         recordings.append(_recording(name, own, other, key, axes, convention, r, relative))
     said = tuple(note for note in notes if note)
     return [replace(recordings[0], notes=(*said, *recordings[0].notes)), *recordings[1:]]
+
+
+def _sheet(table: Path | TableRows, axes: tuple[str, ...], motions: bool = False) -> tuple[TableRows, str]:
+    """Rows of a file, or those in memory, and what they were read as."""
+    if isinstance(table, TableRows):
+        return table, ""
+    return planar_sheet(table, motions) if axes == POSE else (read_sheet(table), "")
 
 
 def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | None) -> str:

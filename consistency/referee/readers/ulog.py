@@ -20,6 +20,13 @@ from consistency.referee.readers.record import count
 from consistency.referee.types import Array, Indices
 
 TOPICS = ("estimator_innovations", "estimator_innovation_variances")
+OLD = "ekf2_innovations"  # of older firmware: innovations and variances in one message
+SPLIT = [
+    *((f"vel[{i}]") for i in range(3)),
+    "hpos[0]",
+    "hpos[1]",
+    "vpos",
+]  # its vel_pos_innov, fused at different times
 SUFFIX = ".ulg"
 COMPONENT = re.compile(r"\[\d+\]$")
 CLOCKS = ("timestamp_sample", "timestamp")  # of the data that was fused, as both topics have it; of publication
@@ -57,10 +64,14 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
     InputError
         The file cannot be read, lacks a topic or the sensor, or holds a variance below zero.
 
-    Source: docs.px4.io, "ULog File Format" and "EstimatorInnovations (UORB message)".
+    Source: docs.px4.io, "ULog File Format" and "EstimatorInnovations (UORB message)"; the older message of PX4,
+    ekf2_innovations.msg, whose first six are of velocity and position, north, east, down: ``vel``, ``hpos``, ``vpos``.
     """
     log = _loaded(path)
     topics = {(each.name, each.multi_id): each.data for each in log.data_list}
+    if not any(name in TOPICS for name, _ in topics):
+        for own in [i for name, i in topics if name == OLD]:
+            topics[TOPICS[0], own], topics[TOPICS[1], own] = _divided(topics[OLD, own])
     for topic in TOPICS:
         if not any(name == topic for name, _ in topics):
             raise InputError(
@@ -91,7 +102,22 @@ def _loaded(path: Path) -> Any:
         raise InputError(f"{path}: no such file")
     refusal = "cannot be read as a ULog, damaged or cut short"
     with reading(path, refusal), path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
-        return ULog(file, list(TOPICS))  # prints what it skips
+        return ULog(file, [*TOPICS, OLD])  # prints what it skips
+
+
+def _divided(data: dict[str, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Innovations and variances of the older message, under names as in the newer two."""
+    parts: tuple[dict[str, Array], dict[str, Array]] = ({}, {})
+    for field, values in data.items():
+        name, index = COMPONENT.sub("", field), COMPONENT.search(field)
+        which = next((k for k, end in enumerate(("_innov", "_innov_var")) if name.endswith(end)), None)
+        if field in CLOCKS:
+            parts[0][field] = parts[1][field] = values
+        elif which is not None:
+            sensor = name[: -len(("_innov", "_innov_var")[which])]
+            at = index[0] if index else ""
+            parts[which][SPLIT[int(at[1:-1])] if sensor == "vel_pos" else sensor + at] = values
+    return parts
 
 
 def _paired(path: Path, innovations: dict[str, Array], variances: dict[str, Array]) -> Pairs:

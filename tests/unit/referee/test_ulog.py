@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 from pathlib import Path
 from unittest import mock
@@ -17,7 +18,7 @@ from consistency.referee.verdicts.monitoring import make_monitor, read_innovatio
 
 pytest.importorskip("pyulog", reason="needs the extra 'ulog'")
 
-from flight import TOPICS, Flight
+from flight import TOPICS, Flight, header, message
 
 STEP = 20_000  # us between messages
 NAN = float("nan")
@@ -173,6 +174,42 @@ def test_what_cannot_be_judged_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="message 4 of estimator_innovations is older than the one before"):
         read_innovations(back.write(path))
     with mock.patch.dict(sys.modules, {"pyulog": None}), pytest.raises(InputError, match="needs pyulog: pip install "):
+        read_innovations(path)
+
+
+OLD = {"vel_pos_innov": 6, "mag_innov": 3, "heading_innov": 1, "flow_innov": 2}  # of ekf2_innovations, PX4 v1.9
+
+
+def old_flight(path: Path, own: Array, variance: Array) -> Path:
+    """The message of older firmware: (N, 12) innovations and their variances, as its definition orders them."""
+    fields = [f"{name}{end}" for end in ("", "_var") for name in OLD]
+    sizes = [*OLD.values(), *OLD.values()]
+    names = "".join(f"float{f'[{n}]' if n > 1 else ''} {name};" for name, n in zip(fields, sizes, strict=True))
+    out = [header(), message("F", f"ekf2_innovations:uint64_t timestamp;{names}".encode())]
+    out.append(message("A", struct.pack("<BH", 0, 0) + b"ekf2_innovations"))
+    for k, row in enumerate(np.hstack([own, variance]).astype("<f4")):
+        out.append(message("D", struct.pack("<HQ", 0, 10**7 + k * STEP) + row.tobytes()))
+    path.write_bytes(b"".join(out))
+    return path
+
+
+def test_the_older_message_holds_innovations_and_variances(tmp_path: Path) -> None:
+    """Six of velocity and position are three sensors, as they are fused at different times: GPS, and the barometer."""
+    own, variance = draws(n=12)
+    held = own.copy()
+    held[1::2, 5], still = held[::2, 5], variance.copy()
+    still[1::2, 5] = still[::2, 5]  # the height comes half as often
+    path = old_flight(tmp_path / "a.ulg", held, still)
+    ratio = (held**2 / still).astype(float)
+    columns = {"vel": [0, 1, 2], "hpos": [3, 4], "mag": [6, 7, 8], "heading": [9], "flow": [10, 11], "mag[1]": [7]}
+    for sensor, places in columns.items():
+        log = read_innovations(path, sensor)
+        np.testing.assert_allclose(log.nis, ratio[:, places].sum(axis=1), rtol=1e-5)
+        assert (log.dof == len(places)).all()
+    height = read_innovations(path, "vpos")
+    np.testing.assert_allclose(height.nis[::2], ratio[::2, 5], rtol=1e-5)
+    assert np.isnan(height.nis[1::2]).all()
+    with pytest.raises(InputError, match=r"more than one sensor \(vel, hpos, vpos, mag, heading, …\)"):
         read_innovations(path)
 
 

@@ -16,6 +16,7 @@ from consistency.referee.diagnostics.record import numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
+from consistency.referee.readers.extended import extended_errors, is_extended
 from consistency.referee.readers.hints import hints, turns
 from consistency.referee.readers.interpolation import Manifold
 from consistency.referee.readers.poses import Poses
@@ -38,9 +39,15 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
     dimension. Optional: ``nis`` and ``nis_dof`` (runs, steps), ``axes`` (n,), ``t`` (steps,), and ``lengths``
     (runs,), the number of steps of each run, where they differ, and ``mask`` (runs, steps), true where there is no
     truth, so that the step does not count. With ``relative`` estimates and truth are planar
-    poses, or estimates are motions; ``cross_covariances`` (runs, steps, 3, 3) are those with the step before.
+    poses, or estimates are motions; ``cross_covariances`` (runs, steps, 3, 3) are those with the step before. States of
+    inertial filters have keys of their own (:mod:`consistency.referee.readers.extended`).
     """
-    return [_of_arrays(path, load_arrays(path), convention, relative)]
+    arrays = load_arrays(path)
+    if not is_extended(arrays):
+        return [_of_arrays(path, arrays, convention, relative)]
+    errors, note = extended_errors(path, arrays, convention)
+    record = _of_arrays(path, errors, relative=relative)
+    return [replace(record, convention=convention or "", notes=(note, *record.notes))]
 
 
 def record_of_arrays(

@@ -1,0 +1,133 @@
+"""States of SE2(3) with biases: the errors by the matrix exponential of 5 x 5 matrices, the NEES by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from test_layouts import skew
+
+import consistency as cs
+from consistency.referee.types import Array
+
+RUNS, STEPS = 3, 7
+
+
+def exponential(phi: Array, p: Array, v: Array) -> Array:
+    """Element of SE2(3) as a matrix (5, 5), columns 3 and 4 velocity and position."""
+    generator = np.zeros((5, 5))
+    generator[:3, :3], generator[:3, 3], generator[:3, 4] = skew(phi), v, p
+    return np.asarray(expm(generator))
+
+
+def states(convention: str, n: int = 15) -> tuple[dict[str, Array], Array, Array]:
+    """States and truth, the errors (runs, steps, n) put between them, of half a radian and more, and covariances."""
+    rng = np.random.default_rng()
+    e = 0.5 * rng.normal(size=(RUNS, STEPS, n))
+    root = rng.normal(size=(RUNS, STEPS, n, n))
+    P = root @ np.swapaxes(root, -1, -2) + np.eye(n)
+    keys = (
+        {"R": (3, 3), "p": (3,), "v": (3,), "bg": (3,), "ba": (3,)} if n == 15 else {"R": (3, 3), "p": (3,), "v": (3,)}
+    )
+    out = {f"{side}{key}": np.zeros((RUNS, STEPS, *shape)) for key, shape in keys.items() for side in ("", "true_")}
+    for at in np.ndindex(RUNS, STEPS):
+        own = exponential(*rng.normal(size=(3, 3)))
+        step = exponential(e[at][:3], e[at][3:6], e[at][6:9])
+        if convention in ("left", "right"):
+            true = own @ step if convention == "left" else step @ own
+        else:
+            turn = expm(skew(e[at][:3]))
+            true = own.copy()
+            true[:3, :3] = turn @ own[:3, :3] if convention == "so3" else own[:3, :3] @ turn
+            true[:3, 4], true[:3, 3] = own[:3, 4] + e[at][3:6], own[:3, 3] + e[at][6:9]
+        for side, T in (("", own), ("true_", true)):
+            out[f"{side}R"][at], out[f"{side}v"][at], out[f"{side}p"][at] = T[:3, :3], T[:3, 3], T[:3, 4]
+        if n == 15:
+            for k, key in enumerate(("bg", "ba")):
+                out[key][at] = rng.normal(size=3)
+                out[f"true_{key}"][at] = out[key][at] + e[at][9 + 3 * k : 12 + 3 * k]
+    return out, e, P
+
+
+def read(path: Path, **arrays: Any) -> Path:
+    np.savez(path, **arrays)
+    return path
+
+
+@pytest.mark.parametrize("n", [9, 15])
+@pytest.mark.parametrize("convention", ["left", "right", "so3", "so3-body"])
+def test_errors_are_those_put_in(convention: str, n: int, tmp_path: Path) -> None:
+    arrays, e, P = states(convention, n)
+    record = cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error=convention)
+    np.testing.assert_allclose(record.error, e, atol=1e-9)
+    nees = np.einsum("rti,rti->rt", e, np.linalg.solve(P, e[..., None])[..., 0])
+    np.testing.assert_allclose(record.nees, nees, rtol=1e-9)
+    assert record.axes[:9] == ("roll", "pitch", "yaw", "x", "y", "z", "vx", "vy", "vz")
+    assert record.convention == convention
+    assert any(note.startswith(f"error convention {convention}: ") for note in record.notes)
+
+
+def test_another_order_of_the_covariance(tmp_path: Path) -> None:
+    """Manif has position, rotation, velocity; one run may lack its dimension."""
+    arrays, e, P = states("left", 9)
+    turned = [3, 4, 5, 0, 1, 2, 6, 7, 8]
+    first = {key: array[0] for key, array in arrays.items()}
+    path = read(tmp_path / "imu.npz", **first, covariances=P[0][:, turned][:, :, turned], order=["p", "R", "v"])
+    record = cs.read(path, error="left")
+    np.testing.assert_allclose(record.error[0], e[0][:, turned], atol=1e-9)
+    np.testing.assert_allclose(
+        record.nees[0], np.einsum("ti,ti->t", e[0], np.linalg.solve(P[0], e[0][..., None])[..., 0])
+    )
+
+
+def test_a_state_that_breaks_down_is_a_failure(tmp_path: Path) -> None:
+    arrays, _, P = states("right")
+    arrays["R"][1, 4] = np.nan
+    record = cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error="right")
+    assert [(failure.run, failure.step) for failure in record.failures] == [(1, 5)]
+
+
+def broken(arrays: dict[str, Array], key: str, value: object) -> dict[str, Any]:
+    changed: dict[str, Any] = dict(arrays)
+    if value is None:
+        del changed[key]
+    else:
+        changed[key] = value
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("true_v", None, "key 'true_v' is missing, of the true states"),
+        ("ba", None, "key 'ba' is missing; there are two biases or none"),
+        ("order", ["R", "v", "p"], "key 'order' is R, v, p; must name R, p, v, bg, ba, each once"),
+        ("R", np.tile(2.0 * np.eye(3), (RUNS, STEPS, 1, 1)), "key 'R' holds a matrix that is no rotation"),
+        ("true_R", np.tile(np.diag([1.0, 1.0, -1.0]), (RUNS, STEPS, 1, 1)), "key 'true_R' holds a matrix that is no"),
+        ("p", np.zeros((RUNS, STEPS, 2)), r"key 'p' has shape \(3, 7, 2\), needs \(runs, steps, 3\)"),
+        ("p", np.zeros((STEPS, RUNS, 3)), r"keys 'p' and 'true_p' have shapes \(7, 3, 3\) and \(3, 7, 3\)"),
+        ("true_bg", np.full((RUNS, STEPS, 3), np.nan), "key 'true_bg' is not finite"),
+        ("covariances", np.tile(np.eye(9), (RUNS, STEPS, 1, 1)), "key 'covariances' has shape"),
+    ],
+)
+def test_what_does_not_fit_is_named(key: str, value: object, said: str, tmp_path: Path) -> None:
+    arrays, _, P = states("left")
+    path = read(tmp_path / "imu.npz", **broken({**arrays, "covariances": P}, key, value))
+    with pytest.raises(cs.InputError, match=rf"imu\.npz: {said}"):
+        cs.read(path, error="left")
+
+
+@pytest.mark.parametrize("options", [{}, {"error": "so2"}, {"error": "vector"}])
+def test_the_error_has_to_be_declared(options: dict[str, str], tmp_path: Path) -> None:
+    arrays, _, P = states("left")
+    with pytest.raises(cs.InputError, match="whose error is not known; add --error so3, so3-body, left, right"):
+        cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), **options)  # type: ignore[arg-type]
+
+
+def test_windows_are_refused(tmp_path: Path) -> None:
+    arrays, _, P = states("left")
+    with pytest.raises(cs.InputError, match="--relative needs"):
+        cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error="left", relative=2, motions=True)

@@ -26,6 +26,7 @@ def equivalence(
     factor: float | None = None,
     low_is_fault: bool = True,
     unseen: float = 0.0,
+    share: float = 0.0,
 ) -> Equivalence:
     """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
 
@@ -40,13 +41,17 @@ def equivalence(
     factor : ``settings.factor`` where it is not given
     low_is_fault : whether a ratio below 1 is a fault, which more runs may find
     unseen : share of the NEES that ``means`` may lack; the ratio is then as much larger on its upper side
+    share : of errors of the truth in the covariances of ``means``; the ratio is of the others
     """
     factor = settings.factor if factor is None else factor
-    top = factor * (1.0 - unseen)
+    top, bottom = (share + (1.0 - share) * factor) * (1.0 - unseen), share + (1.0 - share) / factor
     below = scale_test(means / top, dof, steps).below if top > 0 else 1.0
-    above = scale_test(means * factor, dof, steps).above
-    runs = deciding_runs(scale_test(means, dof, steps), top, settings, low_is_fault) if top > 1.0 else None
-    return _result(below, above, factor, settings, runs)
+    above = scale_test(means / bottom, dof, steps).above
+    runs = None
+    if top > 1.0:
+        nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
+        runs = deciding_runs(scale_test(means, dof, steps), nearer, settings, low_is_fault)
+    return equivalent(below, above, factor, settings, runs)
 
 
 def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:
@@ -60,7 +65,7 @@ def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equiva
     factor = settings.factor
     below = ever(e_process(means / factor, dof).down)
     above = ever(e_process(means * factor, dof).up)
-    return _result(below, above, factor, settings, None)
+    return equivalent(below, above, factor, settings, None)
 
 
 def equivalence_of_innovations(test: NisTest, settings: Settings, factor: float | None = None) -> Equivalence:
@@ -69,10 +74,11 @@ def equivalence_of_innovations(test: NisTest, settings: Settings, factor: float 
     if not test.dof:
         return Equivalence(factor, float("nan"), 1.0 - settings.power, None)
     below, above = float(laws.chi2.cdf(total / factor, test.dof)), float(laws.chi2.sf(total * factor, test.dof))
-    return _result(below, above, factor, settings, None)
+    return equivalent(below, above, factor, settings, None)
 
 
-def _result(below: float, above: float, factor: float, settings: Settings, runs: int | None) -> Equivalence:
+def equivalent(below: float, above: float, factor: float, settings: Settings, runs: int | None) -> Equivalence:
+    """Equivalence by the p values of the ratio being ``factor`` or more, and its inverse or less."""
     p_value = below if settings.one_sided else max(below, above)
     return Equivalence(factor, float(p_value), 1.0 - settings.power, runs, settings.one_sided)
 

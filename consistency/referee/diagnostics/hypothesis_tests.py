@@ -59,7 +59,7 @@ def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: fl
             for key, index in sample.errors.groups.items()
         }
         worst = np.array([t.above if settings.one_sided else t.p_value for t in axes.values()])
-        p[AXIS] = _least(worst)[0] if n > 1 else float("nan")
+        p[AXIS] = least(worst)[0] if n > 1 else float("nan")
         bias_step = _bias(w, in_steps, p)
         outlier = outliers(w, in_steps)
         p["outliers"] = outlier.p_value
@@ -91,14 +91,14 @@ def _bias(whitened: Array, in_steps: Moments, p: dict[str, float]) -> int | None
     if whitened.shape[1] == 1:
         return None
     _, steps = t_squared(whitened, in_steps)
-    p["bias in some step"], step = _least(steps)
+    p["bias in some step"], step = least(steps)
     return step
 
 
 def _shape(whitened: Array, in_steps: Moments, p: dict[str, float]) -> tuple[Array, int | None]:
     _, steps = sphericity(whitened, in_steps)
     matrix, over_runs = mean_shape(whitened)
-    in_step, step = _least(steps)
+    in_step, step = least(steps)
     if whitened.shape[1] > 1:
         p["shape"], p["shape in some step"] = over_runs, in_step
     else:
@@ -106,7 +106,7 @@ def _shape(whitened: Array, in_steps: Moments, p: dict[str, float]) -> tuple[Arr
     return matrix, step
 
 
-def _least(p_values: Array) -> tuple[float, int | None]:
+def least(p_values: Array) -> tuple[float, int | None]:
     """The smallest p value of all steps, corrected for their number, and its step 1..T."""
     count = int(np.isfinite(p_values).sum())
     if not count:

@@ -10,6 +10,7 @@ from consistency.referee.diagnostics.parts import judge_parts
 from consistency.referee.diagnostics.questions import SHARES
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.rejection import rejection_score
+from consistency.referee.diagnostics.uncertain import uncertain_truth
 from consistency.referee.diagnostics.verdict import DEFAULT, judge_alone
 from consistency.referee.diagnostics.verdict_parts import Settings, Verdict
 from consistency.referee.diagnostics.wording import plain
@@ -51,9 +52,14 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
     """:func:`judge` without the maps; with a ``design``, the verdict of the look that decides, or of the last one."""
     if design is not None:
         return of_look(*follow(design, record.first_runs, len(record.run_numbers)), record, design)
-    runs = replace(record.as_runs, unavailable=tuple(SHARES)) if record.unshown else record.as_runs
+    runs, truth = record.as_runs, uncertain_truth(record)
+    if truth is not None:
+        runs, record = truth.evidence, replace(record, unshown=record.unshown or truth.unjudged)
+    if record.unshown:
+        runs = replace(runs, unavailable=tuple(SHARES))
     world = None if record.world is None else judge_alone(record.in_world, settings)
-    return _beside((judge_parts if runs.parts else judge_alone)(runs, settings), record, world)
+    verdict = judge_parts(runs, settings) if runs.parts else judge_alone(runs, settings, truth=truth)
+    return _beside(verdict, record, world)
 
 
 def of_look(verdict: Verdict, runs: int, record: Record, design: Design) -> Verdict:
@@ -101,7 +107,8 @@ def _unshown(verdict: Verdict, why: str) -> Verdict:
     if not why or verdict.scale is None or verdict.status == "failed":
         return verdict
     scale = replace(verdict.scale, equivalence=replace(verdict.scale.equivalence, p_value=float("nan"), runs=None))
-    ratio = f"the covariance ratio would be {plain(scale.inflation)} if they are, reported and not judged"
+    provided = "" if verdict.truth is not None else " if they are"
+    ratio = f"the covariance ratio would be {plain(scale.inflation)}{provided}, reported and not judged"
     reasons = (f"undecided: {why}; {ratio}", *verdict.reasons[1:])
     return replace(verdict, status="undecided", scale=scale, reasons=reasons)
 

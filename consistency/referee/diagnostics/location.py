@@ -189,8 +189,8 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
     )  # fmt: skip
 
 
-def bias_of(sample: Sample, tests: Tests, location: Location, answers: Answers) -> Bias:
-    """Mean error of each axis, and the scale without it."""
+def bias_of(sample: Sample, step: int | None, location: Location, answers: Answers) -> Bias:
+    """Mean error of each axis, clearest in ``step``, and the scale without it."""
     errors, late = _errors(sample), _late(location)
     of_runs = by_runs(_standard_means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
@@ -199,9 +199,9 @@ def bias_of(sample: Sample, tests: Tests, location: Location, answers: Answers) 
         test = hotelling(of_runs, CONFIDENCE)
         by_axis = {a: Interval(test.mean[i], *test.interval[i]) for i, a in enumerate(errors.names)}
     if not _any(answers, BIAS):
-        return Bias(by_axis, tests.bias_step, None, None, None)
+        return Bias(by_axis, step, None, None, None)
     without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
-    return Bias(by_axis, tests.bias_step, *_axis_in_step(sample, tests.bias_step), without)
+    return Bias(by_axis, step, *_axis_in_step(sample, step), without)
 
 
 def _standard_means(error: Array, covariance: Symmetric, counted: Array) -> Array:

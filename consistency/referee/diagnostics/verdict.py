@@ -32,6 +32,7 @@ from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.reported_scale import scale_of
 from consistency.referee.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.referee.diagnostics.sample import shape_of as shape_of_arrays
+from consistency.referee.diagnostics.uncertain import UncertainTruth
 from consistency.referee.diagnostics.verdict_parts import Answer, Equivalence, Innovations, Settings, Verdict
 from consistency.referee.diagnostics.whitening import entries
 
@@ -47,8 +48,13 @@ class Look:
     scale: float  # p value of the scale, valid at any time
 
 
-def judge_alone(evidence: Record, settings: Settings = DEFAULT, look: Look | None = None) -> Verdict:
-    """Judge the errors and innovations of a record, and nothing beside them; see :func:`judging.judge`."""
+def judge_alone(
+    evidence: Record, settings: Settings = DEFAULT, look: Look | None = None, truth: UncertainTruth | None = None
+) -> Verdict:
+    """Judge the errors and innovations of a record, and nothing beside them; see :func:`judging.judge`.
+
+    With a ``truth`` that is uncertain ``evidence`` is :attr:`UncertainTruth.evidence`.
+    """
     runs, steps = shape_of_arrays(evidence)
     both_sides = settings
     settings = replace(settings, allow="conservative") if evidence.reduced else settings
@@ -61,7 +67,8 @@ def judge_alone(evidence: Record, settings: Settings = DEFAULT, look: Look | Non
     tests = None
     if sample is not None:
         tests = ask(sample, settings, p_values, look.scale if look else None)
-        p_values |= {q: p for q, p in tests.p_values.items() if q not in evidence.unavailable}
+        asked = tests.p_values if truth is None else truth.p_values(tests.p_values, settings)
+        p_values |= {q: p for q, p in asked.items() if q not in evidence.unavailable}
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)
@@ -76,10 +83,11 @@ def judge_alone(evidence: Record, settings: Settings = DEFAULT, look: Look | Non
         ends = early_ends(sample.nees)
         verdict = replace(verdict, ends=ends if ends.runs else None)
     if sample is not None and tests is not None:
-        shown = _equivalence(sample, both_sides, look, evidence)
+        shown = _equivalence(sample, both_sides, look, evidence, truth)
         lost = lost_of(evidence, sample.nees, sample.dof, settings, any_time=look is not None)
         verdict = _with_records(replace(verdict, lost=lost), evidence, sample, tests, shown)
     verdict = replace(verdict, status=status_of(verdict, sample, tests, joint))
+    verdict = verdict if truth is None else truth.of_estimate(verdict)
     verdict = replace(verdict, axis=deciding_axis(verdict))
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 
@@ -140,17 +148,21 @@ def _with_records(verdict: Verdict, evidence: Record, sample: Sample, tests: Tes
         impossible=tuple((int(run), int(k) + 1) for run, k in np.argwhere(odd)),
         left_out_steps=tuple(int(k) + 1 for k in np.flatnonzero((there & ~sample.counted).any(axis=0))),
         axes=axes_of(sample, tests, location),
-        bias=bias_of(sample, tests, location, by_question),
+        bias=bias_of(sample, tests.bias_step, location, by_question),
         shape=shape_of(sample, tests, by_question, at_share(verdict).false_alarm),
         tails=tails_of(tests, evidence.run_numbers),
         accuracy=accuracy_of(sample),
     )
 
 
-def _equivalence(sample: Sample, settings: Settings, look: Look | None, evidence: Record) -> Equivalence:
+def _equivalence(
+    sample: Sample, settings: Settings, look: Look | None, evidence: Record, truth: UncertainTruth | None
+) -> Equivalence:
     if look is not None:
         return equivalence_by_betting(sample.means(), sample.dof, settings)
     factor = max(settings.factor, settings.tolerated)
+    if truth is not None:
+        return truth.equivalence(sample, settings, factor)
     return equivalence(
         sample.means(), sample.dof, sample.longest, settings, factor, not evidence.reduced, evidence.unseen
     )

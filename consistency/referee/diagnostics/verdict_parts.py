@@ -308,6 +308,16 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
+class TruthShare:
+    """Share of the truth's own covariance P_t in that of the errors, P + P_t; ratios are of P alone."""
+
+    share: float  # tr((P + P_t)^-1 P_t) / n, mean of runs
+    by_axis: Mapping[str, float]  # of each component and group
+    errors: str | None  # declared: "independent", "per-run" or "common"; None: nothing is
+    shared: bool  # the estimator has fused the truth
+
+
+@dataclass(frozen=True)
 class Verdict:
     """The referee's answer for one filter.
 
@@ -345,6 +355,7 @@ class Verdict:
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
     skipped: Skipped | None = None  # first steps of each run that were left out
     axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does
+    truth: TruthShare | None = None  # where the truth has a covariance of its own
     parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
     record: Record | None = None  # what was judged, where it is kept to be drawn
 

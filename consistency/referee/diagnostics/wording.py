@@ -36,7 +36,8 @@ def reasons(v: Verdict) -> list[str]:
     if judged:
         assert v.scale is not None
         level = _levels(v) if v.parts else _level(v)
-        lines = [_sentence(v, faults), *_early_ends(v), *level, *_within_one(v), *_together(v), *_coverage(v)]
+        about = [*_truth(v), *_early_ends(v), *level, *_within_one(v), *_together(v), *_coverage(v)]
+        lines = [_sentence(v, faults), *about]
     elif v.scale is not None:
         lines = ["no step has a covariance of full rank to judge"]
     elif v.innovations is not None and v.innovations.dof:
@@ -251,6 +252,25 @@ def _tolerated(v: Verdict) -> list[str]:
     if not tolerated:
         return []
     return [f"found, but shown to be within the tolerance of x{v.settings.tolerated:g}: {', '.join(tolerated)}"]
+
+
+def _truth(v: Verdict) -> list[str]:
+    """What errors of the truth leave to be said, and what to declare."""
+    if (truth := v.truth) is None:
+        return []
+    shares = ", ".join(f"{axis} {percent(share)}" for axis, share in truth.by_axis.items())
+    text = (
+        f"the truth has a covariance of its own, {percent(truth.share)} of the sum of both ({shares}); covariance "
+        "ratios are of the estimate alone"
+    )
+    if truth.shared:
+        return [f"{text}; the estimator has fused the truth (--truth-shared): only what holds however both go together"]
+    if truth.errors is None:
+        return [
+            f"{text}; its errors are not declared to be independent, per-run or common (--truth-errors), so only what "
+            "holds however they depend on each other is said"
+        ]
+    return [f"{text}; its errors are declared {truth.errors}"]
 
 
 def _early_ends(v: Verdict) -> list[str]:

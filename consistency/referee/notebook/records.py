@@ -14,6 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers import read_frames, read_recordings
 from consistency.referee.readers.archive import record_of_arrays
+from consistency.referee.readers.uncertain import declared, require_truth_options
 from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import settings_of, skip_asked
 
@@ -39,6 +40,9 @@ def read(
     windows: str | None = None,
     align: str | None = None,
     lever_arm: Sequence[float] | None = None,
+    truth_covariance: str | Path | None = None,
+    truth_errors: str | None = None,
+    truth_shared: bool = False,
     filter: str | None = None,
 ) -> Record:
     """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
@@ -62,6 +66,11 @@ def read(
     windows : "independent" declares errors of different windows independent, so that each is a run
     align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
     lever_arm : of a truth of positions alone: its point in the axes of the estimated body, x, y, z, m
+    truth_covariance : of the truth itself, in the convention of the error: "columns" of its file, or a file of t and 36
+        or 21 numbers
+    truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with
+        None only what holds under any dependence is said
+    truth_shared : the estimator has fused the truth
     filter : which estimator, where the files hold several
 
     Raises
@@ -72,9 +81,10 @@ def read(
     in_memory = any(hasattr(table, "columns") for table in (estimates, truth))
     true = None if truth is None or in_memory else Path(truth)
     stated = None if covariance is None else Path(covariance)
+    of_truth = None if truth_covariance is None else str(truth_covariance)
     reading = Reading(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
-        motions or None, windows, align, lever_arm,
+        motions or None, windows, align, lever_arm, of_truth, truth_errors, truth_shared or None,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates
@@ -97,6 +107,9 @@ def judge(
     name: str = "estimator",
     optimal_gain: bool = False,
     skip: str | float | None = None,
+    truth_covariances: ArrayLike | None = None,
+    truth_errors: str | None = None,
+    truth_shared: bool = False,
     **settings: Any,
 ) -> Verdict:
     """Judge a record, a file, or arrays: consistent, overconfident, conservative, undecided, ..., with reasons.
@@ -117,6 +130,8 @@ def judge(
     name : of the estimator, in messages; arrays alone
     optimal_gain : True if the filter has an optimal gain and gates nothing away: its innovations are then judged
     skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
+    truth_covariances : (runs, steps, n, n), of the truth itself, beside errors
+    truth_errors, truth_shared : of arrays, as for :func:`read`
     settings : ``false_alarm``, ``detect``, ``power``, ``tolerance``, ``allow``, ``lost`` of
         :class:`consistency.diagnostics.Settings`
 
@@ -131,7 +146,11 @@ def judge(
     if len(stated) > 1:
         raise InputError("covariances, deviations: give one of them beside errors")
     if stated:
+        stated |= {} if truth_covariances is None else {"truth_covariances": truth_covariances}
         record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent)
+        options = Reading(truth_errors=truth_errors, truth_shared=truth_shared or None)
+        require_truth_options(options)
+        (record,) = declared([record], options)
     elif isinstance(record, (str, Path)):
         record = read(record)
     elif not isinstance(record, Record):

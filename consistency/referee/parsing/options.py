@@ -90,6 +90,17 @@ class Reading:
             "MODE",
         ),
     )
+    truth_covariance: str | None = field(
+        default=None,
+        metadata=_shown("Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21.", "columns|FILE"),
+    )
+    truth_errors: str | None = field(
+        default=None,
+        metadata=_shown("How errors of the truth depend on each other: independent, per-run or common to all runs."),
+    )
+    truth_shared: bool | None = field(
+        default=None, metadata=_shown("The estimator has fused the truth.", flag="--truth-shared/")
+    )
 
     lever_arm: Sequence[float] | None = field(
         default=None,

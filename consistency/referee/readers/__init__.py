@@ -27,6 +27,7 @@ from consistency.referee.readers.sheet import frame_rows
 from consistency.referee.readers.table import read_tables
 from consistency.referee.readers.text import is_cut, without_end
 from consistency.referee.readers.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
+from consistency.referee.readers.uncertain import declared, require_truth_options
 from consistency.referee.readers.windows import Relative, relative_of
 
 __all__ = [
@@ -135,6 +136,10 @@ def _read(estimates: Path, r: Reading) -> list[Evidence]:
     """Recordings of files as they stand, with the options given."""
     over = relative_of(r.relative, bool(r.motions), r.windows)
     r = _checked(r, over)
+    return declared(_read(estimates, r, over), r)
+
+
+def _read(estimates: Path, r: Reading, over: Relative | None) -> list[Evidence]:
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
     require_name(estimates.name, "file")
@@ -150,7 +155,7 @@ def _read(estimates: Path, r: Reading) -> list[Evidence]:
     if suffix == ".npz":
         _refuse(
             estimates, r, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
-            "lever_arm",
+            "lever_arm", "truth_covariance",
         )  # fmt: skip
         return read_archive(estimates, r.error, over)
     if (suffix in TABLES and (r.state is not None or not is_spatial(estimates))) or is_plane(estimates):
@@ -180,6 +185,7 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
         raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
     if over is not None and offset == "estimate":
         raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
+    require_truth_options(r)
     align = require_alignment(r.align, r.truth or r.truth_topic)
     if over is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
@@ -199,6 +205,7 @@ def _with_frame(recordings: list[Evidence], r: Reading) -> list[Evidence]:
 
 def _refuse(path: Path, r: Reading, *names: str) -> None:
     if given := r.given(names):
-        kept = path.suffix.lower() == ".npz" and given[0] in ("truth", "axes")
-        instead = f", an archive; it has a key '{given[0]}' in its place" if kept else ""
+        keys = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}
+        kept = path.suffix.lower() == ".npz" and given[0] in keys
+        instead = f", an archive; it has a key '{keys[given[0]]}' in its place" if kept else ""
         raise InputError(f"{flag_of(given[0])}: does not go with {path}{instead}")

@@ -28,7 +28,7 @@ from consistency.referee.types import Array, Failure
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
 NEEDED = (("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof"))
-OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances"}
+OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances", "truth_covariances"}
 
 
 def read_archive(path: Path, convention: str | None, relative: Relative | None = None) -> list[Evidence]:
@@ -152,14 +152,20 @@ def _of_arrays(
     known = _known(path, arrays, runs, steps)
     nis, dof = _nis(path, arrays, (runs, steps))
     given = error_kind or "vector"
+    of_truth = None
+    if "truth_covariances" in arrays:
+        of_truth = _array(path, arrays, "truth_covariances", 4)
+        if of_truth.shape != covariances.shape:
+            raise InputError(f"{path}: key 'truth_covariances' has shape {of_truth.shape}, needs {covariances.shape}")
     tracks, poses = [], []
     for run, steps_of_run in enumerate(known):
         k = np.flatnonzero(steps_of_run)
         place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", k)  # type: ignore[misc]
         P = symmetric(covariances[run, k], place.__getitem__)
         poses.append(_poses(place, estimates[run, k], P, truth[run, k], given))
-        cut = (None if values is None else values[run, k] for values in (nis, dof))
-        tracks.append(Track(run, k, place, error[run, k], P, *cut))
+        own_nis, own_dof = (None if values is None else values[run, k] for values in (nis, dof))
+        T = None if of_truth is None else symmetric(of_truth[run, k], place.__getitem__)
+        tracks.append(Track(run, k, place, error[run, k], P, own_nis, own_dof, truth_covariance=T))
     axes = _axes(path, arrays, n)
     notes = [f"error convention {error_kind}: {PLANAR[error_kind]}"] if error_kind else []
     notes += hints(path.stem, axes, poses)

@@ -47,6 +47,12 @@ def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, 
     return Known(rows, truth, before, apart, bend)
 
 
+def nearest(times: Array, reference: Array, before: Indices) -> Indices:
+    """The nearest sample to each of ``times`` (k,), from the one at or before it."""
+    after = np.minimum(before + 1, len(reference) - 1)
+    return np.where(np.abs(times - reference[after]) < np.abs(times - reference[before]), after, before)
+
+
 def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Array:
     """Values (k, m) a ``share`` (k,) of the way from ``start`` to ``end``; the bits of ``start`` at its beginning."""
     step = end - start

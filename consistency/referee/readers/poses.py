@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.referee.geometry.conventions import planar_error, spatial_error
-from consistency.referee.readers.interpolation import Known, Manifold, truth_at
+from consistency.referee.readers.interpolation import Known, Manifold, nearest, truth_at
 from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array, Indices
 
@@ -30,10 +30,17 @@ class Poses:
     convention: str
     max_dt: float  # s
     cross: Array | None = None  # (N, n, n), E e_before e' with the row before; dropped where rows are chosen
+    true_covariance: Array | None = None  # (M, n, n), of the truth's own error in the convention; NaN where it has none
 
     def known(self, shift: float = 0.0) -> Known:
         """The truth at the timestamps, ``shift`` s later."""
         return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
+
+    def truth_covariances(self, known: Known, shift: float = 0.0) -> Array | None:
+        """Covariance of the truth at the rows of ``known``, that of the nearest sample, (k, n, n)."""
+        if self.true_covariance is None:
+            return None
+        return self.true_covariance[nearest(self.t[known.rows] + shift, self.true_t, known.before)]
 
     def errors(self, shift: float = 0.0) -> Array:
         """Truth less estimate, (N, n), with the truth ``shift`` s later; NaN where one of both is not known."""

@@ -28,6 +28,7 @@ class Track:
     nis_dof: Array | None = None  # (k,)
     nees: Array | None = None  # (k,)
     t: Array | None = None  # (k,), s; of windows, of their beginnings
+    truth_covariance: Array | None = None  # (k, n, n), of the truth itself; NaN where it has none
 
     def part(self, index: Sequence[int]) -> Track:
         """Track of some components of the error."""
@@ -35,7 +36,11 @@ class Track:
         assert self.covariance is not None
         if len(index) == self.error.shape[1]:
             return self
-        return replace(self, error=self.error[:, index], covariance=self.covariance[:, index][:, :, index])
+        of_truth = self.truth_covariance
+        return replace(
+            self, error=self.error[:, index], covariance=self.covariance[:, index][:, :, index],
+            truth_covariance=None if of_truth is None else of_truth[:, index][:, :, index],
+        )  # fmt: skip
 
 
 def assemble(
@@ -107,6 +112,7 @@ def assemble(
         convention=convention,
         notes=tuple(notes),
         times=grid(lambda part: part.t),
+        truth_covariance=grid(lambda part: part.truth_covariance),
     )
 
 
@@ -161,16 +167,15 @@ def _judged(track: Track) -> tuple[int, int, str]:
 
 def _cut(track: Track, start: int, end: int) -> Track:
     """Rows before ``end``, with their NEES from ``start`` on."""
-    error, P, nis, dof, t = (
-        None if v is None else v[:end] for v in (track.error, track.covariance, track.nis, track.nis_dof, track.t)
-    )
+    given = (track.error, track.covariance, track.nis, track.nis_dof, track.t, track.truth_covariance)
+    error, P, nis, dof, t, of_truth = (None if v is None else v[:end] for v in given)
     values = None
     if error is not None and P is not None:
         values = np.full(end, np.nan)
         values[start:] = nees(error[start:], P[start:])
         if start:
             P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
-    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values, t)
+    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values, t, of_truth)
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:

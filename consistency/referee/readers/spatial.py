@@ -130,7 +130,9 @@ def _match(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: f
     P = poses.covariance if len(rows) == len(poses.t) else poses.covariance[rows]
     doubts = _doubts(error, P, known.bend[kept])
     t = poses.t[rows]
-    track = Track(run, np.arange(len(rows)), poses.place.at(rows), error, P, t=t)
+    of_truth = poses.truth_covariances(known, shift)
+    of_truth = None if of_truth is None else of_truth[kept]
+    track = Track(run, np.arange(len(rows)), poses.place.at(rows), error, P, t=t, truth_covariance=of_truth)
     return Match(track, t, len(poses.t) - len(rows), *doubts)
 
 

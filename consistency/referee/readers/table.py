@@ -18,7 +18,7 @@ from consistency.referee.parsing.columns import COVARIANCE, OWN_COVARIANCE
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.alignment import Aligned, clocks_and_frames
 from consistency.referee.readers.hints import hints
-from consistency.referee.readers.interpolation import Manifold, truth_at
+from consistency.referee.readers.interpolation import Manifold, nearest, truth_at
 from consistency.referee.readers.kitti import drive_sheet, is_drive
 from consistency.referee.readers.matching import common_steps, common_times
 from consistency.referee.readers.naming import DEVIATIONS
@@ -27,6 +27,7 @@ from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.record import Track, assemble, count, listed, symmetric
 from consistency.referee.readers.relative import Stretch, relative_recording
 from consistency.referee.readers.sheet import Places, TableRows, are_dof, read_sheet
+from consistency.referee.readers.uncertain import COLUMNS
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
@@ -128,7 +129,7 @@ def _recording(
     order = row_order(sheet, runs, key)
     sheet, runs = sheet.rows(order), runs[order]
     keys = sheet.numbers(key, finite=True)
-    error = covariance = deviations = None
+    error = covariance = deviations = of_truth = None
     keep = np.ones(len(runs), bool)
     notes: list[str] = []
     moved = Aligned(())
@@ -141,7 +142,7 @@ def _recording(
         covariance = _covariance(sheet, axes, own) if deviations is None else diagonal(deviations)
         estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
-        samples = _samples(truth, axes, key)
+        samples = _samples(truth, axes, key, r.truth_covariance)
         shift, clocks = 0.0, list[str]()
         if relative is not None and deviations is not None:
             raise InputError(
@@ -160,7 +161,7 @@ def _recording(
                 there = np.isin(runs, np.unique(samples.runs)) if samples.runs is not None else np.ones(len(runs), bool)
                 estimate[there] = np.concatenate([p.estimate for p in moved.runs])
                 covariance[there] = np.concatenate([p.covariance for p in moved.runs])
-        keep, true, notes = _matched(
+        keep, true, of_truth, notes = _matched(
             name, sheet, truth, samples, runs, keys + shift, key, axes, convention, r.tolerance
         )
         if relative is not None:
@@ -198,7 +199,10 @@ def _recording(
             run,
             column,
             Places(sheet.place, rows),
-            *(None if values is None else values[rows] for values in (error, covariance, nis, dof, None, clock)),
+            *(
+                None if values is None else values[rows]
+                for values in (error, covariance, nis, dof, None, clock, of_truth)
+            ),
         )
         for run, rows, column in zip(numbers, members, columns, strict=True)
     ]
@@ -272,6 +276,7 @@ class Samples(NamedTuple):
 
     keys: Array  # (M,), step, or s
     values: Array  # (M, n)
+    covariance: Array | None  # (M, n, n), of the truth itself
     row: Indices  # (M,), of the file
     runs: Indices | None  # (M,); None: it serves all
 
@@ -280,15 +285,19 @@ class Samples(NamedTuple):
         if self.runs is None:
             return self
         here = self.runs == run
-        return Samples(self.keys[here], self.values[here], self.row[here], self.runs[here])
+        P = None if self.covariance is None else self.covariance[here]
+        return Samples(self.keys[here], self.values[here], P, self.row[here], self.runs[here])
 
 
-def _samples(truth: TableRows, axes: tuple[str, ...], key: str) -> Samples:
+def _samples(truth: TableRows, axes: tuple[str, ...], key: str, stated: str | None) -> Samples:
+    if stated not in (None, COLUMNS):
+        raise InputError(f"--truth-covariance {stated}: for tables it is '{COLUMNS}', those of the truth")
     _require(truth, axes)
     values = np.column_stack([truth.numbers(axis, finite=True) for axis in axes])
     runs = truth.numbers("run", whole=True).astype(int) if "run" in truth else None
     order = row_order(truth, runs if runs is not None else np.zeros(len(values), int), key)
-    return Samples(truth.numbers(key)[order], values[order], order, None if runs is None else runs[order])
+    P = None if stated is None else _covariance(truth, axes)[order]
+    return Samples(truth.numbers(key)[order], values[order], P, order, None if runs is None else runs[order])
 
 
 def _manifold(convention: str) -> Manifold:
@@ -331,11 +340,12 @@ def _matched(
     axes: tuple[str, ...],
     convention: str,
     max_dt: float,
-) -> tuple[Array, Array, list[str]]:
-    """Which rows have a truth, (N,), that truth, (N, n), and notes on the matching."""
+) -> tuple[Array, Array, Array | None, list[str]]:
+    """Which rows have a truth, (N,), that truth, (N, n), its covariance, (N, n, n), and notes on the matching."""
     true_runs = samples.runs
     tolerance = 0.0 if key == "step" else max_dt
     keep, true = np.zeros(len(keys), bool), np.full((len(keys), len(axes)), np.nan)
+    of_truth = None if samples.covariance is None else np.full((*true.shape, len(axes)), np.nan)
     partner, furthest = np.full(len(keys), -1), 0.0
     for run in np.unique(runs):
         rows = np.flatnonzero(runs == run)
@@ -357,6 +367,8 @@ def _matched(
                 f"{sheet.path}: no {key} of run {run} ({spans[0]}) is in {truth.path} ({spans[1]}){within}"
             )
         keep[rows[own]], true[rows[own]], partner[rows[own]] = True, found, there.row[match]
+        if of_truth is not None and there.covariance is not None:
+            of_truth[rows[own]] = there.covariance[nearest(keys[rows[own]], there.keys, match)]
     if key == "step" and "t" in sheet and "t" in truth:
         _same_instants(sheet, truth, keep, partner, max_dt)
     notes = []
@@ -370,7 +382,7 @@ def _matched(
         notes.append(f"{name}: {int((~keep).sum())} of {len(keep)} estimates have no truth and are left out")
     if furthest > 1e-6:
         notes.append(f"{name}: the truth is interpolated, from samples up to {furthest:.2g} s away")
-    return keep, true, notes
+    return keep, true, of_truth, notes
 
 
 def _equal(steps: Array, reference: Array) -> tuple[Indices, Indices]:

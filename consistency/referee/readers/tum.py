@@ -32,6 +32,7 @@ from consistency.referee.readers.spatial import (
     recordings_of,
     require_axes,
 )
+from consistency.referee.readers.uncertain import COLUMNS
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
@@ -77,7 +78,7 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
         if isinstance(own, Fixes):
             poses.append(fixed(own, true, r))
             continue
-        poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r.tolerance))
+        poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r))
         if _is_point(true):
             poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
     why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
@@ -154,9 +155,10 @@ def _poses(
     covariance_path: Path | None,
     convention: str,
     order: str,
-    tolerance: float,
+    r: Reading,
 ) -> Poses:
     """A run with its truth; the covariance is NaN where none is near."""
+    tolerance = r.tolerance
     covariance, source, cross = _inline(own, order), own, None
     rows = picked = np.arange(len(own.t))
     if covariance_path is not None:
@@ -180,8 +182,29 @@ def _poses(
     own = own.of(slice(0, POSE))
     place, estimate = Places(own.place, np.arange(len(own.t))), own.values[:, 1:]
     return Poses(
-        place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance, cross
-    )
+        place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance, cross,
+        _of_truth(truth, own, order, r),
+    )  # fmt: skip
+
+
+def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
+    """Covariance of the truth itself, (M, 6, 6): of its own columns, or of a file; NaN where none is near."""
+    if r.truth_covariance is None:
+        return None
+    if r.truth_covariance == COLUMNS:
+        P = _inline(truth, order)
+        if P is None:
+            raise InputError(
+                f"--truth-covariance {COLUMNS}: {truth.path} has none; give a file of t and {FULL} numbers"
+            )
+        return symmetric(P, truth.place)
+    path = Path(r.truth_covariance)
+    source = read_covariances(_same_stem(path, own.path, "--truth-covariance") if path.is_dir() else path)
+    rows, picked = _pairs(truth, source, r.tolerance, "covariance")
+    out = np.full((len(truth.t), 6, 6), np.nan)
+    P = _matrices(source.values[picked, 1 : 1 + FULL], order)
+    out[rows] = symmetric(P, lambda row: source.place(int(picked[row])))
+    return out
 
 
 def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:

@@ -56,6 +56,7 @@ MODULES = (
     "calibration_lost",
     "calibration_questions",
     "calibration_windows",
+    "calibration_truth",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

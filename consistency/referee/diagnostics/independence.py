@@ -42,7 +42,7 @@ class Independence:
         return self.sizes <= self.signs
 
 
-def independence(whitened: Array) -> Independence:
+def independence(whitened: Array, nees: Array | None = None) -> Independence:
     """Test whether the errors of pieces of a log are independent of each other.
 
     The variance of a mean over W pieces, relative to W independent ones, is the sum of their autocorrelations over all
@@ -61,11 +61,13 @@ def independence(whitened: Array) -> Independence:
     ----------
     whitened : (W, n), L^-1 e with L L' = P, in the order of the log; several logs one behind another. Rows that are
         not finite are left out
+    nees : (W,), of each piece, where it is not the squared length of ``whitened``, as of pieces with many steps
     """
-    w = whitened[np.isfinite(whitened).all(axis=1)]
+    there = np.isfinite(whitened).all(axis=1)
+    w = whitened[there]
     if len(w) < FEWEST:
         return Independence(len(w), float("nan"), float("nan"), True)
-    sizes = np.cbrt(np.square(w).sum(axis=1))[:, None]
+    sizes = np.cbrt(np.square(w).sum(axis=1) if nees is None else nees[there])[:, None]
     shares = np.array([ALIKE, 1.0 - ALIKE])
     of_sizes = _low_and_high(sizes - sizes.mean(), True) / (SIZES * shares)
     of_signs = _low_and_high(w, False) / ((1.0 - SIZES) * shares)

@@ -87,8 +87,8 @@ class UncertainTruth:
         if not self.contrasted:
             return self.both
         assert self.record.error is not None
-        error = np.where(np.isfinite(self.P_t).all(axis=(2, 3))[..., None], self.record.error, np.nan)
-        error, P = contrasts(error, self.P, self.record.nees)
+        counted: Array = self.total.counted
+        error, P = contrasts(np.where(counted[..., None], self.record.error, np.nan), self.P)
         return replace(self.both, error=error, covariance=P, nees=None)
 
     @cached_property
@@ -182,18 +182,19 @@ class UncertainTruth:
         """p values of a mean error: by the spread of the runs, and beyond what the truth allows."""
         assert self.total.errors is not None
         e, counted = self.total.errors, self.total.counted
-        runs, steps = counted.any(axis=1), counted.any(axis=0)
+        runs: Array = np.asarray(counted.any(axis=1))
+        steps: Array = np.asarray(counted.any(axis=0))
         if runs.sum() <= self.total.dof:
             return dict.fromkeys(BIAS, float("nan"))
         error = np.where(counted[..., None], e.error, np.nan)
         P, T = (np.where(counted[..., None, None], M, np.nan).reshape(*counted.shape, -1) for M in (self.P, self.P_t))
-        whole = [mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, T)]
-        of_steps = [mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, T)]
+        mean, stated, of_truth = (mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, T))
+        by_step = tuple(mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, T))
         spread = hotelling(mean_of_runs(e.whitened)[runs]).p_value
-        p = {BIAS[0]: max(spread, float(self._allowed(*whole, np.array(runs.sum()))))}
+        p = {BIAS[0]: max(spread, float(self._allowed(mean, stated, of_truth, np.array(runs.sum()))))}
         if len(steps) > 1:
-            _, by_step = t_squared(e.whitened[:, steps])
-            p[BIAS[1]] = least(np.maximum(by_step, self._allowed(*of_steps, counted.sum(axis=0)[steps])))[0]
+            _, spreads = t_squared(e.whitened[:, steps])
+            p[BIAS[1]] = least(np.maximum(spreads, self._allowed(*by_step, counted.sum(axis=0)[steps])))[0]
         return p
 
     def _clearest_step(self) -> int | None:
@@ -242,14 +243,14 @@ class UncertainTruth:
             accepted=self._accepted(v) if self.bounded else v.scale.accepted,
         )
         axes_of = {key: self._of_P(interval, key) for key, interval in v.axes.inflation.items()}
-        mean = v.bias.inflation_without
+        without = v.bias.inflation_without
         if until is not None:
             early = self._of_P(Interval(*[until.early] * 3), MAIN).value
             until = replace(until, early=early, late=self._of_P(until.late, MAIN))
         return replace(
             v, scale=scale,
             axes=replace(v.axes, inflation=axes_of, largest=None if largest is None else self._of_P(largest, MAIN)),
-            bias=replace(v.bias, inflation_without=None if mean is None else self._of_P(mean, MAIN)),
+            bias=replace(v.bias, inflation_without=None if without is None else self._of_P(without, MAIN)),
             location=replace(v.location, until=until),
         )  # fmt: skip
 
@@ -335,7 +336,7 @@ def upper_tail(mean: float, weights: Array) -> float:
     return 1.0 if mean < beyond(weights) else weighted_chi_square_tail(mean, weights)
 
 
-def contrasts(error: Array, P: Array, nees: Array | None) -> tuple[Array, Array]:
+def contrasts(error: Array, P: Array) -> tuple[Array, Array]:
     """Errors less the mean of those of the runs before, and their covariances; without what all runs share.
 
     u_i = (d_i - mean_j<i d_j) sqrt(m / (m + 1)) with m runs before has the covariance
@@ -344,14 +345,12 @@ def contrasts(error: Array, P: Array, nees: Array | None) -> tuple[Array, Array]
 
     Parameters
     ----------
-    error, P : (runs, steps, n), (runs, steps, n, n)
-    nees : (runs, steps), not finite where a value does not count
+    error, P : (runs, steps, n), (runs, steps, n, n); NaN where a value does not count
     """
-    counted = np.isfinite(error).all(axis=2) & np.isfinite(P).all(axis=(2, 3))
-    counted &= True if nees is None else np.isfinite(nees)
-    m = np.cumsum(counted, axis=0) - counted
+    counted: Array = np.asarray(np.isfinite(error).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
+    m: Array = np.cumsum(counted, axis=0) - counted
     e, S = np.where(counted[..., None], error, 0.0), np.where(counted[..., None, None], P, 0.0)
-    first = m[..., None] == 0
+    first: Array = np.asarray(m[..., None] == 0)
     many = np.maximum(m, 1)[..., None]
     before, stated = (np.cumsum(e, axis=0) - e) / many, (np.cumsum(S, axis=0) - S) / many[..., None]
     kept = np.where(first | ~counted[..., None], np.nan, many / (many + 1.0))

@@ -40,6 +40,7 @@ def read(
     windows: str | None = None,
     align: str | None = None,
     lever_arm: Sequence[float] | None = None,
+    split: str | int | None = None,
     truth_covariance: str | Path | None = None,
     truth_errors: str | None = None,
     truth_shared: bool = False,
@@ -66,6 +67,7 @@ def read(
     windows : "independent" declares errors of different windows independent, so that each is a run
     align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
     lever_arm : of a truth of positions alone: its point in the axes of the estimated body, x, y, z, m
+    split : cut one long log into so many pieces, which stand as runs; "auto" takes the advised number
     truth_covariance : of the truth itself, in the convention of the error: "columns" of its file, or a file of t and 36
         or 21 numbers
     truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with
@@ -84,7 +86,8 @@ def read(
     of_truth = None if truth_covariance is None else str(truth_covariance)
     reading = Reading(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
-        motions or None, windows, align, lever_arm, of_truth, truth_errors, truth_shared or None,
+        motions or None, windows, align, lever_arm, split, of_truth, truth_errors,
+        truth_shared or None,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates

@@ -90,6 +90,14 @@ class Reading:
             "MODE",
         ),
     )
+    lever_arm: Sequence[float] | None = field(
+        default=None,
+        metadata=_shown("Of a truth of positions alone: its point in the axes of the body, m.", "X,Y,Z", _lengths),
+    )
+    split: str | int | None = field(
+        default=None,
+        metadata=_shown("Cut one long log into pieces that stand as runs: their number, or 'auto'.", "auto|N", str),
+    )
     truth_covariance: str | None = field(
         default=None,
         metadata=_shown("Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21.", "columns|FILE"),
@@ -100,11 +108,6 @@ class Reading:
     )
     truth_shared: bool | None = field(
         default=None, metadata=_shown("The estimator has fused the truth.", flag="--truth-shared/")
-    )
-
-    lever_arm: Sequence[float] | None = field(
-        default=None,
-        metadata=_shown("Of a truth of positions alone: its point in the axes of the body, m.", "X,Y,Z", _lengths),
     )
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:

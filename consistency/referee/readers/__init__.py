@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.pieces import in_pieces
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
 from consistency.referee.parsing import require_name
@@ -136,7 +137,9 @@ def _read(estimates: Path, r: Reading) -> list[Evidence]:
     """Recordings of files as they stand, with the options given."""
     over = relative_of(r.relative, bool(r.motions), r.windows)
     r = _checked(r, over)
-    return declared(_read(estimates, r, over), r)
+    pieces = pieces_asked(r)
+    records = declared(_read(estimates, r, over), r)
+    return records if pieces is None else [in_pieces(record, pieces or None) for record in records]
 
 
 def _read(estimates: Path, r: Reading, over: Relative | None) -> list[Evidence]:
@@ -168,6 +171,28 @@ def _read(estimates: Path, r: Reading, over: Relative | None) -> list[Evidence]:
         raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
     _refuse(estimates, r, "state")
     return _with_frame(read_tum(estimates, r, over), r)
+
+
+def pieces_asked(r: Reading) -> int | None:
+    """Number of pieces of ``--split``, 0 for the advised one; None without the option.
+
+    Raises
+    ------
+    InputError
+        It is no number of pieces, or another option makes runs of the log.
+    """
+    if r.split is None:
+        return None
+    for option in ("relative", "motions", "windows"):
+        if getattr(r, option):
+            raise InputError(f"--split: does not go with {flag_of(option)}, which cuts the log into windows")
+    if r.align not in (None, "none"):
+        raise InputError(f"--split: does not go with --align {r.align}: all pieces would share the error of one frame")
+    if r.split == "auto":
+        return 0
+    if not str(r.split).isdecimal() or int(r.split) < 1:
+        raise InputError(f"--split {r.split}: must be a number of pieces, or 'auto'")
+    return int(r.split)
 
 
 def _checked(r: Reading, over: Relative | None) -> Reading:

@@ -80,6 +80,7 @@ def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:
     return replace(
         poses, estimate=point, covariance=0.5 * (P + np.swapaxes(P, 1, 2)), truth=poses.truth[:, :3],
         manifold="vector", convention="vector", cross=None,
+        true_covariance=None if poses.true_covariance is None else poses.true_covariance[:, :3, :3],
     )  # fmt: skip
 
 

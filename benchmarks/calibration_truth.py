@@ -1,0 +1,116 @@
+"""Truth with a covariance of its own: is an honest filter called a fault, and is a wrong one found?
+
+Errors of filter and truth are Gaussian with the covariances that they state; the truth has the share s of the sum.
+Errors of the filter are AR(.5) over the steps. ``calibration.py`` puts the rows into its table.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import optimize, signal
+
+from consistency.referee.diagnostics import Evidence, judge
+from consistency.referee.types import Array
+
+RUNS, STEPS, DOF = 50, 20, 3
+SHARES = (0.2, 0.4)
+DECLARED = {"white": "independent", "AR(.9)": "independent", "constant per run": "per-run", "common to all": "common"}
+SIGNS = "common to all but for its sign"  # of each run: nothing can be declared
+GATES, QUICK_GATES = 2000, 60
+POWER = 0.3  # of what is not declared, at least: about half of it is found
+FALSE, POWERS, BOUNDED, CONSISTENT = (
+    "uncertain truth, false alarm", "uncertain truth, power", "uncertain truth, power without a declaration",
+    "uncertain truth, wrong all-clear",
+)  # fmt: skip
+ABOUT = {
+    **{
+        f"truth {kind}, {how}, s = {s:g}": f"n = {DOF}; errors of the truth {kind}, {how}; {100 * s:.0f} % of the sum"
+        for s in SHARES
+        for kind in (*DECLARED, SIGNS)
+        for how in ("declared", "not declared")
+    },
+    FALSE: "a right filter is found at fault against a truth with a covariance of its own",
+    POWERS: "a wrong covariance is called as it is, and errors of the truth are declared",
+    BOUNDED: "a wrong covariance is called as it is, and errors of the truth are not declared",
+    CONSISTENT: "a covariance wrong by exactly `detect` is called consistent against such a truth",
+}
+
+
+def covariance(rng: np.random.Generator) -> Array:
+    A = rng.standard_normal((DOF, DOF))
+    return np.asarray(A @ A.T / DOF + 0.3 * np.eye(DOF))
+
+
+def gate(rng: np.random.Generator, kind: str, s: float, ratio: float, errors: str | None) -> Evidence:
+    """Errors of 50 runs with covariances P, and those of the truth beside them."""
+    P, Q = covariance(rng), covariance(rng)
+    Q *= optimize.brentq(lambda c: np.trace(np.linalg.solve(P + c * Q, c * Q)) / DOF - s, 1e-6, 1e6)
+    e = _ar(rng, 0.5) @ np.linalg.cholesky(ratio * P).T + errors_of_truth(rng, kind) @ np.linalg.cholesky(Q).T
+    shape = (RUNS, STEPS, DOF, DOF)
+    return Evidence(
+        "gate", e, np.broadcast_to(P, shape), truth_covariance=np.broadcast_to(Q, shape), truth_errors=errors
+    )
+
+
+def errors_of_truth(rng: np.random.Generator, kind: str) -> Array:
+    """Standard normal errors, (runs, steps, n)."""
+    if kind == "white":
+        return rng.standard_normal((RUNS, STEPS, DOF))
+    if kind == "AR(.9)":
+        return _ar(rng, 0.9)
+    if kind == "constant per run":
+        return np.broadcast_to(rng.standard_normal((RUNS, 1, DOF)), (RUNS, STEPS, DOF))
+    one = np.broadcast_to(rng.standard_normal((1, 1, DOF)), (RUNS, STEPS, DOF))
+    return one * rng.choice([-1.0, 1.0], (RUNS, 1, 1)) if kind == SIGNS else one
+
+
+def _ar(rng: np.random.Generator, rho: float) -> Array:
+    w = rng.standard_normal((RUNS, STEPS, DOF))
+    w[:, 1:] *= np.sqrt(1.0 - rho**2)
+    return np.asarray(signal.lfilter([1.0], [1.0, -rho], w, axis=1))
+
+
+def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
+    """Rows of the calibration table."""
+    table, gates = [], QUICK_GATES if quick else GATES
+    for k, s in enumerate(SHARES[:1] if quick else SHARES):
+        for kind in (*DECLARED, SIGNS):
+            for errors in dict.fromkeys((DECLARED.get(kind), None)):
+                how = "not declared" if errors is None else "declared"
+                for ratio in (1.0, 2.0, 0.5, 1.5):
+                    key = (seed, k, *map(ord, kind[:5]), len(how), round(100 * ratio))
+                    rng = np.random.default_rng(key)
+                    found = [judge(gate(rng, kind, s, ratio, errors)) for _ in range(gates)]
+                    fault = sum(bool(v.faults) for v in found)
+                    side = "overconfident" if ratio > 1.0 else "conservative"
+                    called = sum(v.status == side for v in found)
+                    consistent = sum(v.status == "consistent" for v in found)
+                    question, stated, bound, count = {
+                        1.0: (FALSE, 0.05, "<=", fault),
+                        1.5: (CONSISTENT, 0.05, "<=", consistent),
+                    }.get(ratio, (POWERS, 0.95, ">=", called) if errors else (BOUNDED, POWER, ">=", called))
+                    world = f"truth {kind}, {how}, s = {s:g}"
+                    if errors or s == SHARES[0] or bound == "<=":
+                        table.append(_row(world, question, ratio, stated, bound, gates, count))
+    return table
+
+
+def _row(world: str, question: str, ratio: float, stated: float, bound: str, gates: int, found: int) -> dict[str, Any]:
+    return {
+        "world": world, "question": question, "ratio": ratio, "runs": RUNS, "looks": 1, "stated": stated,
+        "bound": bound, "gates": gates, "found": found,
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Print the rows."""
+    for row in rows(quick=False, seed=20070101):
+        share = 100 * row["found"] / row["gates"]
+        print(f"{row['question']}, {row['world']}, x{row['ratio']:g}: {share:.2f} % ({row['bound']} {row['stated']})",
+              flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.independence import independence
 from consistency.referee.diagnostics.questions import BIAS
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.scale import run_means
+from consistency.referee.diagnostics.single_log import APART, MOST, REACH
 from consistency.referee.diagnostics.whitening import mean_of_runs, squared_length, whiten
-from consistency.referee.diagnostics.within import APART, MOST, REACH
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
@@ -39,7 +39,7 @@ class Memory:
     @property
     def pieces(self) -> int:
         """Advised number of pieces; it does not depend on the size of the errors."""
-        return min(self.steps // self.piece, MOST)
+        return min(int(self.steps // self.piece), int(MOST))
 
 
 def memory_of(whitened: Array) -> Memory:
@@ -56,7 +56,7 @@ def memory_of(whitened: Array) -> Memory:
     w = whitened[np.isfinite(whitened).all(axis=1)]
     sizes = np.square(w).sum(axis=1)
     found = [_time(series) for series in (*w.T, sizes - sizes.mean())] if len(w) > 1 else []
-    z = float(stats.norm.ppf(CONFIDENCE))
+    z = float(special.ndtri(CONFIDENCE))
     uppers = [time * np.exp(z * np.sqrt(2.0 * (2.0 * reach + 1.0) / len(w))) for time, reach in found]
     return Memory(len(whitened), max((time for time, _ in found), default=np.inf), max(uppers, default=np.inf))
 
@@ -132,11 +132,16 @@ def _require_steady(record: Record, P: Array) -> None:
     names = record.axes or [f"axis {i}" for i in range(medians.shape[1])]
     for axis, values in zip(names, medians.T, strict=True):
         ratio = float(values[-1] / max(values[1], np.finfo(float).tiny))
-        if ratio > GROWTH and float(stats.spearmanr(values, np.arange(LEAST))[0]) > STEADY:
+        if ratio > GROWTH and _rises(values) > STEADY:
             raise InputError(
                 f"--split: the stated variance of {axis} grows by x{ratio:.3g} over the log, so that its pieces are "
                 "not alike; judge motions over windows: --relative 10s"
             )
+
+
+def _rises(values: Array) -> float:
+    """Rank correlation of a series with its order (Spearman 1904)."""
+    return float(np.corrcoef(np.argsort(np.argsort(values)), np.arange(len(values)))[0, 1])
 
 
 def _unshown(memory: Memory, pieces: int, length: int, parts: Array) -> str:

@@ -8,9 +8,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize
 
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.bias import hotelling, t_squared
 from consistency.referee.diagnostics.equivalence import equivalence, equivalent
 from consistency.referee.diagnostics.headline import at_share
@@ -189,12 +190,13 @@ class UncertainTruth:
         error = np.where(counted[..., None], e.error, np.nan)
         P, T = (np.where(counted[..., None, None], M, np.nan).reshape(*counted.shape, -1) for M in (self.P, self.P_t))
         mean, stated, of_truth = (mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, T))
-        by_step = tuple(mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, T))
+        mean_k, stated_k, of_truth_k = (mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, T))
         spread = hotelling(mean_of_runs(e.whitened)[runs]).p_value
         p = {BIAS[0]: max(spread, float(self._allowed(mean, stated, of_truth, np.array(runs.sum()))))}
         if len(steps) > 1:
             _, spreads = t_squared(e.whitened[:, steps])
-            p[BIAS[1]] = least(np.maximum(spreads, self._allowed(*by_step, counted.sum(axis=0)[steps])))[0]
+            allowed = self._allowed(mean_k, stated_k, of_truth_k, counted.sum(axis=0)[steps])
+            p[BIAS[1]] = least(np.maximum(spreads, allowed))[0]
         return p
 
     def _clearest_step(self) -> int | None:
@@ -207,7 +209,7 @@ class UncertainTruth:
         """p values of mean errors (..., n), whose covariance is at most P / runs + P_t, (..., n n) each."""
         n = mean.shape[-1]
         most = (P / runs[..., None] + P_t).reshape(*mean.shape, n) * self._together
-        return np.asarray(stats.chi2.sf((mean * np.linalg.solve(most, mean[..., None])[..., 0]).sum(axis=-1), n))
+        return np.asarray(laws.chi2.sf((mean * np.linalg.solve(most, mean[..., None])[..., 0]).sum(axis=-1), n))
 
     def equivalence(self, sample: Sample, settings: Settings, factor: float) -> Equivalence:
         """Whether the ratio of P is shown to lie in [1 / factor, factor]."""
@@ -288,7 +290,7 @@ class UncertainTruth:
         value, low, high = of_both
         if self.bounded:
             k = self.by_group[group].shape[1]
-            most = s * float(stats.chi2.ppf(0.5 * (1.0 + CONFIDENCE), k)) / k  # of the truth, if all its errors are one
+            most = s * float(laws.chi2.ppf(0.5 * (1.0 + CONFIDENCE), k)) / k  # of the truth, if all its errors are one
             low, high = low - most, high
             if self.record.truth_shared:
                 low = max(np.sqrt(of_both.low) - np.sqrt(most), 0.0) ** 2

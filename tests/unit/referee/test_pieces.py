@@ -12,8 +12,9 @@ from scipy import signal
 import consistency as cs
 from consistency.referee.diagnostics import Evidence, judge
 from consistency.referee.diagnostics.independence import independence
-from consistency.referee.diagnostics.pieces import APART, LEAST, MOST, in_pieces, memory_of
+from consistency.referee.diagnostics.pieces import LEAST, in_pieces, memory_of
 from consistency.referee.diagnostics.questions import BIAS
+from consistency.referee.diagnostics.single_log import APART, MOST
 from consistency.referee.types import Array
 
 N = 2

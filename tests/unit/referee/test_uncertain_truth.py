@@ -105,6 +105,7 @@ def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherw
     """The error that all runs share has s = .3: an honest filter is biased if the truth is said to be independent."""
     rng = np.random.default_rng(5)
     one = record(rng, "common", 0.3, errors="independent")
+    assert one.error is not None
     wrong = judge(Evidence("est", one.error + 1.5, one.covariance, truth_covariance=one.truth_covariance,
                            truth_errors="independent"))  # fmt: skip
     assert "bias" in wrong.faults
@@ -115,6 +116,7 @@ def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherw
 def test_a_bias_beyond_the_truth_is_found(errors: str | None) -> None:
     rng = np.random.default_rng(8)
     one = record(rng, "common", 0.2, errors=errors)
+    assert one.error is not None
     far = 6.0 * np.sqrt(np.diag(truth_of_share(0.2)))
     v = judge(Evidence("est", one.error + far, one.covariance, axes=one.axes, truth_covariance=one.truth_covariance,
                        truth_errors=errors))  # fmt: skip

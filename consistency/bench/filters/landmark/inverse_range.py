@@ -100,6 +100,42 @@ def carried(y: Array, turn: Frame, mount: Mounting, there: Array, J: Array, D: A
     return px, py, bz
 
 
+@inner
+def bent(q: Triple, rho: float, w: Triple) -> Triple:
+    """Second derivative of azimuth, elevation and rho / |q| along q + s w, at s = 0."""
+    h2 = q[0] * q[0] + q[1] * q[1]
+    r2 = h2 + q[2] * q[2]
+    h, r = np.sqrt(h2), np.sqrt(r2)
+    flat = q[0] * w[0] + q[1] * w[1]
+    whole = flat + q[2] * w[2]
+    w2 = w[0] * w[0] + w[1] * w[1]
+    dh, dr = flat / h, whole / r
+    ddh, ddr = (w2 - dh * dh) / h, (w2 + w[2] * w[2] - dr * dr) / r
+    de = (h * w[2] - q[2] * dh) / r2
+    return (
+        -2.0 * (q[0] * w[1] - q[1] * w[0]) * flat / (h2 * h2),
+        -(q[2] * ddh + 2.0 * de * whole) / r2,
+        rho * (2.0 * dr * dr / r - ddr) / r2,
+    )
+
+
+@inner
+def add_curvature(
+    b: Triple, rho: float, D: Array, turn: Frame, mount: Mounting, along: float, about: float, there: Array
+) -> None:
+    """``there`` (3,) += what noise of the drive, m, and of the turn, rad, adds to its mean, to second order.
+
+    ``b``, ``D`` are those of :func:`carried`. An error s of the turn takes b to b + s (b_y, -b_x, 0) -
+    s^2 / 2 (b_x, b_y, 0), one of the drive to b - s rho (c, s, 0).
+    """
+    q = inward(mount, b[0] - rho * mount.x, b[1] - rho * mount.y, b[2] - rho * mount.z)
+    of_turn = bent(q, rho, inward(mount, b[1], -b[0], 0.0))
+    of_drive = bent(q, rho, inward(mount, -rho * turn.c, -rho * turn.s, 0.0))
+    for a in range(3):
+        by_turn = of_turn[a] - D[a, 0] * b[0] - D[a, 1] * b[1]
+        there[a] += 0.5 * (along * along * of_drive[a] + about * about * by_turn)
+
+
 @implement(world_point, InverseRange)
 def inverse_range_in_world(
     landmark: InverseRange, frame: Frame, values: Array, point: Array, Dp: Array, Dl: Array

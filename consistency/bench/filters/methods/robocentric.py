@@ -18,12 +18,11 @@ from consistency.bench.filters.sensor.growth import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched
 from consistency.bench.filters.textbook.robocentric import (
     DOUBT,
-    EVERY,
     KNOWN,
     PASSES,
     PASSES_CHAINED,
-    UNSEEN,
     RobotCentredKalman,
+    rounds,
 )
 from consistency.bench.filters.update import reactivation  # noqa: F401, registers the update
 from consistency.bench.filters.update.converting import Converted, Converting
@@ -42,13 +41,14 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         pixels = Pixels(
             su, sv, sd, growth_of(sensor), low, high, which.truncation, which.debiasing, which.prediction
         )  # fmt: skip
-        every, unseen = (EVERY, UNSEEN) if which.parking else (0, 0)
-        doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if which.parking else 0
-        chain = PASSES_CHAINED if which.turning else 0
+        every, unseen = rounds(which)
+        doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if every > 0 else 0
+        passes, chain = PASSES if which.iteration else 1, PASSES_CHAINED if which.turning else 0
+        waiting = KNOWN if which.waiting else 0.0
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
             InvariantPose(), Converted(),
-            Converting(pixels, KNOWN if which.waiting else 0.0, PASSES if which.iteration else 1, chain, clones),
+            Converting(pixels, waiting, passes, chain, clones, which.recency, which.curvature),
             Parking(every, unseen, doubt, which.turning),
         )  # fmt: skip
 

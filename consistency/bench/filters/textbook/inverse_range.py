@@ -32,6 +32,9 @@ class Corrections(NamedTuple):
     prediction: bool = True  # noise of what is observed taken where it is predicted, not where it was measured
     iteration: bool = True
     waiting: bool = True  # what returns in doubt, and is all that is seen, stays parked
+    recency: bool = True  # an update about a moved robot leaves the errors from before its last motion as they are
+    curvature: bool = True  # mean of a landmark that moves, to second order in the noise of turn and drive
+    promptness: bool = True  # landmarks are parked soon
 
 
 # --- geometry ----------------------------------------------------------------------------------------
@@ -74,6 +77,42 @@ def carried(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array
     return there, J, D @ axes.T, b
 
 
+def bent(q: Array, rho: Array, w: Array) -> Array:
+    """Second derivative (m, 3) of azimuth, elevation and rho / |q| along q + s w, at s = 0; q, w (m, 3), rho (m,)."""
+    h2, r2 = (q[:, :2] ** 2).sum(axis=1), (q**2).sum(axis=1)
+    h, r = np.sqrt(h2), np.sqrt(r2)
+    flat, whole = (q[:, :2] * w[:, :2]).sum(axis=1), (q * w).sum(axis=1)
+    dh, dr = flat / h, whole / r
+    ddh, ddr = ((w[:, :2] ** 2).sum(axis=1) - dh**2) / h, ((w**2).sum(axis=1) - dr**2) / r
+    de = (h * w[:, 2] - q[:, 2] * dh) / r2
+    azimuth = -2.0 * (q[:, 0] * w[:, 1] - q[:, 1] * w[:, 0]) * flat / h2**2
+    elevation = -(q[:, 2] * ddh + 2.0 * de * whole) / r2
+    return np.stack([azimuth, elevation, rho * (2.0 * dr**2 / r - ddr) / r2], axis=1)
+
+
+def curvature(
+    b: Array, rho: Array, D: Array, along: Array, noise: tuple[float, float], sensor: BelievedSensor
+) -> Array:
+    """What noise of drive and turn adds to the mean of landmarks (m, 3), to second order.
+
+    An error s of the turn takes b to Rz(-s) b = b + s (b_y, -b_x, 0) - s^2 / 2 (b_x, b_y, 0), one of the drive to
+    b - s rho ``along``: the mean moves by half of each variance times the second derivative of the landmark by s.
+
+    Parameters
+    ----------
+    b, rho, D : (m, 3), (m,), (m, 3, 3), as of :func:`carried`
+    along : (3,), direction of the drive in the new frame of the robot
+    noise : standard deviations of drive (m) and turn (rad)
+    """
+    mount = sensor.mount.packed()
+    offset, axes = np.array(mount[:3]), np.reshape(mount[3:], (3, 3))
+    q, flat = (b - rho[:, None] * offset) @ axes, b * [1.0, 1.0, 0.0]
+    by_turn = np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1) @ axes
+    of_turn = bent(q, rho, by_turn) - (D @ flat[:, :, None])[:, :, 0]
+    of_drive = bent(q, rho, -rho[:, None] * (along @ axes))
+    return np.asarray(0.5 * (noise[0] ** 2 * of_drive + noise[1] ** 2 * of_turn))
+
+
 def exponential(xi: Array) -> tuple[Array, Array]:
     """Exp of SE(2): rotation (2, 2) and translation (2,) of xi = (x, y, angle)."""
     angle = xi[2]
@@ -100,10 +139,16 @@ def left_jacobian(xi: Array) -> Array:
     return np.asarray(np.eye(3) + ad / 2.0 + ad @ ad / 6.0)
 
 
-def apart(poses: Array, xi: Array) -> tuple[Array, Array]:
-    """Poses (k, 3) moved by errors (k, 3), each Exp(xi) T; d error about the moved ones / d xi, (3 k, 3 k)."""
-    C = basics.block_diagonal(np.array([left_jacobian(x) for x in xi]))
-    return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), C
+def apart(poses: Array, xi: Array, recency: bool = False) -> tuple[Array, Array]:
+    """Poses (k, 3) moved by errors (k, 3), each Exp(xi) T; d error about the moved ones / d xi, (3 k, 3 k).
+
+    With ``recency`` the last pose is moved by the noise of its last motion, whose errors come after all older ones:
+    T_true = Exp(xi) Exp(nu) T, so that T moved by nu has the error xi, not J_l(nu) xi.
+    """
+    J = np.array([left_jacobian(x) for x in xi])
+    if recency:
+        J[-1] = np.eye(3)
+    return np.array([moved(pose, x) for pose, x in zip(poses, xi, strict=True)]), basics.block_diagonal(J)
 
 
 def chained(poses: Array, xi: Array, on: int) -> tuple[Array, Array]:

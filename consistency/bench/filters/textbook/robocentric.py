@@ -17,6 +17,10 @@ its clone: the robot may then be anywhere on a circle about it, a straight line 
 of the robot would keep p + R m / rho to first order only. From the second such step on the robot hangs on that clone,
 since a turn about a point is Exp of one xi, and of a sum of many to first order only.
 
+What an iterated update finds of the robot's error where nothing is in doubt is mostly the noise nu of the last motion,
+T_true = Exp(xi) Exp(nu) T. The error about Exp(nu) T is xi, and not J_l(nu) xi (*recency*). The noise of turn and
+drive also moves the mean of a landmark by half of its variance times the landmark's second derivative (*curvature*).
+
 Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
 its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not
 the conversion of the mean, to second order in the noise of u and v. The noise of the conversion is taken where the
@@ -56,6 +60,7 @@ from consistency.bench.filters.textbook.inverse_range import (
     carried,
     chained,
     converted,
+    curvature,
     observed,
     searched,
 )
@@ -66,7 +71,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.types import Array
 
-EVERY, UNSEEN = 50, 20  # steps between two rounds of parking, and without a sight before a landmark is parked
+EVERY, UNSEEN = 10, 4  # steps between two rounds of parking, and without a sight before a landmark is parked
+EVERY_LATE, UNSEEN_LATE = 50, 20  # without promptness
 DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
 KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
@@ -84,6 +90,13 @@ class Solution(NamedTuple):
     W: Array  # (n, k)
     innovation: Array  # (k,)
     is_settled: bool
+
+
+def rounds(which: Corrections) -> tuple[int, int]:
+    """Steps between two rounds of parking, 0 for none, and without a sight before a landmark is parked."""
+    if not which.parking:
+        return 0, 0
+    return (EVERY, UNSEEN) if which.promptness else (EVERY_LATE, UNSEEN_LATE)
 
 
 class RobotCentredKalman:
@@ -116,6 +129,9 @@ class RobotCentredKalman:
             R = heading_matrix(-turn)
             y, J, D, b = carried(x[rows], R, -R[:, 0] * forward, belief.sensor)
             rho = x[rows][:, 2:]
+            if self.which.curvature:
+                sigmas = (control.dt * belief.motion.sigma_v, control.dt * belief.motion.sigma_omega)
+                y = y + curvature(b, rho[:, 0], D, R[:, 0], sigmas, belief.sensor)
             x[rows] = y
             F[rows[:, :, None], rows[:, None, :]] = J
             by_forward, by_turn = -rho * R[:, 0], np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1)
@@ -135,15 +151,17 @@ class RobotCentredKalman:
         for label, z in zip(np.array(labels)[~known], unbiased[~known], strict=True):
             state = self._inserted(state, int(label), z)
         state = replace(state, seen=state.seen | dict.fromkeys(labels, state.step))
-        if self.which.parking and state.step % EVERY == 0:
-            state = with_parked(state, UNSEEN)
+        every, unseen = rounds(self.which)
+        if every > 0 and state.step % every == 0:
+            state = with_parked(state, unseen)
         return state, info
 
     def _correct(self, state: CentredState, seen: list[int], z: Array, shift: Array) -> tuple[CentredState, Info]:
         is_parked = np.array([label in state.parked for label in seen])
         in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
         new = np.array([state.step - state.seen[label] > 1 for label in seen])
-        attempts: list[tuple[Chart, int]] = [(apart, PASSES if self.which.iteration and is_parked.any() else 1)]
+        separate = partial(apart, recency=self.which.recency)
+        attempts: list[tuple[Chart, int]] = [(separate, PASSES if self.which.iteration and is_parked.any() else 1)]
         if self.which.turning and in_doubt.any():
             state = settled_clones(state)
             held = [state.parked[label] for label in np.array(seen)[in_doubt & ~new]]
@@ -156,7 +174,7 @@ class RobotCentredKalman:
             if found.is_settled:
                 break
         after, turned = moved_by(state, found.delta), np.eye(len(state.x))
-        if chart is not apart:
+        if chart is not separate:
             (after, _), turned = charted(state, found.delta, chart), found.C
         turned = np.linalg.inv(shifts_of(after)) @ turned
         after = replace(after, P=turned @ (P - found.W @ found.S @ found.W.T) @ turned.T)

@@ -22,7 +22,7 @@ from consistency.bench.filters.kernel.slam import (
     predict,
 )
 from consistency.bench.filters.kernel.work import NoNotes, Work
-from consistency.bench.filters.landmark.inverse_range import InverseRange, carried
+from consistency.bench.filters.landmark.inverse_range import InverseRange, add_curvature, carried
 from consistency.bench.filters.motion.unicycle import Unicycle
 from consistency.bench.filters.sensor.conversion import Pixels, conversion_jacobian, convert, subtract_bias
 from consistency.bench.filters.sensor.uvd import Uvd
@@ -34,7 +34,9 @@ class Converting(NamedTuple):
     """What is known of the pixels, and what is done about a return.
 
     ``waiting``: alone and in doubt it stays parked if its distance is known to this part of it; ``passes`` of such an
-    update at most, and of one in a ``chain``, tried first, 0 for none; ``clones`` at most.
+    update at most, and of one in a ``chain``, tried first, 0 for none; ``clones`` at most, and no more than landmarks.
+    ``recency``: a moved robot keeps the errors from before its last motion; ``curvature``: a motion moves landmarks
+    by the mean of its noise to second order.
     """
 
     pixels: Pixels
@@ -42,6 +44,8 @@ class Converting(NamedTuple):
     passes: int
     chain: int
     clones: int
+    recency: bool
+    curvature: bool
 
 
 @part(update="Converting")
@@ -102,7 +106,7 @@ def _every_third(n: int) -> Indices:
 
 @implement(make_room, Converting)
 def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) -> ConvertingRoom:
-    c = max(m, update.clones)
+    c = max(m, min(update.clones, (n - 3) // 6))
     most = 3 + 3 * (m + c)
     return ConvertingRoom(
         integers(m + c, 0), integers(c, 0), integers(m, 0), matrix(most, n),
@@ -140,8 +144,10 @@ def predict_centred(
             J, D, there = room.J[moving], room.three[0], room.poses[0]
             rho = x[o + 2]
             point = carried(x[o : o + 3], turn, slam.landmark.mount, there, J, D)
-            copy(there, x[o : o + 3])
             along, about = u[0] * slam.motion.sigma_v, u[0] * slam.motion.sigma_omega
+            if update.curvature:
+                add_curvature(point, rho, D, turn, slam.landmark.mount, along, about, there)
+            copy(there, x[o : o + 3])
             for a in range(3):
                 noise[0, o + a] = -along * rho * (D[a, 0] * c + D[a, 1] * s)
                 noise[1, o + a] = about * (D[a, 0] * point[1] - D[a, 1] * point[0])

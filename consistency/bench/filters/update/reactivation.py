@@ -117,7 +117,7 @@ def _aim(
         return code, clones, chained, np.nan
     if clones == 0 or update.passes == 1:
         fill(room.delta[: 3 + 3 * (m + clones)], 0.0)
-        aim_apart(state, m, clones, local, room)
+        aim_apart(state, m, clones, update.recency, local, room)
         _expect(update, slam, state, data, True, m, clones, local, work)
     if chained:
         cast_state(state, m, clones, room)
@@ -220,7 +220,7 @@ def _iterate(
             cast_rows(cast, size, m, clones, room)
             cast_columns(cast, room.place, m, clones, room)
         else:
-            aim_apart(state, m, clones, local, room)
+            aim_apart(state, m, clones, update.recency, local, room)
         _expect(update, slam, state, data, i == 0, m, clones, local, work)
         if local.new[0]:
             _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), local, work)

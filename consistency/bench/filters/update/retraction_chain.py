@@ -23,8 +23,12 @@ from consistency.referee.types import Array, Indices
 
 
 @inner
-def aim_apart(state: State, m: int, clones: int, local: Clones, room: ConvertingRoom) -> None:
-    """``frames`` (clones + 1, 3) <- the poses to which ``delta`` leads, ``turns`` <- d error about each / d delta."""
+def aim_apart(state: State, m: int, clones: int, recency: bool, local: Clones, room: ConvertingRoom) -> None:
+    """``frames`` (clones + 1, 3) <- the poses to which ``delta`` leads, ``turns`` <- d error about each / d delta.
+
+    With ``recency`` that of the robot is the identity: most of its ``delta`` is noise of the last motion, which came
+    after all older errors.
+    """
     xi = room.poses[3]
     for c in range(clones):
         q, p = room.at[m + c], 3 + 3 * (m + c)
@@ -33,7 +37,8 @@ def aim_apart(state: State, m: int, clones: int, local: Clones, room: Converting
         move_pose(local.origin[room.number[c]], xi, room.frames[c])
         left_jacobian(xi, room.turns[c])
     move_pose(state.x[:3], room.delta[:3], room.frames[clones])
-    left_jacobian(room.delta[:3], room.turns[clones])
+    fill(xi, 0.0)
+    left_jacobian(xi if recency else room.delta[:3], room.turns[clones])
 
 
 @inner

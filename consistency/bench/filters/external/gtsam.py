@@ -30,7 +30,7 @@ from consistency.referee.types import Array, Failure
 World = Callable[[Problem], Any]  # gives what PlanarStereo has: moved, motion, placed, sight, point, origins
 MOVED = 1e-3  # m, rad, 1/m: change from which a variable is linearised again; a few per cent of the least sigma here
 AGAIN = 1  # further iterations after an observation
-LAG = 50  # steps that poses stay in the window, 5 s; as long as parked-ekf-uvd waits between two rounds of parking
+LAG = 50  # steps that poses stay in the window, 5 s
 WINDOW = 25  # steps that the smoother of the whole trial adds at a time, so that it starts near the solution
 SETTLED, PASSES = 1e-6, 50  # change (m, rad, 1/m) below which that smoother has arrived, and iterations at most
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -174,9 +173,9 @@ def _time(path: Path, number: int, row: Sequence[str], clock: str) -> float:
     """Seconds since 1970 in UTC of a date and a time of day, or of a week and its second."""
     try:
         if "/" in row[0]:
-            date, day = [int(part) for part in row[0].split("/")], re.split(":", row[1])
-            second = float(day[2])
-            at = dt.datetime(*date, int(day[0]), int(day[1]))  # type: ignore[arg-type]
+            (year, month, day), (hour, minute, seconds) = map(int, row[0].split("/")), row[1].split(":")
+            second = float(seconds)
+            at = dt.datetime(year, month, day, int(hour), int(minute))
         else:
             at, second = GPS + dt.timedelta(weeks=int(row[0])), float(row[1])
     except (ValueError, IndexError, TypeError, OverflowError):

@@ -171,9 +171,9 @@ def _matrix(lines: Lines) -> tuple[Array, Array, Array]:
 def _is_rigid(numbers: Array) -> Indices:
     """Whether rows (N, 12) or (N, 16) are the matrix of a rotation and a translation, or not finite."""
     M = numbers.reshape(len(numbers), -1, 4)
-    R, finite = M[:, :3, :3], np.isfinite(numbers).all(axis=1)
+    R, finite = M[:, :3, :3], np.asarray(np.isfinite(numbers).all(axis=1))
     with np.errstate(invalid="ignore", over="ignore"):
-        right = (np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2)) < ROTATION) & (
+        right: Indices = (np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2)) < ROTATION) & (
             np.linalg.det(np.where(finite[:, None, None], R, 0.0)) > 0
         )
     if M.shape[1] == 4:

@@ -99,7 +99,7 @@ def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
             text = file.read(PEEKED).decode("utf-8-sig", "ignore")
     except (OSError, EOFError, zlib.error):
         return [], None
-    lines = []
+    lines: list[tuple[int, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and _is_row(line):
             return lines, line

@@ -429,7 +429,7 @@ def _deviations(sheet: TableRows, axes: tuple[str, ...]) -> Array | None:
     variances = [f"P_{a}_{a}" if f"P_{a}_{a}" in sheet else OWN_NAMES.get((a, a), "") for a in axes]
     if n > 1 and all(name in sheet for name in variances):
         P = np.column_stack([sheet.numbers(name) for name in variances])
-        return np.sign(P) * np.sqrt(np.abs(P))
+        return np.asarray(np.sign(P) * np.sqrt(np.abs(P)))
     for spelling in DEVIATIONS:
         names = [spelling.format(axis) for axis in axes]
         if all(name in sheet for name in names) and not any(name in sheet for name in variances):

@@ -27,6 +27,7 @@ from document_inputs import NOT_RUN
 from documents import PAGES, PROGRAMS, ROOT, SHELL, Block, Command, blocks, commands, parsed, read, typed
 
 import consistency as cs
+from consistency.bench.challenging.worlds import space_of
 from consistency.bench.filters import filter_names
 from consistency.bench.filters.guard.settings import KINDS
 from consistency.bench.runs.findings import experiments
@@ -229,6 +230,9 @@ def reads_toml(block: Block, folder: Path) -> None:
                 cs.load_scenario(path)
         else:
             assert cs.load_scenario(path).hash != cs.load_scenario("herath2007-stereo").hash
+    elif not any(isinstance(value, dict) for value in content.values()):  # bounds of the worlds of a challenge
+        path.write_text(block.text)
+        assert space_of(cs.load_scenario("herath2007-stereo"), [str(path)]).dimensions
     else:
         raise AssertionError(f"{block}: no reader takes the tables {set(content)}")
 

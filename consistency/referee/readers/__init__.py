@@ -88,7 +88,8 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Evidence]:
     true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
     r = _checked(replace(reading, truth=cast(Any, true)), over)
     _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, "topic", "truth_topic")
-    return _asked(read_tables(sheet, r, over), r)
+    pieces = pieces_asked(r)
+    return _asked(read_tables(sheet, r, over), r, pieces)
 
 
 def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
@@ -137,12 +138,13 @@ def _read(estimates: Path, r: Reading) -> list[Evidence]:
     """Recordings of files as they stand, with the options given."""
     over = relative_of(r.relative, bool(r.motions), r.windows)
     r = _checked(r, over)
-    return _asked(_by_kind(estimates, r, over), r)
+    pieces = pieces_asked(r)
+    return _asked(_by_kind(estimates, r, over), r, pieces)
 
 
-def _asked(records: list[Evidence], r: Reading) -> list[Evidence]:
+def _asked(records: list[Evidence], r: Reading, pieces: int | None) -> list[Evidence]:
     """Records with what is declared of their truth, in pieces where that is asked."""
-    pieces, records = pieces_asked(r), declared(records, r)
+    records = declared(records, r)
     return records if pieces is None else [in_pieces(record, pieces or None) for record in records]
 
 

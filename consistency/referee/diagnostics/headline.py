@@ -61,10 +61,14 @@ def smaller(v: Verdict) -> bool:
 def deciding_axis(v: Verdict) -> tuple[str, Interval] | None:
     """The component that decides the status, with its ratio; None where the whole does.
 
-    It is the worst one where an axis is found at fault and the whole is not, or errs in the other direction.
+    It is the worst one where an axis is found at fault and the whole is not, or errs in the other direction, or looks
+    right: its ratio lies in [1 / detect, detect], and the interval of the axis outside.
     """
-    whole_decides = MAIN in v.faults and v.status != "inconsistent"
-    return None if AXIS not in v.faults or whole_decides else clear(v.worst_axis)
+    axis, R = clear(v.worst_axis), v.settings.factor
+    if axis is None or v.scale is None or AXIS not in v.faults:
+        return None
+    hidden = abs(np.log(v.scale.inflation.value)) <= np.log(R) and (axis[1].low > R or axis[1].high < 1.0 / R)
+    return axis if hidden or MAIN not in v.faults or v.status == "inconsistent" else None
 
 
 def clear(axis: tuple[str, Interval] | None) -> tuple[str, Interval] | None:

@@ -102,7 +102,10 @@ def test_opposite_axes_are_inconsistent(rng: np.random.Generator, factors: tuple
     assert float(re.search(rf"\(ratio ([\d.]+)\) in {large}", sentence)[1]) == pytest.approx(min(factors), rel=0.1)  # type: ignore[index]
 
 
-@pytest.mark.parametrize(("factors", "axis"), [((1.3, 0.5), "y"), ((0.9, 0.9, 1.25), "heading"), ((2.0, 2.0), None)])
+@pytest.mark.parametrize(
+    ("factors", "axis"),
+    [((1.3, 0.5), "y"), ((0.9, 0.9, 1.25), "heading"), ((1.2, 0.2), "y"), ((2.0, 2.0), None), ((1.9, 1.4), None)],
+)
 def test_an_axis_that_decides_stands_beside_the_status(
     rng: np.random.Generator, factors: tuple[float, ...], axis: str | None
 ) -> None:

@@ -78,6 +78,7 @@ def test_another_order_of_the_covariance(tmp_path: Path) -> None:
     path = read(tmp_path / "imu.npz", **first, covariances=P[0][:, turned][:, :, turned], order=["p", "R", "v"])
     record = cs.read(path, error="left")
     np.testing.assert_allclose(record.error[0], e[0][:, turned], atol=1e-9)
+    assert record.axes == ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")
     np.testing.assert_allclose(
         record.nees[0], np.einsum("ti,ti->t", e[0], np.linalg.solve(P[0], e[0][..., None])[..., 0])
     )

@@ -262,7 +262,7 @@ def test_matrices_of_data_sets_as_they_are(name: str, count: int, tmp_path: Path
     np.savetxt(tmp_path / "est.txt", np.column_stack([t, own, P]), fmt="%.17g")
     record = cs.read(tmp_path / "est.txt", truth=path)
     assert record.nees.shape == (1, count)
-    np.testing.assert_allclose(record.nees, 4.0, rtol=1e-3)  # digits of the file
+    np.testing.assert_allclose(record.nees, 4.0, rtol=1e-3)  # matrices of seven digits, two ways to a quaternion
 
 
 # --- estimates ---------------------------------------------------------------------------------------
@@ -296,6 +296,20 @@ def bagpy(d: Drive) -> str:
     names += [f"pose.covariance_{i}" for i in range(36)]
     columns = [d.t + 0.003, np.arange(STEPS), *whole(d.t), ["odom"] * STEPS, *d.own.T, *d.P.reshape(STEPS, 36).T]
     return lines("odom.csv", ",".join(names), columns)
+
+
+def twist_first(d: Drive) -> str:
+    names = ["t", *(f"twist.covariance{i}" for i in range(36)), *(f"pose.covariance{i}" for i in range(36))]
+    names += [f"pose.position.{a}" for a in SPACE] + [f"pose.orientation.{a}" for a in W_LAST]
+    return lines("odom.csv", ",".join(names), [d.t, *np.full((36, STEPS), 9.0), *d.P.reshape(STEPS, 36).T, *d.own.T])
+
+
+def plotjuggler(d: Drive) -> str:
+    """Of a topic of ROS 2: its fields with slashes, the stamp in two."""
+    pose = [f"/odom/pose/pose/position/{a}" for a in SPACE] + [f"/odom/pose/pose/orientation/{a}" for a in W_LAST]
+    names = ["__time", "/odom/header/stamp/sec", "/odom/header/stamp/nanosec", *pose]
+    names += [f"/odom/pose/covariance[{i}]" for i in range(36)]
+    return lines("odom.csv", ",".join(names), [d.t + 0.1, *whole(d.t), *d.own.T, *d.P.reshape(STEPS, 36).T])
 
 
 def w_first_indexed(d: Drive) -> str:
@@ -334,6 +348,8 @@ def four_with_triangle(d: Drive) -> str:
 ESTIMATES: dict[str, tuple[Callable[[Drive], str], str]] = {
     "rostopic echo -p": (rostopic, "90 columns, nanoseconds, quaternion w last, covariance in 36 columns"),
     "bagpy": (bagpy, "48 columns, seconds and nanoseconds, quaternion w last, covariance in 36 columns"),
+    "twist first": (twist_first, "80 columns, seconds, quaternion w last, covariance in 36 columns"),
+    "PlotJuggler": (plotjuggler, "46 columns, seconds and nanoseconds, quaternion w last, covariance in 36 columns"),
     "w first, two indices": (w_first_indexed, "44 columns, seconds, quaternion w first, covariance in 36 columns"),
     "cnspy PoseWithCovTyped": (cnspy, "30 columns, seconds, quaternion w last, covariance in 21 columns"),
     "words": (named_words, "29 columns, microseconds, quaternion w last, covariance in 21 columns"),

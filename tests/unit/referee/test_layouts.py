@@ -472,6 +472,11 @@ def test_deviations_of_a_state(names: str, tmp_path: Path, monkeypatch: pytest.M
         cs.read("est.csv", truth="truth.csv", state=["a", "b"])
 
 
+def skewed(d: Drive) -> str:
+    """The last row is not 0 0 0 1."""
+    return lines("t.txt", "", [*matrices(d.true, 4)[:15], np.full(STEPS, 2.0)], " ")
+
+
 REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
     "a quaternion that is no unit": (
         lambda d: lines("t.csv", "t,x,y,z,qw,qx,qy,qz", [d.t, *with_w_first(1.01 * d.true)]),
@@ -490,6 +495,7 @@ REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
         r"t\.csv, line 2: column 'x': not a number",
     ),
     "matrices that stretch": (stretched, r"t\.txt, line 1: the 12 numbers are no rotation"),
+    "matrices with another last row": (skewed, r"t\.txt, line 1: the 16 numbers are no rotation"),
     "another time base": (
         lambda d: lines("t.csv", "#sec,nsec,x,y,z,qx,qy,qz,qw", [*whole(d.t - 1e9), *d.true.T]),
         r"no estimate has a truth within 0\.01 s",

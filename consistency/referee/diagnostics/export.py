@@ -26,6 +26,8 @@ def flat(v: Verdict) -> dict[str, Any]:
         s["early_ends"] = vars(v.ends) | {"lost": v.ends.lost}
     if v.skipped is not None:
         s |= {"skip": v.skipped.skip.option, "skipped_steps": v.skipped.steps, "skipped_runs": v.skipped.empty}
+    if v.guesses:
+        s["guesses"] = {kind: guess._asdict() for kind, guess in v.guesses.items()}
     if v.truth is not None:
         s |= {
             "truth_share": v.truth.share, "truth_share_of_axes": dict(v.truth.by_axis), "truth_errors": v.truth.errors,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from consistency.referee.diagnostics.early_stopping import Design, follow
+from consistency.referee.diagnostics.guessing import judge_guesses
 from consistency.referee.diagnostics.landmarks import map_score
 from consistency.referee.diagnostics.parts import judge_parts
 from consistency.referee.diagnostics.questions import SHARES
@@ -52,6 +53,8 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
     """:func:`judge` without the maps; with a ``design``, the verdict of the look that decides, or of the last one."""
     if design is not None:
         return of_look(*follow(design, record.first_runs, len(record.run_numbers)), record, design)
+    if record.guesses:
+        return replace(judge_guesses(record, settings, judge_runs), notes=tuple(record.notes))
     runs, truth = record.as_runs, uncertain_truth(record)
     if truth is not None:
         runs, record = truth.evidence, replace(record, unshown=record.unshown or truth.unjudged)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -108,6 +108,7 @@ class Record:
     window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
     independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
+    guesses: Mapping[str, Record] = field(default_factory=dict)  # by convention, where none is declared
     truth_covariance: Array | None = None  # (runs, steps, n, n), of the truth itself; NaN where it has none
     truth_errors: str | None = None  # declared: its errors are "independent", "per-run" or "common" to all runs
     truth_shared: bool = False  # declared: the estimator has fused the truth
@@ -152,7 +153,8 @@ class Record:
         numbers = self.run_numbers[rows]
         failures = tuple(failure for failure in self.failures if failure.run in numbers)
         world = None if self.world is None else self.world.of_runs(rows)
-        return replace(self, **arrays, runs=numbers, failures=failures, world=world)
+        guesses = {kind: one.of_runs(rows) for kind, one in self.guesses.items()}
+        return replace(self, **arrays, runs=numbers, failures=failures, world=world, guesses=guesses)
 
     def first_runs(self, runs: int) -> Record:
         """Runs 0 to ``runs`` - 1."""
@@ -178,7 +180,8 @@ class Record:
         world = self.world
         if world is not None:
             world = replace(world, covariance=rest.pop("world covariance"), nees=rest.pop("world nees"))
-        return replace(self, **rest, world=world, skipped=skipped)
+        guesses = {kind: one.without_first(skip) for kind, one in self.guesses.items()}
+        return replace(self, **rest, world=world, skipped=skipped, guesses=guesses)
 
     @property
     def as_runs(self) -> Record:

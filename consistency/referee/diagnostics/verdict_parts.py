@@ -317,6 +317,15 @@ class TruthShare:
     shared: bool  # the estimator has fused the truth
 
 
+class Guess(NamedTuple):
+    """What the errors say if they are of one convention, where none is declared."""
+
+    status: str  # of that convention
+    faults: tuple[str, ...]
+    ratio: Interval  # of true to stated covariance, simultaneous over the conventions
+    possible: bool  # no fault is found
+
+
 @dataclass(frozen=True)
 class Verdict:
     """The referee's answer for one filter.
@@ -356,6 +365,7 @@ class Verdict:
     skipped: Skipped | None = None  # first steps of each run that were left out
     axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does
     truth: TruthShare | None = None  # where the truth has a covariance of its own
+    guesses: Mapping[str, Guess] = field(default_factory=dict)  # by convention, where none is declared
     parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
     record: Record | None = None  # what was judged, where it is kept to be drawn
 

@@ -47,7 +47,8 @@ class Reading:
         default=None, metadata=_shown("Covariances of a TUM trajectory: t and 36 or 21 numbers.")
     )
     error: str | None = field(
-        default=None, metadata=_shown("Error that the covariance is of: so2, vector, left, right, so3 or so3-body.")
+        default=None,
+        metadata=_shown("Error that the covariance is of: so2, vector, left, right, so3, so3-body, or guess."),
     )
     state: Sequence[str] | None = field(
         default=None, metadata=_shown("Columns that make up the state [x,y,heading].", "A,B,C", _names)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -45,6 +46,11 @@ __all__ = [
 ]
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *SPATIAL)))
+GUESS = "guess"  # judge every convention
+NO_GUESS = {
+    "truth_covariance": "whose covariance is of a declared error too",
+    "relative": "which judges motions in one error; name the conventions one by one",
+}
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
 TABLES = (".csv", ".parquet", ".pq")
 
@@ -88,8 +94,9 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Evidence]:
     true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
     r = _checked(replace(reading, truth=cast(Any, true)), over)
     _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, "topic", "truth_topic")
-    pieces = pieces_asked(r)
-    return _asked(read_tables(sheet, r, over), r, pieces)
+    if r.error == GUESS:
+        return guessed("tables", r, lambda kind: _asked(read_tables(sheet, replace(r, error=kind), over), r))
+    return _asked(read_tables(sheet, r, over), r)
 
 
 def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
@@ -138,13 +145,33 @@ def _read(estimates: Path, r: Reading) -> list[Evidence]:
     """Recordings of files as they stand, with the options given."""
     over = relative_of(r.relative, bool(r.motions), r.windows)
     r = _checked(r, over)
-    pieces = pieces_asked(r)
-    return _asked(_by_kind(estimates, r, over), r, pieces)
+    if r.error == GUESS:
+        return guessed(str(estimates), r, lambda kind: _asked(_by_kind(estimates, replace(r, error=kind), over), r))
+    return _asked(_by_kind(estimates, r, over), r)
 
 
-def _asked(records: list[Evidence], r: Reading, pieces: int | None) -> list[Evidence]:
+def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]]) -> list[Evidence]:
+    """Records with the same runs under each convention that such poses have, the default of the files first.
+
+    Parameters
+    ----------
+    read : records under a convention, or under the default
+    """
+    for option, why in NO_GUESS.items():
+        if getattr(r, option):
+            raise InputError(f"--error {GUESS}: does not go with {flag_of(option)}, {why}")
+    first = read(None)
+    default = first[0].convention
+    if default not in (*PLANAR, *SPATIAL) or default == "vector":
+        raise InputError(f"--error {GUESS}: is for poses; the errors of {name} are plain differences")
+    kinds = [kind for kind in (SPATIAL if default in SPATIAL else PLANAR) if kind not in (default, "vector")]
+    others = {kind: {one.name: one for one in read(kind)} for kind in kinds}
+    return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
+
+
+def _asked(records: list[Evidence], r: Reading) -> list[Evidence]:
     """Records with what is declared of their truth, in pieces where that is asked."""
-    records = declared(records, r)
+    pieces, records = pieces_asked(r), declared(records, r)
     return records if pieces is None else [in_pieces(record, pieces or None) for record in records]
 
 
@@ -203,8 +230,8 @@ def pieces_asked(r: Reading) -> int | None:
 
 def _checked(r: Reading, over: Relative | None) -> Reading:
     """Options that go together, whatever the file; numbers are floats, and no alignment is None."""
-    if r.error is not None and r.error not in CONVENTIONS:
-        raise InputError(f"--error {r.error}: must be one of {', '.join(CONVENTIONS)}")
+    if r.error not in (None, GUESS, *CONVENTIONS):
+        raise InputError(f"--error {r.error}: must be one of {', '.join((*CONVENTIONS, GUESS))}")
     if r.max_dt is not None and not (math.isfinite(r.max_dt) and r.max_dt >= 0):
         raise InputError(f"--max-dt {r.max_dt:g}: must be 0 or more, in s")
     if r.lever_arm is not None and not (len(r.lever_arm) == 3 and all(map(math.isfinite, r.lever_arm))):
@@ -220,6 +247,7 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
     align = require_alignment(r.align, r.truth or r.truth_topic)
     if over is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
+    pieces_asked(r)  # refused before anything is read
     return replace(r, time_offset=offset, align=align)
 
 

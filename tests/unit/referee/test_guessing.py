@@ -1,0 +1,152 @@
+"""No error is declared: which conventions the covariances do not contradict."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import read_recordings
+from scipy.spatial.transform import Rotation
+
+import consistency as cs
+from consistency.referee.cli import main
+from consistency.referee.diagnostics import judge
+from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.types import Array
+
+# standard deviations of x, y, z (m) and of the rotation about x, y, z (rad): they differ, so that a frame shows
+SIGMA = np.array([0.02, 0.2, 0.06, 0.01, 0.1, 0.03])
+
+
+def write(folder: Path, convention: str, runs: int = 40, factor: float = 1.0, key: int = 1) -> tuple[Path, Path]:
+    """Poses whose errors have the covariance diag(SIGMA^2) in a convention, to first order; ``factor`` on it."""
+    rng, est, truth = np.random.default_rng(key), folder / "est", folder / "truth"
+    est.mkdir()
+    truth.mkdir()
+    numbers = " ".join(f"{x:.12g}" for x in (np.diag(SIGMA**2)).ravel())
+    for run in range(runs):
+        lines: list[list[str]] = [[], []]
+        for k in range(3):
+            p, R = 20.0 * rng.standard_normal(3), Rotation.random(random_state=rng.integers(2**31))
+            e = 0.1 * np.sqrt(factor) * SIGMA * rng.standard_normal(6)
+            true_p, true_R = applied(p, R, e, convention)
+            lines[0].append(f"{k} {_text(p, R)} {numbers}")
+            lines[1].append(f"{k} {_text(true_p, true_R)}")
+        for each, text in zip((est, truth), lines, strict=True):
+            (each / f"r{run:02d}.txt").write_text("\n".join(text).replace(numbers, small(numbers)) + "\n")
+    return est, truth
+
+
+def small(numbers: str) -> str:
+    """A hundredth of the covariance, so that rotations are small."""
+    return " ".join(f"{float(x) / 100.0:.12g}" for x in numbers.split())
+
+
+def applied(p: Array, R: Rotation, e: Array, convention: str) -> tuple[Array, Rotation]:
+    turn = Rotation.from_rotvec(e[3:])
+    if convention == "so3":
+        return p + e[:3], turn * R
+    if convention == "so3-body":
+        return p + e[:3], R * turn
+    if convention == "left":
+        return p + R.apply(e[:3]), R * turn
+    return turn.apply(p) + e[:3], turn * R
+
+
+def _text(p: Array, R: Rotation) -> str:
+    return " ".join(f"{x:.15g}" for x in (*p, *R.as_quat()))
+
+
+@pytest.mark.parametrize("convention", SPATIAL)
+def test_the_right_convention_is_the_one_that_is_left(tmp_path: Path, convention: str) -> None:
+    """At a false-alarm rate of 1e-4, so that chance rejects the right one in 1 of 10,000 seeds."""
+    (record,) = read_recordings(*write(tmp_path, convention), error="guess")
+    assert set(record.guesses) == set(SPATIAL)
+    v = cs.judge(record, false_alarm=1e-4)
+    assert (v.status, v.faults) == ("undecided", ())
+    assert [kind for kind, guess in v.guesses.items() if guess.possible] == [convention]
+    assert f"not rejected at a rate of 0.01 %: {convention} (covariance ratio" in v.reasons[0]
+    gone = ", ".join(kind for kind in v.guesses if kind != convention)
+    assert f"; rejected: {gone}. The filter's documentation says which it is; declare it with --error" in v.reasons[0]
+    assert v.guesses[convention].ratio.holds(1.0)
+
+
+def test_the_declared_error_has_its_own_status(tmp_path: Path) -> None:
+    files = write(tmp_path, "left")
+    (right,), (wrong,), (guess,) = (read_recordings(*files, error=kind) for kind in ("left", "so3", "guess"))
+    assert judge(wrong).status not in ("consistent", "undecided")
+    v = judge(guess)
+    assert v.guesses["left"].status == judge(right).status
+    assert v.guesses["so3"].status == judge(wrong).status
+    assert v.convention is None
+    assert v.equivalence is not None
+    assert not v.equivalence.shown
+
+
+def test_intervals_hold_together(tmp_path: Path) -> None:
+    """Bonferroni over four conventions: wider than that of one."""
+    (guess,) = read_recordings(*write(tmp_path, "left"), error="guess")
+    v = judge(guess)
+    alone = judge(guess.guesses["left"])
+    assert alone.scale is not None
+    value, low, high = v.guesses["left"].ratio
+    assert value == pytest.approx(alone.scale.inflation.value)
+    assert low < alone.scale.inflation.low
+    assert high > alone.scale.inflation.high
+
+
+def test_none_fits(tmp_path: Path) -> None:
+    (guess,) = read_recordings(*write(tmp_path, "left", factor=9.0), error="guess")
+    v = judge(guess)
+    assert v.status == "undecided"
+    assert "at a rate of 5 % each all are rejected: so3, so3-body, left, right" in v.reasons[0]
+    assert len([line for line in v.reasons if line.startswith("if the error is ")]) == 4
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    est, truth = write(tmp_path, "so3-body")
+    with pytest.raises(SystemExit) as stop:
+        main(["analyse", str(est), "--truth", str(truth), "--error", "guess", "--json"])
+    assert not stop.value.code
+    said = json.loads(capsys.readouterr().out)["est"]
+    assert said["status"] == "undecided"
+    assert set(said["statistics"]["guesses"]) == set(SPATIAL)
+    assert said["statistics"]["guesses"]["so3-body"]["possible"] is True
+    assert said["statistics"]["guesses"]["left"]["possible"] is False
+
+
+def test_a_table_of_planar_poses(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    est = ["run,step,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh"]
+    truth = ["run,step,x,y,heading"]
+    for run in range(60):
+        h, e = rng.uniform(-3, 3), rng.standard_normal(3) * [0.02, 0.3, 1e-3]
+        est.append(f"{run},1,0,0,{h},4e-4,0,0,9e-2,0,1e-6")
+        x, y = np.cos(h) * e[0] - np.sin(h) * e[1], np.sin(h) * e[0] + np.cos(h) * e[1]
+        truth.append(f"{run},1,{x},{y},{h + e[2]}")
+    (tmp_path / "est.csv").write_text("\n".join(est) + "\n")
+    (tmp_path / "truth.csv").write_text("\n".join(truth) + "\n")
+    (guess,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv", error="guess")
+    v = cs.judge(guess, false_alarm=1e-4)
+    assert list(v.guesses) == ["so2", "left", "right"]
+    assert [kind for kind, one in v.guesses.items() if one.possible] == ["left"]
+    part = guess.of_runs(slice(0, 30))
+    assert len(part.guesses["left"].run_numbers) == 30
+    (tmp_path / "plain.csv").write_text("step,a,P_a_a\n1,0.5,1\n2,-0.5,1\n")
+    (tmp_path / "zero.csv").write_text("step,a\n1,0\n2,0\n")
+    with pytest.raises(cs.InputError, match="--error guess: is for poses"):
+        read_recordings(tmp_path / "plain.csv", tmp_path / "zero.csv", error="guess", state=["a"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"relative": "1"}, "--error guess: does not go with --relative"),
+        ({"truth_covariance": "columns"}, "--error guess: does not go with --truth-covariance"),
+    ],
+)
+def test_what_is_refused(tmp_path: Path, options: dict[str, str], message: str) -> None:
+    with pytest.raises(cs.InputError, match=message):
+        read_recordings(*write(tmp_path, "so3", 2), error="guess", **options)

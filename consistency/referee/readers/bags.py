@@ -32,7 +32,8 @@ from consistency.referee.readers.spatial import (
     recordings_of,
     require_axes,
 )
-from consistency.referee.readers.tum import UNIT
+from consistency.referee.readers.tum import UNIT, unused
+from consistency.referee.readers.uncertain import COLUMNS
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance
@@ -112,21 +113,36 @@ def _bagged(bag: Path, r: Reading) -> Bagged:
         true = _lines(bag, reader, truth)
         notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
     own, true, world = localised(own, true)
-    notes = [note for note in (own.note, true.note, world, *notes) if note]
+    notes = [note for note in (own.note, true.note, world, unused(true, r), *notes) if note]
+    P_true = _of_truth(bag, true, r)
     if not np.isfinite(true.values[:, 1 : 4 if isinstance(true, Fixes) else POSE]).all():
         raise InputError(f"{bag}: the truth on {truth} is not finite")
     if isinstance(own, Fixes):
-        return Bagged(fixed(own, true, r), ALONE if own.alone else POINTS, "", notes)
+        return Bagged(fixed(own, true, r, P_true), ALONE if own.alone else POINTS, "", notes)
     place = Places(own.place, np.arange(len(own.t)))
     P = symmetric(own.values[:, POSE:].reshape(-1, 6, 6), place.__getitem__)
     kind, pose = r.error or "so3", slice(1, POSE)
     stated = np.ones(len(own.t), bool)
     poses = Poses(
-        place, own.t, own.values[:, pose], P, stated, true.t, true.values[:, pose], "spatial", kind, r.tolerance
-    )
+        place, own.t, own.values[:, pose], P, stated, true.t, true.values[:, pose], "spatial", kind, r.tolerance,
+        true_covariance=P_true,
+    )  # fmt: skip
     if isinstance(true, Fixes):
         poses = positions(poses, r.lever_arm or (0.0, 0.0, 0.0), blocks=False)
     return Bagged(poses, WHOLE, kind, notes)
+
+
+def _of_truth(bag: Path, true: Lines, r: Reading) -> Array | None:
+    """Covariance of the truth, (M, 6, 6) or of fixes (M, 3, 3), where it is asked for."""
+    if r.truth_covariance is None:
+        return None
+    if r.truth_covariance != COLUMNS:
+        raise InputError(f"--truth-covariance {r.truth_covariance}: with a bag it is '{COLUMNS}', of the messages")
+    P = true.values[:, 4 if isinstance(true, Fixes) else POSE :]
+    if not np.isfinite(P).any():
+        raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {r.truth_topic} state none")
+    n = 3 if isinstance(true, Fixes) else 6
+    return symmetric(P.reshape(-1, n, n), true.place)
 
 
 def _parts_of_one(bags: Sequence[Path]) -> str:

@@ -84,8 +84,12 @@ def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:
     )  # fmt: skip
 
 
-def fixed(own: Fixes, true: Lines, r: Reading) -> Poses:
+def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) -> Poses:
     """Estimated positions without orientations beside the true ones, in one plane.
+
+    Parameters
+    ----------
+    of_truth : (M, 3 or more, 3 or more), covariance of the truth, which begins with the position
 
     Raises
     ------
@@ -99,6 +103,7 @@ def fixed(own: Fixes, true: Lines, r: Reading) -> Poses:
     return Poses(
         Places(own.place, np.arange(len(own.t))), own.t, own.values[:, 1:4], P, np.ones(len(own.t), bool),
         true.t, true.values[:, 1:4], "vector", "vector", r.tolerance,
+        true_covariance=None if of_truth is None else of_truth[:, :3, :3],
     )  # fmt: skip
 
 

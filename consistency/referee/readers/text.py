@@ -135,11 +135,11 @@ def is_cut(path: Path, number: int) -> bool:
     """Whether a line, counted from 1, is the last one of a file and has no end."""
     if not is_file(path):
         return False
+    ends = 0
     with reading(path, REFUSAL), opened(path) as file:
-        lines, last = 1, b"\n"
         while piece := file.read(BLOCK):
-            lines, last = lines + piece.count(b"\n"), piece[-1:]
-    return last != b"\n" and lines == number
+            ends += piece.count(b"\n")
+    return number == ends + 1
 
 
 def opened(path: Path) -> BinaryIO:

@@ -67,7 +67,7 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
         own = read_trajectory(path)
         true = read_drive(true_path, r.body) if is_drive(true_path) else read_trajectory(true_path, true=True)
         own, true, world = localised(own, true)
-        notes += [note for note in (own.note, true.note, world) if note]
+        notes += [note for note in (own.note, true.note, world, unused(true, r)) if note]
         if not poses:
             parts = _parts(own)
             error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
@@ -76,7 +76,7 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
         if _parts(own) is not parts:
             raise InputError(f"{path}: has {own.values.shape[1]} columns, {runs[0][0]} another layout")
         if isinstance(own, Fixes):
-            poses.append(fixed(own, true, r))
+            poses.append(fixed(own, true, r, of_truth(true, own, ORDERS[0], r)))
             continue
         poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r))
         if _is_point(true):
@@ -183,16 +183,24 @@ def _poses(
     place, estimate = Places(own.place, np.arange(len(own.t))), own.values[:, 1:]
     return Poses(
         place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance, cross,
-        _of_truth(truth, own, order, r),
+        of_truth(truth, own, order, r),
     )  # fmt: skip
 
 
-def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
-    """Covariance of the truth itself, (M, 6, 6): of its own columns, or of a file; NaN where none is near."""
+def unused(truth: Lines, r: Reading) -> str:
+    """A note on a covariance of the truth that nothing is done with, "" without one."""
+    stated = isinstance(truth, Fixes) or bool(np.isfinite(truth.values[:, POSE:]).any())
+    if r.truth_covariance is not None or not stated or isinstance(truth, States):
+        return ""
+    return f"{truth.path}: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
+
+
+def of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
+    """Covariance of the truth, (M, 6, 6) or of fixes (M, 3, 3): of its columns, or of a file; NaN without one."""
     if r.truth_covariance is None:
         return None
     if r.truth_covariance == COLUMNS:
-        P = _inline(truth, order)
+        P = truth.values[:, 4:].reshape(-1, 3, 3) if isinstance(truth, Fixes) else _inline(truth, order)
         if P is None:
             raise InputError(
                 f"--truth-covariance {COLUMNS}: {truth.path} has none; give a file of t and {FULL} numbers"

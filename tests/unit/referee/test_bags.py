@@ -267,6 +267,9 @@ def test_the_type_of_a_covariance_counts(tmp_path: Path) -> None:
     off = place + np.array([1e-7, 1e-7, 0.01])
     [r] = read_recordings(write_fixes(tmp_path / "a.bag", 2, off, place, C), topic="/fix", truth_topic="/rtk")
     assert r.parts == ((0,), (1,), (2,))
+    assert r.covariance is not None
+    stated = np.asarray(r.covariance[0])
+    np.testing.assert_allclose(stated, C * np.eye(3), atol=1e-3 * stated.max())  # what is beside the diagonal is not
     bag = write_fixes(tmp_path / "b.bag", 0, off, place, C)
     with pytest.raises(cs.InputError, match=r"b\.bag: states no covariance: its variances are 0, -1"):
         read_recordings(bag, topic="/fix", truth_topic="/rtk")
@@ -292,3 +295,19 @@ def test_other_frames_are_named(tmp_path: Path) -> None:
     [r] = read_recordings(write(tmp_path / "a.bag", 1, "odometry", Drive()), truth_topic="map:body")
     assert any("the body is 'base' on /odom, but 'body' on map:body" in note for note in r.notes)
     assert not any("the world is" in note for note in r.notes)
+
+
+def test_the_covariance_of_a_true_message(tmp_path: Path) -> None:
+    from test_fixes import flight
+
+    place, C = flight()
+    bag = write_fixes(tmp_path / "a.bag", 3, place + np.array([1e-7, 1e-7, 0.01]), place, C)
+    [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk", truth_covariance="columns")
+    assert r.truth_covariance is not None
+    np.testing.assert_allclose(r.truth_covariance[0], C, rtol=1e-3, atol=1e-6)  # axes at places 100 m apart
+    [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk")
+    assert any("/rtk" not in note and "which counts as 0" in note for note in r.notes)
+    drive = write(tmp_path / "b.bag", 1, "odometry", Drive())
+    for value, said in (("P.txt", "with a bag it is 'columns'"), ("columns", "the messages of map:body state none")):
+        with pytest.raises(cs.InputError, match=said):
+            read_recordings(drive, truth_topic="map:body", truth_covariance=value)

@@ -144,6 +144,25 @@ def test_a_solution_as_the_truth_of_poses(tmp_path: Path, monkeypatch: pytest.Mo
     assert any("add --align posyaw-all where est.tum is in another world" in note for note in record.notes)
 
 
+def test_the_truth_of_a_solution_has_a_covariance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it is beside fixes and beside poses, turned into the plane; it counts as 0 unless it is asked for."""
+    monkeypatch.chdir(tmp_path)
+    place, P = flight()
+    turn = axes_at(place[0]) @ np.swapaxes(axes_at(place), 1, 2)
+    stated = turn @ (0.1 * P) @ np.swapaxes(turn, 1, 2)
+    truth, d = solution("rtk.pos", place, 0.1 * P), drive(start=EPOCH)
+    d.own[:, :3] = plane(place, place[0])
+    for estimates in (solution("rover.pos", place + np.array([1e-7, 1e-7, 0.01]), P), tum(d)):
+        record = cs.read(estimates, truth=truth, truth_covariance="columns")
+        assert record.truth_covariance is not None
+        np.testing.assert_allclose(record.truth_covariance[0], stated, rtol=1e-6, atol=1e-12)
+        without = cs.read(estimates, truth=truth)
+        assert without.truth_covariance is None
+        said = "rtk.pos: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
+        assert said in without.notes
+        assert said not in record.notes
+
+
 def test_a_baseline_is_local_already(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng()

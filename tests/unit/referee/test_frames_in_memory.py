@@ -59,6 +59,9 @@ def test_missing_values_and_filters(tmp_path: Path) -> None:
     assert [(f.run, f.step) for f in cs.read(own, truth=truth, state=["a", "b"]).failures] == [(0, 6)]
     nullable = own.astype({"a": "Float64"})
     assert [(f.run, f.step) for f in cs.read(nullable, truth=truth, state=["a", "b"]).failures] == [(0, 6)]
+    mixed = own.astype({"a": object})
+    mixed.loc[5, "a"] = pd.NA
+    assert [(f.run, f.step) for f in cs.read(mixed, truth=truth, state=["a", "b"]).failures] == [(0, 6)]
     both = pd.concat([own.assign(filter="ekf"), own.assign(filter="ukf")])
     assert cs.read(both, truth=truth, state=["a", "b"], filter="ukf").name == "ukf"
     with pytest.raises(cs.InputError, match=r"^estimates: holds several estimators \(ekf, ukf\)"):

@@ -448,6 +448,12 @@ def test_deviations_are_judged_axis_by_axis(
     variances = np.diagonal(np.asarray(record.covariance[0]), axis1=1, axis2=2)
     np.testing.assert_allclose(record.error[0] ** 2 / variances, alone(d), rtol=1e-9)
     assert any("standard deviations" in note for note in record.notes)
+    if path.endswith(".txt"):
+        own = lines(
+            "turned.txt", "", [d.t, *d.own.T, *np.roll(np.sqrt(np.diagonal(d.P, axis1=1, axis2=2)), 3, axis=1).T], " "
+        )
+        turned = cs.read(own, truth=truth, covariance_order="rotation-translation")
+        np.testing.assert_allclose(turned.nees, record.nees, rtol=1e-9)
     assert list(cs.judge(record).parts) == [*SPACE, "roll", "pitch", "yaw"]
     with pytest.raises(cs.InputError, match="--relative needs covariances of whole poses"):
         cs.read(path, truth=truth, relative=2, motions=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -65,12 +66,12 @@ class Drive(NamedTuple):
     P: Array  # (N, 6, 6)
 
 
-def drive(start: float = EPOCH) -> Drive:
-    """Poses with errors of their covariance, which has cross terms and differs from row to row."""
+def drive(start: float = EPOCH, root: Array | None = None) -> Drive:
+    """Poses with errors of their covariance, which has cross terms and differs from row to row, unless it is given."""
     rng = np.random.default_rng()
     turns = rng.normal(size=(STEPS, 4)) + np.array([0, 0, 0, 3])
     true = np.column_stack([rng.normal(size=(STEPS, 3)), turns / np.linalg.norm(turns, axis=1)[:, None]])
-    roots = 0.1 * rng.normal(size=(STEPS, 6, 6))
+    roots = 0.1 * rng.normal(size=(STEPS, 6, 6)) if root is None else np.tile(root, (STEPS, 1, 1))
     P = roots @ np.swapaxes(roots, 1, 2) + 0.001 * np.eye(6)
     e = np.einsum("nij,nj->ni", np.linalg.cholesky(P), rng.normal(size=(STEPS, 6)))
     angle = np.linalg.norm(e[:, 3:], axis=1)
@@ -597,3 +598,40 @@ def test_a_file_of_one_broken_line_is_refused_for_it(tmp_path: Path, monkeypatch
     Path("t.tum").write_text("1.0 2.0", encoding="utf-8")
     with pytest.raises(cs.InputError, match=r"t\.tum, line 1: has 2 columns"):
         cs.read(tum(d), truth="t.tum")
+
+
+# --- what can be read but looks wrong -----------------------------------------------------------------
+
+
+def many(steps: int = 60) -> Drive:
+    """A longer drive."""
+    parts = [drive(root=0.1 * np.eye(6)) for _ in range(steps // STEPS)]
+    t, own, true, P = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return Drive(EPOCH + 0.25 * np.arange(len(t)), own, true, P)
+
+
+def turned_quaternions(d: Drive) -> tuple[str, str]:
+    own = np.column_stack([d.own[:, :3], d.own[:, [6, 3, 4, 5]]])
+    return lines("est.csv", "", [d.t, *own.T, *d.P.reshape(-1, 36).T]), lines("t.csv", NAMES, [d.t, *d.true.T])
+
+
+def millimetres(d: Drive) -> tuple[str, str]:
+    true = d.true * [1000, 1000, 1000, 1, 1, 1, 1]
+    lines("est.tum", "", [d.t, *d.own.T, *d.P.reshape(-1, 36).T], " ")
+    return "est.tum", lines("t.csv", "#timestamp [ns],px,py,pz,qw,qx,qy,qz", [nanoseconds(d.t), *with_w_first(true)])
+
+
+@pytest.mark.parametrize(
+    ("write", "mend"),
+    [
+        (turned_quaternions, "the quaternions of the estimates are w x y z; write them x y z w"),
+        (millimetres, "the positions of the truth are in millimetres; divide them by 1000"),
+    ],
+)
+def test_a_mix_up_that_can_be_read_gets_a_hint(
+    write: Callable[[Drive], tuple[str, str]], mend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    estimates, truth = write(many())
+    record = cs.read(estimates, truth=truth)
+    assert [note for note in record.notes if re.search(mend, note)], record.notes

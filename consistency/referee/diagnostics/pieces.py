@@ -110,7 +110,7 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
     parts = whitened[log.start : end].reshape(pieces, length, -1)
     arrays = {
         name: array[0, log.start : end].reshape(pieces, length, *array.shape[2:])
-        for name in ("error", "nees", "nis", "nis_dof", "innovations", "innovation_covariances")
+        for name in ("error", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "path")
         if (array := getattr(record, name)) is not None
     }
     clock = record.times[0] if record.times is not None else record.t

@@ -108,6 +108,7 @@ class Record:
     window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
     independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
+    path: Array | None = None  # (runs, steps, 2, 2 or 3), m, true and estimated positions, to be drawn
     guesses: Mapping[str, Record] = field(default_factory=dict)  # by convention, where none is declared
     truth_covariance: Array | None = None  # (runs, steps, n, n), of the truth itself; NaN where it has none
     truth_errors: str | None = None  # declared: its errors are "independent", "per-run" or "common" to all runs
@@ -148,7 +149,7 @@ class Record:
     def of_runs(self, rows: slice | Indices) -> Record:
         """Some of the runs, by their rows, with maps and rejections of all."""
         names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times",
-                 "truth_covariance")  # fmt: skip
+                 "truth_covariance", "path")  # fmt: skip
         arrays = {name: array[rows] for name in names if (array := getattr(self, name)) is not None}
         numbers = self.run_numbers[rows]
         failures = tuple(failure for failure in self.failures if failure.run in numbers)

@@ -20,12 +20,14 @@ from consistency.referee.pages.clock import Clock, clock_of
 from consistency.referee.pages.judged import Estimator, Judged, wide
 from consistency.referee.pages.one_step import errors_of_runs, has_one_step, nees_of_runs
 from consistency.referee.pages.provenance import facts
+from consistency.referee.pages.trajectory import trajectory
 from consistency.referee.types import Array
 
 MOST_PANELS = 12  # components of an error that are drawn
 MOST_RUNS = 20  # runs that are drawn beside the shown one
 ANGLES = {"heading", "yaw", "pitch", "roll"}
 METRES = {"x", "y", "z"}
+DERIVED = {"v": "m/s", "bg": "rad/s", "ba": "m/s^2"}  # velocities and biases, by what comes before x, y, z
 SHOWN, OTHERS = replace(style(0), width=1.0), Look("#c0c0c0", width=0.5)
 JOINT = Look("#333333", width=1.4)
 
@@ -82,13 +84,15 @@ def _of_one(record: Evidence, verdict: Verdict, said: bool) -> tuple[Block, ...]
 
 
 def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
-    """Errors with their bounds, NEES with its band, coverage, and innovations; those that the record has."""
-    found = (_errors(record), _nees(record, verdict), _coverage(record), _innovations(record, verdict))
+    """Errors with their bounds, NEES, trajectory, coverage, and innovations; those that the record has."""
+    found = (
+        _errors(record), _nees(record, verdict), _trajectory(record), _coverage(record), _innovations(record, verdict),
+    )  # fmt: skip
     return tuple(figure for figure in found if figure is not None)
 
 
 def record_sheet(record: Evidence, verdict: Verdict | None = None) -> Sheet:
-    """Errors with their bounds, coverage, and with a ``verdict`` the NEES with its band, on one sheet.
+    """Errors with their bounds, trajectory, coverage, and with a ``verdict`` the NEES with its band, on one sheet.
 
     Raises
     ------
@@ -96,7 +100,7 @@ def record_sheet(record: Evidence, verdict: Verdict | None = None) -> Sheet:
         The record has neither errors nor NEES.
     """
     nees = None if verdict is None else _nees(record, verdict)
-    found = [figure for figure in (_errors(record), nees, _coverage(record)) if figure is not None]
+    found = [figure for figure in (_errors(record), nees, _trajectory(record), _coverage(record)) if figure is not None]
     if not found:
         raise InputError(f"{record.name}: has neither errors nor NEES to draw; give --truth, or truth= in Python")
     first, *others = found
@@ -113,7 +117,7 @@ def unit_of(axis: str) -> tuple[str, float]:
     """Unit that a component is shown in, and the factor to it; none where it is not known."""
     if axis in ANGLES:
         return "deg", 180.0 / np.pi
-    return ("m", 1.0) if axis in METRES else ("", 1.0)
+    return ("m" if axis in METRES else DERIVED.get(axis[:-1], "") if axis[-1:] in METRES else "", 1.0)
 
 
 def shown_run(record: Evidence) -> int:
@@ -227,6 +231,15 @@ def _nees_of_windows(record: Evidence) -> Figure | None:
         height=300,
     )  # fmt: skip
     return Figure("NEES", caption, (panel,), (Sheet((panel,), 2.2, keys=keys),), keys)
+
+
+# --- trajectory -------------------------------------------------------------------------------------
+
+
+def _trajectory(record: Evidence) -> Figure | None:
+    if record.error is None or has_one_step(record):
+        return None
+    return trajectory(record, shown_run(record))
 
 
 # --- coverage ---------------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ class Track:
     nees: Array | None = None  # (k,)
     t: Array | None = None  # (k,), s; of windows, of their beginnings
     truth_covariance: Array | None = None  # (k, n, n), of the truth itself; NaN where it has none
+    path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
 
     def part(self, index: Sequence[int]) -> Track:
         """Track of some components of the error."""
@@ -113,6 +114,7 @@ def assemble(
         notes=tuple(notes),
         times=grid(lambda part: part.t),
         truth_covariance=grid(lambda part: part.truth_covariance),
+        path=grid(lambda part: part.path),
     )
 
 
@@ -167,15 +169,15 @@ def _judged(track: Track) -> tuple[int, int, str]:
 
 def _cut(track: Track, start: int, end: int) -> Track:
     """Rows before ``end``, with their NEES from ``start`` on."""
-    given = (track.error, track.covariance, track.nis, track.nis_dof, track.t, track.truth_covariance)
-    error, P, nis, dof, t, of_truth = (None if v is None else v[:end] for v in given)
+    given = (track.error, track.covariance, track.nis, track.nis_dof, track.t, track.truth_covariance, track.path)
+    error, P, nis, dof, t, of_truth, path = (None if v is None else v[:end] for v in given)
     values = None
     if error is not None and P is not None:
         values = np.full(end, np.nan)
         values[start:] = nees(error[start:], P[start:])
         if start:
             P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
-    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values, t, of_truth)
+    return Track(track.run, track.column[:end], track.place[:end], error, P, nis, dof, values, t, of_truth, path)
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:

@@ -133,6 +133,7 @@ def _match(run: int, poses: Poses, path: Path | str, truth: Path | str, shift: f
     of_truth = poses.truth_covariances(known, shift)
     of_truth = None if of_truth is None else of_truth[kept]
     track = Track(run, np.arange(len(rows)), poses.place.at(rows), error, P, t=t, truth_covariance=of_truth)
+    track = replace(track, path=np.stack([known.truth[kept, :3], poses.estimate[rows, :3]], axis=1))
     return Match(track, t, len(poses.t) - len(rows), *doubts)
 
 

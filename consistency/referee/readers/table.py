@@ -129,7 +129,7 @@ def _recording(
     order = row_order(sheet, runs, key)
     sheet, runs = sheet.rows(order), runs[order]
     keys = sheet.numbers(key, finite=True)
-    error = covariance = deviations = of_truth = None
+    error = covariance = deviations = of_truth = path = None
     keep = np.ones(len(runs), bool)
     notes: list[str] = []
     moved = Aligned(())
@@ -174,6 +174,8 @@ def _recording(
             )
         notes += clocks
         error = planar_error(true, estimate, convention) if axes == POSE else true - estimate
+        plane = 3 if axes[:3] == ("x", "y", "z") else 2
+        path = np.stack([true[:, :plane], estimate[:, :plane]], axis=1) if axes[:2] == ("x", "y") else None
         notes.append(f"error convention {convention}: {PLANAR[convention]}")
         if own:
             notes.append(f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error")
@@ -201,7 +203,7 @@ def _recording(
             Places(sheet.place, rows),
             *(
                 None if values is None else values[rows]
-                for values in (error, covariance, nis, dof, None, clock, of_truth)
+                for values in (error, covariance, nis, dof, None, clock, of_truth, path)
             ),
         )
         for run, rows, column in zip(numbers, members, columns, strict=True)

@@ -1,0 +1,135 @@
+"""The figure of a trajectory with ellipses where the errors are largest against the covariance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import read_recordings
+from scipy import stats
+
+import consistency as cs
+from consistency.referee.diagnostics import Evidence
+from consistency.referee.document.drawing import Line, Points
+from consistency.referee.pages.files import record_figures, record_sheet, unit_of
+from consistency.referee.pages.trajectory import ELLIPSE, MOST, ellipse, trajectory
+from consistency.referee.types import Array
+
+STEPS = 60
+
+
+def record(convention: str = "so3", axes: tuple[str, ...] = ("x", "y", "z")) -> Evidence:
+    """A path along x and z, with errors of 1 sigma but for three steps."""
+    k = np.arange(float(STEPS))
+    true = np.column_stack([k, 0.01 * k, 5.0 * np.sin(k / 10.0)])
+    sigma = np.array([0.1, 0.2, 0.3])
+    error = np.tile(sigma, (STEPS, 1))
+    for step, size in ((10, 6.0), (11, 5.0), (40, 4.0)):
+        error[step] *= size
+    index = ["xyz".index(axis) for axis in axes]
+    nees = np.square(error / sigma)[:, index].sum(axis=1)
+    P = np.broadcast_to(np.diag(sigma**2)[np.ix_(index, index)], (1, STEPS, len(axes), len(axes)))
+    path = np.stack([true, true - error], axis=1)[None]
+    return Evidence(
+        "est", error[None][..., index], P, nees[None], len(axes), axes=axes, t=k, convention=convention, path=path
+    )
+
+
+def ellipses(one: Evidence) -> list[Line]:
+    figure = trajectory(one, 0)
+    assert figure is not None
+    (panel,) = figure.panels
+    return [mark for mark in panel.marks if isinstance(mark, Line) and mark.look == ELLIPSE]
+
+
+def test_ellipses_stand_where_the_errors_are_largest() -> None:
+    one = record()
+    figure = trajectory(one, 0)
+    assert figure is not None
+    (panel,) = figure.panels
+    assert (panel.x.label, panel.y.label, panel.equal) == ("x (m)", "z (m)", True)
+    found = ellipses(one)
+    assert len(found) == MOST
+    assert one.path is not None
+    worst = found[0]  # about the estimate of step 11, the 10th from 0
+    np.testing.assert_allclose([worst.x[:-1].mean(), worst.y[:-1].mean()], one.path[0, 10, 1][[0, 2]], atol=1e-9)
+    (points,) = [mark for mark in panel.marks if isinstance(mark, Points)]
+    np.testing.assert_allclose([points.x[0], points.y[0]], one.path[0, 10, 0][[0, 2]])
+    assert (points.x[1], 11.0) == (40.0, 11.0)  # step 12 is beside the first and is not drawn
+    assert "errors are largest against it (" in figure.caption
+    assert {key.text for key in figure.keys} == {"truth", "estimate", "95 % ellipse", "truth there"}
+
+
+def test_an_ellipse_holds_95_percent() -> None:
+    """Of 20,000 points; 4 standard errors."""
+    rng, P = np.random.default_rng(1), np.array([[2.0, 0.9], [0.9, 0.5]])
+    outline = ellipse(np.array([1.0, -1.0]), P)
+    size = np.einsum("ki,ij,kj->k", outline - [1.0, -1.0], np.linalg.inv(P), outline - [1.0, -1.0])
+    np.testing.assert_allclose(size, stats.chi2.ppf(0.95, 2), rtol=1e-9)
+    inside = np.square(rng.standard_normal((20_000, 2))).sum(axis=1) < size[0]
+    assert inside.mean() == pytest.approx(0.95, abs=4.0 * np.sqrt(0.05 * 0.95 / 20_000))
+    assert np.abs(np.diff(outline, axis=0)).max() < 0.4
+    np.testing.assert_allclose(outline[0], outline[-1])
+
+
+def test_no_ellipse_of_errors_about_other_axes() -> None:
+    one = record("left")
+    assert not ellipses(one)
+    figure = trajectory(one, 0)
+    assert figure is not None
+    assert figure.caption.endswith("No ellipses: the stated covariance is not about the axes of the world.")
+
+
+def test_only_what_is_judged_is_drawn() -> None:
+    figure = trajectory(record(axes=("x", "y")), 0)
+    assert figure is not None
+    assert figure.panels[0].y.label == "y (m)"
+    assert trajectory(record(axes=("z",)), 0) is None
+    bare = record()
+    assert trajectory(Evidence("est", bare.error, bare.covariance, axes=bare.axes), 0) is None
+
+
+def test_units() -> None:
+    assert [unit_of(axis)[0] for axis in ("x", "yaw", "vx", "bgy", "baz", "other", "v", "s")] == [
+        "m", "deg", "m/s", "rad/s", "m/s^2", "", "", "",
+    ]  # fmt: skip
+
+
+def write(folder: Path, steps: int = 40) -> tuple[Path, Path]:
+    rng = np.random.default_rng(2)
+    P = " ".join(f"{x:.9g}" for x in (np.eye(6) / 100.0).ravel())
+    lines: list[list[str]] = [[], []]
+    for k in range(steps):
+        e: Array = 0.1 * rng.standard_normal(3)
+        lines[0].append(f"{k} {k} {0.5 * k} 0 0 0 0 1 {P}")
+        lines[1].append(f"{k} {k + e[0]} {0.5 * k + e[1]} {e[2]} 0 0 0 1")
+    for name, text in zip(("est.txt", "truth.txt"), lines, strict=True):
+        (folder / name).write_text("\n".join(text) + "\n")
+    return folder / "est.txt", folder / "truth.txt"
+
+
+def test_readers_keep_the_path_for_the_pictures(tmp_path: Path) -> None:
+    (one,) = read_recordings(*write(tmp_path))
+    assert one.path is not None
+    assert one.error is not None
+    np.testing.assert_allclose(one.path[..., 0, :] - one.path[..., 1, :], one.error[..., :3], atol=1e-12)
+    v = cs.judge(one)
+    titles = [figure.title for figure in record_figures(one, v)]
+    assert titles == ["Errors and stated bounds", "NEES", "Trajectory", "Coverage"]
+    sheet = record_sheet(one, v)
+    assert any(panel.alt == "Trajectory of est" and panel.keys for panel in sheet.panels)
+    assert one.of_runs(slice(0, 1)).path is not None
+    (pieces,) = read_recordings(*write(tmp_path), split="20")
+    assert pieces.path is not None
+    np.testing.assert_array_equal(pieces.path.reshape(-1, 2, 3), one.path[0])
+
+
+def test_tables_keep_it_too(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{k},{2 * k},0.1,1,0,0,1,0,1\n" for k in range(1, 9))
+    (tmp_path / "est.csv").write_text("t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh\n" + rows)
+    (tmp_path / "truth.csv").write_text("t,x,y,heading\n" + "".join(f"{k},{k + 1},{2 * k},0.1\n" for k in range(1, 9)))
+    (one,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
+    assert one.path is not None
+    np.testing.assert_array_equal(one.path[0, 3], [[5.0, 8.0], [4.0, 8.0]])
+    assert trajectory(one, 0) is not None

@@ -14,7 +14,7 @@ import consistency as cs
 from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.covariance_update.parking import Parking, _is_worth_it, make_clones, unpark
 from consistency.bench.filters.kernel.slam import Frame, State
-from consistency.bench.filters.landmark.inverse_range import add_curvature
+from consistency.bench.filters.landmark.inverse_range import curvature
 from consistency.bench.filters.methods import robocentric as rc
 from consistency.bench.filters.sensor.conversion import Pixels
 from consistency.bench.filters.sensor.growth import Growth
@@ -71,18 +71,17 @@ def test_the_noise_of_a_motion_moves_the_mean_by_half_of_its_second_derivatives(
         R = heading_matrix(-turn - about)
         return inverse_range.carried(Y, R, -R[:, 0] * (forward + drive), sensor)[0][i]
 
-    exact = np.zeros(3)
-    for sigma, direction in zip(sigmas, np.eye(2), strict=True):
+    exact = np.zeros((3, 2))
+    for j, direction in enumerate(np.eye(2)):
         ends = there(*(step * direction)) + there(*(-step * direction)) - 2.0 * there(0.0, 0.0)
-        exact += 0.5 * sigma**2 * ends / step**2
+        exact[:, j] = 0.5 * sigmas[j] ** 2 * ends / step**2
     R = heading_matrix(-turn)
-    y, _, D, b = inverse_range.carried(Y, R, -R[:, 0] * forward, sensor)
+    _, _, D, b = inverse_range.carried(Y, R, -R[:, 0] * forward, sensor)
     said = inverse_range.curvature(b, Y[:, 2], D, R[:, 0], sigmas, sensor)[i]
     assert close(said, exact, 1e-8)
-    assert np.abs(exact).min() > 1e-5
-    kernel, frame = y[i].copy(), Frame(0.0, 0.0, R[0, 0], R[1, 0])
-    add_curvature(tuple(b[i]), Y[i, 2], D[i], frame, sensor.mount.packed(), *sigmas, kernel)
-    assert close(kernel - y[i], said, 1e-14)
+    assert np.abs(exact).max(axis=0).min() > 1e-5
+    frame, mount = Frame(0.0, 0.0, R[0, 0], R[1, 0]), sensor.mount.packed()
+    assert close(np.array(curvature(tuple(b[i]), Y[i, 2], D[i], frame, mount, *sigmas)).T, said, 1e-14)
 
 
 @pytest.mark.parametrize("y", Y)
@@ -215,7 +214,7 @@ def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, o
     poses, xi = rng.normal(size=(4, 3)), 0.3 * rng.normal(size=(4, 3))
     moved, C = inverse_range.chained(poses, xi, on=on)
     pixels = Pixels(1.0, 1.0, 1.0, Growth(np.ones(1), np.ones(1)), 0.0, 0.0, False, False, False)
-    update = Converting(pixels, 0.03, 20, 12, clones, True, True)
+    update = Converting(pixels, 0.03, 20, 12, clones, True, True, True)
     room = converting_room(update, 3, 3, 3, m, 30)
     room.number[:], room.on[0], size = number, on, 3 + 3 * (m + clones)
     places = np.array([3 + 3 * (m + c) for c in range(clones)] + [0])[:, None] + np.arange(3)

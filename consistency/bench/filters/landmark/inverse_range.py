@@ -120,20 +120,23 @@ def bent(q: Triple, rho: float, w: Triple) -> Triple:
 
 
 @inner
-def add_curvature(
-    b: Triple, rho: float, D: Array, turn: Frame, mount: Mounting, along: float, about: float, there: Array
-) -> None:
-    """``there`` (3,) += what noise of the drive, m, and of the turn, rad, adds to its mean, to second order.
+def curvature(
+    b: Triple, rho: float, D: Array, turn: Frame, mount: Mounting, along: float, about: float
+) -> tuple[Triple, Triple]:
+    """What noise of the drive, m, and of the turn, rad, adds to the mean of a landmark, to second order.
 
     ``b``, ``D`` are those of :func:`carried`. An error s of the turn takes b to b + s (b_y, -b_x, 0) -
     s^2 / 2 (b_x, b_y, 0), one of the drive to b - s rho (c, s, 0).
     """
     q = inward(mount, b[0] - rho * mount.x, b[1] - rho * mount.y, b[2] - rho * mount.z)
-    of_turn = bent(q, rho, inward(mount, b[1], -b[0], 0.0))
-    of_drive = bent(q, rho, inward(mount, -rho * turn.c, -rho * turn.s, 0.0))
-    for a in range(3):
-        by_turn = of_turn[a] - D[a, 0] * b[0] - D[a, 1] * b[1]
-        there[a] += 0.5 * (along * along * of_drive[a] + about * about * by_turn)
+    t0, t1, t2 = bent(q, rho, inward(mount, b[1], -b[0], 0.0))
+    d0, d1, d2 = bent(q, rho, inward(mount, -rho * turn.c, -rho * turn.s, 0.0))
+    drive, by_turn = 0.5 * along * along, 0.5 * about * about
+    return (drive * d0, drive * d1, drive * d2), (
+        by_turn * (t0 - D[0, 0] * b[0] - D[0, 1] * b[1]),
+        by_turn * (t1 - D[1, 0] * b[0] - D[1, 1] * b[1]),
+        by_turn * (t2 - D[2, 0] * b[0] - D[2, 1] * b[1]),
+    )
 
 
 @implement(world_point, InverseRange)

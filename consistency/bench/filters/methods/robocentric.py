@@ -48,7 +48,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
             InvariantPose(), Converted(),
-            Converting(pixels, waiting, passes, chain, clones, which.recency, which.curvature),
+            Converting(pixels, waiting, passes, chain, clones, which.recency, which.curvature, which.spread),
             Parking(every, unseen, doubt, which.turning),
         )  # fmt: skip
 

@@ -35,6 +35,7 @@ class Corrections(NamedTuple):
     recency: bool = True  # an update about a moved robot leaves the errors from before its last motion as they are
     curvature: bool = True  # mean of a landmark that moves, to second order in the noise of turn and drive
     promptness: bool = True  # landmarks are parked soon
+    spread: bool = True  # covariance of a landmark that moves, to second order in the noise of turn and drive
 
 
 # --- geometry ----------------------------------------------------------------------------------------
@@ -93,7 +94,7 @@ def bent(q: Array, rho: Array, w: Array) -> Array:
 def curvature(
     b: Array, rho: Array, D: Array, along: Array, noise: tuple[float, float], sensor: BelievedSensor
 ) -> Array:
-    """What noise of drive and turn adds to the mean of landmarks (m, 3), to second order.
+    """What noise of drive and of turn adds to the mean of landmarks, to second order, (m, 3, 2).
 
     An error s of the turn takes b to Rz(-s) b = b + s (b_y, -b_x, 0) - s^2 / 2 (b_x, b_y, 0), one of the drive to
     b - s rho ``along``: the mean moves by half of each variance times the second derivative of the landmark by s.
@@ -110,7 +111,7 @@ def curvature(
     by_turn = np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1) @ axes
     of_turn = bent(q, rho, by_turn) - (D @ flat[:, :, None])[:, :, 0]
     of_drive = bent(q, rho, -rho[:, None] * (along @ axes))
-    return np.asarray(0.5 * (noise[0] ** 2 * of_drive + noise[1] ** 2 * of_turn))
+    return 0.5 * np.square(noise) * np.stack([of_drive, of_turn], axis=2)
 
 
 def exponential(xi: Array) -> tuple[Array, Array]:

@@ -119,8 +119,10 @@ class RobotCentredKalman:
 
     def predict(self, state: CentredState, control: Control) -> CentredState:
         belief, x, n = state.problem.belief, state.x.copy(), len(state.x)
-        F, G = np.eye(n), np.zeros((n, 2))
+        F, G, Q = np.eye(n), np.zeros((n, 2)), np.zeros((n, n))
         F[:3, :3], G[:3] = self.robot.jacobians(x[:3], control)
+        sigmas = (control.dt * belief.motion.sigma_v, control.dt * belief.motion.sigma_omega)
+        bends = np.zeros((n, 2))
         x[:3] = self.robot.move(x[:3], control)
         active = [at for label, at in state.places.items() if label not in state.parked]
         if active:
@@ -129,15 +131,19 @@ class RobotCentredKalman:
             R = heading_matrix(-turn)
             y, J, D, b = carried(x[rows], R, -R[:, 0] * forward, belief.sensor)
             rho = x[rows][:, 2:]
-            if self.which.curvature:
-                sigmas = (control.dt * belief.motion.sigma_v, control.dt * belief.motion.sigma_omega)
-                y = y + curvature(b, rho[:, 0], D, R[:, 0], sigmas, belief.sensor)
-            x[rows] = y
+            bends[rows] = curvature(b, rho[:, 0], D, R[:, 0], sigmas, belief.sensor)
+            x[rows] = y + bends[rows].sum(axis=2) if self.which.curvature else y
+            if self.which.spread:  # of the drive, and of the error of rho times it
+                along = D @ R[:, 0]
+                by_range = sigmas[0] ** 2 * state.P[rows[:, 2], rows[:, 2]]
+                Q[rows[:, :, None], rows[:, None, :]] = by_range[:, None, None] * along[:, :, None] * along[:, None, :]
             F[rows[:, :, None], rows[:, None, :]] = J
             by_forward, by_turn = -rho * R[:, 0], np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1)
             G[rows] = control.dt * (D @ np.stack([by_forward, by_turn], axis=2))
         noise = G * [belief.motion.sigma_v, belief.motion.sigma_omega]
-        return replace(state, x=x, P=F @ state.P @ F.T + noise @ noise.T, step=state.step + 1, noise=noise)
+        if self.which.spread:  # the square of a normal of variance s^2 has mean s^2 and variance 2 s^4
+            noise = np.hstack([noise, np.sqrt(2.0) * bends])
+        return replace(state, x=x, P=F @ state.P @ F.T + noise @ noise.T + Q, step=state.step + 1, noise=noise)
 
     def update(self, state: CentredState, observation: Observation) -> tuple[CentredState, Info]:
         labels = [int(label) for label in observation.landmarks]

@@ -22,7 +22,7 @@ from consistency.bench.filters.kernel.slam import (
     predict,
 )
 from consistency.bench.filters.kernel.work import NoNotes, Work
-from consistency.bench.filters.landmark.inverse_range import InverseRange, add_curvature, carried
+from consistency.bench.filters.landmark.inverse_range import InverseRange, carried, curvature
 from consistency.bench.filters.motion.unicycle import Unicycle
 from consistency.bench.filters.sensor.conversion import Pixels, conversion_jacobian, convert, subtract_bias
 from consistency.bench.filters.sensor.uvd import Uvd
@@ -36,7 +36,7 @@ class Converting(NamedTuple):
     ``waiting``: alone and in doubt it stays parked if its distance is known to this part of it; ``passes`` of such an
     update at most, and of one in a ``chain``, tried first, 0 for none; ``clones`` at most, and no more than landmarks.
     ``recency``: a moved robot keeps the errors from before its last motion; ``curvature``: a motion moves landmarks
-    by the mean of its noise to second order.
+    by the mean of its noise to second order; ``spread``: and adds to their covariance what that noise spreads them.
     """
 
     pixels: Pixels
@@ -46,6 +46,7 @@ class Converting(NamedTuple):
     clones: int
     recency: bool
     curvature: bool
+    spread: bool
 
 
 @part(update="Converting")
@@ -88,9 +89,10 @@ class ConvertingRoom(NamedTuple):
     R: Array  # (m, 3, 3)
     delta: Array  # (3 + 3 (m + c),) a correction of the robot and of all these
     before: Array  # (3 + 3 (m + c),)
-    noise: Array  # (2, n) what the motion of this step added to the errors, for each of its noises
+    noise: Array  # (4, n) what the motion of this step added to the errors, for each of its noises and their squares
     moving: Indices  # (n / 3,) offsets of the landmarks that move
     J: Array  # (n / 3, 3, 3) how
+    mixed: Array  # (n / 3, 3) error of each by the noise of the drive times that of its rho, one standard deviation
     three: Array  # (4, 3, 3)
     poses: Array  # (5, 3)
 
@@ -114,7 +116,8 @@ def converting_room(update: Converting, r: int, w: int, s: int, m: int, n: int) 
         matrix(c + 1, 3), blocks(c + 1, 3, 3), blocks(c + 1, 3, 3),
         blocks(m, 3, 3), blocks(m, 3, 3), blocks(m, 3, 3), blocks(m, 3, 3),
         matrix(m, 3), matrix(m, 3), blocks(m, 3, 3), vector(most), vector(most),
-        matrix(2, n), integers(n // 3, 0), blocks(n // 3, 3, 3), blocks(4, 3, 3), matrix(5, 3),
+        matrix(4, n), integers(n // 3, 0), blocks(n // 3, 3, 3), matrix(n // 3, 3),
+        blocks(4, 3, 3), matrix(5, 3),
     )  # fmt: skip
 
 
@@ -131,7 +134,7 @@ def predict_centred(
     x, P, n, room, G = state.x, state.P, state.n, work.room, work.small
     columns = noise_columns(slam.motion, x[:3], u, G)
     move(slam.motion, x[:3], u, x[:3])
-    noise = room.noise[:columns, :n]
+    noise = room.noise[: columns + 2 if update.spread else columns, :n]
     fill_matrix(noise, 0.0)
     for c in range(columns):
         noise[c, 0], noise[c, 1], noise[c, 2] = G[0, c] + x[1] * G[2, c], G[1, c] - x[0] * G[2, c], G[2, c]
@@ -145,17 +148,29 @@ def predict_centred(
             rho = x[o + 2]
             point = carried(x[o : o + 3], turn, slam.landmark.mount, there, J, D)
             along, about = u[0] * slam.motion.sigma_v, u[0] * slam.motion.sigma_omega
-            if update.curvature:
-                add_curvature(point, rho, D, turn, slam.landmark.mount, along, about, there)
-            copy(there, x[o : o + 3])
             for a in range(3):
                 noise[0, o + a] = -along * rho * (D[a, 0] * c + D[a, 1] * s)
                 noise[1, o + a] = about * (D[a, 0] * point[1] - D[a, 1] * point[0])
+            if update.curvature or update.spread:
+                of_drive, of_turn = curvature(point, rho, D, turn, slam.landmark.mount, along, about)
+                for a in range(3):
+                    if update.curvature:
+                        there[a] += of_drive[a] + of_turn[a]
+                    if update.spread:  # the square of a normal of variance s^2 has variance 2 s^4
+                        noise[2, o + a], noise[3, o + a] = np.sqrt(2.0) * of_drive[a], np.sqrt(2.0) * of_turn[a]
+                        by_range = along * np.sqrt(P[o + 2, o + 2])
+                        room.mixed[moving, a] = by_range * (D[a, 0] * c + D[a, 1] * s)
+            copy(there, x[o : o + 3])
             room.moving[moving] = o
             moving += 1
     _move_rows(P, n, room.moving, room.J, moving)
     _move_beyond(local.factors.Phi, state.base, room.moving, room.J, moving)
     add_gram(1.0, noise, P[:n, :n])
+    for i in range(moving if update.spread else 0):
+        o = room.moving[i]
+        for a in range(3):
+            for b in range(a, 3):
+                P[o + a, o + b] += room.mixed[i, a] * room.mixed[i, b]
     for a in range(3):
         for b in range(a):
             P[a, b] = P[b, a]

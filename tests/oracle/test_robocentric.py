@@ -24,6 +24,7 @@ from consistency.bench.filters.textbook import robocentric as textbook
 from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.filters.update.converting import Converting, converting_room
 from consistency.bench.filters.update.retraction_chain import aim_chained, cast_columns, cast_rows, unchain
+from consistency.bench.types import Control
 from consistency.referee.types import Array
 
 Small = Callable[..., cs.Scenario]
@@ -63,20 +64,48 @@ def test_carrying_there_and_back_changes_nothing(sensor: Any) -> None:
     assert close(inverse_range.carried(there, R.T, -R.T @ t, sensor)[0], Y, 1e-12)
 
 
-@pytest.mark.parametrize("i", range(len(Y)))
-def test_the_noise_of_a_motion_moves_the_mean_by_half_of_its_second_derivatives(sensor: Any, i: int) -> None:
-    forward, turn, step, sigmas = 0.4, 0.3, 1e-3, (0.05, 0.2)  # m, rad
+DRIVE, TURN = 0.4, 0.3  # m, rad
+
+
+def bends(sensor: Any, i: int) -> tuple[Array, Array]:
+    """First derivatives of a landmark by drive and turn, and half of the second ones, (3, 2) each."""
 
     def there(drive: float, about: float) -> Array:
-        R = heading_matrix(-turn - about)
-        return inverse_range.carried(Y, R, -R[:, 0] * (forward + drive), sensor)[0][i]
+        R = heading_matrix(-TURN - about)
+        return inverse_range.carried(Y, R, -R[:, 0] * (DRIVE + drive), sensor)[0][i]
 
-    exact = np.zeros((3, 2))
-    for j, direction in enumerate(np.eye(2)):
-        ends = there(*(step * direction)) + there(*(-step * direction)) - 2.0 * there(0.0, 0.0)
-        exact[:, j] = 0.5 * sigmas[j] ** 2 * ends / step**2
-    R = heading_matrix(-turn)
-    _, _, D, b = inverse_range.carried(Y, R, -R[:, 0] * forward, sensor)
+    step, here = 1e-3, there(0.0, 0.0)
+    ends = [(there(*(step * d)), there(*(-step * d))) for d in np.eye(2)]
+    first = np.stack([(a - b) / (2.0 * step) for a, b in ends], axis=1)
+    return first, np.stack([0.5 * (a + b - 2.0 * here) / step**2 for a, b in ends], axis=1)
+
+
+@pytest.mark.parametrize("i", range(len(Y)))
+def test_the_noise_of_a_motion_spreads_landmarks_to_second_order(small: Small, tilted: dict[str, Any], i: int) -> None:
+    scenario = small("herath2007-stereo", belief__sensor__mount=tilted)
+    motion, trial, of_rho, dt = scenario.belief.motion, cs.simulate(scenario), 0.003, 0.5
+    P = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, of_rho])
+    x = np.append([1.0, 2.0, 0.5], Y[i])
+    state = centred.CentredState(x, P, problem_of(trial, scenario.belief), places={0: 3})
+    first, plain = (
+        textbook.RobotCentredKalman("trial", inverse_range.Corrections(spread=spread)).predict(
+            state, Control(dt, DRIVE / dt, TURN / dt)
+        )
+        for spread in (True, False)
+    )
+    slope, bend = bends(scenario.belief.sensor, i)
+    bend = bend * np.square([dt * motion.sigma_v, dt * motion.sigma_omega])
+    by_range = dt * motion.sigma_v * slope[:, 0] / Y[i, 2]
+    exact = np.zeros((6, 6))
+    exact[3:, 3:] = 2.0 * bend @ bend.T + of_rho * np.outer(by_range, by_range)
+    assert np.abs(first.P - plain.P - exact).max() < 1e-5 * exact.max()
+
+
+@pytest.mark.parametrize("i", range(len(Y)))
+def test_the_noise_of_a_motion_moves_the_mean_by_half_of_its_second_derivatives(sensor: Any, i: int) -> None:
+    sigmas, exact = (0.05, 0.2), bends(sensor, i)[1] * np.square((0.05, 0.2))
+    R = heading_matrix(-TURN)
+    _, _, D, b = inverse_range.carried(Y, R, -R[:, 0] * DRIVE, sensor)
     said = inverse_range.curvature(b, Y[:, 2], D, R[:, 0], sigmas, sensor)[i]
     assert close(said, exact, 1e-8)
     assert np.abs(exact).max(axis=0).min() > 1e-5

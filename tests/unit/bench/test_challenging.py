@@ -289,7 +289,7 @@ def test_a_search_is_repeated_by_its_seed() -> None:
 
 
 def test_a_space_of_one_world_ends() -> None:
-    fixed = ("baseline=0.09", "density=1", "range=4", "steps=500", *SMALL[1:])
+    fixed = ("baseline=0.09", "density=1", "range=4", "steps=500", "lap=1", "dt=0.1", "tilt=0", "height=0", *SMALL[1:])
     space, budget = space_of(STEREO, fixed), Budget(trials=100)
     tried: dict[Point, Candidate] = {}
 

@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 .PHONY: docs house house-write tutorial case-studies case-studies-rates reproduce calibrate calibrate-quick calibrate-alignment \
-	calibrate-alignment-quick regime test test-quick test-all bench lint format clean
+	calibrate-alignment-quick calibrate-fit regime test test-quick test-all bench lint format clean
 
 # matrices are small and work is divided among processes: further threads of BLAS would wait for each other
 export OPENBLAS_NUM_THREADS ?= 1
@@ -38,6 +38,9 @@ calibrate-alignment: .venv/.done
 
 calibrate-alignment-quick: .venv/.done
 	$(BIN)/python benchmarks/alignment.py --quick
+
+calibrate-fit: .venv/.done
+	$(BIN)/python benchmarks/fit_covariance.py
 
 RECURSIVE := ekf-uvd ukf-uvd parked-ekf-uvd robocentric-ekf-uvd anchored-ekf-uvd eqf-uvd ri-ekf-uvd fej-ekf-uvd oc-ekf-uvd \
 	ckf-uvd iekf-uvd ispkf-uvd

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import Field, fields
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -40,15 +40,18 @@ def tell_notes(*read: list[Evidence]) -> None:
         print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
 
 
-def reads_files(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command with the options of files, which it gets as one argument ``files``."""
+def reads_files(command: Callable[..., Any] | None = None, without: Collection[str] = ()) -> Callable[..., Any]:
+    """A command with the options of files, which it gets as one argument ``files``; some it may do without."""
+    if command is None:
+        return partial(reads_files, without=without)
     signature = inspect.signature(command, eval_str=True)
     hints = get_type_hints(Reading)
-    own = {each.name: _parameter(each, hints[each.name]) for each in fields(Reading)}
+    taken = [each for each in fields(Reading) if each.name not in without]
+    own = {each.name: _parameter(each, hints[each.name]) for each in taken}
 
     @wraps(command)
     def with_files(**given: Any) -> Any:
-        options = {each.name: _parsed(each, given.pop(each.name)) for each in fields(Reading)}
+        options = {each.name: _parsed(each, given.pop(each.name)) for each in taken}
         return command(files=Reading(**options), **given)
 
     parameters = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from consistency.referee.parsing import is_file, reading, require_name, require_
 from consistency.referee.readers.extended import extended_errors, is_extended
 from consistency.referee.readers.hints import hints, turns
 from consistency.referee.readers.interpolation import Manifold
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.record import Track, assemble, symmetric
 from consistency.referee.readers.relative import Stretch, relative_recording
 from consistency.referee.readers.sheet import Places, are_dof, bounded
@@ -181,6 +181,24 @@ def _poses(place: Places, estimate: Array, covariance: Array, truth: Array, conv
     manifold: Manifold = "vector" if convention == "vector" else "planar"
     stated = np.ones(len(t), bool)
     return Poses(place, t, estimate, covariance, stated, t[known], truth[known], manifold, convention, 0.0)
+
+
+def archive_poses(path: Path) -> Iterator[NamedPoses]:
+    """Planar poses of each run of an archive with the keys ``estimates`` and ``truth``."""
+    arrays = load_arrays(path)
+    if missing := [key for key in ("estimates", "truth") if key not in arrays]:
+        raise InputError(f"{path}: key '{missing[0]}' is missing; needs estimates and truth, (runs, steps, 3)")
+    estimates, truth = (_array(path, arrays, key, 3) for key in ("estimates", "truth"))
+    if estimates.shape != truth.shape or estimates.shape[-1] != 3:
+        raise InputError(f"{path}: estimates {estimates.shape} and truth {truth.shape} must both be (runs, steps, 3)")
+    runs, steps, _ = estimates.shape
+    clock, there = step_times(path, arrays, steps), _known(path, arrays, runs, steps)
+    for run, length in enumerate(run_lengths(path, arrays, runs, steps)):
+        place = Places(lambda row, run=run: f"{path}, run {run}, step {row + 1}", np.arange(length))  # type: ignore[misc]
+        true, step = truth[run, :length], np.arange(length, dtype=float)
+        known = there[run, :length] & np.isfinite(true).all(axis=-1)
+        poses = Poses.bare(place, step, estimates[run, :length], step[known], true[known], "planar", 0.0)
+        yield NamedPoses(f"run {run}" if runs > 1 else path.stem, poses, clock[:length])
 
 
 def _relative(

@@ -19,7 +19,7 @@ from consistency.referee.parsing import reading
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.fixes import Fixes, localised
 from consistency.referee.readers.layouts import POSE
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.positions import fixed, position_source, positions
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Lines, Places
@@ -327,3 +327,22 @@ def _row(header: Any, content: Any) -> tuple[float, list[float], Array]:
 def _stamp(header: Any) -> float:
     """Time of a message, s."""
     return float(header.stamp.sec + SECOND * header.stamp.nanosec)
+
+
+# --- poses alone -------------------------------------------------------------------------------------
+
+
+def bag_poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
+    """Poses of each bag, of a topic with or without covariances, which are not looked at."""
+    for bag in [path] if _is_one(path) else sorted(part for part in path.iterdir() if _is_one(part)):
+        with _opened(bag) as reader:
+            topic = r.topic if r.topic in _topics(reader, POSES) else _chosen(bag, reader, r.topic)
+            if r.truth_topic is None:
+                others = [name for name in _topics(reader, POSES) if name != topic]
+                raise InputError(f"{bag}: needs --truth-topic; there are: {_listed(others, reader)}")
+            own, true = (_lines(bag, reader, each) for each in (topic, r.truth_topic))
+        if isinstance(own, Fixes) or isinstance(true, Fixes):
+            raise InputError(f"{bag}: positions by satellite have no orientations, which motions need")
+        place, pose = Places(own.place, np.arange(len(own.t))), slice(1, POSE)
+        poses = Poses.bare(place, own.t, own.values[:, pose], true.t, true.values[:, pose], "spatial", r.tolerance)
+        yield NamedPoses(bag.stem, poses, own.t)

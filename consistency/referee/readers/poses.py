@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,8 +75,25 @@ class Poses:
             return self
         return self._of(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
 
+    @classmethod
+    def bare(
+        cls, place: Places, t: Array, estimate: Array, true_t: Array, truth: Array, manifold: Manifold, max_dt: float
+    ) -> Poses:
+        """Poses without covariances, which are NaN."""
+        n = 6 if manifold == "spatial" else truth.shape[1]
+        P = np.broadcast_to(np.nan, (len(t), n, n))
+        return cls(place, t, estimate, P, np.zeros(len(t), bool), true_t, truth, manifold, "left", max_dt)
+
     def _of(self, rows: Indices) -> Poses:
         return replace(
             self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
             covariance=self.covariance[rows], stated=self.stated[rows], cross=None,
         )  # fmt: skip
+
+
+class NamedPoses(NamedTuple):
+    """A run of a file without its covariances, by name."""
+
+    name: str
+    poses: Poses
+    clock: Array  # (N,), s, of the estimates; NaN where they are numbered by steps alone

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from consistency.referee.readers.kitti import drive_sheet, is_drive
 from consistency.referee.readers.matching import common_steps, common_times
 from consistency.referee.readers.naming import DEVIATIONS
 from consistency.referee.readers.plane import planar_sheet
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.record import Track, assemble, count, listed, symmetric
 from consistency.referee.readers.relative import Stretch, relative_recording
 from consistency.referee.readers.sheet import Places, TableRows, are_dof, read_sheet
@@ -489,3 +490,33 @@ def _nis(sheet: TableRows) -> tuple[Array | None, Array | None]:
             "nis must be 0 or more, nis_dof a whole number from 0 to below 2^31"
         )
     return nis, np.where(np.isfinite(nis), dof, 0.0)
+
+
+# --- poses alone -------------------------------------------------------------------------------------
+
+
+def table_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
+    """Planar poses of each run of a table; covariances are not looked at."""
+    if r.truth is None:
+        raise InputError(f"{estimates}: needs --truth FILE, poses in any world")
+    sheet, _ = planar_sheet(estimates, bool(r.motions))
+    truth = drive_sheet(r.truth, r.body) if is_drive(r.truth) else planar_sheet(r.truth)[0]
+    if "filter" in sheet and len(set(sheet.texts("filter"))) > 1:
+        raise InputError(f"{estimates}: holds several estimators in its column 'filter'; keep the rows of one")
+    _require(sheet, POSE)
+    key = _key(sheet, truth, r)
+    samples = _samples(truth, POSE, key)
+    runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
+    order = row_order(sheet, runs, key)
+    sheet, runs = sheet.rows(order), runs[order]
+    keys, clock = sheet.numbers(key, finite=True), sheet.numbers("t") if "t" in sheet else np.full(len(runs), np.nan)
+    estimate = np.column_stack([sheet.numbers(axis) for axis in POSE])
+    for run in np.unique(runs):
+        rows, true = np.flatnonzero(runs == run), samples.of(run)
+        if not len(true.keys):
+            raise InputError(f"{truth.path}: holds no run {run}; without a column 'run' it serves all")
+        poses = Poses.bare(
+            Places(sheet.place, rows), keys[rows], estimate[rows], true.keys, true.values, "planar",
+            r.tolerance if key == "t" else 0.0,
+        )  # fmt: skip
+        yield NamedPoses(f"run {run}" if "run" in sheet else estimates.stem, poses, clock[rows])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from consistency.referee.readers.kitti import is_drive, read_drive
 from consistency.referee.readers.layouts import DEVIATED, FULL, POINT, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.openvins import LAYOUT, States, read_deviations
-from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.positions import fixed, position_source, positions
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Lines, Places, read_numbers
@@ -300,3 +300,21 @@ def _triangle(numbers: Array, n: int) -> Array:
     i, j = np.triu_indices(n)
     out[:, i, j] = out[:, j, i] = numbers
     return out
+
+
+# --- poses alone -------------------------------------------------------------------------------------
+
+
+def trajectory_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
+    """Poses of each run of a file or folder beside a truth with orientations; covariances are not looked at."""
+    if r.truth is None:
+        raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
+    for path, true_path, _ in _runs(estimates, r.truth, None):
+        own = read_trajectory(path)
+        truth = read_drive(true_path, r.body) if is_drive(true_path) else read_trajectory(true_path, true=True)
+        for lines, name in ((own, path), (truth, true_path)):
+            if _is_point(lines):
+                raise InputError(f"{name}: holds positions alone; motions need orientations, too")
+        place, pose = Places(own.place, np.arange(len(own.t))), slice(1, POSE)
+        poses = Poses.bare(place, own.t, own.values[:, pose], truth.t, truth.values[:, pose], "spatial", r.tolerance)
+        yield NamedPoses(path.stem, poses, own.t)

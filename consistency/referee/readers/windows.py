@@ -25,6 +25,7 @@ class Relative:
     unit: str  # step | s | m
     motions: bool = False  # each row is the motion since the row before, and errors of motions are independent
     independent: bool = False  # errors of windows are declared to be independent
+    flag: str = "--relative"  # option that names the size, for messages
 
     @property
     def text(self) -> str:
@@ -104,7 +105,7 @@ def _along(t: Array, position: Array, rows: Indices, relative: Relative, file: s
         return rows.astype(float)
     if relative.unit == "s":
         if not np.isfinite(t[rows]).all():
-            raise InputError(f"{file}: --relative {relative.option} needs a column t, in s")
+            raise InputError(f"{file}: {relative.flag} {relative.option} needs a column t, in s")
         return t[rows]
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
 
@@ -112,9 +113,9 @@ def _along(t: Array, position: Array, rows: Indices, relative: Relative, file: s
 def _none(place: Array, relative: Relative, file: str) -> str:
     length, unit = float(place[-1] - place[0]), {"step": " steps"}.get(relative.unit, f" {relative.unit}")
     if length < relative.size - ROUNDING:
-        return f"{file}: --relative {relative.option}: only {length:.4g}{unit} have truth; ask for shorter windows"
+        return f"{file}: {relative.flag} {relative.option}: only {length:.4g}{unit} have truth; ask for shorter windows"
     gap = float(np.median(np.diff(place)))
     return (
-        f"{file}: --relative {relative.option}: rows with truth are {gap:.4g}{unit} apart in the median; "
+        f"{file}: {relative.flag} {relative.option}: rows with truth are {gap:.4g}{unit} apart in the median; "
         "ask for longer windows, or give a truth of a higher rate"
     )

@@ -1,0 +1,285 @@
+"""Noise models of odometry: recovery of known noise, coverage of intervals, and how often "consistent" is wrong.
+
+    python benchmarks/fit_covariance.py                # 200 draws a case, about an hour on one core
+    python benchmarks/fit_covariance.py --draws 20     # quicker
+
+Drives are simulated, of 1 km, and of 500 m for verdicts: an odometry that errs as white noise a metre and a radian, or
+also by a scale that persists in a drive, by noise with a memory, by jumps, by loops that are closed, by a scale that is
+not metric, in another body frame. Each is fitted and judged as ``consistency fit-covariance --span 10m`` does. Exit
+status 1 if a promise is broken
+(binomial, 1 % for all rows together).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from consistency.referee.defaults import DETECT
+from consistency.referee.errors import InputError
+from consistency.referee.fitting.drives import Drive, drive_of
+from consistency.referee.fitting.likelihood import terms_of
+from consistency.referee.fitting.motions import vectors
+from consistency.referee.fitting.noise import fit_noise, intervals
+from consistency.referee.fitting.persistence import persistent
+from consistency.referee.fitting.ratios import folds_of, judged_by
+from consistency.referee.fitting.refusals import growth_of, require_sound
+from consistency.referee.fitting.windows import Windows, span_of, windows_of
+from consistency.referee.geometry.groups import composed
+from consistency.referee.types import Array
+
+SPAN, STEP, LENGTH = "10m", 0.5, 1000.0  # m
+SHORT = 500.0  # m, of drives whose verdicts are counted
+PER_M = np.array([4e-4, 2e-4, 4e-6])  # m^2/m and rad^2/m: x, y, yaw
+PER_RAD = np.array([4e-4, 1e-4, 2e-5])  # m^2/rad and rad^2/rad
+WITHIN, SHARE, OWN = (0.7, 1.5), 0.80, 0.5  # of the true variance; of fits; of the variance of a window
+COVERED = (0.90, 0.98)
+WRONG, SURE = 0.05, 0.01  # share of wrong "consistent"; chance that a promise kept exactly is called broken
+FRESH = 40  # drives that tell the true ratio of a fit
+
+
+@dataclass(frozen=True)
+class World:
+    """How the odometry of a drive errs beyond white noise."""
+
+    scale: float = 0.0  # sd of the scale of the way between drives
+    spread: float = 0.0  # sd of the logarithm of the variance between drives
+    memory: float = 0.0  # m, over which an additional error of the heading rate decays
+    coloured: float = 0.0  # rad/m, its sd
+    jumps: int = 0  # of 1 m, in a drive
+    closed: bool = False  # poses err about the truth by a fixed amount
+    metric: float = 1.0  # true over estimated way
+    turned: float = 0.0  # rad, between the body frames
+    offset: float = 0.0  # m along x at both ends: jitter
+
+
+def steps_of(rng: np.random.Generator, length: float) -> Array:
+    """True motions (N, 3) of a drive: straight roads, and corners of up to a right angle."""
+    n = round(length / STEP)
+    turn = np.zeros(n)
+    k = 0
+    while k < n:
+        k += int(rng.integers(10, 80))
+        corner = int(rng.integers(8, 24))
+        turn[k : k + corner] = rng.uniform(-np.pi / 2, np.pi / 2) / corner
+        k += corner
+    return np.column_stack([np.full(n, STEP), np.zeros(n), turn])
+
+
+def matrices_of(motions: Array) -> Array:
+    """Matrices of motions x, y, heading (N, 3)."""
+    c, s = np.cos(motions[:, 2]), np.sin(motions[:, 2])
+    out = np.zeros((len(motions), 3, 3))
+    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = c, -s, s, c
+    out[:, :2, 2], out[:, 2, 2] = motions[:, :2], 1.0
+    return out
+
+
+def drive(rng: np.random.Generator, world: World = World(), name: str = "drive", length: float = LENGTH) -> Drive:
+    """One drive; the estimate has half the true noise of a step before it and half after it."""
+    true = steps_of(rng, length)
+    factor = np.exp(0.5 * world.spread * rng.normal())
+    sigma = factor * np.sqrt(PER_M * STEP + PER_RAD * np.abs(true[:, 2:]))
+    error = sigma * rng.normal(size=true.shape)
+    if world.memory:
+        keep = np.exp(-STEP / world.memory)
+        rate = world.coloured * np.sqrt(1 - keep**2) * rng.normal(size=len(true))
+        rate[0] = world.coloured * rng.normal()
+        for k in range(1, len(rate)):
+            rate[k] += keep * rate[k - 1]
+        error[:, 2] += STEP * rate
+    if world.jumps:
+        error[rng.choice(len(true), world.jumps, replace=False), 1] += rng.choice([-1.0, 1.0], world.jumps)
+    start = np.eye(3)[None]
+    truth = composed(np.concatenate([start, matrices_of(true)]))
+    estimated = true * [1.0 + world.scale * rng.normal(), 1.0, 1.0] / [world.metric, 1.0, 1.0]
+    T = composed(np.concatenate([start, matrices_of(estimated) @ matrices_of(error)]))
+    if world.closed:
+        T = truth @ matrices_of(np.sqrt(10 * PER_M) * rng.normal(size=(len(truth), 3)))
+    if world.turned:
+        T = T @ matrices_of(np.array([[0.0, 0.0, world.turned]]))
+    if world.offset:
+        T = T @ matrices_of(world.offset * rng.normal(size=(len(T), 1)) * [[1.0, 0.0, 0.0]])
+    return drive_of(name, vectors(T), vectors(truth), STEP * np.arange(len(truth)))
+
+
+def drives(rng: np.random.Generator, number: int, world: World = World(), length: float = LENGTH) -> list[Drive]:
+    """Several drives, by name."""
+    return [drive(rng, world, f"drive {i + 1}", length) for i in range(number)]
+
+
+# --- recovery ------------------------------------------------------------------------------------------
+
+
+def recovery(rng: np.random.Generator, number: int, draws: int) -> tuple[Array, Array, list[str]]:
+    """Fitted over true variance (draws, p), whether the interval holds it, and names; of terms that make up an axis."""
+    theta = np.concatenate([PER_M, PER_RAD])
+    names = [f"{axis} per {unit}" for unit in ("m", "rad") for axis in ("x", "y", "yaw")]
+    ratios, covered, main = [], [], np.zeros(len(theta))
+    for _ in range(draws):
+        made = drives(rng, number)
+        windows = windows_of(made, span_of(SPAN))
+        F = terms_of(windows.pieces).mean(axis=0)
+        total = np.diag(np.tensordot(theta, F, 1))
+        main += np.array([theta[p] * F[p, p % 3, p % 3] / total[p % 3] for p in range(len(theta))]) / draws
+        per_m, per_rad = intervals(fit_noise(windows), windows)
+        ratios.append([each.value / true for each, true in zip((*per_m, *per_rad), theta, strict=True)])
+        covered.append([each.holds(true) for each, true in zip((*per_m, *per_rad), theta, strict=True)])
+    keep = main >= OWN
+    return np.array(ratios)[:, keep], np.array(covered)[:, keep], [n for n, k in zip(names, keep, strict=True) if k]
+
+
+def recovery_rows(draws: int, seed: int, tests: int, numbers: Sequence[int]) -> bool:
+    """Print recovery and coverage; whether both promises hold."""
+    held = True
+    print(f"\nknown noise, {draws} draws; terms with at least {OWN:g} of their axis' variance over {SPAN}")
+    print(
+        "| drives | term | fitted over true, 5 % to 95 % | within 0.7 to 1.5 | covered (0.95) |\n|---|---|---|---|---|"
+    )
+    for number in numbers:
+        rng = np.random.default_rng([seed, number])
+        ratios, covered, names = recovery(rng, number, draws)
+        for p, name in enumerate(names):
+            inside = int(((ratios[:, p] >= WITHIN[0]) & (ratios[:, p] <= WITHIN[1])).sum())
+            least = stats.beta.ppf(SURE, inside, draws - inside + 1) if inside else 0.0
+            cover = int(covered[:, p].sum())
+            low, high = binomial(cover, draws, SURE / tests)
+            held &= bool(least >= SHARE or draws < 200) and low <= COVERED[1] and high >= COVERED[0]
+            five, rest = np.quantile(ratios[:, p], [0.05, 0.95])
+            print(
+                f"| {number} | {name} | {five:.2f} to {rest:.2f} | {inside / draws:.3f}, at least {least:.3f} (99 %) | "
+                f"{cover / draws:.3f} |",
+                flush=True,
+            )
+    return held
+
+
+# --- wrong verdicts --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """Drives that are fitted and drives that are judged; None judges each by the others."""
+
+    name: str
+    world: World
+    fitted: int = 5
+    judged: int = 0
+    times: float = 1.0  # variance of the judged drives over that of the fitted ones
+
+
+CASES = (
+    Case("right, each by the others", World()),
+    Case("judged x1.5", World(), 5, 5, 1.5),
+    Case("judged x0.67", World(), 5, 5, 1 / 1.5),
+    Case("judged x2", World(), 5, 5, 2.0),
+    Case("variance differs, s 0.5", World(spread=0.5)),
+    Case("variance differs, s 1", World(spread=1.0)),
+    Case("variance differs, s 1, 5 and 5", World(spread=1.0), 5, 5),
+    Case("scale persists, sd 1 %", World(scale=0.01)),
+    Case("heading remembers 50 m", World(memory=50.0, coloured=2e-3)),
+    Case("two jumps a drive", World(jumps=2)),
+    Case("jitter 5 cm", World(offset=0.05)),
+    Case("one drive, halves", World(), 1),
+    Case("loops closed", World(closed=True)),
+    Case("one camera, x2.2", World(metric=2.2)),
+    Case("body turned by 5 degrees", World(turned=np.deg2rad(5.0))),
+)
+
+
+def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, float, str]:
+    """Status, true ratio of the exported model on ``fresh`` drives, and the reason of a refusal or first warning.
+
+    The parts of :func:`consistency.fit_covariance` that decide, without those that describe.
+    """
+    made = drives(rng, case.fitted, case.world, SHORT)
+    judged = [scaled(rng, case, f"judged {i}") for i in range(case.judged)]
+    names, every = ",".join(each.name for each in judged) or None, [*made, *judged]
+    try:
+        windows = windows_of(every, span_of(SPAN))
+        require_sound(every, windows, False, True)
+        noise, folds = folds_of(every, windows, names, True)
+    except InputError as error:
+        return "refused", np.nan, str(error)
+    status = judged_by(folds, windows, len(every), case.fitted > 1).status
+    warnings = persistent(noise, windows, growth_of(every, windows, False, noise.mean))
+    nees = noise.nees(fresh)[0]
+    means = [nees[fresh.drive == i].mean() for i in range(FRESH)]
+    return status, float(np.exp(np.log(means).mean())), warnings[0] if warnings else ""
+
+
+def scaled(rng: np.random.Generator, case: Case, name: str) -> Drive:
+    """A drive of the judged kind."""
+    world = case.world
+    if case.times == 1.0:
+        return drive(rng, world, name, SHORT)
+    return with_noise(case.times, lambda: drive(rng, world, name, SHORT))
+
+
+def with_noise(times: float, make: Callable[[], Drive]) -> Drive:
+    """What ``make`` gives while all variances are ``times`` as large."""
+    global PER_M, PER_RAD
+    kept = PER_M, PER_RAD
+    PER_M, PER_RAD = times * PER_M, times * PER_RAD
+    try:
+        return make()
+    finally:
+        PER_M, PER_RAD = kept
+
+
+def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
+    """Print statuses and wrong ones; whether no case has too many."""
+    held = True
+    print(f"\nverdicts at {SPAN}, {draws} draws; wrong: consistent though the true ratio is outside 0.67 to 1.5")
+    print("| drives | statuses | true ratio, 5 % to 95 % | wrong | refused or warned |\n|---|---|---|---|---|")
+    for number, case in enumerate(CASES):
+        if only not in case.name:
+            continue
+        rng = np.random.default_rng([seed, 100 + number])
+        fresh = windows_of([scaled(rng, case, f"fresh {i}") for i in range(FRESH)], span_of(SPAN))
+        found = [told(rng, case, fresh) for _ in range(draws)]
+        ratio = np.array([each[1] for each in found])
+        outside = (ratio < 1 / DETECT) | (ratio > DETECT)
+        wrong = sum(status == "consistent" and out for (status, _, _), out in zip(found, outside, strict=True))
+        held &= binomial(wrong, draws, 2 * SURE / tests)[0] <= WRONG
+        statuses = ", ".join(
+            f"{word} {count / draws:.2f}" for word, count in Counter(f[0] for f in found).most_common()
+        )
+        words = Counter(each[2].split(":")[0] if each[0] == "refused" else each[2] for each in found if each[2])
+        said = f"{sum(words.values()) / draws:.2f}: {words.most_common(1)[0][0]}" if words else "0"
+        known = ratio[np.isfinite(ratio)]
+        spread = "{:.2f} to {:.2f}".format(*np.quantile(known, [0.05, 0.95])) if len(known) else "-"
+        print(f"| {case.name} | {statuses} | {spread} | {wrong / draws:.3f} | {said} |", flush=True)
+    return held
+
+
+def binomial(count: int, draws: int, alpha: float) -> tuple[float, float]:
+    """Exact interval of a share (Clopper & Pearson 1934)."""
+    low = float(stats.beta.ppf(alpha / 2, count, draws - count + 1)) if count else 0.0
+    high = float(stats.beta.isf(alpha / 2, count + 1, draws - count)) if count < draws else 1.0
+    return low, high
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="rows with this in their names; the numbers are the same")
+    arguments = parser.parse_args()
+    draws, seed, only, tests = arguments.draws, arguments.seed, arguments.only, len(CASES) + 10
+    numbers = [number for number in (1, 10) if only in f"known noise, {number} drives"]
+    held = recovery_rows(draws, seed, tests, numbers) if numbers else True
+    if any(only in case.name for case in CASES):
+        held &= verdict_rows(draws, seed, tests, only)
+    print("\nall promises hold" if held else "\na promise is broken")
+    return 0 if held else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

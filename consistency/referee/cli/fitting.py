@@ -1,0 +1,91 @@
+"""``consistency fit-covariance``: parses, calls, prints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from consistency.referee.cli.files import reads_files
+from consistency.referee.cli.options import ESTIMATES
+from consistency.referee.errors import InputError
+from consistency.referee.parsing.options import Reading
+
+OTHERS = ("covariance", "error", "state", "covariance_order", "axes", "relative", "windows", "align")
+
+
+@reads_files(without=OTHERS)
+def fit_covariance(
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="ESTIMATES", help=f"Poses of an odometry: {ESTIMATES}; a folder has a drive a file."),
+    ],
+    files: Reading,
+    span: Annotated[
+        str,
+        typer.Option("--span", metavar="Nm|Ns|N", help="Length of the motions: metres (1m), seconds (1s), steps (10)."),
+    ],
+    held_out: Annotated[
+        str | None,
+        typer.Option(
+            "--held-out",
+            metavar="A,B|half",
+            help="Drives that are judged and not fitted, or second halves [each drive by the fit of the others].",
+        ),
+    ] = None,
+    axes: Annotated[
+        int | None, typer.Option("--axes", help="3 (x, y, yaw) or 6; a number here, names in 'analyse' [of the poses].")
+    ] = None,
+    second: Annotated[
+        Path | None, typer.Option("--second", help="Another estimator's poses of these drives: are errors the truth's?")
+    ] = None,
+    no_correct: Annotated[
+        bool, typer.Option("--no-correct", help="Leave mean errors of scale and heading in.")
+    ] = False,
+    cautious: Annotated[
+        float | None,
+        typer.Option(
+            "--cautious", metavar="P", help="Raise all covariances, so that P of new drives have no larger ones."
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for noise.toml, motions, snippets, page.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless consistent.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
+) -> None:
+    """Give an odometry without covariance one at one span, and judge it on drives that chose nothing."""
+    from dataclasses import replace
+
+    from consistency.referee.fitting.drives import read_drives
+    from consistency.referee.fitting.model import fit_covariance as fit
+    from consistency.referee.fitting.wording import document
+    from consistency.referee.show import json, terminal
+    from consistency.referee.system.folders import require_free
+
+    if fail_on not in (None, "inconsistent"):
+        raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
+    if overwrite and out is None:
+        raise InputError("--overwrite goes with --out: nothing else is written")
+    if out is not None:
+        require_free(out, overwrite, "noise")
+    drives = read_drives(path, reading=files)
+    other = None if second is None else read_drives(second, reading=replace(files, motions=None))
+    model = fit(
+        drives, span, held_out=held_out, axes=axes, correct=not no_correct, cautious=cautious, second=other,
+        name=path.stem,
+    )  # fmt: skip
+    written = []
+    if out is not None:
+        from consistency.referee.fitting.writing import write_model
+
+        written = write_model(model, out, overwrite)
+    shown = document(model)
+    if as_json:
+        print(json.render(shown))
+    else:
+        terminal.show(*shown.opening)
+        for file in written:
+            print(file)
+    if fail_on and model.status != "consistent":
+        raise typer.Exit(1)

@@ -1,0 +1,121 @@
+"""Errors that last for a whole drive, and a truth that errs itself: named, never exported as white noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+from consistency.referee.errors import InputError
+from consistency.referee.fitting.drives import Drive
+from consistency.referee.fitting.likelihood import ENOUGH
+from consistency.referee.fitting.means import design_of
+from consistency.referee.fitting.noise import Noise
+from consistency.referee.fitting.refusals import Growth
+from consistency.referee.fitting.windows import Windows
+from consistency.referee.geometry.groups import inverse, log
+from consistency.referee.readers.relative import BENT
+from consistency.referee.types import Array
+
+SURE = 0.01  # chance to name a term where there is none, all terms together
+SHARED = 0.7  # correlation of two estimators' errors from which the truth's own are behind both
+TERMS = ("the scale of the way", "the scale of turns", "the drift of the heading with the way")
+UNITS = ("", "", " rad/m")
+ADVICE = "add a state for it to the filter; it is not in the exported covariance"
+
+
+def persistent(noise: Noise, windows: Windows, growth: Growth) -> list[str]:
+    """Sentences on terms that differ between drives by more than white noise, from ``ENOUGH`` drives on.
+
+    Each drive has means of its own, by generalised least squares; their differences are compared with their errors by
+    Cochran's (1954) chi-square.
+    """
+    found = []
+    if growth.persists:
+        found.append(
+            f"the squared rotation error grows with the span to the power of {growth.power:.2g}, where white noise has "
+            "1: errors last longer than a window, so that longer spans have more than this model says"
+        )
+    now = noise.mean.applied(windows)
+    angles = np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2)[:, now.d :].max(axis=1)
+    if (sigma := float(np.sqrt(np.median(angles)))) > BENT:
+        found.append(
+            f"the sigma of a rotation over the span is {sigma:.2g} rad: beyond {BENT:g} a covariance to first order is "
+            "doubtful, so take a shorter span"
+        )
+    names = np.unique(windows.drive)
+    if len(names) < ENOUGH:
+        return found
+    own = [_means(noise, now.of(windows.drive == name)) for name in names]
+    for term in range(own[0][0].shape[0]):
+        value, variance = (np.array([each[k][term] for each in own]) for k in (0, 1))
+        weight = np.where(np.isfinite(variance) & (variance > 0), 1.0 / np.where(variance > 0, variance, 1.0), 0.0)
+        if (weight > 0).sum() < ENOUGH:
+            continue
+        center = (weight * value).sum() / weight.sum()
+        statistic, dof = float((weight * (value - center) ** 2).sum()), int((weight > 0).sum()) - 1
+        if stats.chi2.sf(statistic, dof) > SURE / own[0][0].shape[0]:
+            continue
+        # DerSimonian & Laird (1986): variance between drives beyond that of the estimates
+        between = (statistic - dof) / (weight.sum() - (weight**2).sum() / weight.sum())
+        kind = min(term, len(TERMS) - 1)
+        found.append(f"{TERMS[kind]} differs between drives (sigma {np.sqrt(between):.2g}{UNITS[kind]}): {ADVICE}")
+    return list(dict.fromkeys(found))
+
+
+def _means(noise: Noise, windows: Windows) -> tuple[Array, Array]:
+    """Scale, turn and drift (p,) that a drive has beyond the mean of all, and their variances; infinite if unknown."""
+    C, X, e = noise.covariance(windows.pieces), design_of(windows.pieces), windows.errors
+    solved = np.linalg.solve(C, np.concatenate([X, e[..., None]], axis=-1))
+    H = (np.swapaxes(X, 1, 2) @ solved[..., :-1]).sum(axis=0)
+    g = (np.swapaxes(X, 1, 2) @ solved[..., -1:]).sum(axis=0)[:, 0]
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    scaled = np.linalg.pinv(H / np.outer(size, size), rcond=1e-6)
+    known = np.diag(H) > 1e-200
+    return scaled @ (g / size) / size, np.where(known, np.diag(scaled) / size**2, np.inf)
+
+
+def errors_of_second(noise: Noise, windows: Windows, drives: Sequence[Drive], second: Sequence[Drive]) -> Array:
+    """Correlation (n,) of the errors of two estimators over the same windows.
+
+    Raises
+    ------
+    InputError
+        The second one has other drives, or no window in common.
+    """
+    named = {drive.name: drive for drive in second}
+    own, other = [], []
+    corrected = noise.mean.applied(windows).errors
+    for i in np.unique(windows.drive):
+        drive, rows = drives[i], np.flatnonzero(windows.drive == i)
+        twin = named.get(drive.name) or (second[0] if len(second) == len(drives) == 1 else None)
+        if twin is None:
+            raise InputError(f"--second: has no drive '{drive.name}'; it needs the same drives")
+        place = [_at(twin, drive, ends[rows]) for ends in (windows.first, windows.last)]
+        both = (place[0] >= 0) & (place[1] >= 0)
+        T = twin.estimate
+        D = inverse(T[place[0][both]]) @ T[place[1][both]]
+        true = windows.true[rows][both]
+        if D.shape[1:] != true.shape[1:]:
+            raise InputError("--second: needs poses of the same kind, in the plane or in space")
+        error = log(inverse(D) @ true)
+        own.append(corrected[rows][both])
+        other.append(error - error.mean(axis=0) if len(error) else error)
+    a, b = np.concatenate(own), np.concatenate(other)
+    if len(a) < 8:
+        raise InputError(f"--second: has {len(a)} windows in common; its times must be those of the estimates")
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    scale = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+    return np.asarray((a * b).sum(axis=0) / np.where(scale > 0, scale, 1.0))
+
+
+def _at(twin: Drive, drive: Drive, rows: Array) -> Array:
+    """Rows of another drive at the times of some rows; -1 where it has none within half its own period."""
+    clock = np.isfinite(drive.t).all() and np.isfinite(twin.t).all()
+    own, other = (drive.t, twin.t) if clock else (drive.row.astype(float), twin.row.astype(float))
+    at = own[rows]
+    near = np.clip(np.searchsorted(other, at), 1, len(other) - 1)
+    near = near - (at - other[near - 1] < other[near] - at)
+    period = 0.51 * float(np.median(np.diff(other)))
+    return np.where(np.abs(other[near] - at) <= period, near, -1)

@@ -1,0 +1,345 @@
+"""Noise models of odometry: windows, means and variances against finite differences and known truth, folds, ratios."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import fit_covariance as world
+import numpy as np
+import pytest
+import relative_poses as spatial
+from fit_covariance import World, drives
+from scipy.spatial.transform import Rotation
+
+import consistency as cs
+from consistency.referee.errors import InputError
+from consistency.referee.fitting.drives import Drive, drive_of
+from consistency.referee.fitting.likelihood import blocks_of, fit_terms, interval_of, nees_of, terms_of
+from consistency.referee.fitting.means import Mean, carriers, design_of, fit_mean
+from consistency.referee.fitting.model import caution
+from consistency.referee.fitting.noise import fit_noise, with_jitter
+from consistency.referee.fitting.ratios import Ratio, folds_of, ratio_of
+from consistency.referee.fitting.windows import Windows, in_plane, span_of, windows_of
+from consistency.referee.geometry.groups import composed, inverse, log
+from consistency.referee.types import Array
+
+GROUPS = ("SE(2)", "SE(3)")
+
+
+def drive_in(group: str, rng: np.random.Generator, steps: int = 400, name: str = "a") -> Drive:
+    """A drive in the plane or in space whose motions err independently."""
+    made = spatial.drive(rng, group, steps)
+    T = composed(np.concatenate([np.eye(made.motions.shape[-1])[None], made.motions]))
+    return drive_of(name, spatial.vectors(T), spatial.vectors(made.truth), 0.1 * np.arange(len(T)))
+
+
+def cut(group: str, rng: np.random.Generator, span: str = "3m") -> Windows:
+    return windows_of([drive_in(group, rng)], span_of(span))
+
+
+# --- windows ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_errors_are_those_of_whole_motions(group: str, rng: np.random.Generator) -> None:
+    drive = drive_in(group, rng)
+    w = windows_of([drive], span_of("3m"))
+    D, M = (inverse(T[w.first]) @ T[w.last] for T in (drive.estimate, drive.truth))
+    np.testing.assert_allclose(w.motions, D, atol=1e-12)
+    np.testing.assert_allclose(w.errors, log(inverse(D) @ M), atol=1e-10)
+    assert (w.first[1:] == w.last[:-1]).all()
+
+
+def test_a_jump_is_cut_and_counted(rng: np.random.Generator) -> None:
+    clean, jumpy = (windows_of(drives(np.random.default_rng(7), 1, World(jumps=n)), span_of("10m")) for n in (0, 2))
+    assert clean.jumps == 0
+    assert jumpy.jumps in (1, 2)
+    assert np.abs(jumpy.errors[:, :2]).max() < 0.7
+
+
+def test_jumps_are_those_of_their_own_drive() -> None:
+    """A drive that errs a hundred times as much has none."""
+    rng = np.random.default_rng(1)
+    rough = world.with_noise(1e4, lambda: drives(rng, 1)[0])
+    assert windows_of([*drives(rng, 4), rough], span_of("10m")).jumps == 0
+
+
+def test_windows_without_motion_are_left_out(rng: np.random.Generator) -> None:
+    drive = drives(rng, 1)[0]
+    stand = np.zeros((400, 3))
+    T = np.concatenate([drive.estimate[:1000], np.repeat(drive.estimate[999:1000], 400, 0)])
+    M = np.concatenate([drive.truth[:1000], np.repeat(drive.truth[999:1000], 400, 0)])
+    whole = Drive("a", 0.5 * np.arange(1400.0), np.arange(1400), T, M)
+    w = windows_of([whole], span_of("10s"))
+    assert len(stand) == 400
+    assert w.still == 19
+    assert w.long == 0
+
+
+def test_gaps_are_left_out_and_counted(rng: np.random.Generator) -> None:
+    drive = drives(rng, 1)[0]
+    keep = np.r_[0:500, 700:1200]
+    part = Drive("a", drive.t[keep], drive.row[keep], drive.estimate[keep], drive.truth[keep])
+    for span in ("10s", "20", "10m"):
+        assert windows_of([part], span_of(span)).long == 1
+
+
+def test_spans_are_refused() -> None:
+    for bad in ("0m", "-1m", "1km", "m", "", "1.5"):
+        with pytest.raises(InputError, match="--span"):
+            span_of(bad)
+
+
+def test_planar_part_of_motions_in_space(rng: np.random.Generator) -> None:
+    """Poses on a plane give the same windows in either form, whatever the world frame is."""
+    drive = drives(rng, 1)[0]
+    tilt = Rotation.from_euler("xyz", [0.3, -0.2, 1.0])
+
+    def raised(T: Array) -> Array:
+        pose = np.zeros((len(T), 7))
+        pose[:, :3] = tilt.apply(np.column_stack([T[:, :2, 2], np.zeros(len(T))]))
+        yaw = Rotation.from_rotvec(np.arctan2(T[:, 1, 0], T[:, 0, 0])[:, None] * [0, 0, 1])
+        pose[:, 3:] = (tilt * yaw).as_quat()
+        return pose
+
+    space = drive_of("a", raised(drive.estimate), raised(drive.truth), drive.t)
+    flat, cut = windows_of([drive], span_of("10m")), windows_of([space], span_of("10m"), planar=True)
+    np.testing.assert_allclose(cut.errors, flat.errors, atol=1e-9)
+    assert in_plane(space.estimate).shape == (len(drive.t), 3, 3)
+
+
+# --- means ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_an_error_of_a_piece_is_carried_to_the_end(group: str, rng: np.random.Generator) -> None:
+    w = cut(group, rng)
+    A, n = carriers(w.pieces), len(w.axes)
+    perfect = replace(w, true=w.motions)
+    for k in (0, 7, 20):
+        e = 1e-6 * rng.normal(size=(len(A), n))
+        rest = np.array(w.pieces)
+        before = np.eye(w.d + 1)[None].repeat(len(A), 0)
+        for j in range(k):
+            before = before @ rest[:, j]
+        after = inverse(before) @ w.motions
+        moved = replace(perfect, true=before @ spatial.exp(e) @ after)
+        np.testing.assert_allclose(moved.errors, np.einsum("wij,wj->wi", A[:, k], e), atol=1e-10)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_derivatives_of_the_mean(group: str, rng: np.random.Generator) -> None:
+    w = cut(group, rng)
+    w = replace(w, true=w.motions)
+    X, step = design_of(w.pieces), 1e-6
+    for p in range(X.shape[-1]):
+        ends = []
+        for sign in (1, -1):
+            values = np.zeros(X.shape[-1])
+            values[p] = sign * step
+            mean = Mean(1 + values[0], 1 + values[1], tuple(values[2:]))
+            ends.append(mean.applied(w).errors)
+        np.testing.assert_allclose(
+            -(ends[0] - ends[1]) / (2 * step), X[..., p], atol=1e-7 if group == "SE(2)" else 0.02 * np.abs(X).max()
+        )
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_mean_alone_is_found(group: str, rng: np.random.Generator) -> None:
+    w = cut(group, rng)
+    drift = (0.01,) if group == "SE(2)" else (0.01, -0.02, 0.005)
+    known = Mean(0.95, 1.04, drift)
+    w = replace(w, true=known.applied(w).motions)
+    found = fit_mean(w)
+    assert (found.way, found.turn, *found.drift) == pytest.approx((0.95, 1.04, *drift), abs=2e-4)
+    again = fit_mean(w, start=found)
+    assert (again.way, again.turn, *again.drift) == pytest.approx((0.95, 1.04, *drift), abs=1e-6)
+    np.testing.assert_allclose(again.applied(w).errors, 0.0, atol=1e-5)
+
+
+# --- likelihood ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_terms_are_sums_over_pieces(group: str, rng: np.random.Generator) -> None:
+    w = cut(group, rng)
+    F, A, n = terms_of(w.pieces), carriers(w.pieces), len(w.axes)
+    d = w.d
+    for k, axis in ((3, 0), (5, n - 1)):
+        by_hand = np.zeros((2, n, n))
+        for piece in range(20):
+            T = w.pieces[k, piece]
+            turn = np.arctan2(T[1, 0], T[0, 0]) if d == 2 else Rotation.from_matrix(T[:3, :3]).magnitude()
+            for size, out in zip((np.linalg.norm(T[:d, d]), abs(turn)), by_hand, strict=True):
+                out += 0.5 * size * sum(np.outer(A[k, j][:, axis], A[k, j][:, axis]) for j in (piece, piece + 1))
+        np.testing.assert_allclose(F[k, axis], by_hand[0], atol=1e-12)
+        np.testing.assert_allclose(F[k, n + axis], by_hand[1], atol=1e-12)
+
+
+def test_fitted_variances_are_a_fixed_point_and_the_best(rng: np.random.Generator) -> None:
+    """theta = theta (sum u'Fu / sum tr C^-1 F)^.5 where it is positive, and no neighbour is likelier."""
+    made = drives(rng, 3)
+    w = windows_of(made, span_of("10m"))
+    F, e, floor = terms_of(w.pieces), w.errors, np.full(3, 1e-9)
+    theta = fit_terms(e, F, floor)
+    C = np.diag(floor) + np.tensordot(theta, F, (0, 1))
+    u = np.linalg.solve(C, e[..., None])[..., 0]
+    up = np.einsum("wi,wpij,wj->p", u, F, u)
+    down = np.einsum("wij,wpji->p", np.linalg.inv(C), F)
+    positive = theta > 1e-3 * theta.max()
+    np.testing.assert_allclose((up / down)[positive], 1.0, atol=0.02)
+    assert (up[~positive] <= 1.05 * down[~positive]).all()
+
+    def value(t: Array) -> float:
+        P = np.diag(floor) + np.tensordot(t, F, (0, 1))
+        return float(-0.5 * (np.linalg.slogdet(P)[1].sum() + nees_of(e, P).sum()))
+
+    for p in range(6):
+        for times in (0.9, 1.1):
+            other = theta.copy()
+            other[p] = max(other[p] * times, 1e-9)
+            assert value(other) <= value(theta) + 1e-3
+
+
+def test_known_noise_is_recovered(rng: np.random.Generator) -> None:
+    """6 drives, 600 windows: the terms a metre, which make up most of their axes, within 40 % (6 sigma)."""
+    model = cs.fit_covariance(drives(rng, 6), "10m")
+    np.testing.assert_allclose(model.noise.per_m, world.PER_M, rtol=0.4)
+    assert all(each.low < each.value < each.high for each in model.per_m)
+    assert abs(np.log(model.ratio.value)) < 0.25
+    assert model.counts == {"windows": len(model.windows.drive), "long": 0, "still": 0, "jumps": 0}  # type: ignore[union-attr]
+
+
+def test_intervals_of_the_jackknife() -> None:
+    assert interval_of(8.0, [8.0] * 5).low == 0.0
+    assert np.isnan(interval_of(0.0, [0.0] * 5).high)
+    some = interval_of(8.0, [7.0, 8.0, 9.0, 8.5, 7.5])
+    assert 0 < some.low < 8.0 < some.high
+    assert [len(b) for b in blocks_of(np.repeat(np.arange(6), 4))] == [4] * 6
+    assert [len(b) for b in blocks_of(np.zeros(40, int))] == [2] * 20
+
+
+def test_jitter_of_both_ends_is_the_floor(rng: np.random.Generator) -> None:
+    quiet, shaky = (drives(rng, 3, World(offset=offset)) for offset in (0.0, 0.05))
+    for made, low, high in ((quiet, 0.0, 1e-3), (shaky, 2.5e-3, 1e-2)):
+        w = windows_of(made, span_of("10m"))
+        assert low <= with_jitter(fit_noise(w), made, w, False).floor[0] <= high
+
+
+# --- folds and ratios -----------------------------------------------------------------------------------------
+
+
+def test_what_is_judged_chose_nothing(rng: np.random.Generator) -> None:
+    """Another content of the judged drive, or half, changes no fit that judges it."""
+    made, others = drives(rng, 3), drives(rng, 3)
+    mixed = [*made[:2], replace(others[2], name=made[2].name)]
+    for held_out in (None, "drive 3"):
+        first, second = (
+            folds_of(each, windows_of(each, span_of("10m")), held_out, True)[1][-1] for each in (made, mixed)
+        )
+        assert np.array_equal(first.noise.per_m, second.noise.per_m)
+        assert first.judged.tolist() == [2]
+    one = made[:1]
+    w = windows_of(one, span_of("10m"))
+    fold = folds_of(one, w, "half", True)[1][0]
+    judged = fold.judges(w)
+    assert 0.4 < judged.mean() < 0.6
+    late = replace(w, true=np.where(judged[:, None, None], w.true[::-1], w.true))
+    assert np.array_equal(folds_of(one, late, "half", True)[1][0].noise.per_m, fold.noise.per_m)
+
+
+def test_ratio_over_drives() -> None:
+    values = np.exp([0.1, -0.2, 0.3, 0.0, 0.2])
+    r = ratio_of(values, np.repeat(values, 10))
+    logs = np.log(values)
+    assert r.value == pytest.approx(np.exp(logs.mean()))
+    assert np.log(r.high / r.value) == pytest.approx(2.7764451 * logs.std(ddof=1) / np.sqrt(5))
+    assert r.value * r.value == pytest.approx(r.low * r.high)
+    assert r.reach == pytest.approx((r.value * np.exp(-2 * r.spread), r.value * np.exp(2 * r.spread)))
+    single = ratio_of(np.array([np.nan, 1.2]), np.array([1.0, 1.4, 1.1, 1.3] * 5))
+    assert (single.drives, single.windows) == (1, 20)
+    assert np.isnan(single.spread)
+    assert single.low < single.value == pytest.approx(1.2)
+    assert np.isnan(ratio_of(np.array([np.nan]), np.array([])).value)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "drives_", "windows", "general", "status"),
+    [
+        (0.8, 1.3, 5, 20, True, "consistent"), (0.8, 1.3, 2, 60, True, "consistent"),
+        (0.8, 1.3, 4, 49, True, "undecided"), (0.8, 1.3, 5, 500, False, "undecided"),
+        (0.8, 1.3, 1, 500, True, "undecided"), (1.1, 1.6, 5, 500, True, "overconfident"),
+        (1.1, 1.4, 5, 500, True, "consistent"), (0.5, 0.9, 5, 500, True, "conservative"),
+        (0.5, 1.2, 5, 500, True, "undecided"), (np.nan, np.nan, 5, 500, True, "undecided"),
+        (1.1, 1.6, 1, 500, False, "overconfident"),
+    ],
+)  # fmt: skip
+def test_status_of_a_ratio(low: float, high: float, drives_: int, windows: int, general: bool, status: str) -> None:
+    assert Ratio(1.0, low, high, 0.1, drives_, windows, general).status == status
+
+
+def test_halves_and_unknown_drives(rng: np.random.Generator) -> None:
+    made = drives(rng, 2, length=300.0)
+    model = cs.fit_covariance(made, "10m", held_out="half")
+    assert model.status in ("undecided", "overconfident", "conservative")
+    assert "halves" in repr(model)
+    for bad, word in (("drive 9", "no drive"), ("drive 1,drive 2", "no window to fit")):
+        with pytest.raises(InputError, match=word):
+            cs.fit_covariance(made, "10m", held_out=bad)
+
+
+def test_cautious_raises_all_covariances(rng: np.random.Generator) -> None:
+    made = drives(rng, 5, World(spread=0.5), 500.0)
+    plain, raised = (cs.fit_covariance(made, "10m", cautious=p) for p in (None, 0.9))
+    factor = raised.noise.factor
+    assert factor > 1.2
+    assert raised.ratio.value == pytest.approx(plain.ratio.value / factor)
+    np.testing.assert_allclose(raised.covariance([10.0, 0, 0]), factor * plain.covariance([10.0, 0, 0]))
+    with pytest.raises(InputError, match="--cautious"):
+        caution(replace(plain.ratio, drives=4), 0.9)
+    with pytest.raises(InputError, match="between"):
+        cs.fit_covariance(made, "10m", cautious=2.0)
+
+
+# --- the model ---------------------------------------------------------------------------------------------------
+
+
+def test_covariance_of_a_motion_is_that_of_its_steps(rng: np.random.Generator) -> None:
+    model = cs.fit_covariance(drives(rng, 2, length=400.0), "10m")
+    step = np.array([0.5, 0.0, 0.04])
+    whole = composed(np.repeat(world.matrices_of(step[None]), 20, 0))[-1]
+    motion = [whole[0, 2], whole[1, 2], np.arctan2(whole[1, 0], whole[0, 0])]
+    C = model.covariance(np.repeat(step[None], 20, 0))
+    np.testing.assert_allclose(model.covariance(motion), C, rtol=1e-9)
+    n = model.noise
+    assert C[2, 2] == pytest.approx(10 * n.per_m[2] + 0.8 * n.per_rad[2])
+    still = model.covariance([0.0, 0.0, 0.0])
+    np.testing.assert_allclose(still, np.diag(n.floor))
+    assert (n.floor > 0).all()
+    corrected = model.correct([[1.0, 0.0, 0.1]])[0]
+    assert corrected[0, 2] == pytest.approx(n.mean.way)
+    for bad in ([1.0, 2.0], [1.0, 2.0, np.nan], np.zeros((2, 7))):
+        with pytest.raises(InputError, match="motion"):
+            model.covariance(bad)
+
+
+def test_in_space_and_an_axis_that_never_moved(rng: np.random.Generator) -> None:
+    """z, roll and pitch of planar poses have no error, and yet a variance."""
+    flat = [drive_in("SE(2)", rng, 600, name) for name in "ab"]
+
+    def raised(T: Array) -> Array:
+        yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
+        zero = np.zeros(len(T))
+        return np.column_stack([T[:, :2, 2], zero, zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)])
+
+    space = [drive_of(d.name, raised(d.estimate), raised(d.truth), d.t) for d in flat]
+    model, planar = cs.fit_covariance(space, "3m"), cs.fit_covariance(space, "3m", axes=3)
+    assert model.noise.axes == ("x", "y", "z", "roll", "pitch", "yaw")
+    assert planar.noise.axes == ("x", "y", "yaw")
+    C = model.covariance([3.0, 0, 0, 0, 0, 0, 1])
+    assert np.linalg.eigvalsh(C)[0] > 0
+    np.testing.assert_allclose(planar.noise.per_m, cs.fit_covariance(flat, "3m").noise.per_m, rtol=1e-6)
+    with pytest.raises(InputError, match="--axes 6"):
+        cs.fit_covariance(flat, "3m", axes=6)
+    with pytest.raises(InputError, match="--axes 4"):
+        cs.fit_covariance(flat, "3m", axes=4)

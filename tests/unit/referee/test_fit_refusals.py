@@ -1,0 +1,163 @@
+"""Drives that no white noise describes: each refused or named, with the reason and the remedy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fit_covariance import World, drives
+
+import consistency as cs
+from consistency.referee.errors import InputError
+from consistency.referee.fitting.drives import Drive
+from consistency.referee.fitting.noise import fit_noise
+from consistency.referee.fitting.persistence import persistent
+from consistency.referee.fitting.refusals import Growth, body_turn, growth_of, revisits
+from consistency.referee.fitting.windows import span_of, windows_of
+
+SPAN = "10m"
+
+
+@pytest.mark.parametrize(
+    ("world", "words"),
+    [
+        (World(closed=True), ("loops are closed", "record the live odometry")),
+        (World(metric=2.2), ("2.2 times", "not metric", "scale state")),
+        (World(metric=0.5), ("0.5 times", "not metric")),
+        (World(turned=0.1), ("constant turn of the body by 5.7", "calibration")),
+        (World(turned=np.pi / 2), ("constant turn of the body by 90", "calibration")),
+        (World(jumps=8), ("have a jump", "more than 5 %")),
+    ],
+)
+def test_a_drive_that_is_refused(world: World, words: tuple[str, ...], rng: np.random.Generator) -> None:
+    with pytest.raises(InputError) as error:
+        cs.fit_covariance(drives(rng, 2, world), SPAN)
+    assert all(word in str(error.value) for word in words), str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_scale_is_the_users_matter_without_correction(rng: np.random.Generator) -> None:
+    model = cs.fit_covariance(drives(rng, 2, World(metric=2.2), 400.0), SPAN, correct=False)
+    assert (model.noise.mean.way, model.noise.mean.turn, model.noise.mean.drift) == (1.0, 1.0, (0.0,))
+
+
+def test_too_few_windows(rng: np.random.Generator) -> None:
+    short = drives(rng, 1, length=40.0)
+    with pytest.raises(InputError, match=r"too few to fit|fewer than|5 drives"):
+        cs.fit_covariance(short, SPAN)
+    with pytest.raises(InputError, match="only 40 m"):
+        cs.fit_covariance(short, "100m")
+    with pytest.raises(InputError, match="at least one drive"):
+        cs.fit_covariance([], SPAN)
+
+
+def test_estimate_and_truth_are_the_same(rng: np.random.Generator) -> None:
+    drive = drives(rng, 1)[0]
+    with pytest.raises(InputError, match="same positions"):
+        fit_noise(windows_of([replace(drive, estimate=drive.truth)], span_of(SPAN)))
+
+
+def test_a_loop_that_is_closed_has_small_errors_between_passes(rng: np.random.Generator) -> None:
+    """Circles of 250 m: white noise adds up between passes; a heading that is corrected at each pass does not."""
+
+    def circles(closed: bool) -> list[Drive]:
+        found = []
+        for i in range(4):
+            n = 4000
+            angle = 2 * np.pi * np.arange(n) / 500
+            T = np.tile(np.eye(3), (n, 1, 1))
+            T[:, 0, 0] = T[:, 1, 1] = np.cos(angle)
+            T[:, 1, 0], T[:, 0, 1] = np.sin(angle), -np.sin(angle)
+            T[:, 0, 2], T[:, 1, 2] = 250 / (2 * np.pi) * np.sin(angle), 250 / (2 * np.pi) * (1 - np.cos(angle))
+            yaw = np.cumsum(0.002 * rng.normal(size=n))
+            if closed:  # what has gathered in a lap is taken out at its end
+                laps = np.arange(n) // 500
+                ends = np.concatenate([[0.0], yaw[499::500]])
+                yaw = yaw - ends[laps]
+            E = np.tile(np.eye(3), (n, 1, 1))
+            E[:, 0, 0] = E[:, 1, 1] = np.cos(yaw)
+            E[:, 1, 0], E[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
+            found.append(Drive(f"lap {i}", np.arange(n) * 0.5, np.arange(n), T @ E, T))
+        return found
+
+    for closed in (False, True):
+        made = circles(closed)
+        ratio, chance = revisits(made, windows_of(made, span_of("5m")))
+        assert (ratio > 1.2 and chance > 0.002) if not closed else (chance < 0.01 and ratio < 1.2)
+    assert np.isnan(revisits(made, windows_of(made, span_of("5s")))[0])
+
+
+def test_growth_of_white_noise_and_of_a_persistent_drift(rng: np.random.Generator) -> None:
+    """Power 1 within 4 standard errors of 0.1; nearly 2 where the drift of a drive outweighs its noise."""
+    for world, low, high in ((World(), 0.6, 1.4), (World(memory=2000.0, coloured=3e-3), 1.6, 2.1)):
+        made = drives(rng, 5, world)
+        w = windows_of(made, span_of(SPAN))
+        growth = growth_of(made, w, False, fit_noise(w).mean)
+        assert low < growth.power < high
+        assert growth.persists == (low > 1)
+        assert not growth.shrinks
+    short = drives(rng, 1, length=150.0)
+    w = windows_of(short, span_of(SPAN))
+    assert np.isnan(growth_of(short, w, False, fit_noise(w).mean).power)
+
+
+def test_growth_needs_its_standard_errors() -> None:
+    assert Growth(0.3, 0.1).shrinks
+    assert not Growth(0.3, 0.3).shrinks
+    assert not Growth(0.6, 0.01).shrinks
+    assert Growth(1.6, 0.1).persists
+    assert not Growth(1.6, 0.3).persists
+
+
+@pytest.mark.parametrize(
+    ("world", "word"),
+    [(World(scale=0.02), "the scale of the way"), (World(memory=5000.0, coloured=3e-3), "drift of the heading")],
+)
+def test_terms_that_persist_are_named_from_five_drives_on(world: World, word: str, rng: np.random.Generator) -> None:
+    made = drives(rng, 6, world)
+    few = cs.fit_covariance(made[:4], SPAN)
+    assert not any("differs between drives" in each for each in few.warnings)
+    model = cs.fit_covariance(made, SPAN)
+    told = [each for each in model.warnings if word in each]
+    assert told
+    assert "add a state" in told[0]
+
+
+def test_no_term_is_named_without_one(rng: np.random.Generator) -> None:
+    """1 % a draw: of 12, more than 2 with a chance of 2e-4."""
+    named = 0
+    for _ in range(12):
+        w = windows_of(drives(rng, 5, length=300.0), span_of(SPAN))
+        named += bool(persistent(fit_noise(w), w, Growth(1.0, 0.1)))
+    assert named <= 2
+
+
+def test_body_frames_that_agree(rng: np.random.Generator) -> None:
+    w = windows_of(drives(rng, 2), span_of(SPAN))
+    angle, share, chance = body_turn(w)
+    assert angle < 0.05
+    assert share < 0.1
+    assert chance > 1e-6
+
+
+def test_a_second_estimator_with_the_same_errors(rng: np.random.Generator) -> None:
+    """Errors of the truth are in both; of another odometry they are not."""
+    made = drives(rng, 5, length=500.0)
+    same = cs.fit_covariance(made, SPAN, second=made)
+    assert same.shared is not None
+    np.testing.assert_allclose(same.shared, 1.0, atol=0.05)
+    assert same.status != "consistent"
+    assert "correlate" in repr(same)
+    # another estimate of the same truth: noise of its own
+    twins = []
+    for drive in made:
+        error = np.cumsum(rng.normal(size=(len(drive.t), 3)) * [0.02, 0.02, 0.001], axis=0)
+        E = np.tile(np.eye(3), (len(error), 1, 1))
+        E[:, :2, 2] = error[:, :2]
+        twins.append(replace(drive, estimate=drive.truth @ E))
+    other = cs.fit_covariance(made, SPAN, second=twins)
+    assert other.shared is not None
+    assert np.abs(other.shared).max() < 0.4
+    with pytest.raises(InputError, match="--second"):
+        cs.fit_covariance(made, SPAN, second=[replace(each, name="else") for each in twins])

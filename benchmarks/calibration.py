@@ -57,6 +57,7 @@ MODULES = (
     "calibration_questions",
     "calibration_windows",
     "calibration_truth",
+    "calibration_pieces",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

@@ -95,7 +95,7 @@ def turned_frame(runs: Sequence[Poses]) -> WorldTransform:
     """The frame in which orientations of poses in space, and then positions, are right on average."""
     turns = []
     for p in runs:
-        own, true = _pairs(p)
+        own, true = matched(p)
         if len(own):
             turns.append((Rotation.from_quat(true[:, 3:]) * Rotation.from_quat(own[:, 3:]).inv()).mean())
     turn = Rotation.concatenate(turns).mean() if turns else IDENTITY.turn
@@ -114,12 +114,12 @@ def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
     own, true = [np.empty((0, 3))], [np.empty((0, 3))]
     for p in runs:
         d = 2 if p.manifold == "planar" else 3
-        for side, values in zip((own, true), _pairs(p), strict=True):
+        for side, values in zip((own, true), matched(p), strict=True):
             side.append(np.pad(values[:, :d], ((0, 0), (0, 3 - d))))
     return np.concatenate(own), np.concatenate(true)
 
 
-def _pairs(p: Poses) -> tuple[Array, Array]:
+def matched(p: Poses) -> tuple[Array, Array]:
     """Estimates that are finite and have a truth, and that truth, (k, m) both."""
     known = p.known()
     estimate = p.estimate[known.rows]

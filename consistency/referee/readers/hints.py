@@ -13,6 +13,7 @@ from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
+from consistency.referee.readers.bodies import fitted_body, on_body
 from consistency.referee.readers.fits import ReadingFit, fit_of
 from consistency.referee.readers.frames import WorldTransform, fitted_frame, moved, spread
 from consistency.referee.readers.poses import Poses
@@ -29,6 +30,7 @@ ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two,
 ALIKE = 0.01  # decades between guesses of which the likelier is named
 DEGREE = np.pi / 180.0
 MILLI = 1e-3
+ARM = 1e-3  # of the size of the path: shorter lever arms are not named
 TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
 
 NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
@@ -182,10 +184,10 @@ def _guesses(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
     guesses = [*_covariances()]
     if kind == "spatial":
         own = [*_orders(convention), *_quaternions(), *guesses, *_permuted(axes, 3)]
-        return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_frames(runs)]
+        return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_frames(runs), *_bodies(runs)]
     if kind == "planar":
         own = [*_sides(convention), *_headings(), *guesses, *_permuted(axes, 3)]
-        return [*own, *_units(2, slice(2, 3)), _mirrored(convention), *_frames(runs)]
+        return [*own, *_units(2, slice(2, 3)), _mirrored(convention), *_frames(runs), *_bodies(runs)]
     return [*guesses, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
 
 
@@ -389,3 +391,23 @@ def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
     if len(runs) > 1:
         words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
         yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True, fine=False)
+
+
+def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
+    """The bodies of the files differ by a constant turn or lever arm."""
+    body = fitted_body(runs)
+    if body is None:
+        return
+    angle, size = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0, spread(runs)
+    parts = []
+    if np.linalg.norm(angle) >= TURN:
+        planar = runs[0].manifold == "planar"
+        about = "z" if planar else "x, y, z"
+        turned = f"{angle[2]:.1f}" if planar else f"({', '.join(f'{value:.1f}' for value in angle)})"
+        parts.append(f"turned by {turned} degrees about {about}")
+    if np.linalg.norm(body.arm) >= ARM * size:
+        arm = ", ".join(f"{value:.3g}" for value in body.arm[: 2 if runs[0].manifold == "planar" else 3])
+        parts.append(f"shifted by a lever arm of ({arm}) m")
+    if parts:
+        words = f"the body of the truth is {' and '.join(parts)} against that of the estimates; write poses of one body"
+        yield Guess(words, lambda p: on_body(p, body), fine=False)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error, spatial_error
+from consistency.referee.readers.bodies import BodyTransform, fitted_body, on_body
 from consistency.referee.readers.fits import FACTOR, ReadingFit, fit_of
 from consistency.referee.readers.frames import WorldTransform, carried, fitted_frame, moved
 from consistency.referee.readers.hints import _ned, decades, hints, turns
@@ -99,6 +100,7 @@ def deviations(p: Poses) -> Poses:
 SWAP = [3, 4, 5, 0, 1, 2]
 W_FIRST = [0, 1, 2, 6, 3, 4, 5]
 FAR = np.array([10.0, -3.0, 1.0])
+ARM = np.array([2.0, -1.0, 0.5])
 Make = Callable[[np.random.Generator], list[Poses]]
 Mess = Callable[[Poses], Poses]
 MIXED: dict[str, tuple[Make, Mess, str]] = {
@@ -142,6 +144,18 @@ MIXED: dict[str, tuple[Make, Mess, str]] = {
     "planar deviations": (lambda rng: planar(rng, plain=True), deviations, "its diagonal holds standard deviations"),
     "shifted world": (
         planar, lambda p: moved(p, WorldTransform.about_z(0.0, FAR[:2])), "the world of the estimates is shifted by (-",
+    ),
+    "lever arm": (
+        spatial, lambda p: on_body(p, BodyTransform(Rotation.identity(), ARM)),
+        "the body of the truth is shifted by a lever arm of (-",
+    ),
+    "turned body": (
+        lambda rng: spatial(rng, "left"), lambda p: on_body(p, BodyTransform(Rotation.from_euler("z", -0.5), ARM)),
+        "the body of the truth is turned by (0.0, 0.0, 28.",
+    ),
+    "planar lever arm": (
+        planar, lambda p: on_body(p, BodyTransform(Rotation.from_euler("z", 0.3), ARM * [1, 1, 0])),
+        "the body of the truth is turned by -17.",
     ),
 }  # fmt: skip
 
@@ -340,6 +354,54 @@ def test_the_frame_is_found(angle: float, rng: np.random.Generator) -> None:
         back = moved(moved(runs[0], frame), found)
         np.testing.assert_allclose(back.estimate[:, : len(shift)], runs[0].estimate[:, : len(shift)], atol=1e-9)
         assert not any("world" in note for note in hints("est", SIX if len(shift) == 3 else THREE, runs))
+
+
+@pytest.mark.parametrize("convention", ["so3", "so3-body", "left", "right"])
+def test_errors_are_carried_over_to_another_body(convention: str) -> None:
+    """To first order, as those of another world below: in space, and of the plane in its three components."""
+    R, step = Rotation.from_euler("ZYX", [0.7, 0.2, -0.3]), 1e-6
+    body = BodyTransform(Rotation.from_rotvec([0.2, -0.5, 0.9]), ARM)
+    own, found = np.array([[3.0, -1.0, 2.0, *R.as_quat()]]), np.zeros((6, 6))
+    for i, xi in enumerate(step * np.eye(6)):
+        T, E = np.eye(4), expm(hat(xi))
+        T[:3, :3], T[:3, 3] = R.as_matrix(), own[0, :3]
+        G = {"left": T @ E, "right": E @ T}.get(convention, T.copy())
+        if convention.startswith("so3"):
+            G[:3, 3] += xi[:3]
+            G[:3, :3] = E[:3, :3] @ T[:3, :3] if convention == "so3" else T[:3, :3] @ E[:3, :3]
+        true = np.array([[*G[:3, 3], *Rotation.from_matrix(G[:3, :3]).as_quat()]])
+        both = [on_body(poses(np.zeros(1), each, np.eye(6), each, "spatial", convention), body) for each in (own, true)]
+        found[:, i] = spatial_error(both[1].estimate, both[0].estimate, convention)[0] / step
+    P = np.diag(np.arange(1.0, 7.0))
+    moved_P = on_body(poses(np.zeros(1), own, P, own, "spatial", convention), body).covariance[0]
+    np.testing.assert_allclose(moved_P, found @ P @ found.T, atol=1e-3)
+    plane = np.array([[3.0, -1.0, 0.7]])
+    flat = BodyTransform(Rotation.from_euler("z", 0.9), ARM * [1, 1, 0])
+    kind, J = {"so3": "so2", "so3-body": "so2"}.get(convention, convention), np.zeros((3, 3))
+    for i, e in enumerate(step * np.eye(3)):
+        true = plane_pose(plane, e, kind)
+        both = [on_body(poses(np.zeros(1), each, np.eye(3), each, "planar", kind), flat) for each in (plane, true)]
+        J[:, i] = planar_error(both[1].estimate, both[0].estimate, kind)[0] / step
+    moved_P = on_body(poses(np.zeros(1), plane, P[:3, :3], plane, "planar", kind), flat).covariance[0]
+    np.testing.assert_allclose(moved_P, J @ P[:3, :3] @ J.T, atol=1e-3)
+
+
+def plane_pose(own: Array, e: Array, kind: str) -> Array:
+    """The planar pose (1, 3) whose error is e, to first order of e."""
+    x, y, h = own[0]
+    if kind == "so2":
+        return own + e
+    if kind == "left":
+        return np.array([[x + np.cos(h) * e[0] - np.sin(h) * e[1], y + np.sin(h) * e[0] + np.cos(h) * e[1], h + e[2]]])
+    return np.array([[x + e[0] - e[2] * y, y + e[1] + e[2] * x, h + e[2]]])
+
+
+@pytest.mark.parametrize("arm", [np.zeros(3), 1e-6 * ARM])
+def test_a_body_that_is_hardly_another_is_not_named(arm: Array, rng: np.random.Generator) -> None:
+    found = fitted_body([on_body(p, BodyTransform(Rotation.identity(), arm)) for p in spatial(rng)])
+    assert found is not None
+    assert found.turn.magnitude() < 0.01
+    assert fitted_body([]) is None
 
 
 @pytest.mark.parametrize("convention", ["so3", "so3-body", "left", "right"])

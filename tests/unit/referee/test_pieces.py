@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import calibration_pieces
 import numpy as np
 import pytest
 from recorded import read_recordings
@@ -15,6 +16,7 @@ from consistency.referee.diagnostics.independence import independence
 from consistency.referee.diagnostics.pieces import LEAST, in_pieces, memory_of
 from consistency.referee.diagnostics.questions import BIAS
 from consistency.referee.diagnostics.single_log import APART, MOST
+from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.types import Array
 
 N = 2
@@ -145,6 +147,15 @@ def test_steps_before_the_first_covariance_are_in_no_piece() -> None:
     assert r.error is not None
     assert one.error is not None
     np.testing.assert_array_equal(r.error.reshape(-1, N), one.error[0, 10:])
+
+
+def test_the_rows_of_the_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter logs and studies: a right one is at fault in 2 of 2 once in 400."""
+    monkeypatch.setattr(calibration_pieces, "QUICK_GATES", 2)
+    rows = calibration_pieces.rows(True, 7)
+    assert {row["question"] for row in rows} | {row["world"] for row in rows} < set(calibration_pieces.ABOUT)
+    assert len(rows) == 3 + len(SPATIAL)
+    assert all(row["found"] < 2 for row in rows if row["bound"] == "<=")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """One long log in pieces that stand as runs, and errors whose convention nobody declared.
 
-Errors of a log are AR(.95) beside a part of their variance that is the same in all steps. ``calibration.py`` puts the rows
-into its table.
+Errors of a log are AR(.95) beside a part of their variance that is the same in all steps. ``calibration.py`` puts the
+rows into its table.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ SIGMA = np.array([0.002, 0.02, 0.006, 0.001, 0.01, 0.003])  # m and rad
 FALSE, POWER, LEFT = "--split, false alarm", "--split, power", "--error guess, the right one rejected"
 ABOUT = {
     **{
-        f"one log, {100 * share:g} % constant": f"{STEPS} steps of AR({RHO}), {100 * share:g} % of the variance the same "
-        f"in all, n = {DOF}; runs are steps"
+        f"one log, {100 * share:g} % constant": f"{STEPS} steps of AR({RHO}), {100 * share:g} % of the variance the "
+        f"same in all, n = {DOF}; runs are steps"
         for share in CONSTANT
     },
     **{f"poses, error {kind}": f"{POSES} steps of errors that are Gaussian in '{kind}', n = 6" for kind in SPATIAL},

@@ -307,6 +307,12 @@ def uncertain_truth(record: Record) -> UncertainTruth | None:
     return UncertainTruth(record)
 
 
+def of_both(record: Record) -> Record:
+    """The record with covariances and NEES of estimate and truth together, as it is drawn."""
+    truth = uncertain_truth(record)
+    return record if truth is None else replace(truth.both, nees=truth.total.nees)
+
+
 def upper_weights(eigenvalues: Array, ratio: float = 1.0) -> Array:
     """Weights l of chi-square(1) whose sum the mean NEES of d by S, over n, exceeds at most as often, far out.
 

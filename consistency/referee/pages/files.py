@@ -10,6 +10,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.diagnostics import Evidence, Verdict, laws
+from consistency.referee.diagnostics.uncertain import of_both
 from consistency.referee.diagnostics.wording import plural
 from consistency.referee.document.blocks import Block, Chapter, Document, Facts, Text
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
@@ -28,6 +29,7 @@ MOST_RUNS = 20  # runs that are drawn beside the shown one
 ANGLES = {"heading", "yaw", "pitch", "roll"}
 METRES = {"x", "y", "z"}
 DERIVED = {"v": "m/s", "bg": "rad/s", "ba": "m/s^2"}  # velocities and biases, by what comes before x, y, z
+OF_BOTH = "Covariances are those of estimate and truth together."
 SHOWN, OTHERS = replace(style(0), width=1.0), Look("#c0c0c0", width=0.5)
 JOINT = Look("#333333", width=1.4)
 
@@ -85,6 +87,9 @@ def _of_one(record: Evidence, verdict: Verdict, said: bool) -> tuple[Block, ...]
 
 def record_figures(record: Evidence, verdict: Verdict) -> tuple[Figure, ...]:
     """Errors with their bounds, NEES, trajectory, coverage, and innovations; those that the record has."""
+    if record.truth_covariance is not None:
+        figures = record_figures(of_both(record), verdict)
+        return tuple(replace(figure, caption=f"{figure.caption} {OF_BOTH}") for figure in figures)
     found = (
         _errors(record), _nees(record, verdict), _trajectory(record), _coverage(record), _innovations(record, verdict),
     )  # fmt: skip
@@ -99,6 +104,7 @@ def record_sheet(record: Evidence, verdict: Verdict | None = None) -> Sheet:
     InputError
         The record has neither errors nor NEES.
     """
+    record = of_both(record)
     nees = None if verdict is None else _nees(record, verdict)
     found = [figure for figure in (_errors(record), nees, _trajectory(record), _coverage(record)) if figure is not None]
     if not found:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import calibration_truth
@@ -15,7 +16,9 @@ import consistency as cs
 from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, judge
 from consistency.referee.diagnostics.shape import weighted_chi_square_tail
-from consistency.referee.diagnostics.uncertain import contrasts, uncertain_truth, upper_weights
+from consistency.referee.diagnostics.uncertain import contrasts, of_both, uncertain_truth, upper_weights
+from consistency.referee.document.drawing import Line
+from consistency.referee.pages.files import record_figures
 from consistency.referee.types import Array
 
 RUNS, STEPS, N = 50, 8, 3
@@ -211,6 +214,21 @@ def test_json_gains_keys_only() -> None:
     new, old = judge(one).statistics, judge(Evidence("est", *_sum(one), axes=one.axes)).statistics
     assert set(new) - set(old) == {"truth_share", "truth_share_of_axes", "truth_errors", "truth_shared"}
     assert not set(old) - set(new)
+
+
+def test_pictures_are_of_both_covariances() -> None:
+    one = record(np.random.default_rng(2), "white", 0.2, errors="independent")
+    v = judge(one)
+    drawn = of_both(one)
+    assert drawn.nees is not None
+    assert v.scale is not None
+    np.testing.assert_allclose(drawn.nees.mean(axis=0), v.scale.anees)
+    figures = record_figures(replace(one, t=np.arange(float(STEPS)), dof=N), v)
+    assert {figure.title for figure in figures} == {"Errors and stated bounds", "NEES", "Coverage"}
+    assert all(figure.caption.endswith("Covariances are those of estimate and truth together.") for figure in figures)
+    (bounds,) = [mark.bound for mark in figures[0].panels[0].marks if isinstance(mark, Line) and mark.bound is not None]
+    np.testing.assert_allclose(bounds, 2.0 * np.sqrt((P + truth_of_share(0.2))[0, 0]))
+    assert of_both(drawn) is drawn
 
 
 # --- the statistics ----------------------------------------------------------------------------------

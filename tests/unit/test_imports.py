@@ -27,8 +27,8 @@ RANKS = {
         "terminal": 0,
         "extras": 1, "system.ending": 1, "system.provenance": 1, "geometry": 1, "outside": 1, "shipped": 1,
         "parsing": 1, "system.folders": 2,
-        "diagnostics": 2, "readers": 3, "verdicts": 4, "document": 3, "show": 4, "pages": 5, "gating": 6, "notebook": 6, "fitting": 6,
-        "cli": 7,
+        "diagnostics": 2, "readers": 3, "verdicts": 4, "document": 3, "show": 4, "pages": 5, "gating": 6, "notebook": 6,
+        "fitting": 6, "cli": 7,
     },
     "bench": {
         "types": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,

@@ -43,7 +43,7 @@ def trajectory(record: Evidence, row: int) -> Figure | None:
     steps = _worst(record, row) if record.convention in IN_WORLD else np.empty(0, np.int64)
     if len(steps):
         assert record.covariance is not None
-        index = [record.axes.index("xyz"[axis]) for axis in pair]  # type: ignore[attr-defined]
+        index = [list(record.axes).index("xyz"[axis]) for axis in pair]
         P = np.asarray(record.covariance[row], float)[steps][:, index][:, :, index]
         for centre, own in zip(estimated[steps][:, pair], P, strict=True):
             outline = ellipse(centre, own)
@@ -77,7 +77,7 @@ def ellipse(centre: Array, P: Array) -> Array:
 def _widest(position: Array, axes: list[int]) -> list[int]:
     """The two axes over which positions (T, d) reach furthest, in order; the first two where they are alike."""
     reach = np.ptp(position, axis=0)
-    return list(max(itertools.combinations(axes, 2), key=lambda pair: reach[pair[0]] * reach[pair[1]]))
+    return list(max(itertools.combinations(axes, 2), key=lambda pair: float(np.prod(reach[list(pair)]))))
 
 
 def _worst(record: Evidence, row: int) -> Indices:

@@ -505,7 +505,7 @@ def table_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
         raise InputError(f"{estimates}: holds several estimators in its column 'filter'; keep the rows of one")
     _require(sheet, POSE)
     key = _key(sheet, truth, r)
-    samples = _samples(truth, POSE, key)
+    samples = _samples(truth, POSE, key, None)
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
     order = row_order(sheet, runs, key)
     sheet, runs = sheet.rows(order), runs[order]

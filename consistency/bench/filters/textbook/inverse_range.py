@@ -111,7 +111,7 @@ def curvature(
     by_turn = np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1) @ axes
     of_turn = bent(q, rho, by_turn) - (D @ flat[:, :, None])[:, :, 0]
     of_drive = bent(q, rho, -rho[:, None] * (along @ axes))
-    return 0.5 * np.square(noise) * np.stack([of_drive, of_turn], axis=2)
+    return np.asarray(0.5 * np.square(noise) * np.stack([of_drive, of_turn], axis=2))
 
 
 def exponential(xi: Array) -> tuple[Array, Array]:

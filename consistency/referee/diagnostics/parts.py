@@ -131,6 +131,6 @@ def _status(v: Verdict) -> str:
         faults = faults - {"biased"} or faults
         return faults.pop() if len(faults) == 1 else "inconsistent"
     statuses = {part.status for part in v.parts.values()}
-    if v.failures or v.impossible or "failed" in statuses:
+    if "failed" in statuses:
         return "failed"
     return "consistent" if statuses == {"consistent"} and few_lost(v) else "undecided"

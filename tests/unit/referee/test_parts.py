@@ -38,6 +38,11 @@ def test_right_marginals_are_consistent_whatever_the_correlation(rng: np.random.
     verdict = of_deviations(error)
     assert verdict.status == "consistent"
     assert [*verdict.parts] == ["x", "y", "z"]
+    parts = verdict.parts.values()
+    assert verdict.p_value == pytest.approx(min(1.0, 3.0 * min(part.p_value for part in parts)))
+    shown = [part.equivalence.p_value for part in parts if part.equivalence is not None]
+    assert verdict.equivalence is not None
+    assert verdict.equivalence.p_value == max(shown) > min(shown)
     assert verdict.scale is not None
     np.testing.assert_allclose(verdict.scale.mean_anees, 3.0 * np.square(error).mean(), rtol=1e-12)
     assert "(1 expected under any correlation), is not judged" in verdict.reasons[1]

@@ -40,13 +40,13 @@ def tell_notes(*read: list[Evidence]) -> None:
         print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
 
 
-def reads_files(command: Callable[..., Any] | None = None, without: Collection[str] = ()) -> Callable[..., Any]:
-    """A command with the options of files, which it gets as one argument ``files``; some it may do without."""
+def reads_files(command: Callable[..., Any] | None = None, only: Collection[str] | None = None) -> Callable[..., Any]:
+    """A command with the options of files, which it gets as one argument ``files``; with all, or ``only`` some."""
     if command is None:
-        return partial(reads_files, without=without)
+        return partial(reads_files, only=only)
     signature = inspect.signature(command, eval_str=True)
     hints = get_type_hints(Reading)
-    taken = [each for each in fields(Reading) if each.name not in without]
+    taken = [each for each in fields(Reading) if only is None or each.name in only]
     own = {each.name: _parameter(each, hints[each.name]) for each in taken}
 
     @wraps(command)

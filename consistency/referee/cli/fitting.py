@@ -12,10 +12,10 @@ from consistency.referee.cli.options import ESTIMATES
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading
 
-OTHERS = ("covariance", "error", "state", "covariance_order", "axes", "relative", "windows", "align")
+KEPT = ("truth", "max_dt", "time_offset", "topic", "truth_topic", "body")
 
 
-@reads_files(without=OTHERS)
+@reads_files(only=KEPT)
 def fit_covariance(
     path: Annotated[
         Path,
@@ -37,6 +37,9 @@ def fit_covariance(
     axes: Annotated[
         int | None, typer.Option("--axes", help="3 (x, y, yaw) or 6; a number here, names in 'analyse' [of the poses].")
     ] = None,
+    motions: Annotated[
+        bool, typer.Option("--motions", help="Each row is the motion since the row before, not a pose.")
+    ] = False,
     second: Annotated[
         Path | None, typer.Option("--second", help="Another estimator's poses of these drives: are errors the truth's?")
     ] = None,
@@ -69,8 +72,8 @@ def fit_covariance(
         raise InputError("--overwrite goes with --out: nothing else is written")
     if out is not None:
         require_free(out, overwrite, "noise")
-    drives = read_drives(path, reading=files)
-    other = None if second is None else read_drives(second, reading=replace(files, motions=None))
+    drives = read_drives(path, reading=replace(files, motions=motions or None))
+    other = None if second is None else read_drives(second, reading=files)
     model = fit(
         drives, span, held_out=held_out, axes=axes, correct=not no_correct, cautious=cautious, second=other,
         name=path.stem,

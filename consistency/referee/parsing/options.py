@@ -63,7 +63,10 @@ class Reading:
         default=None, metadata=_shown("Seconds to add to the estimates' timestamps.", "S|estimate", _seconds)
     )
     axes: Sequence[str] | None = field(
-        default=None, metadata=_shown("Components of a trajectory to judge, as x,y,yaw in the plane.", "A,B,C", _names)
+        default=None,
+        metadata=_shown(
+            "Components of a trajectory to judge, as x,y,yaw; names here, a number in fit-covariance.", "A,B,C", _names
+        ),
     )
     topic: str | None = field(default=None, metadata=_shown("Of a ROS bag: Odometry or PoseWithCovarianceStamped."))
     truth_topic: str | None = field(

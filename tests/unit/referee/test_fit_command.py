@@ -19,7 +19,7 @@ from fit_covariance import drives
 
 import consistency as cs
 from consistency.referee.cli.app import main
-from consistency.referee.diagnostics.export import flat
+from consistency.referee.diagnostics.export import flat, plain
 from consistency.referee.fitting.drives import Drive, drive_of
 from consistency.referee.fitting.model import NoiseModel
 from consistency.referee.fitting.motions import vectors
@@ -83,7 +83,7 @@ def test_motions_read_back_have_the_same_verdict(planar: NoiseModel, full: Noise
         own, read = (json.dumps(flat(each), default=str, sort_keys=True) for each in (model.verdict, cs.judge(record)))
         assert own == read
         stored = json.loads((out / "verdict.json").read_text())
-        assert stored["referee"]["verdict"] == model.verdict.status
+        assert stored["referee"] == json.loads(json.dumps(plain(flat(model.verdict))))
         assert stored["status"] == model.status
 
 
@@ -276,7 +276,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     made = drives(np.random.default_rng(5), 2, length=300.0)
     estimates, truth = (str(path) for path in write_tables(made, tmp_path))
     broken = tmp_path / "broken.csv"
-    broken.write_text(Path(estimates).read_text().replace("run,t,x,y,heading", "run,t,x,y,theta"))
+    broken.write_text(Path(estimates).read_text().replace("run,t,x,y,heading", "run,t,x,y,angle"))
     words = Path(estimates).read_text().splitlines()
     nan = tmp_path / "nan.csv"
     nan.write_text("\n".join([words[0], words[1], ",".join(["1", "0.5", "nan", "0", "0"]), *words[3:]]) + "\n")

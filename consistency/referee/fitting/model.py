@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -101,14 +102,15 @@ class NoiseModel:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fitting.page import plot
-
-        return plot(self, path)
+        return _shown("page", "plot", self, path)
 
     def __repr__(self) -> str:
-        from consistency.referee.fitting.wording import sentence
+        return f"<NoiseModel {self.name}: {_shown('wording', 'sentence', self)}>"
 
-        return f"<NoiseModel {self.name}: {sentence(self)}>"
+
+def _shown(module: str, function: str, *arguments: Any) -> Any:
+    """Result of a function that draws or describes, whose module is loaded here."""
+    return getattr(import_module(f"consistency.referee.fitting.{module}"), function)(*arguments)
 
 
 def fit_covariance(

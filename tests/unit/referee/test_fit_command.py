@@ -262,9 +262,9 @@ def test_offset_of_clocks_motions_and_folders_of_speeds(tmp_path: Path) -> None:
         (tmp_path / "drives" / "truth" / f"{name}.csv").write_text(
             "t,x,y,heading\n0,0,0,0\n1,1,0,0\n2,2,0,0\n3,3,0,0\n"
         )
-    found = cs.read_drives(tmp_path / "drives" / "wheels", tmp_path / "drives" / "truth")
-    assert [each.name for each in found] == ["a", "b"]
-    assert vectors(found[0].estimate)[-1] == pytest.approx(
+    several = cs.read_drives(tmp_path / "drives" / "wheels", tmp_path / "drives" / "truth")
+    assert [each.name for each in several] == ["a", "b"]
+    assert vectors(several[0].estimate)[-1] == pytest.approx(
         [10 * np.sin(0.1) + 2 * np.cos(0.1), 10 * (1 - np.cos(0.1)) + 2 * np.sin(0.1), 0.1]
     )
     (tmp_path / "drives" / "truth" / "b.csv").unlink()

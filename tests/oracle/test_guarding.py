@@ -251,7 +251,7 @@ def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None
         sighted = np.flatnonzero(whole.landmark == label)
         hidden = (step[sighted] < again[0]) | ((step[sighted] > again[0]) & (step[sighted] < again[1]))
         assert step[sighted].tolist().count(again[0]) == 1
-        z[sighted[0], 2] *= 2.0
+        z[sighted[0], 2] *= 3.0
         keep[sighted[1:]] = ~hidden[1:]
     first = np.append(0, np.cumsum(np.bincount(step[keep], minlength=whole.steps)))
     trial = replace(whole, first=first, landmark=whole.landmark[keep], z=z[keep])

@@ -67,7 +67,8 @@ def read_poses(path: Path, true: bool = False) -> Lines:
         of = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
         return increasing(replace(lines, note=f"{path}: read as {of}, {width} columns"))
     if width in TUM:
-        return increasing(lines)
+        unnamed = f"{path}: read as t x y z qx qy qz qw, as its columns have no names"
+        return increasing(replace(lines, note=unnamed if path.suffix.lower() == ".csv" else ""))
     if width == ASL and not _is_rigid(lines.values[:, 1:]).all():
         return _asl(lines, true)
     if width in widths and (_is_rigid(_matrix(lines)[0]).all() or width not in STATES):

@@ -354,7 +354,7 @@ ESTIMATES: dict[str, tuple[Callable[[Drive], str], str]] = {
     "w first, two indices": (w_first_indexed, "44 columns, seconds, quaternion w first, covariance in 36 columns"),
     "cnspy PoseWithCovTyped": (cnspy, "30 columns, seconds, quaternion w last, covariance in 21 columns"),
     "words": (named_words, "29 columns, microseconds, quaternion w last, covariance in 21 columns"),
-    "no names": (bare, ""),
+    "no names": (bare, "est.csv: read as t x y z qx qy qz qw, as its columns have no names"),
     "KITTI + 36": (kitti_with_covariance, "read as matrices of 3 x 4, 48 columns, times from times.txt beside them"),
     "t + 16 + 21": (four_with_triangle, "read as matrices of 4 x 4, 38 columns, the first one the time in seconds"),
 }
@@ -506,6 +506,10 @@ REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
     "another time base": (
         lambda d: lines("t.csv", "#sec,nsec,x,y,z,qx,qy,qz,qw", [*whole(d.t - 1e9), *d.true.T]),
         r"no estimate has a truth within 0\.01 s",
+    ),
+    "nanoseconds without a name": (
+        lambda d: lines("t.txt", "", [nanoseconds(d.t), *d.true.T], " "),
+        r"no estimate has a truth within .* in t\.txt; t\.txt seems to be in nanoseconds, and has to be in seconds$",
     ),
     "runs in one table": (
         lambda d: lines("t.csv", f"run,{NAMES}", [np.zeros(STEPS), d.t, *d.true.T]),

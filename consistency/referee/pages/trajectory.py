@@ -69,9 +69,8 @@ def trajectory(record: Evidence, row: int) -> Figure | None:
 def ellipse(centre: Array, P: Array) -> Array:
     """Outline (corners, 2) of the region that holds a share of 95 % about ``centre`` (2,) with covariance P (2, 2)."""
     angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
-    values, vectors = np.linalg.eigh(P)
-    radius = np.sqrt(float(laws.chi2.ppf(SHARE, 2)) * values.clip(0.0))
-    return np.asarray(centre + (np.column_stack([np.cos(angle), np.sin(angle)]) * radius) @ vectors.T)
+    circle = np.sqrt(float(laws.chi2.ppf(SHARE, 2))) * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(centre + circle @ np.linalg.cholesky(P).T)
 
 
 def _widest(position: Array, axes: list[int]) -> list[int]:

@@ -81,6 +81,7 @@ def test_the_declared_error_has_its_own_status(tmp_path: Path) -> None:
     assert v.guesses["left"].status == judge(right).status
     assert v.guesses["so3"].status == judge(wrong).status
     assert v.convention is None
+    assert not v.answers
     assert v.equivalence is not None
     assert not v.equivalence.shown
 

@@ -125,6 +125,8 @@ def test_growing_errors_are_refused() -> None:
     growing = np.linspace(0.1, 3.0, 2000)[None, :, None, None] * np.eye(N)
     with pytest.raises(cs.InputError, match=r"the stated variance of x grows by x.* over the log.* --relative 10s"):
         in_pieces(Evidence("log", one.error, growing, axes=("x", "y")))
+    outage = np.where(np.arange(2000) >= 1890, 9.0, 1.0)[None, :, None, None] * np.eye(N)
+    assert in_pieces(Evidence("log", one.error, outage, axes=("x", "y"))).unit == "piece"
     shrinking = growing[:, ::-1]
     assert in_pieces(Evidence("log", one.error, shrinking, axes=("x", "y"))).unit == "piece"
 

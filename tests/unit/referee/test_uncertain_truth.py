@@ -377,6 +377,15 @@ def test_a_covariance_of_the_truth_that_is_none_is_refused() -> None:
         cs.judge(e, S, truth_covariances=np.ones((2, 3, 1, 1)))
 
 
+def test_interpolated_truth_has_the_covariance_of_the_nearer_sample(tmp_path: Path) -> None:
+    (tmp_path / "est.csv").write_text("t,a,P_a_a\n1.2,0,1\n2.7,0.5,1\n")
+    (tmp_path / "truth.csv").write_text("t,a,P_a_a\n" + "".join(f"{k},0,{k}\n" for k in range(1, 5)))
+    files = tmp_path / "est.csv", tmp_path / "truth.csv"
+    (one,) = read_recordings(*files, state=["a"], truth_covariance="columns", max_dt=0.5)
+    assert one.truth_covariance is not None
+    np.testing.assert_array_equal(one.truth_covariance[0, :, 0, 0], [1.0, 3.0])
+
+
 def test_a_table_and_an_archive_state_it(tmp_path: Path) -> None:
     rng = np.random.default_rng(11)
     rows = ["run,step,a,b,P_a_a,P_a_b,P_b_b"] + [f"{r},{k},0,0,2,0,2" for r in range(3) for k in (1, 2)]

@@ -231,8 +231,8 @@ def _raised(noise: Noise, factor: float) -> Noise:
 
 def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:
     """Whether x, y and yaw are modelled."""
-    if not drives:
-        raise InputError("records: needs at least one drive")
+    if not drives or not all(isinstance(drive, Drive) for drive in drives):
+        raise InputError("records: needs at least one drive, of cs.read_drives or cs.drive_of")
     if axes not in (None, 3, 6):
         raise InputError(f"--axes {axes}: must be 3 (x, y, yaw) or 6; a number here, names in 'analyse'")
     spaces = {drive.d for drive in drives}

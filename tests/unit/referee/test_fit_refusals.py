@@ -50,6 +50,8 @@ def test_too_few_windows(rng: np.random.Generator) -> None:
         cs.fit_covariance(short, "100m")
     with pytest.raises(InputError, match="at least one drive"):
         cs.fit_covariance([], SPAN)
+    with pytest.raises(InputError, match=r"of cs\.read_drives"):
+        cs.fit_covariance(["wheels"], SPAN)  # type: ignore[list-item]
 
 
 def test_estimate_and_truth_are_the_same(rng: np.random.Generator) -> None:

@@ -59,7 +59,7 @@ def robot_localization(model: NoiseModel) -> str:
     return "\n".join([
         f'"""robot_localization: fuse the twist of the odometry, not its pose. {_origin(model)}',
         "",
-        "In differential mode a pose is turned into a twist with the covariances of two poses added, which are none of",
+        "In differential mode two poses are turned into a twist with the sum of their covariances, which is none of",
         "a motion; a twist is integrated as it is. Set odom0_config to the velocities alone.",
         '"""',
         "",

@@ -59,8 +59,8 @@ def robot_localization(model: NoiseModel) -> str:
     return "\n".join([
         f'"""robot_localization: fuse the twist of the odometry, not its pose. {_origin(model)}',
         "",
-        "In differential mode two poses are turned into a twist with the sum of their covariances, which is none of",
-        "a motion; a twist is integrated as it is. Set odom0_config to the velocities alone.",
+        "In differential mode two poses are turned into a twist with the sum of their covariances, which is not that",
+        "of a motion; a twist is integrated as it is. Set odom0_config to the velocities alone.",
         '"""',
         "",
         "",

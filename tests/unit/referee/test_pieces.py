@@ -79,7 +79,7 @@ def test_the_correlation_is_about_zero_and_of_sizes_too() -> None:
 
 
 def test_a_right_log_is_no_fault_and_a_wrong_one_is() -> None:
-    """No fault in 20 logs that are right, at most 4 by chance: 3 in 1,000 at a rate of 5 %; it was 1 of 60 for AR(.95)."""
+    """At most 4 faults in 20 right logs: more in 3 of 1,000 at a rate of 5 %; it was 1 of 60 for AR(.95)."""
     rng = np.random.default_rng(3)
     found = [judge(in_pieces(log(rng, 3000, 0.5))) for _ in range(20)]
     assert sum(bool(v.faults) for v in found) <= 4

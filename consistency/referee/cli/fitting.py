@@ -57,7 +57,7 @@ def fit_covariance(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless consistent.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
-    """Give an odometry without covariance one at one span, and judge it on drives that chose nothing."""
+    """Fit a covariance to odometry that states none, and judge it on drives that chose nothing."""
     from dataclasses import replace
 
     from consistency.referee.fitting.drives import read_drives

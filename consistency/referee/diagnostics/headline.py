@@ -67,7 +67,7 @@ def deciding_axis(v: Verdict) -> tuple[str, Interval] | None:
     axis, R = clear(v.worst_axis), v.settings.factor
     if axis is None or v.scale is None or AXIS not in v.faults:
         return None
-    hidden = abs(np.log(v.scale.inflation.value)) <= np.log(R) and (axis[1].low > R or axis[1].high < 1.0 / R)
+    hidden = 1.0 / R <= v.scale.inflation.value <= R and (axis[1].low > R or axis[1].high < 1.0 / R)
     return axis if hidden or MAIN not in v.faults or v.status == "inconsistent" else None
 
 

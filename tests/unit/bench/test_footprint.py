@@ -16,7 +16,7 @@ from consistency.bench.filters.kernel.local_state import make_factors
 from consistency.bench.filters.kernel.loop import _make_memory
 from consistency.bench.filters.kernel.slam import Data, Slam, make_local
 from consistency.bench.runs import footprint as module
-from consistency.bench.runs import touched
+from consistency.bench.runs import touched_memory as touched
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.footprint import footprint, memory_here, trial_bytes, workers_that_fit
 from consistency.bench.runs.isolating import Isolation

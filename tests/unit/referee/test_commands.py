@@ -219,7 +219,7 @@ def test_help_marks_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert "[bench]" not in before
     without(monkeypatch, "numba", "bokeh")
     _, after, _ = status_of(capsys, "--help")
-    lines = dict(re.findall(r"^  ([a-z]+) +(\S.*)$", after, re.MULTILINE))
+    lines = dict(re.findall(r"^  ([a-z-]+) +(\S.*)$", after, re.MULTILINE))
     assert set(COMMANDS) <= set(lines)
     for name, row in COMMANDS.items():
         mark = f"[{','.join(row.extras)}] " if row.extras else ""

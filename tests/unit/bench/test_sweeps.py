@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 import signal
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -336,6 +339,40 @@ def test_a_damaged_cell_is_named(at: Path) -> None:
     path.write_text(json.dumps(data))
     with pytest.raises(InputError, match="key 'result' is damaged"):
         folder.results()
+
+
+@pytest.mark.parametrize("where", ["main", "other"])
+def test_the_cost_of_a_step_is_that_of_the_thread_in_which_it_runs(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the main thread a kernel runs in another one."""
+
+    def spin() -> None:
+        until = time.thread_time() + 0.02
+        while time.thread_time() < until:
+            pass
+
+    def run_filter(*_: Any) -> Any:
+        if threading.current_thread() is threading.main_thread():
+            beside = threading.Thread(target=spin)
+            beside.start()
+            beside.join()
+        else:
+            spin()
+        return SimpleNamespace(failure=None)
+
+    monkeypatch.setattr(cells, "run_filter", run_filter)
+    spent: list[float] = []
+    trial: Any = SimpleNamespace(belief=None)
+
+    def measure() -> None:
+        spent.append(cells._cpu_time(trial, trial, trial))
+
+    if where == "main":
+        measure()
+    else:
+        other = threading.Thread(target=measure)
+        other.start()
+        other.join()
+    assert spent[0] >= 0.02
 
 
 def test_the_cost_is_that_of_a_step(uvd: cs.Scenario) -> None:

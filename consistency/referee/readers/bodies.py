@@ -73,7 +73,7 @@ def _jacobian(convention: str, R: Array, body: BodyTransform) -> Array:
         J[:, :3, 3:], J[:, 3:, 3:] = -R @ _skew(arm), back
     elif convention != "right":
         J[:, :3, 3:] = -_skew((R @ arm[..., None])[..., 0])
-    return J
+    return np.asarray(J)
 
 
 def _skew(v: Array) -> Array:

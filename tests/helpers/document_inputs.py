@@ -91,11 +91,12 @@ def trajectories(folder: Path) -> None:
 
 
 def inline(folder: Path) -> None:
-    """The covariance in the line of its pose: est.txt, and the folders est, NEW and OLD; TRUTH as truth."""
+    """Covariances in the lines of poses: est.txt, the folders est, NEW and OLD, and rtk.txt; TRUTH as truth."""
     trajectories(folder)
     for name in ("est.txt", *(f"{of}/{k:02d}.txt" for of in ("est", "NEW", "OLD") for k in range(RUNS))):
         write_rows(folder / name, estimated(), P)
     shutil.copytree(folder / "truth", folder / "TRUTH")
+    write_rows(folder / "rtk.txt", poses(PLACE, TURN), 0.1 * P)
 
 
 def motions(folder: Path) -> None:

@@ -120,7 +120,7 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
     done = python(copy, f"from consistency.referee.cli import main\nmain({words})")
     assert done.stdout.endswith("out.csv\n"), done.stderr
     heads, cells = (copy / "out.csv").read_text().splitlines()
-    assert heads == "filter,verdict,ANEES,ratio,RMSE m,RMSE deg,NIS/dof,failed"
+    assert heads == "filter,verdict,ANEES,true / stated,RMSE m,RMSE deg,NIS/dof,failed"
     assert cells.startswith("est,overconfident,29.00,")
     refusal = (
         "from pathlib import Path\nfrom consistency.referee.gating.session import refusal\nprint(refusal(Path('a.b')))"

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,6 +58,26 @@ def test_ctrl_c_does_not_wait_for_the_call(looks: bool) -> None:
     assert told.is_set()
     assert over.is_set() == looks, "what looks has ended, what does not is left alone"
     over.set()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize(("seconds", "ended"), [(0.4, True), (30.0, False)])
+def test_what_was_given_up_is_waited_for_at_exit(seconds: float, ended: bool, tmp_path: Path) -> None:
+    """Compiled code that ends while Python shuts down would abort it."""
+    program = f"""
+import os, signal, time, pathlib
+from consistency.bench.filters.kernel.apart import apart
+signal.signal(signal.SIGINT, signal.default_int_handler)
+def work():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep({seconds})
+    pathlib.Path("ended").touch()
+apart(work)
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=20)
+    assert done.returncode in (-signal.SIGINT, 1, 130), done.stderr
+    assert "KeyboardInterrupt" in done.stderr
+    assert (tmp_path / "ended").exists() == ended
 
 
 @pytest.mark.usefixtures("ctrl_c")

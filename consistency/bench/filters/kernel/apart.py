@@ -1,19 +1,24 @@
 """Compiled code in a thread that takes no signals; standard library only.
 
 Python's handlers run in the main thread. One that raises where Numba turns arguments into machine values, or results
-back, finds code that expects no exception, and Python crashes.
+back, finds code that expects no exception, and Python crashes. It also aborts where compiled code ends while Python
+shuts down, so what was given up is waited for at exit.
 """
 
 from __future__ import annotations
 
 import _thread
+import atexit
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 PATIENCE = 0.5  # s for what was told to stop
+AT_EXIT = 1.5  # s for all that was given up
+_given_up: list[_thread.LockType] = []
 
 
 def apart(call: Callable[..., Result], *args: Any, stop: Callable[[], None] | None = None) -> Result:
@@ -44,8 +49,16 @@ def apart(call: Callable[..., Result], *args: Any, stop: Callable[[], None] | No
     except BaseException:
         if stop is not None:
             stop()
-            working.acquire(timeout=PATIENCE)
+        if not working.acquire(timeout=0.0 if stop is None else PATIENCE):
+            _given_up.append(working)
         raise
     if errors:
         raise errors[0]
     return left[0]
+
+
+@atexit.register
+def _wait_for_given_up() -> None:
+    until = time.monotonic() + AT_EXIT
+    for working in _given_up:
+        working.acquire(timeout=max(0.0, until - time.monotonic()))

@@ -47,10 +47,11 @@ def apart(call: Callable[..., Result], *args: Any, stop: Callable[[], None] | No
         while not working.acquire(timeout=GLANCE):
             pass
     except BaseException:
-        if stop is not None:
-            stop()
-        if not working.acquire(timeout=0.0 if stop is None else PATIENCE):
-            _given_up.append(working)
+        if not (left or errors):  # else the lock may be held here already
+            if stop is not None:
+                stop()
+            if not working.acquire(timeout=0.0 if stop is None else PATIENCE):
+                _given_up.append(working)
         raise
     if errors:
         raise errors[0]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from calibration_count import row, show
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
@@ -74,33 +75,17 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
             rng = np.random.default_rng((seed, k, round(100 * ratio)))
             found = [judge(in_pieces(log_of(rng, constant, ratio))) for _ in range(gates)]
             if ratio == 1.0:
-                table.append(_row(world, FALSE, 1.0, STEPS, 0.05, "<=", gates, sum(bool(v.faults) for v in found)))
+                table.append(row(world, FALSE, 1.0, STEPS, 0.05, "<=", gates, sum(bool(v.faults) for v in found)))
             else:
                 side = "overconfident" if ratio > 1.0 else "conservative"
                 called = sum(v.status == side for v in found)
-                table.append(_row(world, POWER, ratio, STEPS, 0.95, ">=", gates, called))
+                table.append(row(world, POWER, ratio, STEPS, 0.95, ">=", gates, called))
     for k, kind in enumerate(SPATIAL):
         rng = np.random.default_rng((seed, 100, k))
         gone = sum(not judge(study_of(rng, kind)).guesses[kind].possible for _ in range(gates))
-        table.append(_row(f"poses, error {kind}", LEFT, 1.0, RUNS, 0.05, "<=", gates, gone))
+        table.append(row(f"poses, error {kind}", LEFT, 1.0, RUNS, 0.05, "<=", gates, gone))
     return table
 
 
-def _row(
-    world: str, question: str, ratio: float, runs: int, stated: float, bound: str, gates: int, found: int
-) -> dict[str, Any]:
-    return {
-        "world": world, "question": question, "ratio": ratio, "runs": runs, "looks": 1, "stated": stated,
-        "bound": bound, "gates": gates, "found": found,
-    }  # fmt: skip
-
-
-def main() -> None:
-    """Print the rows."""
-    for row in rows(quick=False, seed=20070101):
-        share = 100 * row["found"] / row["gates"]
-        print(f"{row['question']}, {row['world']}, x{row['ratio']:.3g}: {share:.2f} % ({row['bound']} {row['stated']})")
-
-
 if __name__ == "__main__":
-    main()
+    show(rows(quick=False, seed=20070101))

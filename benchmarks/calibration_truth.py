@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from calibration_count import row, show
 from scipy import optimize, signal
 
 from consistency.referee.diagnostics import Evidence, judge
@@ -93,24 +94,9 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
                     }.get(ratio, (POWERS, 0.95, ">=", called) if errors else (BOUNDED, POWER, ">=", called))
                     world = f"truth {kind}, {how}, s = {s:g}"
                     if errors or s == SHARES[0] or bound == "<=":
-                        table.append(_row(world, question, ratio, stated, bound, gates, count))
+                        table.append(row(world, question, ratio, RUNS, stated, bound, gates, count))
     return table
 
 
-def _row(world: str, question: str, ratio: float, stated: float, bound: str, gates: int, found: int) -> dict[str, Any]:
-    return {
-        "world": world, "question": question, "ratio": ratio, "runs": RUNS, "looks": 1, "stated": stated,
-        "bound": bound, "gates": gates, "found": found,
-    }  # fmt: skip
-
-
-def main() -> None:
-    """Print the rows."""
-    for row in rows(quick=False, seed=20070101):
-        share = 100 * row["found"] / row["gates"]
-        print(f"{row['question']}, {row['world']}, x{row['ratio']:g}: {share:.2f} % ({row['bound']} {row['stated']})",
-              flush=True)  # fmt: skip
-
-
 if __name__ == "__main__":
-    main()
+    show(rows(quick=False, seed=20070101))

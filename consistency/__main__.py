@@ -1,5 +1,6 @@
 """``python -m consistency`` and the command ``consistency``: the command line, in a process that can be ended."""
 
+import gc
 from typing import Any
 
 from consistency.referee.system.ending import supervised
@@ -11,6 +12,7 @@ def main() -> Any:
 
 
 def _command() -> Any:
+    gc.set_threshold(50_000, 20, 100)  # most of what is made lives as long as the modules that are imported
     from consistency.referee.cli import main
 
     return main()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import consistency as cs
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.kernel import jit
 
+gc.set_threshold(100_000, 20, 100)  # what is collected lives to the end
 pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin
 
 settings.register_profile("bench", deadline=None, max_examples=60, derandomize=True, database=None)

@@ -21,8 +21,9 @@ from edited import accept_changes
 from flight import Flight
 
 import consistency as cs
+from consistency.bench.store.frames import failures_table, rejections_table
 from consistency.bench.store.log import read_log
-from consistency.bench.store.results import Rejected, failures_table, rejections_table
+from consistency.bench.store.outcomes import Rejected
 from consistency.referee.cli import main
 from consistency.referee.readers.kitti import read_drive
 from consistency.referee.system.provenance import manifest_of

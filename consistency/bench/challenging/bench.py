@@ -19,7 +19,7 @@ from consistency.bench.runs.isolating import Isolation
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
-from consistency.bench.store.results import outcome_of
+from consistency.bench.store.outcomes import outcome_of
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.columns import POSE
 

@@ -14,8 +14,6 @@ from multiprocessing import current_process
 from typing import Any
 
 import numpy as np
-from joblib.externals.loky.backend import get_context
-from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.record import RunRecord
@@ -157,6 +155,8 @@ class _Supervisor:
                 "filters that are not compiled run in processes of their own, which a worker of multiprocessing.Pool "
                 "cannot start; use concurrent.futures or joblib"
             )
+        from joblib.externals.loky.backend import get_context  # slow to load
+
         context = get_context("loky")
         self.link, end = context.Pipe()
         self.process = context.Process(target=supervise, args=(end,), env=ONE_THREAD)
@@ -202,6 +202,8 @@ class _Supervisor:
 
 
 def _guest(filter_: Filter) -> Guest:
+    from joblib.externals.loky.backend.reduction import dumps
+
     name = name_of(filter_)
     try:
         pickled = bytes(dumps(filter_))

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.store.parquet import Columns
 from consistency.bench.store.results import JOINT, Tables, open_results
 from consistency.referee.diagnostics import Design, JointNees, MapRecord, Record, Rejections, sequential_design
@@ -146,6 +145,8 @@ def _require_all(r: Record, column: str, covariance: Symmetric) -> None:
     """Refuse a missing NEES from the first step on whose covariance, of the filter's own error, has full rank."""
     if r.nees is None:
         return
+    from consistency.bench.filters.kernel.linalg import definiteness  # loads Numba
+
     steps = np.isfinite(covariance.entry(0, 0)).sum(axis=1)  # with an estimate, of each run
     first = by_runs(_first_number, r.nees)
     missing = np.isfinite(r.nees).sum(axis=1) < steps - np.minimum(first, steps)

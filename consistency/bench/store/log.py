@@ -25,7 +25,7 @@ from consistency.bench.scenario import (
     toml_text,
 )
 from consistency.bench.scenario.tables import SIGMA_UNITS
-from consistency.bench.store.results import controls_table, observations_table, truth_of
+from consistency.bench.store.frames import controls_table, observations_table, truth_of
 from consistency.bench.store.storage import write_folder
 from consistency.bench.store.tables import read_table_file, require_format, table_file
 from consistency.bench.types import Trial

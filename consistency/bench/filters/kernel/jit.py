@@ -19,6 +19,7 @@ from consistency.bench.filters.kernel.apart import apart
 from consistency.bench.filters.kernel.content import Content
 from consistency.bench.filters.kernel.dispatch import INNER, OPTIONS, Function
 from consistency.bench.filters.kernel.whole import one_program
+from consistency.bench.models import jitable
 
 _result: Any = CompileResult  # untyped
 _typeof: Callable[[Any], Any] = numba.typeof
@@ -85,11 +86,15 @@ class Kernel:
         """What a call with these arguments begins with."""
         signature = _signature(args)
         if signature not in self._entries or signature not in self._contents:
-            self._contents[signature] = Content(self.function, signature)
+            self._contents[signature] = self._content(signature)
         content = self._contents[signature]
         is_shared = content.unknown is None
         is_ready = signature in self._entries or (is_shared and kept.read(kept.place(content.key)) is not None)
         return Outlook(content.key, is_ready, is_shared, foreseen.seconds_for(self._size(content)))
+
+    def _content(self, signature: tuple[Any, ...]) -> Content:
+        jitable.register()
+        return Content(self.function, signature)
 
     def _size(self, content: Content) -> float:
         """Bytes of bytecode to be compiled; functions that this process has compiled before count less."""
@@ -103,7 +108,7 @@ class Kernel:
         return list(self._entries)
 
     def _made(self, signature: tuple[Any, ...]) -> Any:
-        content = self._contents.get(signature) or Content(self.function, signature)
+        content = self._contents.get(signature) or self._content(signature)
         entry = numba.njit(**OPTIONS)(self.function)
         if content.unknown is not None:
             return self._compiled(entry, signature, content)

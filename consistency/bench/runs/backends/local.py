@@ -8,11 +8,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from itertools import islice
 
-import joblib
-
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.runs.work import Outcomes, TrialWork
-from consistency.bench.store.results import RunOutcome
+from consistency.bench.store.outcomes import RunOutcome
 from consistency.referee.errors import InputError
 
 AHEAD = 2  # runs that wait for each worker, so that none waits for them
@@ -96,4 +94,8 @@ def worker_count(jobs: int) -> int:
     """
     if jobs == 0 or jobs < -1:
         raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
-    return jobs if jobs > 0 else int(joblib.cpu_count())
+    if jobs > 0:
+        return jobs
+    import joblib  # slow to load
+
+    return int(joblib.cpu_count())

@@ -28,6 +28,7 @@ EXTRAS = {
     "parquet": ("pyarrow",),
     "ros": ("rosbags",),
     "ulog": ("pyulog",),
+    "ardupilot": ("pymavlink",),
     "peers": ("[bench]", "filterpy", "stonesoup"),
     "smoothing": ("[bench]", "gtsam"),
     "cluster": ("[bench]", "distributed", "submitit"),

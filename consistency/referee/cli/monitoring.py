@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +19,8 @@ def monitor(
         str,
         typer.Argument(
             metavar="FILE",
-            help="Innovations of one run: .csv, .parquet, .npz, .ulg of PX4, a folder of 'run', or - for CSV lines.",
+            help="Innovations of one run: .csv, .parquet, .npz, .ulg of PX4, .bin of ArduPilot, a folder of 'run', "
+            "or - for CSV lines.",
         ),
     ],
     innovations: Annotated[
@@ -38,10 +40,10 @@ def monitor(
         int | None, typer.Option("--mission", help="Innovations of the whole mission, if known.")
     ] = None,
     filter_name: Annotated[
-        str | None, typer.Option("--filter", help="Which, if FILE holds several; of a .ulg the sensor.")
+        str | None, typer.Option("--filter", help="Which, if FILE holds several; of a flight log the sensor.")
     ] = None,
     run: Annotated[
-        int | None, typer.Option("--run", help="Which, if FILE holds several; of a .ulg the EKF2's instance.")
+        int | None, typer.Option("--run", help="Which, if FILE holds several; of a flight log the EKF's instance.")
     ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
@@ -51,12 +53,19 @@ def monitor(
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
     from consistency.referee.document.monitor import monitor_document
     from consistency.referee.pages import require_plot, write_monitor_plot
-    from consistency.referee.parsing import one_line
+    from consistency.referee.readers.dataflash import STATED, is_dataflash
     from consistency.referee.show import json, terminal
     from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
 
     if fail_on not in (None, "alarm"):
         raise InputError(f"--fail-on must be 'alarm', got '{fail_on}'")
+    if is_dataflash(Path(path)) and filter_name not in STATED:
+        if refused := given(fail_on=fail_on, gate=gate, mission=mission):
+            option = next(iter(refused)).replace("_", "-")
+            raise InputError(f"--{option}: {path} holds test ratios, of which nothing is judged, unless --filter names "
+                             f"{' or '.join(STATED)}")  # fmt: skip
+        _show_ratios(Path(path), filter_name, run, plot, overwrite, as_json)
+        return
     watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
     if path == "-":
         options = given(filter=filter_name, run=run, plot=plot)
@@ -65,8 +74,7 @@ def monitor(
         watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
     else:
         log = read_innovations(Path(path), filter_name, run)
-        for note in log.notes:
-            print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)
+        _print_notes(log.notes)
         if plot is not None:
             require_plot(plot, overwrite)
         watched = watch(log, watcher)
@@ -79,3 +87,32 @@ def monitor(
         terminal.show(*document.opening)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
+
+
+def _show_ratios(
+    path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
+) -> None:
+    """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
+    from consistency.referee.document.ratios import ratios_document
+    from consistency.referee.pages import require_plot, write_monitor_plot
+    from consistency.referee.readers.dataflash import read_ratios
+    from consistency.referee.show import json, terminal
+
+    if plot is not None:
+        require_plot(plot, overwrite)
+    ratios, notes = read_ratios(path, sensor, core)
+    _print_notes(notes)
+    if plot is not None:
+        write_monitor_plot(plot, ratios)
+    document = ratios_document(path.stem, ratios)
+    if as_json:
+        print(json.render(document))
+    else:
+        terminal.show(*document.opening)
+
+
+def _print_notes(notes: Iterable[str]) -> None:
+    from consistency.referee.parsing import one_line
+
+    for note in notes:
+        print(f"consistency: {one_line(note, 4000)}", file=sys.stderr)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from consistency.referee.diagnostics import Evidence, Verdict
+    from consistency.referee.diagnostics.gate_ratios import GateRatios
     from consistency.referee.document.blocks import Document
     from consistency.referee.terminal.progress import Advance
     from consistency.referee.verdicts.monitoring import Watched
@@ -151,11 +152,11 @@ def require_plot(path: Path, overwrite: bool) -> None:
     require_writable(path, overwrite)
 
 
-def write_monitor_plot(path: Path, watched: Watched) -> None:
-    """NIS and evidence of a run over its steps, as PNG, PDF or SVG by the suffix of ``path``."""
+def write_monitor_plot(path: Path, shown: Watched | Sequence[GateRatios]) -> None:
+    """NIS and evidence of a run over its steps, or test ratios, as PNG, PDF or SVG by the suffix of ``path``."""
     from consistency.referee.pages.monitor import monitor_plot
 
-    write_file(path, monitor_plot(watched, path.suffix.lower().removeprefix(".")))
+    write_file(path, monitor_plot(shown, path.suffix.lower().removeprefix(".")))
 
 
 def require_writable(path: Path, overwrite: bool) -> None:

@@ -1,13 +1,16 @@
-"""The figure of a monitor: the NIS of a run and the evidence against it."""
+"""Figures of a monitor: the NIS of a run and the evidence against it, or the test ratios of a gate."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from consistency.referee.diagnostics.gate_ratios import GateRatios
 from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
 from consistency.referee.document.looks import EXPECTED, LIMIT, style
+from consistency.referee.document.thin import thin
 from consistency.referee.show import paper
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitoring import Watched
@@ -17,9 +20,22 @@ POINTS = 600  # at most, of the NIS: few enough to see a change among them
 FAULT = replace(style(1), dash=(), width=1.1)
 
 
-def monitor_plot(watched: Watched, kind: str, resolution: int = 200) -> bytes:
-    """NIS / dof above, the e-value below, over the steps of the file; ``kind`` is png, pdf or svg."""
-    return paper.render(sheet(watched), kind, resolution)
+def monitor_plot(shown: Watched | Sequence[GateRatios], kind: str, resolution: int = 200) -> bytes:
+    """NIS / dof above, the e-value below, over the steps of the file, or test ratios; ``kind`` is png, pdf or svg."""
+    return paper.render(sheet(shown) if isinstance(shown, Watched) else ratios_sheet(shown), kind, resolution)
+
+
+def ratios_sheet(ratios: Sequence[GateRatios]) -> Sheet:
+    """A panel for each sensor: its test ratios over time, the gate, and what a right filter seldom exceeds."""
+    return Sheet(tuple(map(_ratios, ratios)), HEIGHT * len(ratios) / 2.0, columns=1)
+
+
+def _ratios(each: GateRatios) -> Panel:
+    keep = thin(each.ratio)
+    marks: list[Mark] = [Points(each.t[keep], each.ratio[keep], replace(style(0), size=2.0, alpha=0.7))]
+    marks += [Rule("y", at, look) for at, look in ((1.0, LIMIT), (each.unusual, EXPECTED)) if np.isfinite(at)]
+    alt = f"Test ratios of {each.sensor} over time"
+    return Panel(Axis("t / s", share="t"), Axis("test ratio"), tuple(marks), alt, title=each.sensor)
 
 
 def sheet(watched: Watched) -> Sheet:

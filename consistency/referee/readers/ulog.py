@@ -88,7 +88,7 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
     known = [*sensors, *(part for parts in sensors.values() for part in parts)]
     name = choose(path, "filter", known if sensor in known else list(sensors), sensor, "sensor")
     parts = sensors.get(name, [name])
-    nis, dof, held = _nis(pairs, parts)
+    nis, dof, held = nis_of(pairs, parts)
     notes = _notes(path, name, pairs, dof, held, log)
     return NisLog(name, np.arange(1.0, len(nis) + 1), pairs.t, nis, dof, tuple(notes))
 
@@ -181,7 +181,7 @@ def _fused(pairs: Pairs, parts: list[str]) -> Array:
     return np.asarray(np.isfinite(innovation) & np.isfinite(variance) & (variance > 0))
 
 
-def _nis(pairs: Pairs, parts: list[str]) -> tuple[Array, Array, int]:
+def nis_of(pairs: Pairs, parts: list[str]) -> tuple[Array, Array, int]:
     """NIS (N,), degrees of freedom (N,), and the number of messages that repeat the one before."""
     fused = _fused(pairs, parts)
     innovation, variance = (np.column_stack([of[part] for part in parts]) for of in (pairs.innovation, pairs.variance))

@@ -13,7 +13,8 @@ import numpy as np
 from consistency.referee.diagnostics import Alarm, Monitor
 from consistency.referee.errors import InputError
 from consistency.referee.outside import outside
-from consistency.referee.readers.nis import NisLog, read_nis, stream_nis
+from consistency.referee.readers.dataflash import STATED, is_dataflash, read_stated
+from consistency.referee.readers.nis import NisLog, choose, read_nis, stream_nis
 from consistency.referee.readers.ulog import SUFFIX, read_ulog
 from consistency.referee.types import Array
 
@@ -59,7 +60,7 @@ def make_monitor(innovations: str | None, **options: Any) -> Monitor:
 def read_innovations(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
     """The innovations of one run from a file, or from a folder of ``consistency run``.
 
-    Of a PX4 flight log (.ulg), ``filter_name`` is the sensor, and ``run`` the instance of the EKF2.
+    Of a flight log (.ulg of PX4, .bin of ArduPilot), ``filter_name`` is the sensor, and ``run`` the EKF's instance.
 
     Raises
     ------
@@ -68,6 +69,8 @@ def read_innovations(path: Path, filter_name: str | None = None, run: int | None
     """
     if path.suffix.lower() == SUFFIX:
         return read_ulog(path, filter_name, run)
+    if is_dataflash(path):
+        return read_stated(path, choose(path, "filter", list(STATED), filter_name), run)
     read: Callable[..., NisLog] = outside("innovations") if path.is_dir() else read_nis
     return read(path, filter_name, run)
 

@@ -1,0 +1,236 @@
+"""Flight logs of ArduPilot through the monitor, written message by message with pymavlink."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from consistency.referee.cli import main
+from consistency.referee.diagnostics.gate_ratios import GateRatios
+from consistency.referee.errors import InputError
+from consistency.referee.readers.dataflash import read_ratios
+from consistency.referee.types import Array
+from consistency.referee.verdicts.monitoring import read_innovations
+
+pytest.importorskip("pymavlink", reason="needs the extra 'ardupilot'")
+
+from pymavlink.DFReader import DFFormat, DFMessage
+
+# names, types and fields of messages, as ArduPilot declares them
+DECLARED = {
+    "FMT": (0x80, "BBnNZ", "Type,Length,Name,Format,Columns"),
+    "PARM": (0x40, "QNff", "TimeUS,Name,Value,Default"),
+    "XKF4": (0x41, "QBcccccfffHBIHb", "TimeUS,C,SV,SP,SH,SM,SVT,errRP,OFN,OFE,FS,TS,SS,GPS,PI"),
+    "NKF4": (0x42, "QcccccfffHBIHb", "TimeUS,SV,SP,SH,SM,SVT,errRP,OFN,OFE,FS,TS,SS,GPS,PI"),
+    "XKFD": (0x43, "QBffffff", "TimeUS,C,IX,IY,IZ,IVX,IVY,IVZ"),
+    "XKF0": (0x44, "QBBccccc", "TimeUS,C,ID,rng,innov,SIV,TR,BPN"),
+}
+STEP = 100_000  # us between messages
+
+
+class Flight:
+    """A log in the making."""
+
+    def __init__(self, *names: str) -> None:
+        self.body = b""
+        self.formats = {name: self._format(name, *DECLARED[name]) for name in ("FMT", "PARM", *names)}
+        for each in self.formats.values():
+            values = (each.type, each.len, each.name.encode(), each.format.encode(), ",".join(each.columns).encode())
+            self.body += DFMessage(self.formats["FMT"], list(values), False, None).get_msgbuf()
+
+    @staticmethod
+    def _format(name: str, number: int, types: str, columns: str) -> Any:
+        import struct
+
+        return DFFormat(
+            number, name, 3 + struct.calcsize(DFFormat(number, name, 0, types, columns).msg_struct), types, columns
+        )
+
+    def log(self, name: str, stamp: int, values: Mapping[str, float | bytes]) -> None:
+        """One message; fields that are not given are zero."""
+        form = self.formats[name]
+        raw = [
+            stamp if c == "TimeUS" else values.get(c, b"" if kind == "N" else 0)
+            for c, kind in zip(form.columns, form.format, strict=True)
+        ]
+        raw = [round(100 * v) if kind == "c" else v for v, kind in zip(raw, form.format, strict=True)]
+        self.body += DFMessage(form, raw, True, None).get_msgbuf()
+
+    def set(self, gates: Mapping[str, float]) -> Flight:
+        for name, value in gates.items():
+            self.log("PARM", 0, {"Name": name.encode(), "Value": value})
+        return self
+
+    def write(self, path: Path) -> Path:
+        path.write_bytes(self.body)
+        return path
+
+
+GATES = {
+    "EK3_VEL_I_GATE": 500,
+    "EK3_POS_I_GATE": 300,
+    "EK3_HGT_I_GATE": 200,
+    "EK3_MAG_I_GATE": 300,
+    "EK3_YAW_I_GATE": 250,
+}
+
+
+def flight(
+    path: Path, ratios: Mapping[str, Sequence[float] | Array], message: str = "XKF4", gates: Mapping[str, float] = GATES
+) -> Path:
+    """Test ratios by field."""
+    log = Flight(message).set(gates)
+    for k, row in enumerate(zip(*ratios.values(), strict=True)):
+        log.log(message, 10**7 + k * STEP, dict(zip(ratios, map(float, row), strict=True)))
+    return log.write(path)
+
+
+def test_ratios_by_sensor_with_the_gates_of_the_log(tmp_path: Path) -> None:
+    heights = [0.0, 0.1, 0.0, 1.5, 0.99, 1.01]
+    ratios, notes = read_ratios(flight(tmp_path / "a.bin", {"SH": heights, "SM": [0.2] * 6}))
+    assert [(each.sensor, each.gate, each.components) for each in ratios] == [("hgt", 2.0, 1), ("mag", 2.5, 4)]
+    np.testing.assert_allclose(ratios[0].ratio, heights[1:])  # before the first it is not fused
+    np.testing.assert_allclose(ratios[0].t, 10.1 + 0.1 * np.arange(5))
+    assert ratios[0].above(1.0) == pytest.approx(0.4)
+    assert notes == [f"{tmp_path / 'a.bin'}: read as test ratios of XKF4, 6 messages"]
+
+
+@pytest.mark.parametrize("components", [1, 3])
+def test_a_right_filter_stays_within_its_shares(components: int) -> None:
+    """Whether the ratio is the largest of the components or the root of a mean, by quantiles and not by chance.
+
+    The shares are of 2e5 draws: an excess of 6 standard deviations has a chance of 1e-9.
+    """
+    e = np.random.default_rng().normal(size=(200_000, components))
+    weight = np.array([0.9, 0.05, 0.05])[:components]
+    for sigma in (np.abs(e).max(axis=1), np.sqrt((e**2 @ weight) / weight.sum())):
+        of = GateRatios("pos", np.arange(len(e)) * 1.0, sigma / 2.0, 2.0, components)
+        assert of.above(of.unusual) < 0.05 + 6 * np.sqrt(0.05 / len(e))
+        assert of.above(1.0) < of.rejected + 6 * np.sqrt(of.rejected / len(e))
+    assert of.unusual == pytest.approx(stats.norm.isf(0.025 / components) / 2.0)
+    assert GateRatios("hgt", e[:, 0], e[:, 0], 2.0, 1).rejected == pytest.approx(stats.chi2.sf(4.0, 1))
+
+
+def test_shares_over_time() -> None:
+    of = GateRatios("hgt", np.array([0.0, 1.0, 2.0, 9.0, 10.0]), np.array([0.1, 2.0, 2.0, 0.3, 2.0]), 5.0, 1)
+    begin, share = of.over_time(1.0)
+    np.testing.assert_allclose(begin, np.arange(10.0))
+    np.testing.assert_array_equal(share, [0.0, 1.0, 1.0, *[np.nan] * 6, 0.5])
+
+
+def test_older_filters_cores_and_gates_that_are_missing(tmp_path: Path) -> None:
+    """EKF2 without the number of a core; its SVT is no airspeed; a gate below 1 sigma counts as 1; cores are chosen."""
+    path = tmp_path / "old.BIN"
+    fields = {"SV": [0.5, 0.1], "SP": [0.3, 0.3], "SVT": [0.7, 0.7]}
+    ratios, notes = read_ratios(flight(path, fields, "NKF4", {"EK2_VEL_I_GATE": 50, "EK3_POS_I_GATE": 300}))
+    assert [each.sensor for each in ratios] == ["vel", "pos"]
+    assert ratios[0].gate == 1.0
+    assert np.isnan([ratios[1].gate, ratios[1].unusual, ratios[1].rejected, ratios[1].above(ratios[1].unusual)]).all()
+    assert notes[1].endswith("PARM holds no gate of pos; what a right filter would exceed is not known")
+    log = Flight("XKF4").set({**GATES, "EK3_HGT_I_GATE": 400}).set({"EK3_HGT_I_GATE": 350})
+    for core, value in ((0, 0.2), (1, 0.9)):
+        log.log("XKF4", 10**7, {"C": core, "SH": value, "SVT": 0.1})
+    log.write(path)
+    with pytest.raises(InputError, match=r"more than one core of the EKF \(0, 1\); choose with --run"):
+        read_ratios(path)
+    (only,), _ = read_ratios(path, "hgt", 1)
+    assert (only.ratio.tolist(), only.gate) == ([0.9], 3.5)
+    with pytest.raises(InputError, match=r"--filter sonar: is not in .*; there are: hgt, tas"):
+        read_ratios(path, "sonar", 0)
+
+
+def test_the_nis_of_innovations_with_their_variances(tmp_path: Path) -> None:
+    rng = np.random.default_rng()
+    own, variance = rng.normal(size=(30, 3)), np.exp(rng.normal(size=(30, 3)))
+    own[7], variance[7] = own[6], variance[6]
+    log = Flight("XKFD", "XKF0")
+    for k in range(30):
+        values = {f"I{a}": e for a, e in zip("XYZ", own[k], strict=True)} | {
+            f"IV{a}": v for a, v in zip("XYZ", variance[k], strict=True)
+        }
+        log.log("XKFD", 10**7 + k * STEP, values)
+        log.log("XKF0", 10**7 + k * STEP, {"ID": k % 3, "innov": 0.01 * (k - 15), "SIV": 0.5})
+    path = log.write(tmp_path / "a.bin")
+    odometry, beacon = (read_innovations(path, sensor) for sensor in ("odometry", "beacon"))
+    there = np.arange(30) != 7
+    np.testing.assert_allclose(odometry.nis[there], (own**2 / variance).sum(axis=1)[there], rtol=1e-5)
+    assert odometry.dof.tolist() == [3 * int(each) for each in there]
+    assert odometry.notes[0].endswith("odometry: 29 innovations in 30 messages XKFD; 1 repeat the innovation before")
+    np.testing.assert_allclose(beacon.nis, (0.01 * (np.arange(30) - 15) / 0.5) ** 2)
+    np.testing.assert_allclose(beacon.t, 10.0 + 0.1 * np.arange(30))
+
+
+def test_one_command_from_a_flight_to_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = flight(tmp_path / "a.bin", {"SH": [0.3] * 90 + [1.2] * 10, "SP": [0.1] * 100})
+
+    def run(*options: str) -> tuple[str, str]:
+        with pytest.raises(SystemExit) as end:
+            main(["monitor", str(path), *options])
+        assert not end.value.code
+        return capsys.readouterr()
+
+    out, err = run("--plot", str(tmp_path / "a.png"))
+    for said in ("hgt", "2 sigma", "10.0%", "100.0% from 18.91 s", "no NIS", "no verdict and no alarm", "≤ 0.05"):
+        assert said in " ".join(out.split())
+    assert "read as test ratios of XKF4, 100 messages" in err
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    data = json.loads(run("--json", "--filter", "hgt")[0])
+    assert list(data["sensors"]) == ["hgt"]
+    assert data["sensors"]["hgt"]["above_1"] == pytest.approx(0.1)
+    assert data["sensors"]["hgt"]["unusual_above"] == pytest.approx(stats.norm.isf(0.025) / 2.0)
+    assert [piece["unusual"] for piece in data["sensors"]["hgt"]["over_time"]][-1] == pytest.approx(1.0)
+    assert "alarm" not in data
+
+
+def refused(capsys: pytest.CaptureFixture[str], *args: str) -> str:
+    with pytest.raises(SystemExit) as end:
+        main(["monitor", *args])
+    assert end.value.code == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert len(err.splitlines()) == 1, err
+    return err
+
+
+def test_what_cannot_be_used_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.bin"
+    assert "a.bin: no such file" in refused(capsys, str(path))
+    for content in (b"", b"not a log", bytes(1000)):
+        path.write_bytes(content)
+        assert "a.bin: is no flight log of ArduPilot" in refused(capsys, str(path))
+    Flight().write(path)
+    assert "holds no message XKF4 or NKF4" in refused(capsys, str(path))
+    flight(path, {"SH": [0.0, 0.0]})
+    assert "the test ratios of XKF4 are 0 throughout" in refused(capsys, str(path))
+    flight(path, {"SH": [0.5, 0.5]})
+    assert "holds no message XKFD" in refused(capsys, str(path), "--innovations", "optimal", "--filter", "odometry")
+    for option in (("--fail-on", "alarm"), ("--gate", "0.99")):
+        said = refused(capsys, str(path), *option)
+        assert f"{option[0]}: {path} holds test ratios, of which nothing is judged, unless --filter names" in said
+    back = Flight("XKF4", "XKFD")
+    for stamp in (10**7, 10**6):
+        back.log("XKF4", stamp, {"SH": 0.4})
+        back.log("XKFD", 10**6, {"IVX": -1.0})
+    back.write(path)
+    assert "message 2 of XKF4 is older than the one before" in refused(capsys, str(path))
+    said = refused(capsys, str(path), "--innovations", "optimal", "--filter", "odometry")
+    assert "XKFD at 1 s: -1 is below 0, beside IX" in said
+    with mock.patch.dict(sys.modules, {"pymavlink.DFReader": None}):
+        assert "a log of ArduPilot needs pymavlink: pip install " in refused(capsys, str(path))
+
+
+def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = flight(tmp_path / "a.bin", {"SH": np.linspace(0.1, 0.9, 50)})
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-700])
+    (only,), _ = read_ratios(path)
+    assert 20 < len(only.ratio) < 45
+    np.testing.assert_allclose(only.ratio, np.linspace(0.1, 0.9, 50)[: len(only.ratio)], atol=0.006)

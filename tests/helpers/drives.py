@@ -43,20 +43,29 @@ def write_drive(folder: Path, calibrated: bool = True) -> Path:
     return folder
 
 
-def write_states(at: Path, cameras: int = 1, more: int = 0) -> tuple[Array, Array]:
-    """state_estimate.txt, state_deviation.txt and state_groundtruth.txt; errors and deviations, position first."""
+def write_states(at: Path, cameras: int = 1, more: int = 0, moving: bool = False) -> tuple[Array, Array]:
+    """state_estimate.txt, state_deviation.txt and state_groundtruth.txt; errors and deviations, position first.
+
+    Velocity and biases are 0 and exact, or with ``moving`` have errors and deviations like the others.
+    """
     rng = np.random.default_rng()
     t = 0.05 * np.arange(STEPS)
-    sigma = np.exp(rng.normal(-3.0, 0.3, (STEPS, 6)))
-    e = sigma * rng.normal(size=(STEPS, 6))
+    sigma = np.exp(rng.normal(-3.0, 0.3, (STEPS, 15 if moving else 6)))
+    e = sigma * rng.normal(size=sigma.shape)
     true_turn = Rotation.from_rotvec(np.outer(t, [0.1, 0.2, 0.5]))
     true = np.column_stack([np.sin(t), np.cos(t), t])
-    turn = true_turn * Rotation.from_rotvec(-e[:, 3:])  # R_true = R_est Exp(e): about the axes of the body
+    turn = true_turn * Rotation.from_rotvec(-e[:, 3:6])  # R_true = R_est Exp(e): about the axes of the body
     rest, calibration = np.zeros((STEPS, 10)), np.ones((STEPS, 15 * cameras + more))
+    if moving:
+        rest[:, :9] = np.sin(t[:, None] + np.arange(9))
     count = np.full((STEPS, 1), float(cameras))
-    for name, p, q in (("estimate", true - e[:, :3], turn), ("groundtruth", true, true_turn)):
-        rows = np.column_stack([t, q.as_quat(), p, rest, count, calibration])
+    own = rest.copy()
+    own[:, : e.shape[1] - 6] -= e[:, 6:]
+    for name, p, q, more_of in (("estimate", true - e[:, :3], turn, own), ("groundtruth", true, true_turn, rest)):
+        rows = np.column_stack([t, q.as_quat(), p, more_of, count, calibration])
         np.savetxt(at / f"state_{name}.txt", rows, fmt="%.12g", header="timestamp(s) q p v bg ba ...")
-    rows = np.column_stack([t, sigma[:, 3:], sigma[:, :3], rest, count, np.ones((STEPS, 14 * cameras + more))])
+    stated = np.zeros((STEPS, 10))
+    stated[:, : e.shape[1] - 6] = sigma[:, 6:]
+    rows = np.column_stack([t, sigma[:, 3:6], sigma[:, :3], stated, count, np.ones((STEPS, 14 * cameras + more))])
     np.savetxt(at / "state_deviation.txt", rows, fmt="%.12g")
     return e, sigma

@@ -27,6 +27,10 @@ SPATIAL = {
     "left": "Log(estimate^-1 truth) of SE(3), in the frame of the estimated body",
     "right": "Log(truth estimate^-1) of SE(3), in the world frame",
 }
+INERTIAL = {
+    **SPATIAL,
+    "additive": "difference of every number, of the rotation that of two rotation vectors, the nearer way round",
+}  # of poses with a velocity, and biases
 SERIES = 1e-2  # rad, below which the half-angle cotangent is a series; the next term is below 1e-17 there
 
 
@@ -130,6 +134,38 @@ def spatial_error(truth: Array, estimate: Array, convention: str) -> Array:
     else:
         error = np.concatenate([shift, delta.as_rotvec()], axis=-1)
     return error.reshape(*shape[:-1], 6)
+
+
+def state_error(truth: Array, estimate: Array, convention: str) -> Array:
+    """Error of poses that a velocity follows, and two biases, (..., 7 + k) -> (..., 6 + k) with k of 0, 3 or 9.
+
+    ``left`` and ``right`` are of SE2(3), where the velocity is treated as the position is, by the same rotation; biases
+    are differences. ``additive`` is the difference of every number, of the rotation that of two rotation vectors.
+
+    Source: Barrau & Bonnabel (2017), "The invariant extended Kalman filter as a stable observer", whose group of
+    extended poses this is.
+    """
+    truth, estimate = np.asarray(truth, float), np.asarray(estimate, float)
+    pose = spatial_error(truth[..., :7], estimate[..., :7], "so3" if convention == "additive" else convention)
+    if convention == "additive":
+        pose[..., 3:] = _vector_gap(truth[..., 3:7], estimate[..., 3:7])
+    rest = truth[..., 7:] - estimate[..., 7:]
+    if convention in ("left", "right") and rest.shape[-1]:
+        moving = (np.concatenate([state[..., 7:10], state[..., 3:7]], axis=-1) for state in (truth, estimate))
+        rest[..., :3] = spatial_error(*moving, convention)[..., :3]
+    return np.concatenate([pose, rest], axis=-1)
+
+
+def _vector_gap(truth: Array, estimate: Array) -> Array:
+    """Difference of the rotation vectors of quaternions (..., 4), the true one of those that differ by whole turns."""
+    shape = truth.shape
+    if not truth.size:
+        return np.empty((*shape[:-1], 3))
+    own, true = (Rotation.from_quat(each.reshape(-1, 4)).as_rotvec() for each in (estimate, truth))
+    angle = np.linalg.norm(true, axis=1, keepdims=True)
+    axis = true / np.where(angle > 0.0, angle, 1.0)
+    turns = np.rint(((own * axis).sum(axis=1, keepdims=True) - angle) / (2.0 * np.pi))
+    return (true + 2.0 * np.pi * turns * axis - own).reshape(*shape[:-1], 3)
 
 
 def se2_log(pose: Array) -> Array:

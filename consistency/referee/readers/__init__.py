@@ -15,7 +15,15 @@ from typing import Any, cast
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.pieces import in_pieces
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error, se2_log, se3_log, spatial_error
+from consistency.referee.geometry.conventions import (
+    INERTIAL,
+    PLANAR,
+    SPATIAL,
+    planar_error,
+    se2_log,
+    se3_log,
+    spatial_error,
+)
 from consistency.referee.parsing import require_name
 from consistency.referee.parsing.options import Reading, flag_of
 from consistency.referee.readers.alignment import ALIGNMENTS, require_alignment
@@ -45,7 +53,7 @@ __all__ = [
     "spatial_error",
 ]
 
-CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *SPATIAL)))
+CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
     "truth_covariance": "whose covariance is of a declared error too",

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import SPATIAL, spatial_error
+from consistency.referee.geometry.conventions import INERTIAL, state_error
 from consistency.referee.types import Array
 
 AXES = {
@@ -19,6 +19,7 @@ AXES = {
     "bg": ("bgx", "bgy", "bgz"),
     "ba": ("bax", "bay", "baz"),
 }  # parts of a state, in their order in the covariance where the key ``order`` names no other
+STATE = ("p", "R", "v", "bg", "ba")  # their order in a state
 TRUE = "true_"  # before the name of a part
 ROTATION = 1e-3  # largest entry of R R' - I
 
@@ -36,22 +37,19 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
     arrays : R (runs, steps, 3, 3), from body to world, p and v (runs, steps, 3), in the world, m and m/s; bg and ba
         (runs, steps, 3), rad/s and m/s^2, both or none; the same of the truth as true_R and so on; ``order``, names of
         the parts as they stand in the covariance, R, p, v, bg, ba by default; one run may lack the first dimension
-    convention : ``left`` is Log(est^-1 truth) of SE2(3), ``right`` Log(truth est^-1); ``so3`` and ``so3-body`` are
-        additive but for the rotation (:func:`consistency.referee.geometry.conventions.spatial_error`). Biases are
-        differences.
+    convention : ``left`` is Log(est^-1 truth) of SE2(3), ``right`` Log(truth est^-1), ``additive`` a difference;
+        ``so3`` and ``so3-body`` are additive but for the rotation
+        (:func:`consistency.referee.geometry.conventions.state_error`). Biases are differences.
 
     Raises
     ------
     InputError
         A part is missing or of another shape, no rotation, or the truth is not finite; or no error is declared.
-
-    Source: Barrau & Bonnabel (2017), "The invariant extended Kalman filter as a stable observer", whose group of
-    extended poses this is: Log treats the velocity as it does the position, by the same rotation vector.
     """
-    if convention not in SPATIAL:
+    if convention not in INERTIAL:
         raise InputError(
-            f"{path}: holds states of R, p and v, whose error is not known; add --error {', '.join(SPATIAL)}: left or "
-            "right of SE2(3), or additive with the rotation about axes of the world or of the body"
+            f"{path}: holds states of R, p and v, whose error is not known; add --error {', '.join(INERTIAL)}: left or "
+            "right of SE2(3), or differences, the rotation's about axes of the world or of the body or of its vector"
         )
     parts = [part for part in AXES if part in arrays]
     order = _order(path, arrays, parts)
@@ -63,21 +61,18 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
             raise InputError(f"{path}: {beside}, beside R {own['R'].shape}")
         if not np.isfinite(true[part]).all():
             raise InputError(f"{path}: key '{TRUE}{part}' is not finite; leave such steps out")
-    turns = _quaternions(path, "R", own["R"]), _quaternions(path, f"{TRUE}R", true["R"])
-    errors = {part: true[part] - own[part] for part in parts if part.startswith("b")}
-    finite = np.isfinite(turns[0]).all(axis=-1)
-    for part in ("p", "v"):
-        estimate, truth = (
-            np.concatenate([state[part], turn], axis=-1) for state, turn in zip((own, true), turns, strict=True)
-        )
-        out = np.full((*finite.shape, 6), np.nan)
-        out[finite] = spatial_error(truth[finite], estimate[finite], convention)
-        errors[part], errors["R"] = out[..., :3], out[..., 3:]
+    own["R"], true["R"] = _quaternions(path, "R", own["R"]), _quaternions(path, f"{TRUE}R", true["R"])
+    states = [part for part in STATE if part in parts]
+    estimate, truth = (np.concatenate([side[part] for part in states], axis=-1) for side in (own, true))
+    finite = np.isfinite(estimate).all(axis=-1)
+    error = np.full((*finite.shape, 3 * len(states)), np.nan)
+    error[finite] = state_error(truth[finite], estimate[finite], convention)
+    errors = dict(zip(states, np.split(error, len(states), axis=-1), strict=True))
     rest = {key: array for key, array in arrays.items() if key.removeprefix(TRUE) not in (*AXES, "order")}
     axes = [axis for part in order for axis in AXES[part]]
     rest |= {"errors": np.concatenate([errors[part] for part in order], axis=-1), "axes": np.array(axes)}
     of = "with the velocity, of SE2(3)" if convention in ("left", "right") else "and the difference of the velocity"
-    return rest, f"error convention {convention}: {SPATIAL[convention]}, {of}; in the order {', '.join(order)}"
+    return rest, f"error convention {convention}: {INERTIAL[convention]}, {of}; in the order {', '.join(order)}"
 
 
 def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[str]:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.geometry import wrap
 from consistency.referee.types import Array, Indices
 
-Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z and a quaternion x, y, z, w
+Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
 BRIDGED = 0.1  # s between two samples of the truth that are always interpolated: a period of 10 Hz
 ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
 
@@ -63,9 +63,9 @@ def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Arra
         out[:, 2] = wrap(out[:, 2])
     turned = np.flatnonzero(share > 0.0)
     if manifold == "spatial" and len(turned):
-        first, second = (Rotation.from_quat(values[turned, 3:]) for values in (start, end))
+        first, second = (Rotation.from_quat(values[turned, 3:7]) for values in (start, end))
         turn = Rotation.from_rotvec(share[turned, None] * (first.inv() * second).as_rotvec())
-        out[turned, 3:] = (first * turn).as_quat()
+        out[turned, 3:7] = (first * turn).as_quat()
     out[share == 0.0] = start[share == 0.0]
     return np.asarray(out)
 

@@ -33,7 +33,8 @@ from consistency.referee.types import Array, Indices
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
 FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
 POINT = 4  # columns of a truth of positions alone: t, x, y, z
-DEVIATED = POSE + 6  # a pose and six standard deviations
+DEVIATIONS = (6, 9, 15)  # of a pose, with a velocity, with two biases
+DEVIATED = POSE + 6  # columns of a pose and six standard deviations
 TUM = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
 ASL = 17  # columns of the truth of EuRoC: t in ns, position, quaternion w first, velocity, two biases
 MATRICES = {12: (), 13: (0,), 16: (), 17: (0,)}  # numbers of a matrix, 3 x 4 or 4 x 4, behind its time or number
@@ -95,16 +96,19 @@ def is_poses(path: Path) -> bool:
 
 def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
     """Rows under the names of their columns."""
-    lines, columns = read_named(path, head, (*roles.time, *roles.position, *roles.quaternion, *roles.covariance))
+    pose = (*roles.time, *roles.position, *roles.quaternion, *roles.covariance)
+    lines, columns = read_named(path, head, (*pose, *roles.rest))
     t, unit = times_of(lines, roles.time, columns[: len(roles.time)], roles.unit)
     of = roles.kind if true else roles.kind.replace(" truth", " poses")
     clock = UNIT_NAMES[unit] if len(roles.time) == 1 else "seconds and nanoseconds"
     order = f"quaternion {'w first' if roles.w_first else 'w last'}" if roles.quaternion else "no orientation"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if roles.covariance:
-        stated = "standard deviations" if len(roles.covariance) == 6 else "covariance"
+        stated = "standard deviations" if len(roles.covariance) in DEVIATIONS else "covariance"
         note += f", {stated} in {len(roles.covariance)} columns"
-    return increasing(replace(lines, values=np.column_stack([t, *columns[len(roles.time) :]]), note=note))
+    values = np.column_stack([t, *columns[len(roles.time) : len(pose)]])
+    rest = np.column_stack(columns[len(pose) :]) if roles.rest else None
+    return increasing(replace(lines, values=values, note=note, rest=rest))
 
 
 def read_named(path: Path, head: Head, places: Sequence[int]) -> tuple[Lines, list[Array]]:
@@ -126,7 +130,7 @@ def _asl(lines: Lines, true: bool) -> Lines:
     of = f"EuRoC {'truth' if true else 'poses'}, {ASL} columns, {UNIT_NAMES[unit]}, quaternion w first"
     note = f"{lines.path}: read as {of}"
     values = np.column_stack([t, lines.values[:, [1, 2, 3, 5, 6, 7, 4]]])
-    return increasing(replace(lines, values=values, note=note))
+    return increasing(replace(lines, values=values, note=note, rest=lines.values[:, POSE:]))
 
 
 def times_of(

@@ -20,6 +20,11 @@ from consistency.referee.types import Array
 PEEKED = 2**16  # bytes of a file that hold its header and its first row
 POSITIONS = ("p_rs_r_{}", "p_{}", "p{}", "t_{}", "t{}", "pos_{}", "position_{}", "translation_{}", "{}")
 QUATERNIONS = ("q_rs_{}", "q_{}", "q{}", "quat_{}", "orientation_{}", "rotation_{}")
+MOVING = (
+    ("v_rs_r_{}", "v_{}", "v{}", "vel_{}", "velocity_{}"),
+    ("b_w_rs_s_{}", "bg_{}", "bg{}", "bw_{}", "bw{}", "b_g_{}", "gyro_bias_{}"),
+    ("b_a_rs_s_{}", "ba_{}", "ba{}", "b_a_{}", "accel_bias_{}"),
+)  # velocity, biases of gyroscope and accelerometer
 INNER = ("position_{}", "translation_{}", "orientation_{}", "rotation_{}")  # which a longer name may end in
 CLOCKS = ("header_stamp", "stamp", "timestamp", "timestamps", "t", "time", "")  # pandas leaves its index without a name
 HALVES = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"))
@@ -28,6 +33,7 @@ UNIT_NAMES = {1: "seconds", 10**3: "milliseconds", 10**6: "microseconds", 10**9:
 EPOCHS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3))  # times since 1970 are larger than this in ns, us and ms
 RECORDED = ("field_header_stamp",)  # names whose times are in ns: rostopic echo -p
 LABELS = (("x", "y", "z", "roll", "pitch", "yaw"), ("x", "y", "z", "rx", "ry", "rz"), ("x", "y", "z", "a", "b", "c"))
+MOVING_LABELS = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # behind those of a pose
 PREFIXES = ("p_", "p", "cov_", "cov", "t")  # before two labels
 DEVIATIONS = ("sigma_{}", "std_{}", "s{}", "s_{}", "sd_{}", "sigma{}", "std{}", "stddev_{}")  # standard, not squared
 APART = {"p": ("x", "y", "z"), "q": ("r", "p", "y")}  # two triangles of cnspy: position, rotation
@@ -51,8 +57,9 @@ class Roles:
     unit: int | None  # in a second; None where the name says none
     position: tuple[int, ...]  # (3,)
     quaternion: tuple[int, ...]  # (4,), x, y, z, w; none of positions alone
-    covariance: tuple[int, ...] = ()  # 36, 21 as an upper triangle, or 12: rotation, then position; or 6 deviations
+    covariance: tuple[int, ...] = ()  # n^2, its upper triangle, or 12: rotation, then position; or n deviations
     kind: str = "poses by the names of their columns"
+    rest: tuple[int, ...] = ()  # (3,), a velocity, or (9,), biases of gyroscope and accelerometer, too
 
     @property
     def is_tum(self) -> bool:
@@ -142,13 +149,9 @@ def roles_of(names: Sequence[str], where: Path) -> Roles | None:
         return None
     asl = plain[position[0]] == "p_rs_r_x" or (len(plain) == 17 and plain[-3:] == ["bax", "bay", "baz"])
     kind = "EuRoC truth" if asl else "poses by the names of their columns"
-    return Roles(
-        *clock,
-        position,
-        quaternion or (),
-        _covariance(plain),
-        kind if quaternion else kind.replace("poses", "positions"),
-    )
+    rest = _rest(plain) if quaternion else ()
+    kind = kind if quaternion else kind.replace("poses", "positions")
+    return Roles(*clock, position, quaternion or (), _covariance(plain, len(rest)), kind, rest)
 
 
 def _plain(name: str) -> str:
@@ -216,10 +219,22 @@ def _unit(name: str, plain: str) -> int | None:
     return 10**9 if plain in RECORDED else None
 
 
-def _covariance(plain: list[str]) -> tuple[int, ...]:
-    """Places of 36, 21 or 12 columns of a covariance; none where there is none."""
-    for prefix, labels in itertools.product(PREFIXES, LABELS):
-        if found := _places(plain, _pairs(prefix, labels)):
+def _rest(plain: list[str]) -> tuple[int, ...]:
+    """Places of a velocity, and of both biases where they are there."""
+    found = []
+    for spellings in MOVING:
+        there = ([spelling.format(axis) for axis in "xyz"] for spelling in spellings)
+        places = [tuple(map(plain.index, names)) for names in there if all(plain.count(name) == 1 for name in names)]
+        found.append(places[0] if places else ())
+    return (*found[0], *found[1], *found[2]) if all(found) else found[0]
+
+
+def _covariance(plain: list[str], rest: int) -> tuple[int, ...]:
+    """Places of the columns of a covariance of a pose and ``rest`` more, or of the pose alone; none without one."""
+    sizes = sorted({6, 6 + min(rest, 3), 6 + rest}, reverse=True)
+    every = [(*labels, *MOVING_LABELS[: n - 6]) for n in sizes for labels in LABELS]
+    for labels, prefix in itertools.product(every, PREFIXES):
+        if found := _places(plain, _pairs(prefix, labels, len(labels))):
             return found
     blocks = [_places(plain, _pairs(prefix, APART[prefix], 3)) for prefix in ("q", "p")]
     if all(blocks):
@@ -230,9 +245,9 @@ def _covariance(plain: list[str]) -> tuple[int, ...]:
             place = (int(number[2]), -1) if number[3] is None else (int(number[2]), int(number[3]))
             stated.setdefault(number[1], {})[place] = i
     for places in stated.values():
-        if len(places) in (36, 21):
+        if len(places) in [size for n in sizes for size in (n * n, n * (n + 1) // 2)]:
             return tuple(places[key] for key in sorted(places))
-    for spelling, labels in itertools.product(DEVIATIONS, LABELS):
+    for labels, spelling in itertools.product(every, DEVIATIONS):
         if set(names := [spelling.format(label) for label in labels]) <= set(plain):
             return tuple(plain.index(name) for name in names)
     return ()

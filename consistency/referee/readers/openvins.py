@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from consistency.referee.diagnostics.parts import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.readers.sheet import Lines, read_numbers
 from consistency.referee.types import Array
@@ -15,7 +16,8 @@ LARGEST = 200  # columns, of more cameras than OpenVINS takes
 FULL = range(CAMERAS + 1 + CALIBRATION, LARGEST)  # columns of a state
 DEVIATED = range(CAMERAS + CALIBRATION - 1, LARGEST)  # of its deviations: three for a rotation, in place of four
 AS_TUM = [0, 5, 6, 7, 1, 2, 3, 4]  # t, position and quaternion in the order of TUM
-SIGMA = slice(1, 7)  # rotation, position
+REST = slice(8, 17)  # velocity, biases
+SIGMA = slice(1, 16)  # rotation, position, velocity, biases
 LAYOUT = (
     "t, three standard deviations of the rotation, rad, three of the position, m, and those of the rest of the state"
 )
@@ -35,11 +37,13 @@ def as_states(lines: Lines) -> States | None:
     """
     if not _has_cameras(lines.values, CAMERAS, CALIBRATION):
         return None
-    return States(lines.path, lines.values[:, AS_TUM], lines.line)
+    return States(lines.path, lines.values[:, AS_TUM], lines.line, rest=lines.values[:, REST])
 
 
 def read_deviations(path: Path) -> tuple[Lines, Array]:
-    """Standard deviations of states, and covariances (N, 6, 6) of position and rotation, whose diagonal alone is known.
+    """Standard deviations of states, and covariances (N, 15, 15) whose diagonal alone is known.
+
+    They are of position, rotation, velocity and the biases of gyroscope and accelerometer.
 
     The rotation is the error about the axes of the body, in rad.
     """
@@ -50,9 +54,7 @@ def read_deviations(path: Path) -> tuple[Lines, Array]:
     negative = np.flatnonzero((sigma < 0).any(axis=1))
     if len(negative):
         raise InputError(f"{lines.place(int(negative[0]))}: a standard deviation is below 0; should be {LAYOUT}")
-    P = np.zeros((len(sigma), 6, 6))
-    P[:, range(6), range(6)] = np.square(np.roll(sigma, 3, axis=1))
-    return lines, P
+    return lines, diagonal(np.concatenate([sigma[:, 3:6], sigma[:, :3], sigma[:, 6:]], axis=1))
 
 
 def _has_cameras(values: Array, column: int, each: int) -> bool:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.referee.geometry.conventions import planar_error, spatial_error
+from consistency.referee.geometry.conventions import planar_error, state_error
 from consistency.referee.readers.interpolation import Known, Manifold, nearest, truth_at
 from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array, Indices
@@ -55,7 +55,7 @@ class Poses:
         estimate = self.estimate[rows]
         finite = np.isfinite(estimate).all(axis=1)
         out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
-        error = spatial_error if self.manifold == "spatial" else planar_error
+        error = state_error if self.manifold == "spatial" else planar_error
         out[finite] = error(truth[finite], estimate[finite], self.convention)
         return out
 
@@ -74,6 +74,14 @@ class Poses:
         if len(self.t) <= most:
             return self
         return self._of(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
+
+    def alone(self) -> Poses:
+        """Without velocities and biases behind the poses in space."""
+        if self.manifold != "spatial" or self.covariance.shape[-1] == 6:
+            return self
+        return replace(
+            self, estimate=self.estimate[:, :7], covariance=self.covariance[:, :6, :6], truth=self.truth[:, :7]
+        )
 
     @classmethod
     def bare(

@@ -113,6 +113,7 @@ class Lines:
     line: Indices  # (N,)
     note: str = ""  # what they were read as
     unit: str = "line"  # line | message
+    rest: Array | None = None  # (N, 3) velocity in the world, m/s, or (N, 9) biases of gyroscope and accelerometer, too
 
     @property
     def t(self) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.parts import each_alone
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import PLANAR, SPATIAL
+from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.alignment import clocks_and_frames
 from consistency.referee.readers.hints import hints
@@ -25,11 +25,14 @@ from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 
 AXES: tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw")  # from roll on a rotation vector
-WHOLE = {"": range(6)}  # what is one recording, by what its name ends in
+REST = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # velocity, biases of gyroscope and accelerometer
+STATE = (*AXES, *REST)
+WHOLE = {"": range(len(STATE))}  # what is one recording, by what its name ends in
 ALONE = dict(WHOLE)  # one recording, each of whose components is judged by itself; told from WHOLE by identity
 POINTS = {"": range(3)}  # positions without orientations
 BLOCKS = {" position": range(3), " rotation": range(3, 6)}  # their cross-covariance is not known
-SINGLE = {f" {axis}": range(i, i + 1) for i, axis in enumerate(AXES)}  # no covariance is
+SINGLE = {f" {axis}": range(i, i + 1) for i, axis in enumerate(AXES)}  # no covariance is; the rest as ALONE
+SINGLE[" velocity and biases"] = range(len(AXES), len(STATE))
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
 
@@ -56,10 +59,10 @@ class Match:
     bent: float  # sigma, median of what the interpolated truth may be off by
 
 
-def require_axes(axes: Sequence[str] | None) -> None:
-    """Refuse components that a pose in space does not have."""
-    if unknown := [axis for axis in axes or () if axis not in AXES]:
-        raise InputError(f"--axes {','.join(axes or ())}: '{unknown[0]}' is not one of {', '.join(AXES)}")
+def require_axes(axes: Sequence[str] | None, there: Sequence[str] = AXES) -> None:
+    """Refuse components that a pose in space, or what is judged of a state, does not have."""
+    if unknown := [axis for axis in axes or () if axis not in there]:
+        raise InputError(f"--axes {','.join(axes or ())}: '{unknown[0]}' is not one of {', '.join(there)}")
 
 
 def recordings_of(
@@ -81,8 +84,11 @@ def recordings_of(
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
-    kind, axes = poses[0].convention, AXES[: poses[0].covariance.shape[-1]]
+    kind, axes = poses[0].convention, STATE[: poses[0].covariance.shape[-1]]
+    require_axes(r.axes, axes)
     judged = [i for i, axis in enumerate(axes) if r.axes is None or axis in r.axes]
+    if parts is not WHOLE:  # what is 0 throughout is not estimated
+        judged = [i for i in judged if i < len(AXES) or any((one.covariance[:, i, i] != 0).any() for one in poses)]
     if relative is not None:
         if parts is not WHOLE:
             raise InputError(f"{source.path}: --relative needs covariances of whole poses; here parts are stated apart")
@@ -104,16 +110,16 @@ def recordings_of(
         *_notes(source.path, matches, poses[0].max_dt),
         *clocks,
         *moved.notes,
-        *hints(source.path.name, axes, poses, shift),
+        *hints(source.path.name, axes[: len(AXES)], [one.alone() for one in poses], shift),
     ]
-    notes.append(f"error convention {kind}: {SPATIAL.get(kind) or PLANAR[kind]}{source.why}")
+    notes.append(f"error convention {kind}: {INERTIAL.get(kind) or PLANAR[kind]}{source.why}")
     recordings = []
     for title, whole in parts.items():
         if part := [i for i in judged if i in whole]:
             some = [track.part(part) for track in tracks]
-            names, name = tuple(AXES[i] for i in part), f"{source.path.stem}{title}"
+            names, name = tuple(axes[i] for i in part), f"{source.path.stem}{title}"
             record = moved.on(assemble(name, some, t, names, str(source.covariance), kind, notes))
-            recordings.append(each_alone(record) if parts is ALONE else record)
+            recordings.append(each_alone(record) if parts is ALONE or parts is SINGLE else record)
             notes = []
     return recordings
 
@@ -173,7 +179,7 @@ def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, toleran
 
 def _doubts(error: Array, P: Array, bend: Array) -> tuple[float, float]:
     """Medians over a run: angle of the rotation error, rad; what the interpolated truth may be off by, sigma."""
-    angles = np.linalg.norm(error[:, 3:], axis=1)
+    angles = np.linalg.norm(error[:, 3:6], axis=1)
     angle = float(np.nanmedian(angles)) if np.isfinite(angles).any() else 0.0
     sigma = np.sqrt(np.abs(np.diagonal(P[:, :3, :3], axis1=1, axis2=2)).mean(axis=1))
     ratio = np.where((sigma > 0) & (bend > 1e-9), bend / np.where(sigma > 0, sigma, 1.0), 0.0)

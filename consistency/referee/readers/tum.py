@@ -10,11 +10,11 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.parts import diagonal
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.fixes import Fixes, is_solution, localised
 from consistency.referee.readers.kitti import is_drive, read_drive
-from consistency.referee.readers.layouts import DEVIATED, FULL, POINT, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
+from consistency.referee.readers.layouts import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.openvins import LAYOUT, States, read_deviations
 from consistency.referee.readers.poses import NamedPoses, Poses
@@ -26,6 +26,7 @@ from consistency.referee.readers.spatial import (
     BLOCKS,
     POINTS,
     SINGLE,
+    STATE,
     WHOLE,
     TrajectorySource,
     apart,
@@ -52,11 +53,11 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     simulation each component is one. The truth may be a drive of KITTI.
     """
     order = r.covariance_order
-    if r.error not in (None, *SPATIAL):
+    if r.error not in (None, *INERTIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     if order not in (None, *ORDERS):
         raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}")
-    require_axes(r.axes)
+    require_axes(r.axes, STATE)
     if r.truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
     runs = _runs(estimates, r.truth, r.covariance)
@@ -71,6 +72,7 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
         if not poses:
             parts = _parts(own)
             error_kind = r.error or ("so3" if parts in (WHOLE, ALONE) else "so3-body")
+            require_error(own, r.error)
         if parts not in (WHOLE, ALONE) and order == ORDERS[0]:
             raise InputError(f"--covariance-order: {path} is written by OpenVINS, rotation before translation")
         if _parts(own) is not parts:
@@ -78,7 +80,9 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
         if isinstance(own, Fixes):
             poses.append(fixed(own, true, r, of_truth(true, own, ORDERS[0], r)))
             continue
-        poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r))
+        k, why = judged_rest(own, true, r, relative)
+        notes += [why] * bool(why)
+        poses.append(_poses(own, true, P_path, error_kind, order or ORDERS[0], r, k))
         if _is_point(true):
             poses[-1] = positions(poses[-1], r.lever_arm or (0.0, 0.0, 0.0), parts is not WHOLE)
     why = "" if r.error else f"; the default of this layout, {_origin(parts)}"
@@ -102,7 +106,8 @@ def _parts(own: Lines) -> Mapping[str, range]:
         return POINTS
     if isinstance(own, States):
         return SINGLE
-    return {SPLIT: BLOCKS, DEVIATED: ALONE}.get(own.values.shape[1], WHOLE)
+    stated = own.values.shape[1] - POSE
+    return BLOCKS if stated == SPLIT - POSE else ALONE if stated in DEVIATIONS else WHOLE
 
 
 def _origin(parts: Mapping[str, range]) -> str:
@@ -156,8 +161,9 @@ def _poses(
     convention: str,
     order: str,
     r: Reading,
+    k: int,
 ) -> Poses:
-    """A run with its truth; the covariance is NaN where none is near."""
+    """A run with its truth, of poses and ``k`` numbers of velocity and biases; P is NaN where none is near."""
     tolerance = r.tolerance
     covariance, source, cross = _inline(own, order), own, None
     rows = picked = np.arange(len(own.t))
@@ -175,16 +181,52 @@ def _poses(
     if covariance is None:
         of = f"the standard deviations of {LAYOUT}" if isinstance(own, States) else f"lines of t and {FULL} numbers"
         raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
-    P = np.full((len(own.t), 6, 6), np.nan)
+    covariance = covariance[:, : 6 + k, : 6 + k]
+    P = np.full((len(own.t), 6 + k, 6 + k), np.nan)
     P[rows] = symmetric(covariance if source is own else covariance[picked], lambda row: source.place(int(picked[row])))
     with_P = np.zeros(len(own.t), bool)
     with_P[rows] = True
     own = own.of(slice(0, POSE))
-    place, estimate = Places(own.place, np.arange(len(own.t))), own.values[:, 1:]
+    place, (estimate, true) = Places(own.place, np.arange(len(own.t))), (_states(lines, k) for lines in (own, truth))
     return Poses(
-        place, own.t, estimate, P, with_P, truth.t, truth.values[:, 1:POSE], "spatial", convention, tolerance, cross,
+        place, own.t, estimate, P, with_P, truth.t, true, "spatial", convention, tolerance, cross,
         of_truth(truth, own, order, r),
     )  # fmt: skip
+
+
+def _states(lines: Lines, k: int) -> Array:
+    """Poses (N, 7 + k) with ``k`` numbers of the velocity and the biases."""
+    pose = lines.values[:, 1:POSE]
+    return pose if lines.rest is None or not k else np.column_stack([pose, lines.rest[:, :k]])
+
+
+def _width(lines: Lines) -> int:
+    """Components whose covariance or deviations stand behind the poses."""
+    stated = lines.values.shape[1] - POSE
+    return next((n for n in DEVIATIONS if stated in (n, n * n, n * (n + 1) // 2)), 6)
+
+
+def require_error(own: Lines, error: str | None) -> None:
+    """Refuse covariances of states whose error is not declared, and an error of states for poses alone."""
+    if _width(own) > 6 and error is None:
+        what = f"{own.path}: holds a covariance of poses with their velocity, whose error is not known"
+        raise InputError(f"{what}; add --error {', '.join(INERTIAL)}")
+    if _width(own) == 6 and error not in (None, *SPATIAL):
+        raise InputError(f"--error {error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
+
+
+def judged_rest(own: Lines, true: Lines, r: Reading, relative: Relative | None) -> tuple[int, str]:
+    """How many numbers of velocity and biases are judged beside the poses, and a note where they are not."""
+    stated = 9 if isinstance(own, States) else _width(own) - 6
+    k = min(stated, *(0 if lines.rest is None else lines.rest.shape[1] for lines in (own, true)))
+    moving = {"--relative": relative, "--align": r.align, "--truth-covariance": r.truth_covariance}
+    options = [option for option, value in moving.items() if value is not None]
+    if k and options:
+        return 0, f"{own.path}: with {options[0]} the poses alone are judged, not their velocities and biases"
+    if k < stated and not isinstance(own, States):
+        what = "biases" if k else "velocities"
+        return k, f"{true.path}: holds no {what}, so that those of {own.path} are not judged"
+    return k, ""
 
 
 def unused(truth: Lines, r: Reading) -> str:
@@ -205,7 +247,7 @@ def of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
             raise InputError(
                 f"--truth-covariance {COLUMNS}: {truth.path} has none; give a file of t and {FULL} numbers"
             )
-        return symmetric(P, truth.place)
+        return symmetric(P[:, :6, :6], truth.place)
     path = Path(r.truth_covariance)
     source = read_covariances(_same_stem(path, own.path, "--truth-covariance") if path.is_dir() else path)
     rows, picked = _pairs(truth, source, r.tolerance, "covariance")
@@ -276,8 +318,8 @@ def _inline(own: Lines, order: str) -> Array | None:
     numbers = own.values[:, POSE:]
     if not numbers.shape[1]:
         return None
-    if own.values.shape[1] == DEVIATED:
-        return diagonal(numbers if order == ORDERS[0] else np.roll(numbers, 3, axis=1))
+    if numbers.shape[1] in DEVIATIONS:
+        return diagonal(numbers[:, _turned(numbers.shape[1], order)])
     if own.values.shape[1] == SPLIT:  # rotation, then position
         rotation, position = _triangle(numbers[:, :6], 3), _triangle(numbers[:, 6:], 3)
         out = np.zeros((len(numbers), 6, 6))
@@ -287,12 +329,17 @@ def _inline(own: Lines, order: str) -> Array | None:
 
 
 def _matrices(numbers: Array, order: str) -> Array:
-    """(N, 36) or (N, 21) -> (N, 6, 6), translation first."""
-    P = numbers.reshape(-1, 6, 6) if numbers.shape[1] == FULL else _triangle(numbers, 6)
+    """(N, n^2) or its upper triangle -> (N, n, n), translation first; n is 6, 9 or 15."""
+    n = next(n for n in DEVIATIONS if numbers.shape[1] in (n * n, n * (n + 1) // 2))
+    P = numbers.reshape(-1, n, n) if numbers.shape[1] == n * n else _triangle(numbers, n)
     if order == ORDERS[1]:
-        turned = [3, 4, 5, 0, 1, 2]
-        P = P[:, turned][:, :, turned]
+        P = P[:, _turned(n, order)][:, :, _turned(n, order)]
     return np.asarray(P)
+
+
+def _turned(n: int, order: str) -> list[int]:
+    """Places of x, y, z, the rotation and n - 6 more among components in an order."""
+    return [*([0, 1, 2, 3, 4, 5] if order == ORDERS[0] else [3, 4, 5, 0, 1, 2]), *range(6, n)]
 
 
 def _triangle(numbers: Array, n: int) -> Array:

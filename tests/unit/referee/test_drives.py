@@ -169,6 +169,30 @@ def test_states_are_judged_component_by_component(cameras: int, more: int, tmp_p
     assert yaw.axes == ("yaw",)
 
 
+def test_velocity_and_biases_of_states(tmp_path: Path) -> None:
+    """One recording more, each of whose components is judged by itself; EuRoC's truth has them, too."""
+    e, sigma = write_states(tmp_path, moving=True)
+    est, truth, deviation = (tmp_path / f"state_{name}.txt" for name in ("estimate", "groundtruth", "deviation"))
+    rows = np.loadtxt(truth)
+    euroc = tmp_path / "data.csv"
+    np.savetxt(euroc, rows[:, [0, 5, 6, 7, 4, 1, 2, 3, *range(8, 17)]], delimiter=",", fmt="%.17g")
+    for path in (truth, euroc):
+        *poses, rest = read_recordings(est, path, deviation)
+        assert len(poses) == 6
+        assert rest.name == "state_estimate velocity and biases"
+        assert rest.axes == ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")
+        assert rest.parts == tuple((i,) for i in range(9))
+        np.testing.assert_allclose(rest.error[0], e[:, 6:], atol=1e-9)  # type: ignore[index]
+        np.testing.assert_allclose(np.diagonal(rest.covariance[0], axis1=1, axis2=2), sigma[:, 6:] ** 2, rtol=1e-9)  # type: ignore[index]
+    [bias] = read_recordings(est, truth, deviation, axes=["bgy"])
+    np.testing.assert_allclose(bias.error[0, :, 0], e[:, 10], atol=1e-9)  # type: ignore[index]
+    np.savetxt(tmp_path / "tum.txt", rows[:, [0, 5, 6, 7, 1, 2, 3, 4]])
+    assert len(read_recordings(est, tmp_path / "tum.txt", deviation)) == 6
+    found = read_recordings(est, truth, deviation, align="posyaw-all")
+    assert len(found) == 6
+    assert f"{est}: with --align the poses alone are judged, not their velocities and biases" in found[0].notes
+
+
 def test_what_is_wrong_with_states_is_said(tmp_path: Path) -> None:
     write_states(tmp_path)
     est, truth, deviation = (tmp_path / f"state_{name}.txt" for name in ("estimate", "groundtruth", "deviation"))

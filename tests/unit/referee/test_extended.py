@@ -34,7 +34,8 @@ def states(convention: str, n: int = 15) -> tuple[dict[str, Array], Array, Array
     )
     out = {f"{side}{key}": np.zeros((RUNS, STEPS, *shape)) for key, shape in keys.items() for side in ("", "true_")}
     for at in np.ndindex(RUNS, STEPS):
-        own = exponential(*rng.normal(size=(3, 3)))
+        phi, *rest = rng.normal(size=(3, 3))
+        own = exponential(phi, *rest)
         step = exponential(e[at][:3], e[at][3:6], e[at][6:9])
         if convention in ("left", "right"):
             true = own @ step if convention == "left" else step @ own
@@ -42,6 +43,10 @@ def states(convention: str, n: int = 15) -> tuple[dict[str, Array], Array, Array
             turn = expm(skew(e[at][:3]))
             true = own.copy()
             true[:3, :3] = turn @ own[:3, :3] if convention == "so3" else own[:3, :3] @ turn
+            if convention == "additive":
+                angle = np.sqrt(phi @ phi)  # Log(own) is the rotation vector of at most half a turn
+                principal = phi * (1.0 - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi)) / angle)
+                true[:3, :3] = expm(skew(principal + e[at][:3]))
             true[:3, 4], true[:3, 3] = own[:3, 4] + e[at][3:6], own[:3, 3] + e[at][6:9]
         for side, T in (("", own), ("true_", true)):
             out[f"{side}R"][at], out[f"{side}v"][at], out[f"{side}p"][at] = T[:3, :3], T[:3, 3], T[:3, 4]
@@ -58,7 +63,7 @@ def read(path: Path, **arrays: Any) -> Path:
 
 
 @pytest.mark.parametrize("n", [9, 15])
-@pytest.mark.parametrize("convention", ["left", "right", "so3", "so3-body"])
+@pytest.mark.parametrize("convention", ["left", "right", "so3", "so3-body", "additive"])
 def test_errors_are_those_put_in(convention: str, n: int, tmp_path: Path) -> None:
     arrays, e, P = states(convention, n)
     record = cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error=convention)
@@ -68,6 +73,42 @@ def test_errors_are_those_put_in(convention: str, n: int, tmp_path: Path) -> Non
     assert record.axes[:9] == ("roll", "pitch", "yaw", "x", "y", "z", "vx", "vy", "vz")
     assert record.convention == convention
     assert any(note.startswith(f"error convention {convention}: ") for note in record.notes)
+
+
+def test_the_additive_error_is_the_others_to_first_order(tmp_path: Path) -> None:
+    """Jacobians of ``left`` and ``so3`` by the additive error, by complex steps of 1e-30 through the exponential.
+
+    Errors of 1e-5 rad and m: their squares are 1e-5 of them.
+    """
+    arrays, e, P = states("additive", 9)
+    small = {key: array[:1, :1].copy() for key, array in arrays.items()}
+    own = np.eye(5)
+    own[:3, :3], own[:3, 3], own[:3, 4] = small["R"][0, 0], small["v"][0, 0], small["p"][0, 0]
+    phi = np.array(rotation_vector(own[:3, :3]))
+    J = {kind: np.zeros((9, 9)) for kind in ("left", "so3")}
+    for i in range(9):
+        step = np.zeros(9, complex)
+        step[i] = 1e-30j
+        true = np.eye(5, dtype=complex)
+        true[:3, :3] = expm(skew(phi + step[:3]))
+        true[:3, 4], true[:3, 3] = own[:3, 4] + step[3:6], own[:3, 3] + step[6:]
+        turned = np.linalg.solve(own.astype(complex), true).imag / 1e-30
+        world = (true[:3, :3] @ own[:3, :3].T).imag / 1e-30
+        J["left"][:, i] = [turned[2, 1], turned[0, 2], turned[1, 0], *turned[:3, 4], *turned[:3, 3]]
+        J["so3"][:, i] = [world[2, 1], world[0, 2], world[1, 0], *step[3:].imag / 1e-30]
+    tiny = 1e-5 * e[0, 0]
+    small["true_R"][0, 0] = expm(skew(phi + tiny[:3]))
+    small["true_p"][0, 0], small["true_v"][0, 0] = own[:3, 4] + tiny[3:6], own[:3, 3] + tiny[6:]
+    for kind, jacobian in J.items():
+        record = cs.read(read(tmp_path / "imu.npz", **small, covariances=P[:1, :1]), error=kind)
+        np.testing.assert_allclose(record.error[0, 0], jacobian @ tiny, rtol=0, atol=1e-8)
+
+
+def rotation_vector(R: Array) -> Array:
+    """Of a rotation of less than half a turn."""
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = np.sqrt(axis @ axis)
+    return np.asarray(axis * np.arctan2(sine, np.trace(R) - 1.0) / sine)
 
 
 def test_another_order_of_the_covariance(tmp_path: Path) -> None:
@@ -124,7 +165,9 @@ def test_what_does_not_fit_is_named(key: str, value: object, said: str, tmp_path
 @pytest.mark.parametrize("options", [{}, {"error": "so2"}, {"error": "vector"}])
 def test_the_error_has_to_be_declared(options: dict[str, str], tmp_path: Path) -> None:
     arrays, _, P = states("left")
-    with pytest.raises(cs.InputError, match="whose error is not known; add --error so3, so3-body, left, right"):
+    with pytest.raises(
+        cs.InputError, match="whose error is not known; add --error so3, so3-body, left, right, additive: left"
+    ):
         cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), **options)  # type: ignore[arg-type]
 
 

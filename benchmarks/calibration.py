@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from calibration_cases import DETECT, MOST, POWER, QUICK_FAILURE, Case, cases, quick_cases, quick_confidence
 from calibration_gates import DOF, SEED, STEPS, Draw, Gate, joined
-from calibration_rows import CONFIDENCE, Row, document, kept, write_docs
+from calibration_rows import CONFIDENCE, Row, document, kept, merged, write_docs
 from calibration_worlds import HEAVY, LOGS, POOL, WORLDS
 
 import consistency as cs
@@ -230,9 +230,11 @@ def _share(folder: Path | None) -> None:
         POOL["linear-gaussian"] = error, np.load(folder / "covariance.npy")
 
 
-def further_rows(quick: bool, seed: int, workers: int = 2) -> tuple[list[Row], dict[str, str]]:
-    """Rows of the other modules, each measured by one worker, and what their worlds and questions are."""
-    there = [name for name in MODULES if importlib.util.find_spec(name) is not None]
+def further_rows(
+    quick: bool, seed: int, workers: int = 2, modules: Sequence[str] = MODULES
+) -> tuple[list[Row], dict[str, str]]:
+    """Rows of other modules, each measured by one worker, and what their worlds and questions are."""
+    there = [name for name in modules if importlib.util.find_spec(name) is not None]
     rows: list[Row] = []
     about: dict[str, str] = {}
     with ProcessPoolExecutor(workers) as pool:
@@ -261,6 +263,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows, about = _measured(options, seed)
     seconds = round(time.monotonic() - started, 1)
     table = document(rows, about, seed=seed, wall_time_s=seconds)
+    if options.module and options.out is not None:
+        table = merged(json.loads(options.out.read_text(encoding="utf-8")), rows, about)
     if options.out is not None:
         options.out.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
     if options.docs is not None:
@@ -273,16 +277,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _measured(options: argparse.Namespace, seed: int) -> tuple[list[Row], dict[str, str]]:
     """All rows that are asked for, each printed as it comes, and what further worlds are."""
-    every = [
-        replace(case, gates=min(case.gates, options.gates))
-        for case in (quick_cases() if options.quick else cases())
-        if options.only in f"{case.world} {case.claims}"
-    ]
+    every = (
+        []
+        if options.module
+        else [
+            replace(case, gates=min(case.gates, options.gates))
+            for case in (quick_cases() if options.quick else cases())
+            if options.only in f"{case.world} {case.claims}"
+        ]
+    )
     rows = []
     for row in measure(every, seed, options.workers, QUICK_POOLED if options.quick else POOLED):
         rows.append(row)
         print(said(row), flush=True)
-    further, about = ([], {}) if options.only else further_rows(options.quick, seed, options.workers)
+    modules = options.module or MODULES
+    further, about = ([], {}) if options.only else further_rows(options.quick, seed, options.workers, modules)
     for row in further:
         print(said(row), flush=True)
     return rows + further, about
@@ -303,6 +312,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="JSON file to write")
     parser.add_argument("--docs", type=Path, help="document whose table to replace")
     parser.add_argument("--only", default="", help="rows whose world or question contains this text")
+    parser.add_argument("--module", action="append", choices=MODULES, help="rows of this module alone, put into --out")
     parser.add_argument("--gates", type=int, default=10**9, help="of a row, at most")
     parser.add_argument("--seed", type=int)
     parser.add_argument("--workers", type=int, default=2)

@@ -74,6 +74,14 @@ def document(rows: Sequence[Row], about: dict[str, str], **facts: Any) -> dict[s
     }  # fmt: skip
 
 
+def merged(table: dict[str, Any], rows: Sequence[Row], about: dict[str, str]) -> dict[str, Any]:
+    """A table with these rows in place of its own on the same questions."""
+    asked = {row.question for row in rows}
+    others = [row for row in rows_of(table) if row.question not in asked]
+    facts = {key: table[key] for key in ("seed", "wall_time_s")}
+    return document([*others, *rows], table["worlds"] | table["questions"] | about, **facts)
+
+
 def rows_of(table: dict[str, Any]) -> list[Row]:
     return [Row(**row) for row in table["rows"]]
 

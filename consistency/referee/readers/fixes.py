@@ -26,12 +26,16 @@ LEAPS = (  # days from which GPS time is one second more ahead of UTC (IERS, Bul
 )  # fmt: skip
 AHEAD = {"GPST": 0.0, "UTC": 0.0, "JST": 9 * 3600.0}  # s of the clocks of RTKLIB before UTC, leap seconds aside
 GEODETIC = ("latitude(deg)", "longitude(deg)", "height(m)")
+SEXAGESIMAL = ("latitude(d'\")", "longitude(d'\")", "height(m)")  # degrees, minutes and seconds apart
+CENTRED = ("x-ecef(m)", "y-ecef(m)", "z-ecef(m)")
 BASELINE = ("e-baseline(m)", "n-baseline(m)", "u-baseline(m)")
 STATED = {
     GEODETIC: ("sdn", "sde", "sdu", "sdne", "sdeu", "sdun"),
+    SEXAGESIMAL: ("sdn", "sde", "sdu", "sdne", "sdeu", "sdun"),
+    CENTRED: ("sdx", "sdy", "sdz", "sdxy", "sdyz", "sdzx"),
     BASELINE: ("sde", "sdn", "sdu", "sden", "sdnu", "sdue"),
 }
-EAST_NORTH_UP = {"e": 0, "n": 1, "u": 2}
+AXES = {"e": 0, "n": 1, "u": 2, "x": 0, "y": 1, "z": 2}
 QUALITY: dict[float, str] = {1: "fixed", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
 
 
@@ -69,6 +73,19 @@ def centred(place: Array) -> Array:
     N = A / np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
     out = [(N + height) * np.cos(phi) * np.cos(lam), (N + height) * np.cos(phi) * np.sin(lam)]
     return np.stack([*out, (N * (1.0 - E2) + height) * np.sin(phi)], axis=-1)
+
+
+def geodetic(point: Array) -> Array:
+    """Latitude, longitude, degrees, and height, m, (..., 3), of x, y, z from the centre of the earth, m.
+
+    The latitude is the fixed point of tan phi = (z + e^2 N sin phi) / p, which each round brings e^2 nearer.
+    """
+    x, y, z = np.moveaxis(np.asarray(point, float), -1, 0)
+    p, phi = np.hypot(x, y), np.arctan2(z, (1.0 - E2) * np.hypot(x, y))
+    for _ in range(8):
+        phi = np.arctan2(z + E2 * A * np.sin(phi) / np.sqrt(1.0 - E2 * np.sin(phi) ** 2), p)
+    height = p * np.cos(phi) + z * np.sin(phi) - A * np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
+    return np.stack([np.rad2deg(phi), np.rad2deg(np.arctan2(y, x)), height], axis=-1)
 
 
 def axes_at(place: Array) -> Array:
@@ -112,7 +129,7 @@ def is_solution(path: Path) -> bool:
 
 
 def read_solution(path: Path) -> Fixes:
-    """A solution of RTKLIB in latitude, longitude and height, or as a baseline in east, north and up.
+    """A solution of RTKLIB: latitude, longitude, height; x, y, z from the earth's centre; or east, north, up.
 
     Its deviations are in m. ``sdne`` and the like are the roots of cross terms with the sign of the cross term (RTKLIB
     manual 2.4.2, appendix B.1).
@@ -133,28 +150,34 @@ def read_solution(path: Path) -> Fixes:
                 raise InputError(f"{path}, line {number}: stands under no header '%  GPST  latitude(deg) ...'")
             rows.append(line.replace(",", " ").split())
             numbers.append(number)
-            if len(rows[-1]) != len(names) + 2:
-                what = f"has {len(rows[-1])} fields; its header names a time of two and {len(names)} more"
+            width = len(names) + 2 * (1 + sum(name in SEXAGESIMAL[:2] for name in names))
+            if len(rows[-1]) != width:
+                what = f"has {len(rows[-1])} fields; its header names a time of two and {width - 2} more"
                 raise InputError(f"{path}, line {number}: {what}")
     if not rows:
         raise InputError(f"{path}: holds no solution")
     kind = next((each for each in STATED if set(each) <= set(names)), None)
     if kind is None:
         raise InputError(
-            f"{path}: holds no {', '.join(GEODETIC)} and no {', '.join(BASELINE)}; have RTKLIB write it with "
-            "out-solformat =llh or =enu, and out-degform =deg"
+            f"{path}: holds none of {', '.join(GEODETIC)}; {', '.join(CENTRED)}; {', '.join(BASELINE)}; have RTKLIB "
+            "write it with out-solformat =llh, =xyz or =enu"
         )
     t = np.array([_time(path, number, row, clock) for number, row in zip(numbers, rows, strict=True)])
     values = _numbers(path, numbers, [row[2:] for row in rows])
+    if kind is SEXAGESIMAL:
+        values, names = _in_degrees(path, numbers, values, names, rows)
     place = values[:, [names.index(name) for name in kind]]
     P = _covariance(path, names, values, STATED[kind])
+    if kind is CENTRED:
+        place = geodetic(place)
+        P = axes_at(place) @ P @ np.swapaxes(axes_at(place), 1, 2)
     quality = Counter(int(each) for each in values[:, names.index("Q")]) if "Q" in names else Counter[int]()
     shares = ", ".join(f"{count} {QUALITY.get(q, f'Q={q}')}" for q, count in sorted(quality.items()))
     note = (
         f"{path}: read as a solution of RTKLIB, {len(names) + 2} columns, {_clock_note(clock, t)}; {shares or 'no Q'}"
     )
     values = np.column_stack([t, place, P.reshape(-1, 9)])
-    lines = Fixes(path, values, np.array(numbers), note, geodetic=kind is GEODETIC)
+    lines = Fixes(path, values, np.array(numbers), note, geodetic=kind is not BASELINE)
     increasing(lines)
     return lines
 
@@ -167,6 +190,27 @@ def _numbers(path: Path, numbers: Sequence[int], rows: Sequence[Sequence[str]]) 
         except ValueError:
             raise InputError(f"{path}, line {number}: a field is not a number ({' '.join(row)[:60]})") from None
     return np.array(out)
+
+
+def _in_degrees(
+    path: Path, numbers: Sequence[int], values: Array, names: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[Array, list[str]]:
+    """Values with degrees, minutes and seconds in one column, and their names; -0 degrees are negative."""
+    columns, at = [], 0
+    for name in names:
+        if name not in SEXAGESIMAL[:2]:
+            columns.append(values[:, at])
+            at += 1
+            continue
+        whole, minutes, seconds = values[:, at : at + 3].T
+        bad = np.flatnonzero((minutes < 0) | (minutes >= 60) | (seconds < 0) | (seconds > 60) | (whole % 1 != 0))
+        if len(bad):
+            row = rows[bad[0]]
+            what = f"'{' '.join(row[2 + at : 5 + at])}' is no angle of degrees, minutes and seconds"
+            raise InputError(f"{path}, line {numbers[bad[0]]}: {what}")
+        columns.append(np.copysign(np.abs(whole) + minutes / 60.0 + seconds / 3600.0, whole))
+        at += 3
+    return np.column_stack(columns), list(names)
 
 
 def _time(path: Path, number: int, row: Sequence[str], clock: str) -> float:
@@ -198,12 +242,12 @@ def _clock_note(clock: str, t: Array) -> str:
 
 
 def _covariance(path: Path, names: Sequence[str], values: Array, stated: Sequence[str]) -> Array:
-    """Covariances (N, 3, 3) of east, north, up of deviations and signed roots of cross terms."""
+    """Covariances (N, 3, 3) of east, north, up, or of x, y, z, of deviations and signed roots of cross terms."""
     P = np.zeros((len(values), 3, 3))
     for name in stated:
         if f"{name}(m)" not in names:
             raise InputError(f"{path}: column '{name}(m)' is missing, of the deviations of the position")
         root = values[:, names.index(f"{name}(m)")]
-        i, j = (EAST_NORTH_UP[letter] for letter in (name[2:] * 2)[:2])
+        i, j = (AXES[letter] for letter in (name[2:] * 2)[:2])
         P[:, i, j] = P[:, j, i] = root * np.abs(root)
     return P

@@ -187,10 +187,69 @@ def test_a_baseline_is_local_already(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert any(note.endswith("12 float") for note in record.notes)
 
 
+def centred_solution(path: str, place: Array, P: Array) -> str:
+    """The same fixes from the centre of the earth, with covariances of x, y, z."""
+    header = HEADER.format(clock="GPST")
+    for old, new in zip(("latitude(deg)", "longitude(deg)", "height(m)"), "xyz", strict=True):
+        header = header.replace(old, f"{new}-ecef(m)")
+    for old, new in (("sdn(m)", "sdx(m)"), ("sde(m)", "sdy(m)"), ("sdu(m)", "sdz(m)"), ("sdne", "sdxy"),
+                     ("sdeu", "sdyz"), ("sdun", "sdzx")):  # fmt: skip
+        header = header.replace(old, new)
+    rows = []
+    for when, at, C in zip(stamps(), place, P, strict=True):
+        turn = axes_at(at)
+        C = turn.T @ C @ turn
+        roots = [signed_root(v) for v in (C[0, 0], C[1, 1], C[2, 2], C[0, 1], C[1, 2], C[2, 0])]
+        numbers = [*map(repr, map(float, centred(at))), "1", "9", *map(repr, roots), "0.00", "12.3"]
+        rows.append(" ".join([when, *numbers]))
+    Path(path).write_text(header + "\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+def sexagesimal_solution(path: str, place: Array, P: Array) -> str:
+    """The same fixes in degrees, minutes and seconds."""
+    text = Path(solution(path, place, P)).read_text(encoding="utf-8")
+    text = text.replace("(deg)", "(d'\")")
+    for value in {float(v) for v in place[:, :2].ravel()}:
+        minutes, seconds = divmod(abs(value) * 3600.0, 60.0)
+        degrees, minutes = divmod(minutes, 60.0)
+        text = text.replace(f" {value!r} ", f" {'-' * (value < 0)}{degrees:.0f} {minutes:02.0f} {seconds:.14f} ")
+    Path(path).write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("write", [centred_solution, sexagesimal_solution])
+@pytest.mark.parametrize("corner", [PLACE, [-33.5, -0.2, 12.0], [-0.3, 179.9, -20.0], [89.9, -120.0, 5.0]])
+def test_other_forms_of_a_place(write: object, corner: Array, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert callable(write)
+    monkeypatch.chdir(tmp_path)
+    place, P = flight()
+    place = place - PLACE + np.asarray(corner)
+    plain, other = read_solution(Path(solution("a.pos", place, P))), read_solution(Path(write("b.pos", place, P)))
+    here, there = plain.local(), other.local(plain.origin)
+    np.testing.assert_allclose(there[0], here[0], atol=2e-8)  # 6e6 m in a double, and degrees of 14 digits
+    np.testing.assert_allclose(there[1], here[1], rtol=1e-7, atol=1e-12)
+    np.testing.assert_array_equal(other.t, plain.t)
+    record = cs.read("b.pos", truth=solution("truth.pos", place + np.array([1e-7, 2e-7, 0.05]), 1e-6 * P))
+    same = cs.read("a.pos", truth="truth.pos")
+    np.testing.assert_allclose(record.nees, same.nees, rtol=1e-4)
+
+
+def test_an_angle_that_is_none(tmp_path: Path) -> None:
+    place, P = flight()
+    path = Path(sexagesimal_solution(str(tmp_path / "rover.pos"), place, P))
+    lines_of = path.read_text(encoding="utf-8").splitlines()
+    fields = lines_of[5].split()
+    fields[3] = "61"
+    path.write_text("\n".join([*lines_of[:5], " ".join(fields), *lines_of[6:]]), encoding="utf-8")
+    with pytest.raises(cs.InputError, match=r"rover\.pos, line 6: '47 61 .*' is no angle of degrees, minutes and"):
+        read_solution(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("latitude(deg)", "latitude(d'\")", r"rover\.pos: holds no latitude\(deg\).*out-degform =deg"),
+        ("latitude(deg)", "latitude(gon)", r"rover\.pos: holds none of latitude\(deg\).*out-solformat =llh, =xyz or"),
         ("sdeu(m)", "other(m)", r"rover\.pos: column 'sdeu\(m\)' is missing"),
         ("GPST", "LOCAL", r"rover\.pos, line 6: stands under no header"),
         ("2024/03/05 10:00:00.250", "2024/13/05 10:00:00.250", r"rover\.pos, line 7: .* is no date and time"),

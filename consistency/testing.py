@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Comparison, Record, Settings, Verdict, gate_runs, judge
 from consistency.referee.diagnostics.comparison import FEWEST
-from consistency.referee.gating.checks import checked, of_results, planned_dof
+from consistency.referee.gating.checks import checked, of_results, planned_dof, shares
 from consistency.referee.gating.comparing import Sides, of_arrays, of_filters
 from consistency.referee.gating.watch import DEFAULTS, Entry, Terms, current, terms
 from consistency.referee.gating.wording import fault_text, few_to_compare, undecided_text
@@ -45,6 +45,7 @@ def assert_consistent(
     errors: ArrayLike | Results | None = None,
     covariances: ArrayLike | None = None,
     *,
+    deviations: ArrayLike | None = None,
     filter: str | None = None,
     nees: ArrayLike | None = None,
     dof: int | None = None,
@@ -76,6 +77,8 @@ def assert_consistent(
     errors : (runs, steps, n), truth minus estimate, angles wrapped; or the results of ``consistency.run_trials``,
         with ``filter`` the name of one in them. Steps without a truth are masked (``numpy.ma``) and do not count
     covariances : (runs, steps, n, n), in the squared units of the errors
+    deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
+        judged by itself, at a false-alarm rate that all share, see :func:`consistency.judge`
     nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances
     false_alarm : chance to fail a right filter; 0.001 unless an argument, marker or session sets it
     detect : ratio of true to stated covariance, in all steps, that must not pass (1.5)
@@ -87,7 +90,8 @@ def assert_consistent(
     axes : names of the n components
     subsets : further groups of components to look at, name -> indices
     method : of the band over all steps, see :func:`consistency.diagnostics.simultaneous_band`
-    innovations, innovation_covariances : (runs, steps, m), (runs, steps, m, m); all NaN in steps without any
+    innovations, innovation_covariances : (runs, steps, m), (runs, steps, m, m); all NaN in steps without any, or masked
+        (``numpy.ma``), so that all NaN is a failed run
     nis, nis_dof : (runs, steps); nis_dof is 0 in steps without any, and may be one number
     optimal_gain : True judges the innovations: they are those of an optimal gain, and none was gated away
     skip : first steps of each run to leave out of the statistics (20), of results also seconds ("2s"); a number that
@@ -102,8 +106,8 @@ def assert_consistent(
     ------
     ConsistencyError
         A fault at the stated false-alarm rate, however few the runs; or failed runs: of results, and those whose error
-        is not finite or whose covariance is not positive definite. Steps in which the covariance is singular, as at a
-        start that is known exactly, are left out up to the first of full rank.
+        or innovation is not finite or whose covariance of either is not positive definite. Steps in which the
+        covariance is singular, as at a start that is known exactly, are left out up to the first of full rank.
     InsufficientTrials
         No fault, and too few runs to show that the ratio is in [1 / ``detect``, ``detect``], or that few runs are lost;
         :func:`consistency.diagnostics.gate_runs` gives a number that suffices for nearly every right filter.
@@ -114,7 +118,7 @@ def assert_consistent(
     __tracebackhide__ = True
     demand = terms(false_alarm, detect, power, allow, tolerance, lost)
     arrays: dict[str, Any] = {
-        "covariances": covariances, "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
+        "covariances": covariances, "deviations": deviations, "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
         "innovations": innovations, "innovation_covariances": innovation_covariances, "axes": axes,
     }  # fmt: skip
     if filter is not None or hasattr(errors, "estimates"):
@@ -135,7 +139,9 @@ def assert_consistent(
         return _Look(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
-        return gate_runs(planned_dof(record), demand.detect, rate, demand.power, demand.allow, demand.lost)
+        return gate_runs(
+            planned_dof(record), demand.detect, rate / shares(record), demand.power, demand.allow, demand.lost
+        )
 
     result = _settle("assert_consistent", record, demand, look, needed)
     assert result.verdict is not None
@@ -148,6 +154,8 @@ def assert_not_worse(
     errors_b: ArrayLike | None = None,
     covariances_b: ArrayLike | None = None,
     *,
+    deviations_a: ArrayLike | None = None,
+    deviations_b: ArrayLike | None = None,
     filter: str | None = None,
     than: str | None = None,
     reference: Results | Baseline | str | Path | None = None,
@@ -169,6 +177,8 @@ def assert_not_worse(
     Parameters
     ----------
     errors_a, covariances_a, errors_b, covariances_b : as in :func:`assert_consistent`; row i of both is one trial
+    deviations_a, deviations_b : in place of covariances, as in :func:`assert_consistent`; the mean NEES without cross
+        terms is that of a right filter under any correlation
     nees_a, nees_b, dof : (runs, steps) and the dimension of the error, in place of them
     filter, than : names of the candidate and its reference, in results given as ``errors_a``
     reference : other results, or a baseline or its file, in place of the same results; ``than`` is then ``filter``
@@ -192,8 +202,9 @@ def assert_not_worse(
     __tracebackhide__ = True
     demand = terms(false_alarm, detect, power, None)
     arrays: dict[str, Any] = {
-        "covariances_a": covariances_a, "errors_b": errors_b, "covariances_b": covariances_b, "nees_a": nees_a,
-        "nees_b": nees_b, "dof": dof, "axes": axes,
+        "covariances_a": covariances_a, "errors_b": errors_b, "covariances_b": covariances_b,
+        "deviations_a": deviations_a, "deviations_b": deviations_b, "nees_a": nees_a, "nees_b": nees_b, "dof": dof,
+        "axes": axes,
     }  # fmt: skip
     if filter is not None or hasattr(errors_a, "estimates"):
         _refuse(arrays, "results bring their own; the reference is named by than and reference")
@@ -204,8 +215,8 @@ def assert_not_worse(
         if nees_a is not None and dof is None:
             dof = current().marked.get("dof")
         both: dict[str, Any] = {"dof": dof, "axes": axes, "skip": skip}
-        a = {"errors": errors_a, "covariances": covariances_a, "nees": nees_a, **both}
-        b = {"errors": errors_b, "covariances": covariances_b, "nees": nees_b, **both}
+        a = {"errors": errors_a, "covariances": covariances_a, "deviations": deviations_a, "nees": nees_a, **both}
+        b = {"errors": errors_b, "covariances": covariances_b, "deviations": deviations_b, "nees": nees_b, **both}
         sides = of_arrays(name or "the candidate", a, b)
     return _compare(sides, demand)
 
@@ -277,7 +288,8 @@ def _settle(
         if result.verdict is None:
             text = few_to_compare(gate, record.name, runs, least, demand)
         else:
-            text = undecided_text(gate, record.name, result.reasons[0], least, dof, demand)
+            each = replace(demand, false_alarm=demand.false_alarm / shares(record))
+            text = undecided_text(gate, record.name, result.reasons[0], least, dof, each)
             text += _marker_text(dof, runs)
         raise InsufficientTrials(text, least, runs, result.verdict)
     return result
@@ -323,9 +335,9 @@ def _entry(
         gate=gate, name=record.name, outcome=outcome, p_value=_finite(result.p_value),
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
-        runs=len(record.run_numbers), needed=least, dof=planned_dof(record), detect=demand.detect, power=demand.power,
-        allow=demand.allow, lost=demand.lost, late={} if late is None else _summary(late), statistics=statistics,
-        **fields,
+        runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=shares(record),
+        detect=demand.detect, power=demand.power, allow=demand.allow, lost=demand.lost,
+        late={} if late is None else _summary(late), statistics=statistics, **fields,
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.diagnostics import Comparison, Record, RunSummary, compare, summary
 from consistency.referee.diagnostics.comparison import FailedRuns
 from consistency.referee.diagnostics.skipping import Skip
-from consistency.referee.gating.checks import checked, of_results, planned_dof
+from consistency.referee.gating.checks import checked, of_results
 from consistency.referee.parsing.columns import POSE
 
 if TYPE_CHECKING:
@@ -82,8 +82,8 @@ def of_arrays(name: str, candidate: Mapping[str, Any], reference: Mapping[str, A
     m, n = len(a.run_numbers), len(b.run_numbers)
     if m != n:
         raise ValueError(f"the candidate has {m} runs and the reference {n}; row i of both must be one trial")
-    if planned_dof(a) != planned_dof(b):
-        raise ValueError(f"the errors have {planned_dof(a)} and {planned_dof(b)} components")
+    if a.dof != b.dof:
+        raise ValueError(f"the errors have {a.dof} and {b.dof} components")
     failures = FailedRuns(len(a.failures), len(b.failures))
     return Sides(a, row_a, row_b, "the reference", tuple(a.axes) or None, paired=True, failures=failures)
 

@@ -114,7 +114,7 @@ def needed_at(entry: Entry, rate: float) -> int:
     from consistency.referee.diagnostics import Comparison, gate_runs
 
     if entry.standard_error is None:
-        return gate_runs(entry.dof, entry.detect, rate, entry.power, entry.allow, entry.lost)
+        return gate_runs(entry.dof, entry.detect, rate / entry.parts, entry.power, entry.allow, entry.lost)
     comparison = Comparison(entry.runs, True, (), 0.0, entry.standard_error, 1.0, rate, **entry.spread)
     return comparison.needed_runs(entry.detect, entry.power)
 

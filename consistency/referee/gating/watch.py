@@ -40,6 +40,7 @@ class Entry:
     threshold: list[float | None] = field(default_factory=list)
     inflation: float | None = None
     inflation_interval: list[float | None] = field(default_factory=list)
+    parts: int = 1  # that share the false-alarm rate: components whose cross terms are not stated
     axis: str | None = None  # that decides the status; None where the whole does
     axis_ratio: list[float | None] = field(default_factory=list)
     first_step: int | None = None

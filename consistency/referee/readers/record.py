@@ -71,7 +71,7 @@ def assemble(
     notes = list(notes)
     failures, parts, skipped = [], [], 0
     for track in tracks:
-        start, end, reason = _judged(track)
+        start, end, reason = judged_rows(track)
         if reason:
             failures.append(Failure(name, track.run, int(track.column[end]) + 1, f"{reason} ({track.place[end]})"))
         skipped += start
@@ -146,8 +146,8 @@ def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     return out
 
 
-def _judged(track: Track) -> tuple[int, int, str]:
-    """First row with a covariance of full rank, first broken row, and why it is broken."""
+def judged_rows(track: Track, what: str = "estimate") -> tuple[int, int, str]:
+    """First row with a covariance of full rank, first broken row, and why it is broken: ``what`` is not finite, ..."""
     rows = len(track.column)
     error_ok: Array = np.all(np.isfinite(np.zeros((rows, 1)) if track.error is None else track.error), axis=1)
     kind = np.zeros(rows, int) if track.covariance is None else classify(track.covariance, ROUNDED)
@@ -159,7 +159,7 @@ def _judged(track: Track) -> tuple[int, int, str]:
         return start, rows, ""
     end = int(np.argmax(bad))
     if not error_ok[end]:
-        reason = "estimate is not finite"
+        reason = f"{what} is not finite"
     elif kind[end] == Validity.NOT_FINITE:
         reason = "covariance is not finite"
     else:

@@ -6,6 +6,7 @@ Verdicts on right estimators are at a rate of 1e-6 each, or are counted against 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ from draws import independent
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.diagnostics import Record, Settings, judge
+from consistency.referee.diagnostics import Record, Settings, gate_runs, judge
 from consistency.referee.diagnostics.parts import diagonal, each_alone
+from consistency.referee.gating.session import needed_at
+from consistency.referee.gating.watch import Entry, Watch, watching
 from consistency.referee.types import Array
+from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 SURE = 1e-6
 RATE = 0.2  # high, so that few draws show a rate that is too high
@@ -149,3 +153,45 @@ def test_misuse_is_refused(rng: np.random.Generator) -> None:
 def test_rows_that_are_runs(rng: np.random.Generator) -> None:
     error = correlated(rng, 300, 1)[:, 0]
     assert cs.judge(error, deviations=np.ones(error.shape), independent=True, false_alarm=SURE).runs == 300
+
+
+# --- gates -----------------------------------------------------------------------------------------
+
+
+def test_a_gate_judges_deviations_as_files_and_arrays_are(rng: np.random.Generator) -> None:
+    error = correlated(rng)
+    verdict = assert_consistent(error, deviations=np.ones(error.shape), axes=["x", "y", "z"], false_alarm=SURE)
+    assert verdict.reasons == replace(of_deviations(error), filter=verdict.filter).reasons
+    stated = np.ones(error.shape) * [1.0, 0.5, 1.0]
+    with pytest.raises(ConsistencyError, match="overconfident: y: covariance too small by x") as caught:
+        assert_consistent(error, deviations=stated, axes=["x", "y", "z"], false_alarm=SURE)
+    assert caught.value.verdict is not None
+    assert [name for name, part in caught.value.verdict.parts.items() if part.faults] == ["y"]
+    error[4, 5:] = np.nan
+    with pytest.raises(ConsistencyError, match="1 of 60 runs failed, first run 4 in step 6"):
+        assert_consistent(error, deviations=np.ones(error.shape), false_alarm=SURE)
+
+
+@pytest.mark.parametrize("innovations", [False, True])
+def test_a_gate_plans_for_parts_that_share_the_rate(innovations: bool, rng: np.random.Generator) -> None:
+    error = correlated(rng, 9, 3)
+    kept: list[Entry] = []
+    more: dict[str, Any] = {"nis": rng.chisquare(2, (9, 3)), "nis_dof": 2, "optimal_gain": True} if innovations else {}
+    needed = gate_runs(1, 1.5, SURE / (3 + innovations), 0.95)
+    with watching(Watch(keep=kept.append)), pytest.raises(InsufficientTrials, match=f"Simulate {needed} ") as caught:
+        assert_consistent(error, deviations=np.ones(error.shape), false_alarm=SURE, **more)
+    assert caught.value.needed == needed
+    assert f"consistency plan --dof 1 --detect 1.5 --false-alarm {SURE / (3 + innovations)!r}" in str(caught.value)
+    assert needed_at(kept[0], 0.1 * SURE) == gate_runs(1, 1.5, 0.1 * SURE / (3 + innovations), 0.95)
+
+
+def test_two_estimators_that_state_deviations(rng: np.random.Generator) -> None:
+    error = correlated(rng)
+    right, small = np.ones(error.shape), np.full(error.shape, 0.5)
+    assert not assert_not_worse(error, None, error, deviations_a=right, deviations_b=small, detect=9.0).worse
+    with pytest.raises(ConsistencyError, match="worse than the reference"):
+        assert_not_worse(error, None, error, deviations_a=small, deviations_b=right, false_alarm=SURE)
+    whole = {"covariances_b": diagonal(right), "deviations_a": right, "false_alarm": SURE}
+    assert not assert_not_worse(error, None, error, **whole).worse  # the same matrices: no chance in it
+    with pytest.raises(ValueError, match="the errors have 2 and 3 components"):
+        assert_not_worse(error[..., :2], None, error, deviations_a=right[..., :2], deviations_b=right)

@@ -268,7 +268,7 @@ def test_innovations_end_with_a_failed_run(rng: np.random.Generator) -> None:
     nis[4, 6:] = np.nan
     v, S = rng.normal(size=(RUNS, 8, 2)), np.broadcast_to(np.eye(2), (RUNS, 8, 2, 2)).copy()
     S[4, 7], v[4, 7, 0] = -1.0, np.nan
-    for arrays in ({"nis": nis, "nis_dof": 2}, {"innovations": v, "innovation_covariances": S}):
+    for step, arrays in ((7, {"nis": nis, "nis_dof": 2}), (8, {"innovations": v, "innovation_covariances": S})):
         record = checked("f", errors, covariances, **arrays)
         assert record.nis is not None
         assert np.isnan(record.nis[4]).tolist() == [False] * 6 + [True] * 2
@@ -276,8 +276,81 @@ def test_innovations_end_with_a_failed_run(rng: np.random.Generator) -> None:
         assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
         with pytest.raises(ConsistencyError, match="1 of"):
             assert_consistent(errors, covariances, **arrays, false_alarm=RARE)
-        with pytest.raises(ValueError, match="not finite in run 4"):
-            assert_consistent(np.nan_to_num(errors), covariances, **arrays)
+        with pytest.raises(ConsistencyError, match=rf"first run 4 in step {step}: (NIS|innovation) is not finite"):
+            assert_consistent(np.nan_to_num(errors), covariances, **arrays, false_alarm=RARE)
+
+
+def broken_innovations(what: str, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Right innovations but for runs 4 and 9, which break down in step 7."""
+    v, S = rng.normal(size=(40, 50, 2)), np.broadcast_to(np.eye(2), (40, 50, 2, 2)).copy()
+    broken = np.isin(np.arange(40), (4, 9))[:, None] & (np.arange(50) >= 6)
+    if what == "masked":
+        v[broken] = np.nan
+        v = np.ma.masked_array(v, np.broadcast_to((np.arange(50) == 3)[:, None], v.shape))  # not measured in step 4
+    elif what == "innovation":
+        v[broken] = [0.0, np.inf]
+    else:
+        S[broken] = {"indefinite": [[1, 0], [0, -0.1]], "singular": [[1, 1], [1, 1]], "NaN": np.nan}[what]
+    return v, S
+
+
+@pytest.mark.parametrize(("what", "reason"), [
+    ("indefinite", "innovation covariance is not positive definite"),
+    ("singular", "innovation covariance is not positive definite"),
+    ("NaN", "innovation covariance is not finite"),
+    ("innovation", "innovation is not finite"),
+    ("masked", "innovation is not finite"),
+])  # fmt: skip
+def test_runs_fail_by_their_innovations(what: str, reason: str, rng: np.random.Generator) -> None:
+    v, S = broken_innovations(what, rng)
+    with pytest.raises(ConsistencyError, match=f"2 of 40 runs failed, first run 4 in step 7: {reason}") as caught:
+        assert_consistent(innovations=v, innovation_covariances=S, false_alarm=RARE, **OPTIMAL)
+    verdict = caught.value.verdict
+    assert verdict is not None
+    assert verdict.status == "failed"
+    assert verdict.innovations is not None
+    assert verdict.innovations.dof == 2 * (40 * 50 - 2 * 44) - 80 * (what == "masked")
+    assert verdict.innovations.ratio == pytest.approx(1.0, abs=0.2)  # of the rest; 6 standard errors
+    errors, covariances = spoilt("", rng, 40)
+    own = checked("f", errors, covariances, innovations=v[:, :8], innovation_covariances=S[:, :8])
+    assert own.nees is not None
+    assert np.isnan(own.nees).sum(axis=1).tolist() == [2 * (run in (4, 9)) for run in range(40)]
+    assert [(each.run, each.step) for each in own.failures] == [(4, 7), (9, 7)]
+
+
+def test_a_run_fails_where_anything_of_it_failed_first(rng: np.random.Generator) -> None:
+    errors, covariances = spoilt("error", rng, 20)  # run 4 in step 7
+    v, S = rng.normal(size=(20, 8, 1)), np.ones((20, 8, 1, 1))
+    S[4, 2], S[3, 7] = -1.0, np.nan
+    record = checked("f", errors, covariances, innovations=v, innovation_covariances=S)
+    assert [(each.run, each.step, "innovation" in each.reason) for each in record.failures] == [
+        (3, 8, True),
+        (4, 3, True),
+    ]
+    assert record.error is not None
+    assert record.nis_dof is not None
+    assert np.isfinite(record.error[4]).all(axis=-1).tolist() == [True] * 2 + [False] * 6
+    assert record.nis_dof[[3, 4]].tolist() == [[1] * 7 + [0], [1] * 2 + [0] * 6]
+
+
+def test_misuse_of_innovations_is_no_failed_run(rng: np.random.Generator) -> None:
+    v, S = rng.normal(size=(6, 8, 2)), np.broadcast_to(np.eye(2), (6, 8, 2, 2))
+
+    def refused(match: str, v: Array, S: Array) -> None:
+        with pytest.raises(ValueError, match=match):
+            assert_consistent(innovations=v, innovation_covariances=S, **OPTIMAL)
+
+    turned, nowhere, never = S.copy(), S.copy(), v.copy()
+    turned[2, 4, 0, 1], nowhere[:, 3], never[:, 5, 1] = 0.1, np.nan, np.nan
+    refused("innovation_covariances, run 2, step 5: the covariance is not symmetric", v, turned)
+    refused("innovation_covariances, step 4: not finite in any run", v, nowhere)
+    refused("innovations, step 6: not finite in any run", never, S)
+    known = S.copy()
+    known[:, 0] = 0.0  # a start that is known exactly, and a measurement without noise
+    record = checked("f", innovations=v, innovation_covariances=known, optimal_gain=True)
+    assert record.failures == ()
+    assert record.nis_dof is not None
+    assert record.nis_dof[0].tolist() == [0] + [2] * 7
 
 
 def test_misuse_is_no_failed_run(rng: np.random.Generator) -> None:
@@ -328,7 +401,12 @@ E, P = np.random.default_rng(0).normal(size=(4, 2, 3)), np.broadcast_to(np.eye(3
         ({"nees": E[..., 0] ** 2, "dof": 3, "axes": ["a", "b", "c"]}, "axes needs errors and covariances"),
         ({"nis": E[..., 0]}, "give nis and nis_dof together"),
         ({"nis": E[..., 0] ** 2, "nis_dof": 1.5}, "whole numbers"),
-        ({"nis": E[..., 0] * np.nan, "nis_dof": 1}, "nis: not finite in run 0, step 1"),
+        ({"nis": E[..., 0] * np.nan, "nis_dof": 1}, "nis, step 1: not finite in any run"),
+        ({"nis": -(E[..., 0] ** 2), "nis_dof": 1}, "nis: negative in run 0, step 1"),
+        ({"errors": E, "covariances": P, "deviations": E}, "covariances or deviations, not both"),
+        ({"deviations": E}, "deviations without errors"),
+        ({"errors": E, "deviations": E[:2]}, "deviations has shape (2, 2, 3), needs that of errors"),
+        ({"errors": E, "deviations": np.ones(E.shape), "subsets": {"a": [0]}}, "subsets needs covariances"),
         ({"innovations": E}, "give innovations and innovation_covariances together"),
         ({"innovations": E, "innovation_covariances": E}, "(runs, steps, m) and (runs, steps, m, m)"),
         ({"errors": E, "covariances": P, "nis": E[:2, :, 0] ** 2, "nis_dof": 1}, "nis has (2, 2) runs and steps"),

@@ -10,18 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.scenario import (
-    Circle,
-    FigureOfEight,
-    Path_,
-    RoundedRectangle,
-    Scenario,
-    Truth,
-    UniformLandmarks,
-    UvdSensor,
-    misbelief,
-)
-from consistency.bench.simulation.path import lap_length, planned_path
+from consistency.bench.scenario import Scenario, Truth, UniformLandmarks, UvdSensor, misbelief
+from consistency.bench.simulation.variation import SHAPES, course_of, mount_of
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_toml
 from consistency.referee.types import Array
@@ -29,7 +19,6 @@ from consistency.referee.types import Array
 Value = float | int | str
 Point = tuple[Value, ...]  # a value of every dimension
 
-SHAPES = ("circle", "rounded-rectangle", "figure-of-eight")
 SEEDS = 64  # sets of landmarks beside that of the base
 DIGITS = 2  # significant ones of a value that is not the base's: a file is read by people
 # bounds as factors of the base's value: twice the noise, three times the range; a denser world costs too much
@@ -289,9 +278,8 @@ def _changes(base: Scenario, values: Mapping[str, Value]) -> dict[str, Any]:
     if "dt" in values:
         changes["truth__dt"] = float(values["dt"])
     if "tilt" in values or "height" in values:
-        (x, y, z), (roll, pitch, heading) = truth.sensor.mount.position, truth.sensor.mount.rotation
-        tilt = float(np.deg2rad(float(values["tilt"]))) if "tilt" in values else pitch
-        mount = {"position": (x, y, float(values.get("height", z))), "rotation": (roll, tilt, heading)}
+        tilt, height = (float(values[name]) if name in values else None for name in ("tilt", "height"))
+        mount = mount_of(truth.sensor, tilt, height)
         changes |= {f"{half}__sensor__mount": mount for half in ("truth", "belief")}
     if "range" in values:
         changes["truth__sensor__range"] = (truth.sensor.range[0], float(values["range"]))
@@ -310,39 +298,11 @@ def _landmarks(truth: Truth, values: Mapping[str, Value]) -> dict[str, Any]:
     landmarks, changes = truth.landmarks, dict[str, Any]()
     if not isinstance(landmarks, UniformLandmarks):
         return changes
-    box, area = np.array([landmarks.x, landmarks.y]), 1.0
+    count: float = landmarks.count
     if "path" in values or "lap" in values:
-        path = _path(str(values.get("path", truth.path.shape)), truth, float(values.get("lap", 1.0)))
-        margin = box - _extent(truth)
-        other = np.round(_extent(truth.model_copy(update={"path": path})) + margin.mean(axis=0), 1)
-        area = float(np.prod(other[:, 1] - other[:, 0]) / np.prod(box[:, 1] - box[:, 0]))
-        changes |= {"truth__path": path.model_dump()}
-        changes |= {f"truth__landmarks__{axis}": tuple(map(float, other[i])) for i, axis in enumerate("xy")}
-    count = max(1, round(landmarks.count * area * float(values.get("density", 1.0))))
+        shape = str(values.get("path", truth.path.shape))
+        path, x, y, count = course_of(truth, shape, float(values.get("lap", 1.0)))
+        changes |= {"truth__path": path.model_dump(), "truth__landmarks__x": x, "truth__landmarks__y": y}
+    count = max(1, round(count * float(values.get("density", 1.0))))
     changes |= {"truth__landmarks__count": count} if count != landmarks.count else {}
     return changes | ({"truth__landmarks__seed": int(values["seed"])} if "seed" in values else {})
-
-
-def _path(shape: str, truth: Truth, lap: float = 1.0) -> Path_:
-    """A path of another shape about the centre of the base, ``lap`` times as long, with sides of 8 to 5."""
-    length, (x, y) = lap * lap_length(truth.path), np.round(_extent(truth).mean(axis=1), 1)
-    speed = truth.path.speed
-    if shape == "circle":
-        radius = round(length / (2 * np.pi), 2)
-        return Circle(shape="circle", radius=radius, start=(x + radius, y), heading=np.pi / 2, speed=speed)
-    if shape == "figure-of-eight":
-        radius = round(length / (4 * np.pi), 2)
-        return FigureOfEight(shape="figure-of-eight", radius=radius, start=(x, y), heading=0.0, speed=speed)
-    corner = round(length / 25, 2)
-    long, wide = (round((length + (8 - 2 * np.pi) * corner) * side / 26, 2) for side in (8, 5))
-    return RoundedRectangle(
-        shape="rounded-rectangle", length=long, width=wide, corner_radius=corner, start=(x, y - wide / 2), heading=0.0,
-        speed=speed,
-    )  # fmt: skip
-
-
-def _extent(truth: Truth) -> Array:
-    """Smallest and largest x and y of one lap of the path, (2, 2)."""
-    steps = int(np.ceil(lap_length(truth.path) / truth.path.speed / truth.dt))
-    path = planned_path(truth.model_copy(update={"steps": steps}))
-    return np.column_stack([path[:, :2].min(axis=0), path[:, :2].max(axis=0)])

@@ -47,6 +47,8 @@ RECURSIVE := ekf-uvd ukf-uvd parked-ekf-uvd robocentric-ekf-uvd anchored-ekf-uvd
 regime: .venv/.done
 	$(BIN)/consistency sweep regime $(addprefix --filter ,$(RECURSIVE)) --out reports/regime
 	cp reports/regime/map.json reports/reference/regime.json
+	$(BIN)/consistency sweep beyond --out reports/beyond
+	cp reports/beyond/map.json reports/reference/beyond.json
 
 case-studies:
 	$(PYTHON) docs/case-studies/run.py $(ONLY)

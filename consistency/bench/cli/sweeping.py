@@ -95,8 +95,13 @@ def recommend(
     density: Annotated[
         float | None, typer.Option("--density", help="Landmarks on a square metre, as seen from above.")
     ] = None,
+    dt: Annotated[float | None, typer.Option("--dt", help="Seconds from step to step.")] = None,
     map_: Annotated[
-        Path | None, typer.Option("--map", help="Folder of 'sweep', or its map.json [the shipped map].")
+        list[Path] | None,
+        typer.Option(
+            "--map",
+            help="Folder of 'sweep', or its map.json; a second one may have axes that vary alone [the shipped maps].",
+        ),
     ] = None,
     runs: Annotated[
         int | None,
@@ -110,12 +115,13 @@ def recommend(
     """Which filter to trust on one rig: looked up in a map, and confirmed by runs of that rig."""
     from consistency.bench.sweeps.printing import advice_blocks, advice_json
     from consistency.bench.sweeps.recommend import recommend_for
-    from consistency.bench.sweeps.regime import read_regime
+    from consistency.bench.sweeps.regime import read_maps
     from consistency.bench.sweeps.rig import Request
     from consistency.referee.show import terminal
 
-    request = Request(rig, range_, speed, density)
-    advice = recommend_for(request, read_regime(map_), runs, confirm, seed, jobs)
+    request = Request(rig, range_, speed, density, dt)
+    regime, alone = read_maps(map_ or ())
+    advice = recommend_for(request, regime, runs, confirm, seed, jobs, alone)
     if as_json:
         print(json.dumps(advice_json(advice), indent=2, allow_nan=False))
     else:

@@ -33,22 +33,47 @@ PAPER_TITLE, LINE = 52, 0.12  # characters of a title above half a page, and inc
 ROOM = 5  # rows of tiles on a sheet of paper, about
 
 
-def heat_axes(regime: Regime) -> tuple[list[GridAxis], list[GridAxis]]:
-    """Two axes for the sides of a heat map, numbers first, and the others, one map for each of their values."""
-    long = [axis for axis in regime.sweep.axes if len(axis.values) > 1]
-    sides = (sorted(long, key=lambda axis: not axis.numeric) or list(regime.sweep.axes))[:2]
-    return sides, [axis for axis in regime.sweep.axes if axis not in sides]
+View = tuple[list[GridAxis], list[tuple[GridAxis, int]]]  # axes for the sides of a panel, and a place on each other one
+
+
+def views(regime: Regime, numbers: bool = False) -> list[View]:
+    """Panels that show all cells; two axes of the grid are their sides, or one and an axis that varies alone.
+
+    Parameters
+    ----------
+    numbers : leave out panels whose sides would not be numbers
+    """
+    sweep = regime.sweep
+    grid = sorted((a for a in sweep.grid if len(a.values) > 1), key=lambda axis: not axis.numeric)
+    grid = [axis for axis in grid if axis.numeric or not numbers]
+    sets = [[axis, *grid[:1]] for axis in sweep.alone] or [grid[:2] or list(sweep.axes)[: 0 if numbers else 2]]
+    found: list[View] = []
+    for sides in (sides for sides in sets if sides and (sides[0].numeric or not numbers)):
+        others = [axis for axis in sweep.axes if axis not in sides]
+        places = itertools.product(*(range(len(a.values)) if a.home is None else (a.home,) for a in others))
+        found += [(sides, list(zip(others, at, strict=True))) for at in places]
+    return found
+
+
+def cells_of(regime: Regime, fixed: Sequence[tuple[GridAxis, int]]) -> list[Cell]:
+    """Cells at one place on each of some axes."""
+    places = [(regime.sweep.axes.index(axis), i) for axis, i in fixed]
+    return [cell for cell in regime.sweep.cells if all(cell.indices[k] == i for k, i in places)]
+
+
+def title_of(fixed: Sequence[tuple[GridAxis, int]]) -> str:
+    """Values on the axes of a grid that a panel does not show."""
+    shown = ((axis, i) for axis, i in fixed if axis.home is None and len(axis.values) > 1)
+    return ", ".join(f"{axis.key.rpartition('.')[2]} {axis.say(i)}" for axis, i in shown)
 
 
 def heat_figure(regime: Regime, name: str) -> Figure:
     """All heat maps of one filter."""
-    sides, facets = heat_axes(regime)
-    panels = tuple(
-        _panel(regime, name, sides, list(zip(facets, at, strict=True)))
-        for at in itertools.product(*(range(len(axis.values)) for axis in facets))
-    )
-    rows = len(sides[1].values) if len(sides) > 1 else 1
-    columns = 1 if len(panels) == 1 or len(sides[0].values) > 6 else 2
+    found = views(regime)
+    panels = tuple(_panel(regime, name, sides, fixed) for sides, fixed in found)
+    rows = max(len(sides[1].values) if len(sides) > 1 else 1 for sides, _ in found)
+    widest = max(len(sides[0].values) for sides, _ in found)
+    columns = 1 if len(panels) == 1 or widest > 6 else 2
     most = columns * max(1, ROOM * 3 // (rows + 2))
     ends = ((f"{FULL:g} and more: overconfident", LARGE), (f"1/{FULL:g} and less: conservative", SMALL))
     keys = tuple(Key(text, Look(colour), "band") for text, colour in (*ends, ("no ratio", NOTHING)))
@@ -73,10 +98,8 @@ def on_paper(title: str, width: int) -> str:
 
 def _panel(regime: Regime, name: str, sides: Sequence[GridAxis], at: Sequence[tuple[GridAxis, int]]) -> Panel:
     """The heat map at one place on each other axis."""
-    places = [regime.sweep.axes.index(axis) for axis in sides]
-    cells = [cell for cell in regime.sweep.cells if all(cell.indices[regime.sweep.axes.index(a)] == i for a, i in at)]
-    found = [(cell, regime.results[cell.number, name]) for cell in cells if (cell.number, name) in regime.results]
-    title = ", ".join(f"{axis.key.rpartition('.')[2]} {axis.say(i)}" for axis, i in at if len(axis.values) > 1)
+    places, title = [regime.sweep.axes.index(axis) for axis in sides], title_of(at)
+    found = [(c, regime.results[c.number, name]) for c in cells_of(regime, at) if (c.number, name) in regime.results]
     second = _side(sides[1]) if len(sides) > 1 else Axis("", rows=("",))
     words = f" with {title}" if title else ""
     return Panel(

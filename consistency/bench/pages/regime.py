@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.bench.pages.heat import PAPER_TITLE, heat_figure, on_paper
+from consistency.bench.pages.heat import PAPER_TITLE, cells_of, heat_figure, on_paper, title_of, views
 from consistency.bench.sweeps import axes as grid
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell as GridCell
+from consistency.bench.sweeps.plan import text_alone
 from consistency.bench.sweeps.printing import by_verdict
 from consistency.bench.sweeps.regime import Regime
 from consistency.referee.diagnostics.verdict_parts import STATUSES
@@ -114,21 +115,35 @@ def _summary(regime: Regime) -> Table:
 
 def _rigs(regime: Regime) -> Table:
     """Table with a row for each cell: the filters that are consistent there, by RMSE and then cost."""
-    shown, facets = _shown(regime)
+    alone = regime.sweep.alone
+    shown = [axis for axis in regime.sweep.grid if alone or axis in _sides(regime)]
+    facets = [axis for axis in regime.sweep.grid if axis not in shown]
     columns = (
         *(Column(_short(axis.key).capitalize(), number=True) for axis in shown),
+        *((Column("Otherwise"),) if alone else ()),
         Column("Filters to trust: RMSE, cost", width="1fr"), Column("Others", width="1fr"),
     )  # fmt: skip
     groups = []
-    for title, cells in _by_facet(regime, facets):
-        rows = tuple((*_values(regime, shown, cell), _trusted(regime, cell), _others(regime, cell)) for cell in cells)
+    for at in itertools.product(*(range(len(axis.values)) for axis in facets)):
+        fixed = list(zip(facets, at, strict=True))
+        title = ", ".join(f"{_short(axis.key)} {axis.say(i)}" for axis, i in fixed)
+        rows = tuple(
+            (*_values(regime, shown, cell), _trusted(regime, cell), _others(regime, cell))
+            for cell in cells_of(regime, fixed)
+        )
         groups.append((title, rows))
     caption = "Filters by RMSE of the position; of those that differ by 2 % or less the cheaper one first."
     return Table(columns, tuple(groups), "Filters to trust for each rig", caption=caption, style="grouped")
 
 
+def _sides(regime: Regime) -> list[grid.Axis]:
+    return next((sides for sides, _ in views(regime, numbers=True)), [])
+
+
 def _values(regime: Regime, shown: list[grid.Axis], cell: GridCell) -> list[str]:
-    return [axis.say(cell.indices[regime.sweep.axes.index(axis)]) for axis in shown]
+    sweep = regime.sweep
+    values = [axis.say(cell.indices[sweep.axes.index(axis)]) for axis in shown]
+    return [*values, text_alone(sweep, cell)] if sweep.alone else values
 
 
 def _trusted(regime: Regime, cell: GridCell) -> Cell:
@@ -150,7 +165,10 @@ def _others(regime: Regime, cell: GridCell) -> str:
 
 def _provenance(regime: Regime) -> tuple[Block, ...]:
     sweep = regime.sweep
-    grid_rows = [(f"Grid: {axis.text}", ", ".join(map(axis.say, range(len(axis.values))))) for axis in sweep.axes]
+    grid_rows = [
+        (f"{axis.table.capitalize()}: {axis.text}", ", ".join(map(axis.say, range(len(axis.values)))))
+        for axis in sweep.axes
+    ]
     rows = [("World", f"{sweep.base.name}: {sweep.base.summary}"), *grid_rows, ("Seed", str(sweep.seed))]
     return (Facts((*rows, *facts(dict(regime.manifest)))),)
 
@@ -162,32 +180,15 @@ def _short(key: str) -> str:
     return key.rpartition(".")[2]
 
 
-def _shown(regime: Regime) -> tuple[list[grid.Axis], list[grid.Axis]]:
-    """The first two axes of numbers, which panels have, and the others, one panel for each of their values."""
-    shown = [axis for axis in regime.sweep.axes if axis.numeric and len(axis.values) > 1][:2]
-    return shown, [axis for axis in regime.sweep.axes if axis not in shown]
-
-
-def _by_facet(regime: Regime, facets: list[grid.Axis]) -> list[tuple[str, list[GridCell]]]:
-    """Cells with equal values on all ``facets``, and those values in words."""
-    places = [regime.sweep.axes.index(axis) for axis in facets]
-    groups = []
-    for at in itertools.product(*(range(len(axis.values)) for axis in facets)):
-        cells = [
-            cell for cell in regime.sweep.cells if all(cell.indices[p] == i for p, i in zip(places, at, strict=True))
-        ]
-        groups.append((", ".join(f"{_short(a.key)} {a.say(i)}" for a, i in zip(facets, at, strict=True)), cells))
-    return groups
-
-
 def _figures(regime: Regime, name: str) -> tuple[Figure, ...]:
     """Verdicts of one filter over two axes, with the RMSE beside them; none without an axis of numbers."""
-    shown, facets = _shown(regime)
-    if not shown:
+    found = views(regime, numbers=True)
+    if not found:
         return ()
-    panels = [panel for title, cells in _by_facet(regime, facets) for panel in _pair(regime, name, shown, title, cells)]
-    found = {r.status for (_, n), r in regime.results.items() if n == name}
-    keys = [Key(status, LOOKS[status], "points") for status in STATUSES if status in found]
+    panels = [panel for sides, fixed in found for panel in _pair(regime, name, sides, fixed)]
+    shown = found[0][0]
+    statuses = {r.status for (_, n), r in regime.results.items() if n == name}
+    keys = [Key(status, LOOKS[status], "points") for status in STATUSES if status in statuses]
     lines = shown[1:] or shown[:0]
     keys += [
         Key(f"RMSE, {_short(axis.key)} {axis.say(i)}", style(i), marked=True)
@@ -208,10 +209,10 @@ def _figures(regime: Regime, name: str) -> tuple[Figure, ...]:
     return (Figure(name, caption, tuple(panels), sheets, tuple(keys), layout="pair", stacked=len(sheets) > 1),)
 
 
-def _pair(regime: Regime, name: str, shown: list[grid.Axis], title: str, cells: list[GridCell]) -> tuple[Panel, Panel]:
-    """The panel of verdicts and the panel of RMSE for one set of cells."""
-    places = [regime.sweep.axes.index(axis) for axis in shown]
-    found = [(cell, regime.results[cell.number, name]) for cell in cells if (cell.number, name) in regime.results]
+def _pair(regime: Regime, name: str, shown: list[grid.Axis], fixed: list[tuple[grid.Axis, int]]) -> tuple[Panel, Panel]:
+    """The panel of verdicts and the panel of RMSE for the cells at one place on each other axis."""
+    places, title = [regime.sweep.axes.index(axis) for axis in shown], title_of(fixed)
+    found = [(c, regime.results[c.number, name]) for c in cells_of(regime, fixed) if (c.number, name) in regime.results]
     x = np.array([shown[0].values[cell.indices[places[0]]] for cell, _ in found], float)
     second = shown[1] if len(shown) > 1 else None
     rows = np.array([cell.indices[places[1]] if second else 0 for cell, _ in found], int)

@@ -19,7 +19,7 @@ class Course(NamedTuple):
     path: Path_
     x: tuple[float, float]  # m
     y: tuple[float, float]  # m
-    count: float  # landmarks that are as dense as before
+    landmarks: float  # number of them that are as dense as before
 
 
 def course_of(truth: Truth, shape: str, lap: float = 1.0) -> Course:

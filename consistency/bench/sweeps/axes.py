@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,20 +13,24 @@ import numpy as np
 from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor
 from consistency.bench.scenario.tables import UNITS
 from consistency.bench.simulation import draw_landmarks
+from consistency.bench.simulation.path import lap_length
+from consistency.bench.simulation.variation import course_of, mount_of
 from consistency.referee.errors import InputError
 
 Changes = dict[str, Any]  # dotted key of the scenario -> value
+SAME_TIME = 0.05  # relative: a drive that takes longer or less long is another one
 BOTH = ("sensor", "motion")  # tables that truth and belief both have: a key of one is set in both
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A named axis, which changes several keys of a scenario together; its values are positive numbers."""
+    """A named axis, which changes several keys of a scenario together; its values are numbers."""
 
     text: str
     unit: str  # m, m/s; × for a multiple of what the base has
     changes: Callable[[Scenario, float], Changes]
     measure: Callable[[Scenario, Scenario], float]  # of a scenario beside the base; NaN where it has none
+    positive: bool = True  # whether values must be
 
 
 def _baseline(base: Scenario, value: float) -> Changes:
@@ -99,6 +104,53 @@ def _noise_ratio(scenario: Scenario, base: Scenario) -> float:
     return float(np.sqrt(np.prod([a / b if b else np.nan for a, b in pairs])))
 
 
+def _mounted(base: Scenario, **place: float) -> Changes:
+    """The key of the mount that a tilt or a height changes, in truth and belief."""
+    key = "rotation" if "tilt" in place else "position"
+    if not isinstance(base.truth.sensor, UvdSensor):
+        raise ValueError(f"a sensor '{base.truth.sensor.model}' has no tilt or height")
+    value = mount_of(base.truth.sensor, **place)[key]
+    return {f"{half}.sensor.mount.{key}": value for half in ("truth", "belief")}
+
+
+def _on_mount(key: str, index: int, scenario: Scenario, base: Scenario) -> float:
+    """One number of the mount; NaN where another of the same key is not that of the base."""
+    sensors = scenario.truth.sensor, base.truth.sensor
+    if not all(isinstance(sensor, UvdSensor) for sensor in sensors):
+        return np.nan
+    own, known = ([*getattr(sensor.mount, key)] for sensor in sensors)
+    value = own.pop(index)
+    known.pop(index)
+    return value if own == known else np.nan
+
+
+def _interval(base: Scenario, value: float) -> Changes:
+    """Fewer steps where each is longer, so that the way stays."""
+    return {"truth.dt": value, "truth.steps": max(1, round(base.truth.steps * base.truth.dt / value))}
+
+
+def _interval_of(scenario: Scenario, base: Scenario) -> float:
+    """Time of a step (s), if all of them take as long as those of the base."""
+    whole, known = (s.truth.steps * s.truth.dt for s in (scenario, base))
+    return scenario.truth.dt if abs(whole / known - 1.0) <= SAME_TIME else np.nan
+
+
+def _loops(base: Scenario, value: float) -> Changes:
+    """A shorter lap of the same shape, of which the same steps make more."""
+    course = course_of(base.truth, base.truth.path.shape, 1.0 / value)
+    path = course.path.model_dump(exclude={"shape", "speed"})
+    return {f"truth.path.{key}": value for key, value in path.items()} | {
+        "truth.landmarks.x": course.x, "truth.landmarks.y": course.y,
+        "truth.landmarks.count": max(1, round(course.landmarks)),
+    }  # fmt: skip
+
+
+def _loops_of(scenario: Scenario, base: Scenario) -> float:
+    """How many laps one of the base's length holds, if they have its shape."""
+    path, known = scenario.truth.path, base.truth.path
+    return lap_length(known) / lap_length(path) if path.shape == known.shape else np.nan
+
+
 QUANTITIES: dict[str, Quantity] = {
     "baseline": Quantity("baseline", "m", _baseline, equivalent_baseline),
     "range": Quantity("range of landmarks", "m", _range, lambda scenario, _: float(scenario.truth.sensor.range[1])),
@@ -109,15 +161,37 @@ QUANTITIES: dict[str, Quantity] = {
     "speed": Quantity(
         "speed", "m/s", lambda _, value: {"truth.path.speed": value}, lambda scenario, _: scenario.truth.path.speed
     ),
+    "dt": Quantity("time of a step", "s", _interval, _interval_of),
+    "tilt": Quantity(
+        "tilt",
+        "deg",
+        lambda base, value: _mounted(base, tilt=value),
+        lambda *both: float(np.rad2deg(_on_mount("rotation", 1, *both))),
+        positive=False,
+    ),
+    "height": Quantity(
+        "height",
+        "m",
+        lambda base, value: _mounted(base, height=value),
+        partial(_on_mount, "position", 2),
+        positive=False,
+    ),
+    "loops": Quantity("number of loops", "×", _loops, _loops_of),
 }
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of a grid: a named quantity or a key of the scenario, with its values in order."""
+    """One axis of a sweep: a named quantity or a key of the scenario, with its values in order."""
 
     key: str
     values: tuple[Any, ...]
+    home: int | None = None  # index of the base's value, where the axis varies alone; None in a grid
+
+    @property
+    def table(self) -> str:
+        """Table of the sweep's file in which it stands."""
+        return "grid" if self.home is None else "alone"
 
     @property
     def text(self) -> str:
@@ -196,7 +270,7 @@ def require_key(axis: Axis, base: Scenario) -> None:
                 known = sorted(table) if isinstance(table, Mapping) else []
                 allowed = f"{', '.join(QUANTITIES)}, or a key of the scenario"
                 beside = f", where '{part}' could be {', '.join(known)}" if known and part != key.split(".")[0] else ""
-                raise InputError(f"key 'grid.{axis.key}': unknown; allowed: {allowed}{beside}")
+                raise InputError(f"key '{axis.table}.{axis.key}': unknown; allowed: {allowed}{beside}")
             table = table.get(part, table.get(stem))
 
 

@@ -6,7 +6,6 @@ import functools
 import hashlib
 import itertools
 import json
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.storage import write_folder
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
-from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep
+from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep, alone, number_of_points
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
 from consistency.referee.system.atomic import write_whole
@@ -215,11 +214,13 @@ class StaleCell(InputError):
 
 def describe(sweep: Sweep) -> dict[str, Any]:
     """A sweep as JSON, from which it can be made again."""
+    varied = {axis.key: list(axis.values) for axis in sweep.alone}
     return {
         "name": sweep.name,
         "summary": sweep.summary,
         "base": sweep.base.model_dump(mode="json"),
-        "grid": {axis.key: list(axis.values) for axis in sweep.axes},
+        "grid": {axis.key: list(axis.values) for axis in sweep.grid},
+        **({"alone": varied} if varied else {}),
         "filters": list(sweep.filters),
         "seed": sweep.seed,
         "rule": sweep.rule.model_dump(),
@@ -236,16 +237,19 @@ def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
     """
     with reading(path, "key 'sweep' is damaged; write it again"):
         data = manifest["sweep"]
-        lists = [data["filters"], *data["grid"].values()]
+        varied = data.get("alone", {})
+        lists = [data["filters"], *data["grid"].values(), *varied.values()]
         if not all(isinstance(values, list) and values for values in lists):
             raise TypeError("filters and values must be lists")
         if not all(isinstance(name, str) for name in data["filters"]):
             raise TypeError("filters must be names")
-        if math.prod(map(len, lists[1:])) > MOST_CELLS:
+        base = Scenario.model_validate(data["base"])
+        axes = [Axis(key, tuple(values)) for key, values in data["grid"].items()]
+        axes += [alone(Axis(key, tuple(values)), base) for key, values in varied.items()]
+        if number_of_points(axes) > MOST_CELLS:
             raise ValueError(f"more than {MOST_CELLS} cells")
         sweep = Sweep(
-            str(data["name"]), str(data["summary"]), Scenario.model_validate(data["base"]),
-            tuple(Axis(key, tuple(values)) for key, values in data["grid"].items()),
+            str(data["name"]), str(data["summary"]), base, tuple(axes),
             tuple(data["filters"]), int(data["seed"]), StoppingRule.model_validate(data["rule"]),
         )  # fmt: skip
         _ = sweep.cells  # each is checked when it is made

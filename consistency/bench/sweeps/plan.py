@@ -8,7 +8,7 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -58,9 +58,10 @@ class SweepFile(Table):
     filters: Annotated[list[str], Field(min_length=1)]
     seed: Annotated[int, Field(ge=0, strict=True)] = 0
     rule: StoppingRule = StoppingRule()
-    grid: Annotated[dict[str, Any], Field(min_length=1)]
+    grid: dict[str, Any] = Field(default_factory=dict)
+    alone: dict[str, Any] = Field(default_factory=dict)  # each from the base's value, at every point of the grid
 
-    @field_validator("grid")
+    @field_validator("grid", "alone")
     @classmethod
     def _flat(cls, grid: dict[str, Any]) -> dict[str, Any]:
         """``truth.path.speed = [...]`` may stand with or without quotes."""
@@ -69,9 +70,9 @@ class SweepFile(Table):
 
 @dataclass(frozen=True)
 class Cell:
-    """One point of the grid."""
+    """One point of the sweep."""
 
-    number: int  # 0, 1, ... in the order of the grid, the last axis fastest
+    number: int  # 0, 1, ... in the order of :func:`points`
     indices: tuple[int, ...]  # place on each axis
     name: str  # of its folder
     text: str  # "baseline 0.09 m, range 4 m"
@@ -80,7 +81,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A grid of scenarios, filters, and the rule by which each filter is judged in each of them."""
+    """Scenarios, filters, and the rule by which each filter is judged in each of them.
+
+    The scenarios are those of a grid, and at each of its points those in which one more axis has another value.
+    """
 
     name: str
     summary: str
@@ -90,16 +94,34 @@ class Sweep:
     seed: int
     rule: StoppingRule
 
+    @property
+    def grid(self) -> tuple[Axis, ...]:
+        """Axes whose values are combined."""
+        return tuple(axis for axis in self.axes if axis.home is None)
+
+    @property
+    def alone(self) -> tuple[Axis, ...]:
+        """Axes that vary one at a time."""
+        return tuple(axis for axis in self.axes if axis.home is not None)
+
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """Every cell, in the order of the grid."""
-        places = itertools.product(*(range(len(axis.values)) for axis in self.axes))
-        return tuple(self.cell(number, at) for number, at in enumerate(places))
+        """Every cell, in the order of :func:`points`."""
+        return tuple(self._cell(number, at) for at, number in self._numbers.items())
 
-    def cell(self, number: int, at: tuple[int, ...]) -> Cell:
-        """The cell at a place on each axis; raises ValueError or pydantic's ValidationError."""
+    @cached_property
+    def _numbers(self) -> dict[tuple[int, ...], int]:
+        return {at: number for number, at in enumerate(points(self.axes))}
+
+    def at(self, place: Sequence[int]) -> Cell | None:
+        """The cell at a place on each axis; None where the sweep has none."""
+        number = self._numbers.get(tuple(place))
+        return None if number is None else self._cell(number, tuple(place))
+
+    def _cell(self, number: int, at: tuple[int, ...]) -> Cell:
+        """Raises ValueError or pydantic's ValidationError."""
         changes: dict[str, Any] = {}
-        for axis, i in zip(self.axes, at, strict=True):
+        for axis, i in _changed(self.axes, at):
             changes |= axis.changes(self.base, axis.values[i])
         name, text = _folder_name(self.axes, at), text_of(self.axes, at)
         return Cell(number, at, name, text, with_changes(self.base, name, f"{self.base.name}, {text}", changes))
@@ -123,18 +145,44 @@ class Sweep:
         return mixed[part - 1 :: parts]
 
 
+def points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
+    """Places on all axes: those of the grid, the last axis fastest, each with the values of one more axis alone."""
+    for at in itertools.product(*(range(len(a.values)) if a.home is None else (a.home,) for a in axes)):
+        yield at
+        for k, axis in enumerate(axes):
+            for i in range(len(axis.values)):
+                if axis.home not in (None, i):
+                    yield (*at[:k], i, *at[k + 1 :])
+
+
+def number_of_points(axes: Sequence[Axis]) -> int:
+    """How many :func:`points` gives."""
+    grid = math.prod(len(axis.values) for axis in axes if axis.home is None)
+    return grid * (1 + sum(len(axis.values) - 1 for axis in axes if axis.home is not None))
+
+
+def text_alone(sweep: Sweep, cell: Cell) -> str:
+    """What of a cell varies alone, in words."""
+    return text_of(sweep.alone, [i for axis, i in zip(sweep.axes, cell.indices, strict=True) if axis.home is not None])
+
+
+def _changed(axes: Sequence[Axis], at: Sequence[int]) -> list[tuple[Axis, int]]:
+    """Axes at which a cell is not the base by definition, with its place there."""
+    return [(axis, i) for axis, i in zip(axes, at, strict=True) if i != axis.home]
+
+
 def text_of(axes: Sequence[Axis], at: Sequence[int]) -> str:
-    """A place in the grid in words."""
-    return ", ".join(f"{axis.text} {axis.say(i)}" for axis, i in zip(axes, at, strict=True))
+    """A place in words, without axes on which it is that of the base."""
+    return ", ".join(f"{axis.text} {axis.say(i)}" for axis, i in _changed(axes, at)) or "the base"
 
 
 def _folder_name(axes: Sequence[Axis], at: Sequence[int]) -> str:
     parts = []
-    for axis, i in zip(axes, at, strict=True):
+    for axis, i in _changed(axes, at):
         value = axis.values[i]
         text = f"{value:.12g}" if isinstance(value, float) else str(value)
         parts.append(f"{axis.key}-{re.sub(r'[^A-Za-z0-9.+-]+', '_', text).strip('_')}")
-    name = "_".join(parts)
+    name = "_".join(parts) or "base"
     return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
@@ -186,26 +234,54 @@ def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
 def _sweep(path: Path, file: SweepFile, filters: tuple[str, ...]) -> Sweep:
     beside = path.parent / file.base
     base = load_scenario(beside if file.base.endswith(".toml") else file.base)
-    axes = tuple(_axis(key, values) for key, values in file.grid.items())
-    for axis in axes:
-        require_key(axis, base)
-    return Sweep(path.stem, file.summary, base, axes, filters, file.seed, file.rule)
+    if not (file.grid or file.alone):
+        raise InputError("key 'grid': missing; give it axes, or a table 'alone' of axes that vary one at a time")
+    if both := [key for key in file.grid if key in file.alone]:
+        raise InputError(f"key 'alone.{both[0]}': stands in 'grid', too; leave one of them out")
+    axes = [_axis("grid", key, values, base) for key, values in file.grid.items()]
+    axes += [_axis("alone", key, values, base) for key, values in file.alone.items()]
+    return Sweep(path.stem, file.summary, base, tuple(axes), filters, file.seed, file.rule)
 
 
-def _axis(key: str, values: Any) -> Axis:
+def _axis(table: str, key: str, values: Any, base: Scenario) -> Axis:
+    name = f"key '{table}.{key}'"
     if not isinstance(values, list) or not values:
-        raise InputError(f"key 'grid.{key}': must be a list of one value or more, got {values!r}")
+        raise InputError(f"{name}: must be a list of one value or more, got {values!r}")
     if any(values.count(value) > 1 for value in values):
-        raise InputError(f"key 'grid.{key}': a value is given twice; each may stand once")
+        raise InputError(f"{name}: a value is given twice; each may stand once")
     if key in QUANTITIES:
+        positive = QUANTITIES[key].positive
         for value in values:
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
-                raise InputError(f"key 'grid.{key}': values must be positive numbers, got {value!r}")
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not is_number or not (0 if positive else -math.inf) < value < math.inf:
+                raise InputError(f"{name}: values must be {'positive ' * positive}numbers, got {value!r}")
     numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
     if numbers and not all(-HUGE <= value <= HUGE for value in values):
-        raise InputError(f"key 'grid.{key}': numbers must be finite, and {HUGE:g} at most")
+        raise InputError(f"{name}: numbers must be finite, and {HUGE:g} at most")
     values = sorted(map(float, values)) if numbers and any(isinstance(value, float) for value in values) else values
-    return Axis(key, tuple(sorted(values) if numbers else values))
+    axis = Axis(key, tuple(sorted(values) if numbers else values), None if table == "grid" else 0)
+    require_key(axis, base)
+    return axis if table == "grid" else alone(axis, base)
+
+
+def alone(axis: Axis, base: Scenario) -> Axis:
+    """The axis with the base's own value among its values, from which it varies.
+
+    Raises
+    ------
+    InputError
+        The base has no such value.
+    """
+    try:
+        own = axis.of(base, base)
+    except (KeyError, ValueError):
+        own = None
+    if own is None or own != own:
+        raise InputError(f"key 'alone.{axis.key}': {base.name} has no value there to start from; use 'grid'")
+    values = axis.values if own in axis.values else (own, *axis.values)
+    if Axis(axis.key, values).numeric:
+        values = tuple(sorted(values))
+    return Axis(axis.key, values, values.index(own))
 
 
 def _require_cells(sweep: Sweep) -> None:
@@ -218,13 +294,15 @@ def _require_cells(sweep: Sweep) -> None:
                 with_changes(sweep.base, sweep.base.name, "", changes)
             except (ValidationError, ValueError) as error:
                 text = explain(error, Scenario) if isinstance(error, ValidationError) else str(error)
-                raise InputError(f"key 'grid.{axis.key}', value {value!r}: {text}") from None
+                raise InputError(f"key '{axis.table}.{axis.key}', value {value!r}: {text}") from None
         for key in changes:
-            if taken.setdefault(key, axis.key) != axis.key:
+            if key in taken:
                 raise InputError(
-                    f"keys 'grid.{taken[key]}' and 'grid.{axis.key}' both set {key}; leave one of them out"
+                    f"keys 'grid.{taken[key]}' and '{axis.table}.{axis.key}' both set {key}; leave one of them out"
                 )
-    count = math.prod(len(axis.values) for axis in sweep.axes)
+        if axis.home is None:  # axes that vary alone never meet
+            taken |= dict.fromkeys(changes, axis.key)
+    count = number_of_points(sweep.axes)
     if count > MOST_CELLS:
         raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
     try:

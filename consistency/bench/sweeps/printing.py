@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from consistency.bench.sweeps.cell import CellResult, plain_numbers
-from consistency.bench.sweeps.recommend import Advice, NearFilter
+from consistency.bench.sweeps.plan import text_alone
+from consistency.bench.sweeps.recommend import Advice, MapPlace, NearFilter
 from consistency.bench.sweeps.regime import Regime
+from consistency.bench.sweeps.rig import AxisPlace
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.verdict_parts import STATUSES
 from consistency.referee.diagnostics.wording import plural, short
@@ -56,16 +59,19 @@ def regime_blocks(regime: Regime) -> tuple[Block, ...]:
 
 def _cells_table(regime: Regime) -> Table:
     """A row for each cell: its values, and the verdict and covariance ratio of each filter."""
-    axes = [axis for axis in regime.sweep.axes if len(axis.values) > 1] or list(regime.sweep.axes)
+    sweep = regime.sweep
+    axes = [axis for axis in sweep.grid if len(axis.values) > 1] or list(sweep.grid)
     columns = (
         *(Column(axis.key.rpartition(".")[2], number=axis.numeric, most=WIDEST) for axis in axes),
-        *map(Column, regime.sweep.filters),
+        *((Column("otherwise", most=WIDEST),) if sweep.alone else ()),
+        *map(Column, sweep.filters),
     )
     rows: list[tuple[Cell, ...]] = []
-    for cell in regime.sweep.cells:
-        values = (axis.say(cell.indices[regime.sweep.axes.index(axis)]) for axis in axes)
+    for cell in sweep.cells:
+        values = [axis.say(cell.indices[sweep.axes.index(axis)]) for axis in axes]
+        values += [text_alone(sweep, cell)] if sweep.alone else []
         found = regime.at(cell)
-        rows.append((*values, *(_verdict(found.get(name)) for name in regime.sweep.filters)))
+        rows.append((*values, *(_verdict(found.get(name)) for name in sweep.filters)))
     return table(columns, rows, "Cells")
 
 
@@ -84,6 +90,8 @@ def advice_blocks(advice: Advice) -> tuple[Block, ...]:
     first = [f"{advice.rig.name}: {'; '.join(place.text for place in advice.places)}"]
     first += [f"  {note}" for note in notes_of(advice)]
     first.append(f"nearest cell of the map: {advice.nearest.text}")
+    if advice.beyond is not None:
+        first.append(f"and of the map of single axes: {advice.beyond.nearest.text}")
     rows = [_row(candidate) for candidate in advice.candidates]
     return *map(Text, first), table(OF_ADVICE, rows, "Filters"), Text(""), *map(Text, sentences_of(advice))
 
@@ -92,10 +100,16 @@ def _row(c: NearFilter) -> tuple[Cell, ...]:
     near = c.nearest
     said = "not run" if c.verdict is None else Status(c.verdict.status)
     return (
-        c.filter, Status(near.status), f"{c.agreeing} of {c.around}", Quantity(near.rmse_position, digits=".3f"),
+        c.filter, _there(c), f"{c.agreeing} of {c.around}", Quantity(near.rmse_position, digits=".3f"),
         Quantity(np.rad2deg(near.rmse_heading), digits=".2f"), f"×{near.cost:.2g}" if np.isfinite(near.cost) else "-",
         said,
     )  # fmt: skip
+
+
+def _there(c: NearFilter) -> Cell:
+    """The verdict in the nearest cell, of the second map where that is looked at and does not agree."""
+    found = c.nearest if c.beyond is None or c.nearest.status != "consistent" else c.beyond
+    return Status(found.status)
 
 
 def notes_of(advice: Advice) -> list[str]:
@@ -148,10 +162,11 @@ def _none_of(advice: Advice) -> str:
 
 
 def _why(advice: Advice, best: NearFilter) -> str:
-    inside = "The rig lies inside the map" if advice.inside else "The rig lies outside the map, which only hints"
+    maps = "map" if advice.beyond is None else "maps"
+    inside = f"The rig lies inside the {maps}" if advice.inside else f"The rig lies outside the {maps}: a hint only"
     cells = f"all {best.around}" if best.agreeing == best.around else f"{best.agreeing} of the {best.around}"
     where = f"{cells} cells around it" if best.around > 1 else "the cell where it lies"
-    unlike = "; no cell of it is as the rig is" if advice.unlike else ""
+    unlike = "; no cell is as the rig is" if advice.unlike else ""
     alone = " By the map alone: the filter was not run on this rig." if best.verdict is None else ""
     return f"{inside}{unlike}; the filter is consistent in {where}.{alone}"
 
@@ -183,15 +198,28 @@ def advice_json(advice: Advice) -> dict[str, Any]:
         "rig": advice.rig.name, "map": advice.regime.sweep.name, "inside": advice.inside,
         "take": None if best is None else best.filter, "sure": None if best is None else best.sure,
         "answer": sentences_of(advice), "notes": notes_of(advice), "nearest_cell": advice.nearest.text,
-        "axes": {p.axis.key: {"value": plain(p.value), "inside": p.inside} for p in advice.places},
+        "axes": _axes_json(advice.places), "beyond": _beyond_json(advice.beyond),
         "runs": advice.runs,
         "filters": [
             {"filter": c.filter, "sure": c.sure or None, "cells_around": c.around, "agreeing": c.agreeing}
             | {"nearest": plain_numbers(c.nearest)}
+            | {"beyond": None if c.beyond is None else plain_numbers(c.beyond)}
             | {"confirmed": None if c.verdict is None else _verdict_json(c)}
             for c in advice.candidates
         ],
     }  # fmt: skip
+
+
+def _axes_json(places: Sequence[AxisPlace]) -> dict[str, Any]:
+    return {place.axis.key: {"value": plain(place.value), "inside": place.inside} for place in places}
+
+
+def _beyond_json(beyond: MapPlace | None) -> dict[str, Any] | None:
+    """The place in the second map, where that is looked at."""
+    if beyond is None:
+        return None
+    name, near = beyond.regime.sweep.name, beyond.nearest.text
+    return {"map": name, "nearest_cell": near, "axes": _axes_json(beyond.places)}
 
 
 def _verdict_json(c: NearFilter) -> dict[str, Any]:

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import Cell, Sweep, text_of
 from consistency.bench.sweeps.regime import Regime, ranked
-from consistency.bench.sweeps.rig import ALIKE, AxisPlace, Request, Rig, differences, distance, place_on, read_rig
+from consistency.bench.sweeps.rig import (
+    ALIKE,
+    AxisPlace,
+    Request,
+    Rig,
+    differences,
+    distance,
+    is_known,
+    place_on,
+    read_rig,
+)
 from consistency.referee.diagnostics import Verdict, gate_runs
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.columns import POSE
@@ -39,6 +47,12 @@ class NearFilter:
     around: int  # cells around the rig; one that the map does not have yet does not agree
     verdict: Verdict | None = None  # of the confirming runs
     sure: str = ""  # one of SURENESS
+    beyond: CellResult | None = None  # in the nearest cell of the second map, where that is looked at
+
+    @property
+    def is_near(self) -> bool:
+        """Whether it is consistent in the nearest cells."""
+        return all(found.status == "consistent" for found in (self.nearest, self.beyond) if found is not None)
 
     @property
     def trusted(self) -> bool:
@@ -52,21 +66,52 @@ class NearFilter:
 
 
 @dataclass(frozen=True)
+class MapPlace:
+    """Where a rig lies in a map."""
+
+    regime: Regime
+    places: tuple[AxisPlace, ...]
+    nearest: Cell
+    around: tuple[Cell, ...]
+    unlike: tuple[str, ...]  # keys in which no cell of the map is as the rig is
+
+    @property
+    def outside(self) -> set[str]:
+        """Axes beyond whose ends the rig lies."""
+        return {place.axis.key for place in self.places if not place.inside}
+
+
+@dataclass(frozen=True)
 class Advice:
     """What can be said of one rig."""
 
     rig: Rig
-    regime: Regime
-    places: tuple[AxisPlace, ...]
-    nearest: Cell
+    here: MapPlace  # in the map
+    beyond: MapPlace | None  # in the map of axes that vary alone, if the rig differs in one of these
     candidates: tuple[NearFilter, ...]  # the best first
-    unlike: tuple[str, ...]  # keys in which no cell of the map is as the rig is
     runs: int  # confirming runs of each filter; 0: the map alone was asked
     elsewhere: str  # the nearest cell with a filter to trust, where there is none here
 
     @property
+    def regime(self) -> Regime:
+        return self.here.regime
+
+    @property
+    def places(self) -> tuple[AxisPlace, ...]:
+        return self.here.places
+
+    @property
+    def nearest(self) -> Cell:
+        return self.here.nearest
+
+    @property
+    def unlike(self) -> tuple[str, ...]:
+        """Keys in which no cell of a map is as the rig is."""
+        return _left(self.here, self.beyond)[0]
+
+    @property
     def inside(self) -> bool:
-        return all(place.inside for place in self.places)
+        return not _left(self.here, self.beyond)[1]
 
     @property
     def lacking(self) -> tuple[str, ...]:
@@ -77,7 +122,7 @@ class Advice:
     @property
     def untried(self) -> tuple[str, ...]:
         """Filters that the map has as consistent here and that were not run, though runs were asked for."""
-        good = [c.filter for c in self.candidates if c.nearest.status == "consistent" and c.verdict is None]
+        good = [c.filter for c in self.candidates if c.is_near and c.verdict is None]
         return tuple(good) if self.runs else ()
 
     @property
@@ -96,7 +141,13 @@ class Advice:
 
 
 def recommend_for(
-    request: Request, regime: Regime, runs: int | None = None, confirm: int = CONFIRM, seed: int = 0, jobs: int = -1
+    request: Request,
+    regime: Regime,
+    runs: int | None = None,
+    confirm: int = CONFIRM,
+    seed: int = 0,
+    jobs: int = -1,
+    alone: Regime | None = None,
 ) -> Advice:
     """Look a rig up in a map, and confirm filters by runs of the rig, the best first, until one is not contradicted.
 
@@ -105,6 +156,7 @@ def recommend_for(
     runs : confirming runs of each filter, by default as many as the rule of the map needs; 0 for the
         map alone
     confirm : filters to confirm, at most
+    alone : a map of axes that vary one at a time, for a rig that lies beyond the other one
 
     Raises
     ------
@@ -118,23 +170,68 @@ def recommend_for(
     if runs < 0 or runs == 1:
         raise InputError(f"--runs {runs}: must be 0, or 2 or more")
     rig = read_rig(request, sweep.base)
-    places = tuple(place_on(axis, axis.of(rig.scenario, sweep.base)) for axis in sweep.axes)
-    nearest = _cell(regime, [place.nearest for place in places])
-    candidates = candidates_of(regime, nearest, [_cell(regime, at) for at in around(places)])
+    here = place_in(regime, rig)
+    if here is None:
+        raise InputError("the map varies one axis at a time, and the rig differs in more; give a map of a grid first")
+    beyond = None if alone is None else beyond_of(here, alone, rig)
+    candidates = candidates_of(here, beyond)
     if not candidates:
-        raise InputError(f"the map has nothing of {nearest.text}; finish its sweep first")
-    unlike = tuple(differences(rig.scenario, sweep))
-    inside = all(place.inside for place in places)
+        raise InputError(f"the map has nothing of {here.nearest.text}; finish its sweep first")
+    unlike, outside = _left(here, beyond)
     left, known = confirm if runs else 0, []
     for candidate in candidates:
-        if left and candidate.nearest.status == "consistent":
+        if left and candidate.is_near:
             results = run_trials(rig.scenario, [candidate.filter], runs, seed, jobs)
             (verdict,) = analyse(results, [candidate.filter], settings=sweep.rule.settings).values()
             candidate = replace(candidate, verdict=verdict)
             left = 0 if verdict.status in OPEN else left - 1
-        known.append(replace(candidate, sure=sureness(candidate, inside, not unlike, alone=runs == 0)))
-    elsewhere = "" if any(c.nearest.status == "consistent" for c in known) else _elsewhere(regime, places)
-    return Advice(rig, regime, places, nearest, _sorted(known), unlike, runs, elsewhere)
+        alike = not unlike and (beyond is None or candidate.beyond is not None)
+        known.append(replace(candidate, sure=sureness(candidate, not outside, alike, alone=runs == 0)))
+    elsewhere = "" if any(c.is_near for c in known) else _elsewhere(regime, here.places)
+    return Advice(rig, here, beyond, _sorted(known), runs, elsewhere)
+
+
+def place_in(regime: Regime, rig: Rig, known: Collection[str] = ()) -> MapPlace | None:
+    """Where a rig lies in a map; None where it differs on two axes of those that vary alone.
+
+    Parameters
+    ----------
+    known : axes that another map has; on them the rig counts as the base of this one, if they vary alone here
+    """
+    sweep, places = regime.sweep, list[AxisPlace]()
+    for axis in sweep.axes:
+        value = axis.of(rig.scenario, sweep.base)
+        if axis.home is not None and (axis.key in known or not is_known(value)):
+            value = axis.values[axis.home]  # one that is not known is among the differences
+        places.append(place_on(axis, value))
+    nearest = sweep.at([place.nearest for place in places])
+    if nearest is None:
+        return None
+    cells = (sweep.at(at) for at in around(places))
+    near = tuple(cell for cell in cells if cell is not None)
+    return MapPlace(regime, tuple(places), nearest, near, tuple(differences(rig.scenario, sweep)))
+
+
+def beyond_of(here: MapPlace, alone: Regime, rig: Rig) -> MapPlace | None:
+    """The rig's place in the second map; None where it differs in nothing that this one varies."""
+    base, model = alone.sweep.base, rig.scenario.truth.sensor.model
+    if base.truth.sensor.model != model:
+        raise InputError(f"--map: the second map is of sensors '{base.truth.sensor.model}', the first of '{model}'")
+    inside = [place.axis.key for place in here.places if place.inside]
+    found = place_in(alone, rig, inside)
+    if found is None:
+        return None
+    covered = here.outside & ({place.axis.key for place in found.places} - found.outside)
+    return found if covered or not set(here.unlike) <= set(found.unlike) else None
+
+
+def _left(here: MapPlace, beyond: MapPlace | None) -> tuple[tuple[str, ...], set[str]]:
+    """Keys in which no cell of either map is as the rig is, and axes beyond the ends of which it lies."""
+    if beyond is None:
+        return here.unlike, here.outside
+    varied = {place.axis.key for place in beyond.places if place.axis.home is not None}
+    unlike = tuple(key for key in here.unlike if key in beyond.unlike)
+    return unlike, (here.outside - varied) | beyond.outside
 
 
 def runs_of(sweep: Sweep) -> int:
@@ -153,26 +250,22 @@ def around(places: Sequence[AxisPlace]) -> list[tuple[int, ...]]:
     return list(dict.fromkeys(found))
 
 
-def _cell(regime: Regime, at: Sequence[int]) -> Cell:
-    sweep = regime.sweep
-    number = int(np.ravel_multi_index(tuple(at), tuple(len(axis.values) for axis in sweep.axes)))
-    return sweep.cell(number, tuple(at))
-
-
-def candidates_of(regime: Regime, nearest: Cell, around: Sequence[Cell]) -> list[NearFilter]:
-    """Filters by what the map says: consistent in the nearest cell, in all cells around, then RMSE and cost."""
-    here, cells = regime.at(nearest), [regime.at(cell) for cell in around]
-    found = []
-    for name, result in ranked(here):
+def candidates_of(here: MapPlace, beyond: MapPlace | None = None) -> list[NearFilter]:
+    """Filters by what the maps say: consistent in the nearest cell, in all cells around, then RMSE and cost."""
+    found, at = here.regime.at(here.nearest), [place for place in (here, beyond) if place is not None]
+    there = {} if beyond is None else beyond.regime.at(beyond.nearest)
+    cells = [place.regime.at(cell) for place in at for cell in place.around]
+    candidates = []
+    for name, _ in ranked(found | {name: result for name, result in there.items() if name in found}):
         near = [results[name].status == "consistent" for results in cells if name in results]
-        found.append(NearFilter(name, result, sum(near), len(cells)))
-    return sorted(found, key=lambda c: (c.nearest.status != "consistent", c.agreeing < c.around))
+        candidates.append(NearFilter(name, found[name], sum(near), len(cells), beyond=there.get(name)))
+    return sorted(candidates, key=lambda c: (not c.is_near, c.agreeing < c.around))
 
 
 def sureness(candidate: NearFilter, inside: bool, alike: bool, alone: bool = False) -> str:
     """How sure it is that the candidate is consistent on the rig; ``alone``: the map was asked without runs."""
     verdict = candidate.verdict
-    if candidate.nearest.status != "consistent" or (verdict is None and not alone):
+    if not candidate.is_near or (verdict is None and not alone):
         return ""
     if verdict is not None and verdict.status not in OPEN:
         return "no"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 
 MAP_KIND = "map"
-SHIPPED = "regime.json"
+SHIPPED, SHIPPED_ALONE = "regime.json", "beyond.json"
 FIELDS = tuple(CellResult.__dataclass_fields__)
 EQUAL = 0.02  # relative difference of two RMSE below which the cheaper filter comes first
 
@@ -110,6 +110,31 @@ def dumped(regime: Regime) -> str:
     return f'{head},\n "rows": [\n  ' + ",\n  ".join(rows) + "\n ]\n}\n"
 
 
+def read_maps(paths: Sequence[Path] = ()) -> tuple[Regime, Regime | None]:
+    """The map of a grid, and that of axes that vary one at a time; the shipped ones where no path is given.
+
+    Raises
+    ------
+    InputError
+        More than two, one is missing or damaged, or the second has no axis that varies alone.
+    """
+    if not paths:
+        second = _shipped(SHIPPED_ALONE)
+        return read_regime(), read_regime(second) if second.is_file() else None
+    if len(paths) > 2:
+        raise InputError(f"--map {paths[2]}: at most two, that of a grid and one of axes that vary alone")
+    first, *others = map(read_regime, paths)
+    if others and not others[0].sweep.alone:
+        raise InputError(f"--map {paths[1]}: the second map must be of a sweep with a table 'alone'")
+    return first, others[0] if others else None
+
+
+def _shipped(name: str) -> Path:
+    """Path of a map that comes with the package, or would."""
+    path = data_folder("reference") / name
+    return path if path.is_file() else data_folder("reports") / "reference" / name
+
+
 def read_regime(path: Path | None = None) -> Regime:
     """A map from ``map.json``, from a folder of ``consistency sweep``, or the shipped one.
 
@@ -119,9 +144,7 @@ def read_regime(path: Path | None = None) -> Regime:
         There is none, or it is damaged.
     """
     if path is None:
-        path = data_folder("reference") / SHIPPED
-        if not path.is_file():
-            path = data_folder("reports") / "reference" / SHIPPED
+        path = _shipped(SHIPPED)
         if not path.is_file():
             raise InputError(
                 "no map is shipped with this version; make one with 'consistency sweep regime --out regime' (about 20 "

@@ -28,6 +28,7 @@ class Request:
     range: float | None = None  # m
     speed: float | None = None  # m/s
     density: float | None = None  # landmarks a square metre
+    dt: float | None = None  # s from step to step
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,8 @@ def _from_sensor(path: Path, base: Scenario, request: Request) -> Rig:
         assumed.append(f"speed {base.truth.path.speed:g} m/s (--speed)")
     if request.density is None:
         assumed.append(f"{density_of(base):.2g} landmarks a square metre (--density)")
+    if request.dt is None:
+        assumed.append(f"time of a step {base.truth.dt:g} s (--dt)")
     changes: Changes = {
         f"truth.sensor.{key}": value
         for key, value in {"sigma": file.sigma, "f": file.f, "B": file.B, "image": image, "disparity": disparity,
@@ -120,7 +123,7 @@ def _with_bias(camera: UvdSensor, file: SensorFile) -> list[ListedEffect]:
 
 def _with_options(scenario: Scenario, request: Request) -> Scenario:
     """The scenario with what the options say."""
-    for option in ("range", "speed", "density"):
+    for option in ("range", "speed", "density", "dt"):
         value = getattr(request, option)
         if value is None:
             continue
@@ -156,13 +159,17 @@ class AxisPlace:
     @property
     def text(self) -> str:
         """The value, and what the map has if it lies beyond."""
-        known = not (self.value is None or self.value != self.value)
-        value = (
-            say_value(self.axis.unit, float(self.value) if self.axis.numeric else self.value) if known else "unknown"
-        )
+        value = "unknown"
+        if is_known(self.value):
+            value = say_value(self.axis.unit, float(self.value) if self.axis.numeric else self.value)
         ends = f"{self.axis.say(0)} to {self.axis.say(len(self.axis.values) - 1)}"
         values = ends if self.axis.numeric else ", ".join(map(self.axis.say, range(len(self.axis.values))))
         return f"{self.axis.text} {value}" + ("" if self.inside else f", beyond the map's {values}")
+
+
+def is_known(value: Any) -> bool:
+    """Whether a rig has a value on an axis."""
+    return value is not None and bool(value == value)
 
 
 def place_on(axis: Axis, value: Any) -> AxisPlace:
@@ -190,9 +197,10 @@ def distance(places: tuple[AxisPlace, ...], cell: Cell) -> float:
 
 
 def differences(rig: Scenario, sweep: Sweep) -> list[str]:
-    """What the rig has otherwise than every cell of the map, for no axis of the map changes it."""
+    """What the rig has otherwise than every cell of the map, for no axis on which it has a value changes it."""
     base = sweep.base
-    varied = {key for axis in sweep.axes for key in axis.changes(base, axis.values[0])}
+    axes = [axis for axis in sweep.axes if is_known(axis.of(rig, base))]
+    varied = {key for axis in axes for key in axis.changes(base, axis.values[0])}
     if any(axis.key == "density" for axis in sweep.axes):
         varied |= {f"truth.landmarks.{key}" for key in ("layout", "count", "seed", "x", "y", "z", "points")}
     theirs, ours = dict(leaves(base.model_dump())), dict(leaves(rig.model_dump()))

@@ -94,6 +94,34 @@ def test_every_cell_is_shown_once(name: str, panels: int) -> None:
     assert (mark.text, mark.below, mark.faces) == (("–",), ("failed",), (heat.NOTHING,))
 
 
+def test_axes_that_vary_alone_have_a_map_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Beside the axis of the grid; each map has the cells in which no other axis is away from its base."""
+    regime = regime_of(replace(load_sweep("beyond"), filters=("a", "b")))
+    sweep, figure = regime.sweep, heat_figure(regime, "a")
+    assert [panel.x.label for panel in figure.panels] == [axis.text for axis in sweep.alone]
+    for axis, mark in zip(sweep.alone, tiles(figure), strict=True):
+        k = sweep.axes.index(axis)
+        shown = [
+            c for c in sweep.cells if all(c.indices[j] == a.home for j, a in enumerate(sweep.axes) if j not in (0, k))
+        ]
+        placed = {(int(x), int(y)): text for x, y, text in zip(mark.x, mark.y, mark.text, strict=True)}
+        numbers = {(c.indices[k], 2 - c.indices[0]): c.number for c in shown}
+        last = len(sweep.cells) - 1
+        assert placed == {at: "∞" if n == last else heat.brief(1.0 + n) for at, n in numbers.items()}
+    page, _ = write_regime_reports(regime, tmp_path)
+    text = page.read_text(encoding="utf-8")
+    assert "Otherwise" in text
+    assert "Alone: time of a step" in text
+    assert text.count("noise of the odometry ×3<") == 3  # a row for each rig
+    show(*regime_blocks(regime))
+    rows = [line for line in capsys.readouterr().out.splitlines() if "overconfident " in line and "cost" not in line]
+    assert len(rows) == len(sweep.cells)
+    assert [row.split("overconfident")[0].split()[2:] for row in rows[:2]] == [
+        ["the", "base"],
+        ["time", "of", "a", "step", "0.05", "s"],
+    ]
+
+
 def test_long_values_are_told_apart() -> None:
     axis = Axis("truth.sensor.effects", tuple([{"kind": "mismatch", "rate": rate}] * 3 for rate in (0.1, 0.2)))
     texts = [heat.said(axis, i) for i in range(2)]

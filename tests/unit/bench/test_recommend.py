@@ -15,7 +15,8 @@ from consistency.bench.scenario import data_folder, misbelief
 from consistency.bench.store.log import write_log
 from consistency.bench.sweeps import recommend as advising
 from consistency.bench.sweeps import regime as maps
-from consistency.bench.sweeps.axes import Axis, equivalent_baseline
+from consistency.bench.sweeps import rig as rigs
+from consistency.bench.sweeps.axes import QUANTITIES, Axis, equivalent_baseline, with_changes
 from consistency.bench.sweeps.cell import CellResult
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.bench.sweeps.printing import advice_blocks, advice_json, notes_of, sentences_of
@@ -135,8 +136,9 @@ def test_a_filter_at_the_edge_of_its_region_comes_second(regime: Regime) -> None
     changes = {"truth__sensor__B": 0.26, "belief__sensor__B": 0.26}
     edge = scenario.variant("edge", **changes)
     places = tuple(place_on(axis, axis.of(edge, scenario)) for axis in regime.sweep.axes)
-    cells = [advising._cell(regime, [i, *(p.nearest for p in places[1:])]) for i in places[0].around]
-    found = advising.candidates_of(regime, cells[1], cells)
+    cells = [regime.sweep.at([i, *(p.nearest for p in places[1:])]) for i in places[0].around]
+    assert None not in cells
+    found = advising.candidates_of(advising.MapPlace(regime, places, cells[1], tuple(cells), ()))
     assert [(c.filter, c.agreeing) for c in found] == [("parked-ekf-uvd", 2), ("ekf-uvd", 1), ("ukf-uvd", 0)]
 
 
@@ -298,7 +300,133 @@ def test_a_rig_unlike_the_map_is_unsure(regime: Regime, monkeypatch: pytest.Monk
     advice = recommend_for(Request(BASE, speed=1.0), regime, jobs=1)
     assert advice.best is not None
     assert (advice.inside, advice.unlike, advice.best.sure) == (True, ("truth.path.speed",), "unsure")
-    assert "no cell of it is as the rig is" in sentences_of(advice)[0]
+    assert "no cell is as the rig is" in sentences_of(advice)[0]
+
+
+# --- the second map -----------------------------------------------------------------------------
+
+
+def beyond(status: Callable[[tuple[int, ...]], str] = lambda _: "consistent") -> Regime:
+    """A map of axes that vary alone; ``parked-ekf-uvd`` is as ``status`` says for the indices of a cell."""
+    sweep = load_sweep("beyond")
+    found = {
+        (c.number, n): result(status(c.indices) if n == "parked-ekf-uvd" else "biased")
+        for c in sweep.cells for n in sweep.filters
+    }  # fmt: skip
+    return Regime(sweep, found, {})
+
+
+def varied(**changes: Any) -> Any:
+    """The published rig otherwise; keys of the second map's axes."""
+    base = cs.load_scenario(BASE)
+    for key, value in changes.items():
+        base = with_changes(base, "varied", "", QUANTITIES[key].changes(base, value))
+    return base
+
+
+def advised(regime: Regime, alone: Regime | None, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> advising.Advice:
+    Said(monkeypatch, parked_ekf_uvd="consistent", robocentric_ekf_uvd="consistent", ukf_uvd="consistent")
+    monkeypatch.setattr(rigs, "load_scenario", lambda _: varied(**changes))
+    return recommend_for(Request("varied"), regime, jobs=1, alone=alone)
+
+
+@pytest.mark.parametrize(("changes", "sure", "around"), [
+    ({"tilt": 20.0}, "sure", 5), ({"tilt": 10.0}, "sure", 5), ({"dt": 0.2}, "sure", 5), ({"speed": 0.8}, "sure", 4),
+    ({"height": 1.0}, "sure", 4), ({"loops": 3.0}, "sure", 5), ({"odometry": 2.0}, "sure", 4),
+    ({"tilt": 60.0}, "unsure", 4), ({"dt": 0.5, "tilt": 20.0}, "unsure", 0),
+    ({"odometry": 2.0, "tilt": 20.0}, "unsure", 0), ({"odometry": 0.3, "tilt": 20.0}, "sure", 5),
+])  # fmt: skip
+def test_a_rig_that_differs_in_one_thing_is_looked_up(
+    regime: Regime, monkeypatch: pytest.MonkeyPatch, changes: dict[str, float], sure: str, around: int
+) -> None:
+    """Sure inside the second map and where the rig differs on one of its axes; in two no cell is like it."""
+    advice = advised(regime, beyond(), monkeypatch, **changes)
+    first = len(advice.here.around)
+    assert first in (6, 7)
+    assert advice.best is not None
+    assert (advice.best.filter, advice.best.sure) == ("parked-ekf-uvd", sure)
+    assert (advice.best.agreeing, advice.best.around) == (first + around, first + around)
+    without = advised(regime, None, monkeypatch, **changes).best
+    assert without is not None
+    assert without.sure == "unsure"
+
+
+def test_outside_the_baselines_of_the_second_map(regime: Regime, monkeypatch: pytest.MonkeyPatch) -> None:
+    best = advised(regime, beyond(), monkeypatch, baseline=0.5, tilt=20.0).best
+    assert best is not None
+    assert (best.filter, best.sure) == ("parked-ekf-uvd", "unsure")
+
+
+def test_cells_around_in_the_second_map(regime: Regime, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The neighbours on the tilt and on the baseline; those on another axis would be two steps from its base."""
+    advice = advised(regime, beyond(), monkeypatch, tilt=20.0)
+    assert advice.beyond is not None
+    assert advice.beyond.nearest.text == "baseline 0.09 m, tilt 20 deg"
+    assert {cell.text for cell in advice.beyond.around} == {
+        "baseline 0.05 m, tilt 20 deg", "baseline 0.09 m, tilt 20 deg", "baseline 0.3 m, tilt 20 deg",
+        "baseline 0.09 m", "baseline 0.09 m, tilt 40 deg",
+    }  # fmt: skip
+    data = advice_json(advice)
+    assert data["beyond"]["axes"]["tilt"] == {"value": pytest.approx(20.0), "inside": True}
+    assert data["inside"]
+    assert "The rig lies inside the maps; the filter is consistent in all 12 cells" in sentences_of(advice)[0]
+
+
+@pytest.mark.parametrize(("bad", "sure"), [
+    (lambda at: "biased" if at[3] == 3 else "consistent", "fairly sure"),  # a neighbour
+    (lambda at: "biased" if at[3] == 0 else "consistent", "sure"),  # the other way
+    (lambda at: "biased" if at[3] == 2 and at[0] == 1 else "consistent", None),  # the cell itself
+])  # fmt: skip
+def test_cells_of_the_second_map_count(
+    regime: Regime, monkeypatch: pytest.MonkeyPatch, bad: Callable[[tuple[int, ...]], str], sure: str | None
+) -> None:
+    best = advised(regime, beyond(bad), monkeypatch, tilt=20.0).best
+    assert (None if best is None else best.sure) == sure
+
+
+def test_a_filter_that_the_second_map_lacks_is_unsure(regime: Regime, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = {(cell, "ukf-uvd" if n == "parked-ekf-uvd" else n): r for (cell, n), r in regime.results.items()}
+    advice = advised(replace(regime, results=found), beyond(), monkeypatch, tilt=20.0)
+    assert advice.best is not None
+    assert (advice.best.filter, advice.best.sure) == ("ukf-uvd", "unsure")
+
+
+def test_a_rig_that_the_first_map_holds_needs_no_second(regime: Regime, monkeypatch: pytest.MonkeyPatch) -> None:
+    advice = advised(regime, beyond(lambda _: "biased"), monkeypatch)
+    assert advice.beyond is None
+    assert advice.best is not None
+    assert advice.best.sure == "sure"
+
+
+def test_a_camera_off_centre_is_unlike_both_maps(regime: Regime, monkeypatch: pytest.MonkeyPatch) -> None:
+    mount = {"position": (0.3, 0.0, 0.5), "rotation": (0.0, 0.0, 0.0)}
+    scenario = varied().variant("off", truth__sensor__mount=mount, belief__sensor__mount=mount, truth__path__speed=1.0)
+    Said(monkeypatch, parked_ekf_uvd="consistent")
+    monkeypatch.setattr(rigs, "load_scenario", lambda _: scenario)
+    advice = recommend_for(Request("off"), regime, jobs=1, alone=beyond())
+    assert advice.unlike == ("truth.sensor.mount.position", "belief.sensor.mount.position")
+    assert advice.best is not None
+    assert advice.best.sure == "unsure"
+
+
+def test_maps_that_are_given(tmp_path: Path) -> None:
+    """The shipped ones, one of a grid, or that and one of axes that vary alone."""
+    first, second = maps.read_maps()
+    assert first.sweep.name == "regime"
+    assert second is not None
+    assert second.missing == 0
+    assert second.sweep.axes == load_sweep("beyond").axes
+    (tmp_path / "map.json").write_text(maps.dumped(first))
+    (tmp_path / "alone.json").write_text(maps.dumped(second))
+    one, two = tmp_path / "map.json", tmp_path / "alone.json"
+    assert maps.read_maps([one])[1] is None
+    both = maps.read_maps([one, two])[1]
+    assert both is not None
+    assert both.results.keys() == second.results.keys()
+    with pytest.raises(InputError, match=r"map.json: the second map must be of a sweep with a table 'alone'"):
+        maps.read_maps([two, one])
+    with pytest.raises(InputError, match="at most two"):
+        maps.read_maps([one, two, two])
 
 
 def test_a_contradicted_filter_is_not_taken(regime: Regime) -> None:

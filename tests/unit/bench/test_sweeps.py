@@ -22,9 +22,10 @@ from consistency.bench.scenario import data_folder
 from consistency.bench.sweeps import cell as cells
 from consistency.bench.sweeps import folder as folders
 from consistency.bench.sweeps import running
+from consistency.bench.sweeps.axes import QUANTITIES, density_of, with_changes
 from consistency.bench.sweeps.cell import CellResult, cost_of, run_cell
-from consistency.bench.sweeps.folder import CellWork, SweepFolder, open_sweep
-from consistency.bench.sweeps.plan import Sweep, load_sweep, sweep_names
+from consistency.bench.sweeps.folder import CellWork, SweepFolder, describe, open_sweep, sweep_from
+from consistency.bench.sweeps.plan import Sweep, load_sweep, number_of_points, sweep_names
 from consistency.bench.sweeps.regime import Regime, ranked, read_regime, regime_of, write_regime
 from consistency.bench.sweeps.running import run_sweep
 from consistency.referee.errors import InputError
@@ -133,7 +134,93 @@ def test_built_in_sweeps_are_fine() -> None:
     assert all(load_sweep(name).cells for name in sweep_names())
 
 
+# --- axes that vary alone -----------------------------------------------------------------------
+
+
+def test_axes_that_vary_alone_are_no_product(at: Path) -> None:
+    """At each point of the grid its own cell, and one for each other value of each axis; the base's value is added."""
+    path = edited(at, "density = [0.5, 1.0]", "[alone]\ntruth.dt = [0.2, 0.4]\ndensity = [1.0, 0.5]")
+    sweep = load_sweep(path)
+    assert [axis.home for axis in sweep.axes] == [None, 0, 1]
+    assert [axis.values for axis in sweep.axes] == [(1.0, 2.0), (0.1, 0.2, 0.4), (0.5, 1.0)]
+    noisy = [cell.indices for cell in sweep.cells][4:]
+    assert noisy == [(1, 0, 1), (1, 1, 1), (1, 2, 1), (1, 0, 0)]
+    texts = [cell.text for cell in sweep.cells[:4]]
+    assert texts == [f"noise of the odometry ×1{more}" for more in (
+        "", ", truth.dt 0.2", ", truth.dt 0.4", ", density of landmarks ×0.5")]  # fmt: skip
+    truths = [cell.scenario.truth for cell in sweep.cells]
+    plain = sweep.base.truth
+    assert [truth.dt for truth in truths] == [0.1, 0.2, 0.4, 0.1] * 2
+    assert [truth.landmarks.count for truth in truths] == [*[plain.landmarks.count] * 3, plain.landmarks.count // 2] * 2
+    assert [round(truth.motion.sigma_v / plain.motion.sigma_v) for truth in truths] == [1] * 4 + [2] * 4
+    assert [sweep.at(cell.indices) for cell in sweep.cells] == list(sweep.cells)
+    assert sweep.at((0, 1, 0)) is None
+    assert len(sweep.cells) == number_of_points(sweep.axes)
+    assert sweep_from({"sweep": json.loads(json.dumps(describe(sweep)))}, at) == sweep
+
+
+def test_a_sweep_without_a_grid_starts_from_its_base(at: Path) -> None:
+    path = edited(at, "[grid]\nodometry = [1.0, 2.0]\ndensity", "[alone]\ndensity")
+    sweep = load_sweep(path)
+    assert [cell.name for cell in sweep.cells] == ["base", "density-0.5"]
+    assert sweep.cells[0].scenario.hash == sweep.base.hash
+    folder, missing = run_sweep(sweep, at / "out", jobs=1)
+    assert missing == 0
+    write_regime(regime_of(folder), at / "out")
+    back = read_regime(at / "out" / "map.json")
+    assert (back.sweep, len(back.results)) == (sweep, 2)
+
+
+@pytest.mark.parametrize("name", ["dt", "tilt", "height", "loops", "speed"])
+def test_a_quantity_is_read_off_the_scenario_that_it_makes(name: str) -> None:
+    sweep = load_sweep("beyond")
+    (axis,) = (axis for axis in sweep.alone if axis.key == name)
+    k = sweep.axes.index(axis)
+    for cell in sweep.cells:
+        assert axis.of(cell.scenario, sweep.base) == pytest.approx(axis.values[cell.indices[k]], rel=0.01, abs=1e-9)
+
+
+def test_worlds_of_the_axes() -> None:
+    """A slower rate is the same drive in fewer steps; loops are shorter laps of the same drive, as dense."""
+    base = cs.load_scenario("herath2007-stereo")
+
+    def made(name: str, value: float) -> cs.Scenario:
+        return with_changes(base, "made", "", QUANTITIES[name].changes(base, value))
+
+    slow = made("dt", 0.5).truth
+    assert (slow.dt, slow.steps, slow.path) == (0.5, 100, base.truth.path)
+    tilted, high = made("tilt", -20.0), made("height", 0.5)
+    for half in (tilted.truth, tilted.belief):
+        assert half.sensor.mount.rotation == pytest.approx((0.0, -np.pi / 9, 0.0))
+    for half in (high.truth, high.belief):
+        assert half.sensor.mount.position == (0.0, 0.0, 0.5)
+    loops = made("loops", 4.0).truth
+    assert (loops.path.radius, loops.path.shape, loops.steps) == (1.0, "circle", 500)
+    assert loops.path.speed == base.truth.path.speed
+    assert loops.landmarks.x == pytest.approx((-5.0, 5.0), abs=0.1)  # 4 m beyond the path, as before
+    assert density_of(made("loops", 4.0)) == pytest.approx(density_of(base), rel=0.02)
+
+
+def test_quantities_that_are_not_there_are_none() -> None:
+    """A drive that takes another time, a camera off centre or turned otherwise, and laps of another shape."""
+    base = cs.load_scenario("herath2007-stereo")
+    mount = {"position": (0.1, 0.0, 0.5), "rotation": (0.2, 0.3, 0.0)}
+    path = {"shape": "corridor", "length": 12.0, "turn_radius": 1.0, "speed": 0.5, "start": (0, 0), "heading": 0.0}
+    other = base.variant("other", truth__steps=900, truth__sensor__mount=mount, truth__path=path)
+    assert all(np.isnan(QUANTITIES[name].measure(other, base)) for name in ("dt", "tilt", "height", "loops"))
+
+
 BAD = {
+    "alone without a value": (
+        "density = [0.5, 1.0]", "[alone]\nbaseline = [0.1]", "'alone.baseline': small has no value there"),
+    "alone and in the grid": ("seed = 3", "seed = 3\nalone.density = [0.1]", "'alone.density': stands in 'grid', too"),
+    "alone of the same key": (
+        "density = [0.5, 1.0]", "[alone]\nmotion.sigma_v = [0.3]",
+        "'grid.odometry' and 'alone.motion.sigma_v' both set truth.motion.sigma_v"),
+    "alone no list": ("density = [0.5, 1.0]", "[alone]\ntilt = 3", "'alone.tilt': must be a list"),
+    "alone text": ("density = [0.5, 1.0]", '[alone]\ntilt = ["up"]', "'alone.tilt': values must be numbers"),
+    "alone unknown": ("density = [0.5, 1.0]", "[alone]\ncolour = [1]", "'alone.colour': unknown; allowed: baseline"),
+    "tilt of no camera": ("density = [0.5, 1.0]", "tilt = [20]", "'grid.tilt', value 20: a sensor 'linear' has no"),
     "filter that does not fit": ('"kf"', '"ekf-uvd"', "works on a sensor uvd, not 'linear'"),
     "unknown filter": ('"kf"', '"kff"', "did you mean 'kf'"),
     "baseline without a baseline": ("density = [0.5, 1.0]", "baseline = [0.1]", "'grid.baseline', value 0.1: a sensor"),

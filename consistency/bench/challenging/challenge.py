@@ -5,15 +5,15 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from consistency.bench.challenging.bench import ChallengeScorer
+from consistency.bench.challenging.bench import ChallengeScorer, Part, has_map
 from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search, standard_error
 from consistency.bench.challenging.shrink import shrink
-from consistency.bench.challenging.worlds import Point, Space, space_of
+from consistency.bench.challenging.worlds import Point, Space, require_right_belief, space_of
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.stepping import name_of
 from consistency.bench.protocols import Filter
@@ -21,14 +21,14 @@ from consistency.bench.runs.montecarlo import resolve_filters, run_trials
 from consistency.bench.scenario import Scenario, load_scenario
 from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.diagnostics import Settings, Verdict, gate_runs
-from consistency.referee.diagnostics.questions import SCALE
+from consistency.referee.diagnostics.questions import JOINT, SCALE
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.columns import POSE
 from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
-SIZE_QUESTIONS = (*SCALE, "outliers")  # what a confirmation needs a fault in: errors that are too large
+SIZE_QUESTIONS = (*SCALE, JOINT, "outliers")  # what a confirmation needs a fault in: errors that are too large
 SEARCH, GO_ON, SHRINK = 0.4, 0.8, 0.8  # of the budget, spent when these end; going on if nothing is clearly wrong
 CONFIRM = 0.2  # of the time, the most that the confirmation may take in a world that is searched
 CHECKS = (6, 12, 24, 48)  # trials after which a smaller world is given up or kept
@@ -88,6 +88,7 @@ class Challenge:
     """Result of a challenge. ``world`` is the tested world: the smallest one, or if not ``clear`` the worst one."""
 
     filter: str
+    part: Part  # of the estimates, whose covariance was challenged
     plan: Plan
     space: Space
     worst: Point  # the most overconfident world of the search
@@ -116,17 +117,21 @@ class Challenge:
 def is_overconfident(verdict: Verdict) -> bool:
     """Are the errors larger than the covariance says, or did a run break down?
 
-    The mean NEES lies above 3, and a question about the size of the errors found a fault. The referee finds a fault in
-    any question with probability ``false_alarm`` or less if the covariance is right. A breakdown is a fact and needs no
-    test.
+    The mean NEES lies above its degrees of freedom, 3 of a pose or of a landmark in space, and a question about the
+    size of the errors found a fault. The referee finds a fault in any question with probability ``false_alarm`` or less
+    if the covariance is right. A breakdown is a fact and needs no test.
     """
     if verdict.failures or verdict.status == "failed":
         return True
-    return verdict.statistic > len(POSE) and any(question in SIZE_QUESTIONS for question in verdict.faults)
+    return verdict.inflation > 1.0 and any(question in SIZE_QUESTIONS for question in verdict.faults)
 
 
 def challenge(
-    filter_: str | Filter, base: str | Scenario | None = None, plan: Plan | None = None, within: Sequence[str] = ()
+    filter_: str | Filter,
+    base: str | Scenario | None = None,
+    plan: Plan | None = None,
+    within: Sequence[str] = (),
+    part: Part = "pose",
 ) -> Challenge:
     """Look for the world in which a filter is most overconfident, and confirm it on fresh trials.
 
@@ -138,20 +143,48 @@ def challenge(
     ----------
     base : the scenario whose values are the plain ones; None for the first of :data:`BASES` that fits the filter
     within : bounds of dimensions, see ``consistency.bench.challenging.worlds.space_of``
+    part : whose covariance is challenged, that of the pose in all steps or that of the map at the end, given the pose
 
     Raises
     ------
     InputError
-        Unknown filter or scenario, one that does not fit the other, or bounds that hold no world.
+        Unknown filter or scenario, one that does not fit the other, bounds that hold no world, or no map.
     """
     plan = Plan() if plan is None else plan
+    instance, scenario = opponents(filter_, base)
+    if part == "map" and not has_map(instance, scenario):
+        raise InputError(f"filter '{name_of(instance)}': states no covariance of pose and map; use --of pose")
+    space = space_of(scenario, within)
+    with ChallengeScorer(instance, plan.jobs, part) as bench:
+        bench.compile(corners(space))
+        return ChallengePhases(bench, space, plan).run()
+
+
+def challenge_parts(
+    filter_: str | Filter, base: str | Scenario | None = None, plan: Plan | None = None, within: Sequence[str] = ()
+) -> tuple[Challenge, Challenge | None]:
+    """A challenge of the pose and one of the map, each with half of the time; of the pose alone where there is no map.
+
+    Each is a challenge by itself, with its own confirmation, and finds a right covariance too small with probability
+    ``plan.false_alarm`` or less. See :func:`challenge` for parameters and errors.
+    """
+    plan = Plan() if plan is None else plan
+    instance, scenario = opponents(filter_, base)
+    if not has_map(instance, scenario):
+        return challenge(instance, scenario, plan, within), None
+    minutes = None if plan.minutes is None else plan.minutes / 2
+    half = replace(plan, minutes=minutes, trials=None if plan.trials is None else max(RUNGS[0], plan.trials // 2))
+    pose, map_ = (challenge(instance, scenario, half, within, part) for part in ("pose", "map"))
+    return pose, map_
+
+
+def opponents(filter_: str | Filter, base: str | Scenario | None) -> tuple[Filter, Scenario]:
+    """The filter, and the scenario from which its worlds differ; raises InputError."""
     instance = get_filter(filter_) if isinstance(filter_, str) else filter_
     scenario = base_of(instance) if base is None else load_scenario(base) if isinstance(base, str) else base
     resolve_filters([instance], scenario.belief)
-    space = space_of(scenario, within)
-    with ChallengeScorer(instance, plan.jobs) as bench:
-        bench.compile(corners(space))
-        return ChallengePhases(bench, space, plan).run()
+    require_right_belief(scenario)
+    return instance, scenario
 
 
 def base_of(filter_: Filter) -> Scenario:
@@ -200,11 +233,14 @@ class ChallengePhases:
             self.tell("shrinking", now=True)
             point = shrink(self.space, worst, lambda p: self.holds(p, limit), partial(self.budget.left, SHRINK))
         self.tell(f"confirming on {plan.runs} fresh runs", now=True)
-        world = self.space.world(point, f"challenge-{name}")
+        part = self.bench.part
+        world = self.space.world(point, f"challenge-{name}" + ("-map" if part == "map" else ""))
         results = run_trials(world, [self.bench.filter], plan.runs, self.confirm_seed, plan.jobs)
         verdict = analyse(results, settings=Settings(plan.false_alarm))[name]
+        if part == "map" and verdict.map is not None:  # without a map every run failed
+            verdict = verdict.map.verdict or verdict
         return Challenge(
-            name, plan, self.space, worst, np.exp(np.mean(self.checked.get(worst) or self.tried[worst].scores)),
+            name, part, plan, self.space, worst, np.exp(np.mean(self.checked.get(worst) or self.tried[worst].scores)),
             limit is not None, point, world, verdict, len({*self.tried, *self.checked} - self.unusable),
             self.budget.used, len(self.unusable), self.budget.elapsed,
         )  # fmt: skip
@@ -279,7 +315,8 @@ class ChallengePhases:
         """A line of progress, every few seconds."""
         if now or time.monotonic() - self.told >= EVERY:
             self.told = time.monotonic()
+            worlds, trials = len(self.tried), self.budget.used
             print(
-                f"{what}: {self.budget.elapsed:.0f} s, {len(self.tried)} worlds, {self.budget.used} trials",
+                f"{self.bench.part}, {what}: {self.budget.elapsed:.0f} s, {worlds} worlds, {trials} trials",
                 file=sys.stderr, flush=True,
             )  # fmt: skip

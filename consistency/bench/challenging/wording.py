@@ -18,6 +18,7 @@ from consistency.referee.system.atomic import write_whole
 def lines(outcome: Challenge, out: Path) -> list[str]:
     """What to print; ``out`` is the file that was written, if the filter was found overconfident."""
     plan, verdict = outcome.plan, outcome.verdict
+    name = _subject(outcome)
     searched = f"{outcome.worlds} worlds and {outcome.trials} trials in {_duration(outcome.seconds)}"
     tested = f"ANEES {verdict.statistic:.3g} (3 is right), {verdict.status}, on {verdict.runs} fresh runs"
     if verdict.failures:
@@ -26,7 +27,7 @@ def lines(outcome: Challenge, out: Path) -> list[str]:
     if not outcome.found:
         given = f"{plan.minutes:g} minutes" if plan.minutes is not None else f"{plan.trials} trials"
         return [
-            f"{outcome.filter}: no world found within {given} in which it is overconfident",
+            f"{name}: no world found within {given} in which it is overconfident",
             f"  most overconfident: {worst}",
             f"  that world: {tested}",
             f"  searched: {searched}; no proof that there is no such world",
@@ -35,12 +36,16 @@ def lines(outcome: Challenge, out: Path) -> list[str]:
     rate = f"a right filter is found so in at most {plan.false_alarm:.3g} of challenges"
     rate += "" if outcome.clear else "; not shrunk, for its trials were not clear enough"
     return [
-        f"{outcome.filter} is overconfident in {outcome.space.text(outcome.point)}",
+        f"{name} is overconfident in {outcome.space.text(outcome.point)}",
         f"  confirmed: {tested}{p}; {rate}",
         f"  worst: {worst}",
         f"  searched: {searched}",
         f"  {out} has the world; again: {command(outcome, out)}",
     ]
+
+
+def _subject(outcome: Challenge) -> str:
+    return f"the map of {outcome.filter}" if outcome.part == "map" else outcome.filter
 
 
 def command(outcome: Challenge, out: Path) -> str:
@@ -55,6 +60,7 @@ def as_data(outcome: Challenge, out: Path) -> dict[str, Any]:
     search_seed, shrink_seed, confirm_seed = plan.seeds
     return {
         "filter": outcome.filter,
+        "of": outcome.part,
         "base": space.base.name,
         "found": outcome.found,
         "world": space.values(outcome.point),
@@ -106,7 +112,7 @@ def write_scenario(outcome: Challenge, out: Path) -> None:
     """
     verdict = outcome.verdict
     summary = (
-        f"{outcome.filter} is {verdict.status} here, ANEES {verdict.statistic:.3g} in {verdict.runs} runs: "
+        f"{_subject(outcome)} is {verdict.status} here, ANEES {verdict.statistic:.3g} in {verdict.runs} runs: "
         f"{outcome.space.text(outcome.point)}"
     )
     text = scenario_text(

@@ -17,7 +17,8 @@ import pytest
 
 import consistency as cs
 from consistency.bench.challenging import bench as scoring
-from consistency.bench.challenging.bench import WORST, ChallengeScorer, Done, score_of_run
+from consistency.bench.challenging import challenge as challenging
+from consistency.bench.challenging.bench import WORST, ChallengeScorer, Done, map_nees, score_of_run
 from consistency.bench.challenging.challenge import BASES, ChallengePhases, Plan, base_of, challenge, is_overconfident
 from consistency.bench.challenging.search import BATCH, RUNGS, Budget, Candidate, ranked, search, standard_error
 from consistency.bench.challenging.shrink import changed, shrink
@@ -26,6 +27,7 @@ from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space,
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.path import lap_length, planned_path
+from consistency.bench.store.results import outcome_of
 from consistency.referee.cli import main
 from consistency.referee.errors import InputError
 
@@ -377,7 +379,7 @@ def test_shrinking_stops_with_the_time() -> None:
     ],
 )
 def test_only_errors_that_are_too_large_count(status: str, anees: float, faults: tuple[str, ...], found: bool) -> None:
-    verdict: Any = SimpleNamespace(status=status, statistic=anees, faults=faults, failures=())
+    verdict: Any = SimpleNamespace(status=status, inflation=anees / 3.0, faults=faults, failures=())
     assert is_overconfident(verdict) is found
     verdict.failures = ("a run",)
     assert is_overconfident(verdict)  # a breakdown always does
@@ -464,6 +466,60 @@ def test_what_is_not_found_is_not_called_consistent() -> None:
     assert as_data(outcome, Path("out.toml"))["file"] is None
 
 
+@pytest.fixture(scope="module")
+def far_map() -> Any:
+    """The same worlds, and the map of ``ekf-uvd``."""
+    plan = Plan(minutes=None, trials=60, jobs=1)
+    return challenge("ekf-uvd", None, plan, [*SMALL, "range=6:9", "baseline=0.05:0.09"], part="map")
+
+
+def test_the_map_is_challenged_apart(far_map: Any, tmp_path: Path) -> None:
+    """By its own verdict, in its own world."""
+    assert far_map.found
+    assert far_map.part == "map"
+    assert far_map.world.name == "challenge-ekf-uvd-map"
+    results = cs.run_trials(far_map.world, ["ekf-uvd"], 61, far_map.plan.seeds[-1], 1)
+    whole = cs.analyse(results)["ekf-uvd"]
+    assert whole.map is not None
+    assert whole.map.verdict is not None
+    assert far_map.verdict.statistic == whole.map.verdict.statistic != whole.statistic
+    assert lines(far_map, Path("a.toml"))[0].startswith("the map of ekf-uvd is overconfident in ")
+    assert as_data(far_map, Path("a.toml"))["of"] == "map"
+    write_scenario(far_map, tmp_path / "found.toml")
+    assert cs.load_scenario(tmp_path / "found.toml").summary.startswith("the map of ekf-uvd is ")
+
+
+def test_the_score_of_a_map_is_the_joint_nees_given_the_pose() -> None:
+    """Of the landmarks alone; the mean over them, in the logarithm."""
+    world = require_landmarks_in_view(STEREO)
+    with Isolation([cs.get_filter("ekf-uvd")], STEREO.belief) as isolation:
+        trial = world.trial(3, 0)
+        outcome = outcome_of(trial, isolation.run(trial))
+        joint = outcome.maps["ekf-uvd"]["joint_nees"]
+        score = score_of_run(isolation, world, 3, 0, "map")
+        of_pose = score_of_run(isolation, world, 3, 0)
+    assert score == pytest.approx(np.log(np.mean(joint) / 3.0))
+    assert score != pytest.approx(of_pose)
+    halved = {"ekf-uvd": {"joint_nees": np.array([2.0, np.nan, 4.0]), "P_zz": np.zeros(3)}}
+    assert map_nees(replace(outcome, maps=halved)).tolist() == [3.0, 6.0]
+    assert len(map_nees(replace(outcome, maps={}))) == 0
+
+
+def test_pose_and_map_share_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, float | None, int | None]] = []
+    monkeypatch.setattr(
+        challenging, "challenge", lambda _, __, plan, ___, part="pose": asked.append((part, plan.minutes, plan.trials))
+    )
+    challenging.challenge_parts("kf", None, Plan(minutes=4.0))
+    challenging.challenge_parts("kf", None, Plan(minutes=None, trials=101))
+    assert asked == [("pose", 2.0, None), ("map", 2.0, None), ("pose", None, 50), ("map", None, 50)]
+    asked.clear()
+    assert challenging.challenge_parts(Breaking(), STEREO, Plan(minutes=4.0))[1] is None
+    assert asked == [("pose", 4.0, None)]
+    with pytest.raises(InputError, match="'breaking': states no covariance of pose and map; use --of pose"):
+        challenge(Breaking(), STEREO, Plan(minutes=4.0), part="map")
+
+
 class Breaking:
     """A Python filter that breaks down at step 3."""
 
@@ -495,7 +551,7 @@ def test_a_filter_that_breaks_down_is_the_worst() -> None:
 class Constant:
     """In the place of a bench: every trial of every world has the same score. Keeps the seeds it is asked with."""
 
-    filter, workers = SimpleNamespace(name="constant"), 1
+    filter, workers, part = SimpleNamespace(name="constant"), 1, "pose"
 
     def __init__(self, score: float) -> None:
         self.score, self.seeds = score, list[int]()
@@ -616,6 +672,7 @@ def test_the_time_is_kept() -> None:
         (("kf", "--out", "found.txt"), "--out found.txt: must end in .toml"),
         (("kf", "--out", "no/found.toml"), "there is no folder no; make it first"),
         (("kf", "--fail-on", "nothing"), "--fail-on must be 'found'"),
+        (("kf", "--of", "path"), "--of must be 'pose', 'map' or 'both', got 'path'"),
     ],
 )
 def test_unusable_input_ends_in_one_line_and_status_2(

@@ -125,7 +125,8 @@ def map_nees(outcome: RunOutcome) -> Array:
     for columns in outcome.maps.values():
         nees = np.asarray(columns.get(JOINT, ()), float)
         flat = len(nees) > 0 and not np.asarray(columns["P_zz"]).any()
-        return nees[~np.isnan(nees)] * (1.5 if flat else 1.0)
+        kept: Array = nees[~np.isnan(nees)] * (1.5 if flat else 1.0)
+        return kept
     return np.empty(0)
 
 

@@ -151,8 +151,8 @@ def state_error(truth: Array, estimate: Array, convention: str) -> Array:
         pose[..., 3:] = _vector_gap(truth[..., 3:7], estimate[..., 3:7])
     rest = truth[..., 7:] - estimate[..., 7:]
     if convention in ("left", "right") and rest.shape[-1]:
-        moving = (np.concatenate([state[..., 7:10], state[..., 3:7]], axis=-1) for state in (truth, estimate))
-        rest[..., :3] = spatial_error(*moving, convention)[..., :3]
+        true, own = (np.concatenate([state[..., 7:10], state[..., 3:7]], axis=-1) for state in (truth, estimate))
+        rest[..., :3] = spatial_error(true, own, convention)[..., :3]
     return np.concatenate([pose, rest], axis=-1)
 
 
@@ -165,7 +165,8 @@ def _vector_gap(truth: Array, estimate: Array) -> Array:
     angle = np.linalg.norm(true, axis=1, keepdims=True)
     axis = true / np.where(angle > 0.0, angle, 1.0)
     turns = np.rint(((own * axis).sum(axis=1, keepdims=True) - angle) / (2.0 * np.pi))
-    return (true + 2.0 * np.pi * turns * axis - own).reshape(*shape[:-1], 3)
+    difference: Array = true + 2.0 * np.pi * turns * axis - own
+    return difference.reshape(*shape[:-1], 3)
 
 
 def se2_log(pose: Array) -> Array:

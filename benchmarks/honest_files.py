@@ -28,7 +28,7 @@ from consistency.referee.verdicts.monitoring import make_monitor, read_innovatio
 sys.path.append(str(Path(__file__).parents[1] / "tests/helpers"))  # writers of flight logs
 
 RUNS, STEPS = 50, 6
-POWERED = 30  # draws with x2 in P, at most
+POWERED = 20  # draws with x2 in P, at most
 FOUND = 0.95  # of them, at least
 T = 1_700_000_000 + 0.25 * np.arange(STEPS)
 UPPER = np.triu_indices(6)
@@ -341,6 +341,8 @@ def verdicts(row: str, rng: np.random.Generator, ratio: float) -> list[tuple[boo
             sensor = "odometry" if ROWS[row] is ardupilot else "gps_hpos"
             alarm = watch(read_innovations(path, sensor), make_monitor("optimal", false_alarm=0.05)).alarm
             return [(alarm is not None, alarm is not None and alarm.direction == "overconfident")]
+        if "truth" in options and ROWS[row] not in (planar, rates):
+            options["time_offset"] = 0.0  # spares the search for another clock, which changes no verdict
         found: list[Verdict] = [judge(record) for record in read_recordings(path, Reading(**options))]
     return [(bool(each.faults), each.status == "overconfident") for each in found]
 

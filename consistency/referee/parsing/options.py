@@ -48,7 +48,9 @@ class Reading:
     )
     error: str | None = field(
         default=None,
-        metadata=_shown("Error that the covariance is of: so2, vector, left, right, so3, so3-body, additive, or guess."),
+        metadata=_shown(
+            "Error that the covariance is of: so2, vector, left, right, so3, so3-body, additive, or guess."
+        ),
     )
     state: Sequence[str] | None = field(
         default=None, metadata=_shown("Columns that make up the state [x,y,heading].", "A,B,C", _names)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -61,12 +62,12 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     if r.truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
     runs = _runs(estimates, r.truth, r.covariance)
+    truth_of = _truths(r)
     parts: Mapping[str, range] = WHOLE
     poses: list[Poses] = []
     notes: list[str] = []
     for path, true_path, P_path in runs:
-        own = read_trajectory(path)
-        true = read_drive(true_path, r.body) if is_drive(true_path) else read_trajectory(true_path, true=True)
+        own, true = read_trajectory(path), truth_of(true_path)
         own, true, world = localised(own, true)
         notes += [note for note in (own.note, true.note, world, unused(true, r)) if note]
         if not poses:
@@ -93,6 +94,16 @@ def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> l
     elif r.lever_arm is not None:
         raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
     return recordings_of(source, poses, parts, r, relative)
+
+
+def _truths(r: Reading) -> Callable[[Path], Lines]:
+    """Reads a truth, once where runs that follow each other have the same."""
+
+    @lru_cache(maxsize=1)
+    def read(path: Path) -> Lines:
+        return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, true=True)
+
+    return read
 
 
 def _is_point(lines: Lines) -> bool:
@@ -356,9 +367,9 @@ def trajectory_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
     """Poses of each run of a file or folder beside a truth with orientations; covariances are not looked at."""
     if r.truth is None:
         raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
+    truth_of = _truths(r)
     for path, true_path, _ in _runs(estimates, r.truth, None):
-        own = read_trajectory(path)
-        truth = read_drive(true_path, r.body) if is_drive(true_path) else read_trajectory(true_path, true=True)
+        own, truth = read_trajectory(path), truth_of(true_path)
         for lines, name in ((own, path), (truth, true_path)):
             if _is_point(lines):
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")

@@ -77,7 +77,7 @@ def runs(at: Path, s: Study, columns: Callable[[Array], list[Array]], header: st
     return at / "est"
 
 
-def repeated(numbers: Array) -> list[Array]:
+def repeated(numbers: Array | float) -> list[Array]:
     return [np.full(STEPS, number) for number in np.ravel(numbers)]
 
 

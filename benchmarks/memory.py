@@ -20,7 +20,7 @@ import numpy as np
 
 import consistency as cs
 from consistency.bench.runs.footprint import trial_bytes
-from consistency.bench.store.outcomes import outcome_of
+from consistency.bench.store.trial_rows import outcome_of
 
 MIB = 2**20
 OFF = 0.25

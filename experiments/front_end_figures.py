@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from consistency.referee.document.drawing import Axis, Line, Panel, Points, Sheet, xy
 from consistency.referee.document.looks import COLOURS, DASHES, TRUTH, Look
-from consistency.referee.show import paper
+from consistency.referee.show import with_matplotlib
 from consistency.referee.types import Array
 
 FEATURES = 3.0  # standard deviations of the ellipses, fig. 2.4
@@ -24,14 +24,17 @@ def matches_png(image: Array, uv: Array, covariances: Array, resolution: int = 2
 
     As Valencia & Andrade-Cetto (2018) fig. 2.4.
     """
-    with mpl.rc_context(paper.RC):
-        figure = Figure(figsize=(paper.WIDTH, paper.WIDTH * image.shape[0] / image.shape[1]), layout="constrained")
+    with mpl.rc_context(with_matplotlib.RC):
+        figure = Figure(
+            figsize=(with_matplotlib.WIDTH, with_matplotlib.WIDTH * image.shape[0] / image.shape[1]),
+            layout="constrained",
+        )
         axes = figure.subplots()
         axes.imshow(image, cmap="gray", vmin=0, vmax=255)
         axes.set_axis_off()
         for centre, covariance in zip(uv, covariances, strict=True):
-            paper.draw_line(axes, ellipse(centre, covariance, FEATURES, NOISE), 4.0)
-        return paper.picture(figure, "png", resolution)
+            with_matplotlib.draw_line(axes, ellipse(centre, covariance, FEATURES, NOISE), 4.0)
+        return with_matplotlib.picture(figure, "png", resolution)
 
 
 def samples_png(samples: Array, centre: Array, covariance: Array, resolution: int = 200) -> bytes:
@@ -50,7 +53,7 @@ def samples_png(samples: Array, centre: Array, covariance: Array, resolution: in
             Points(*xy(mean[None]), MEAN),
         )
         panels.append(Panel(Axis(labels[0]), Axis(labels[1]), marks, f"{labels[0]} and {labels[1]} of the poses"))
-    return paper.render(Sheet(tuple(panels), paper.WIDTH / 3), "png", resolution)
+    return with_matplotlib.render(Sheet(tuple(panels), with_matplotlib.WIDTH / 3), "png", resolution)
 
 
 def ellipse(centre: Array, covariance: Array, scale: float, look: Look) -> Line:

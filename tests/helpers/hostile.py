@@ -23,7 +23,7 @@ from flight import Flight
 import consistency as cs
 from consistency.bench.store.frames import failures_table, rejections_table
 from consistency.bench.store.log import read_log
-from consistency.bench.store.outcomes import Rejected
+from consistency.bench.store.trial_rows import Rejected
 from consistency.referee.cli import main
 from consistency.referee.readers.kitti import read_drive
 from consistency.referee.system.provenance import manifest_of

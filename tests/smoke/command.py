@@ -35,7 +35,7 @@ def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.Compl
 
 STARTER = """
 import gc, json, os, sys
-import consistency.referee.cli, consistency.referee.show.html, consistency.referee.show.paper
+import consistency.referee.cli, consistency.referee.show.html, consistency.referee.show.with_matplotlib
 import consistency.referee.show.pdf, consistency.referee.verdicts.comparison, consistency.bench.runs.montecarlo
 from consistency.__main__ import main
 

@@ -33,7 +33,7 @@ RANKS = {
     "bench": {
         "types": 0, "models": 1, "scenario": 2, "protocols": 3, "simulation": 4, "filters": 4,
         "store.parquet": 3, "store.storage": 4, "store.soundness": 4, "store.tables": 4, "store.journal": 5,
-        "store.results": 5, "store.outcomes": 6, "store.frames": 7, "store.log": 8,
+        "store.results": 5, "store.trial_rows": 6, "store.frames": 7, "store.log": 8,
         "runs.finding": 4,
         "runs.streams": 4, "runs.supervising": 5, "runs.touched_memory": 5, "runs.footprint": 8, "runs.gather": 8,
         "runs.isolating": 8, "runs.resuming": 8, "runs.compiling": 8, "runs.work": 9, "runs.backends": 10,

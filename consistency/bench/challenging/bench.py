@@ -19,8 +19,8 @@ from consistency.bench.runs.isolating import Isolation
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
-from consistency.bench.store.outcomes import RunOutcome, outcome_of
 from consistency.bench.store.results import JOINT
+from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.columns import POSE
 from consistency.referee.types import Array

@@ -14,7 +14,7 @@ from consistency.bench.runs.isolating import Isolation
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
-from consistency.bench.store.outcomes import RunOutcome, outcome_of
+from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.bench.types import Trial
 
 Outcomes = Generator[RunOutcome, None, None]

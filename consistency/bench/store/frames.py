@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from consistency.bench.store.outcomes import Rejected, truth_columns
 from consistency.bench.store.parquet import OPTIONAL, Columns
 from consistency.bench.store.results import JOINT
+from consistency.bench.store.trial_rows import Rejected, truth_columns
 from consistency.bench.types import Trial
 from consistency.referee.parsing.columns import COLUMNS
 from consistency.referee.types import Array, Failure

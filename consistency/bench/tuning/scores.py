@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.bench.filters.stepping import name_of, rejects
 from consistency.bench.protocols import Filter
-from consistency.bench.store.outcomes import outcome_of
+from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.columns import POSE

@@ -1,4 +1,4 @@
-"""What a figure shows, described once for two painters: ``screen`` draws it with Bokeh, ``paper`` with Matplotlib.
+"""What a figure shows, described once for two painters: ``with_bokeh`` and ``with_matplotlib`` in ``show``.
 
 A figure has panels, a panel has two axes and marks on them, in the order in which they are drawn. Nothing here draws
 and nothing is worked out; all records are plain data.

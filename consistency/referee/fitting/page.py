@@ -62,7 +62,7 @@ def sheets(model: NoiseModel) -> tuple[Sheet, Sheet]:
 def plot(model: NoiseModel, path: str | Path | None) -> Any:
     """All panels in one figure of Matplotlib; see :meth:`NoiseModel.plot`."""
     require("a plot", "plot")
-    from consistency.referee.show.paper import drawn, picture
+    from consistency.referee.show.with_matplotlib import drawn, picture
 
     errors, rest = sheets(model)
     figure = drawn(Sheet((*errors.panels, *rest.panels), 5.0, columns=3))

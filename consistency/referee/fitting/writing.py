@@ -10,7 +10,7 @@ from consistency.referee.fitting.motions import write_motions
 from consistency.referee.fitting.page import page
 from consistency.referee.fitting.snippets import snippets
 from consistency.referee.fitting.wording import document
-from consistency.referee.show import json, static
+from consistency.referee.show import json, static_html
 from consistency.referee.system.folders import write_folder
 from consistency.referee.system.provenance import manifest_of
 
@@ -27,7 +27,7 @@ def write_model(model: NoiseModel, folder: Path, overwrite: bool = False) -> lis
     """
     texts = snippets(model)
     texts["verdict.json"] = json.render(document(model)) + "\n"
-    texts["report.html"] = static.render(page(model, with_pictures=is_installed("plot")))
+    texts["report.html"] = static_html.render(page(model, with_pictures=is_installed("plot")))
     names: list[str] = []
 
     def contents(at: Path) -> None:

@@ -11,7 +11,7 @@ from consistency.referee.diagnostics.gate_ratios import GateRatios
 from consistency.referee.document.drawing import Axis, Line, Mark, Panel, Points, Rule, Sheet, Span
 from consistency.referee.document.looks import EXPECTED, LIMIT, style
 from consistency.referee.document.thin import thin
-from consistency.referee.show import paper
+from consistency.referee.show import with_matplotlib
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitoring import Watched
 
@@ -22,7 +22,7 @@ FAULT = replace(style(1), dash=(), width=1.1)
 
 def monitor_plot(shown: Watched | Sequence[GateRatios], kind: str, resolution: int = 200) -> bytes:
     """NIS / dof above, the e-value below, over the steps of the file, or test ratios; ``kind`` is png, pdf or svg."""
-    return paper.render(sheet(shown) if isinstance(shown, Watched) else ratios_sheet(shown), kind, resolution)
+    return with_matplotlib.render(sheet(shown) if isinstance(shown, Watched) else ratios_sheet(shown), kind, resolution)
 
 
 def ratios_sheet(ratios: Sequence[GateRatios]) -> Sheet:

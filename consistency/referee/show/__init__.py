@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from consistency.referee.document.blocks import Document
 
-FORMATS = {".json": "json", ".html": "static", ".xml": "junit", ".md": "markdown"}  # suffix of a file -> renderer
+FORMATS = {".json": "json", ".html": "static_html", ".xml": "junit", ".md": "markdown"}  # suffix of a file -> renderer
 
 
 def rendered(document: Document, path: Path) -> str:

@@ -18,7 +18,7 @@ from consistency.referee.document.blocks import Block, Document
 from consistency.referee.document.drawing import Figure, Panel, numbers
 from consistency.referee.document.thin import LIMIT
 from consistency.referee.document.wording import written
-from consistency.referee.show.screen import Screen
+from consistency.referee.show.with_bokeh import Screen
 
 MAXIMUM = 6_000_000  # bytes of the whole file
 SCRIPT = 1_400_000  # bytes of Bokeh itself, style and words

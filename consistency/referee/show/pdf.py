@@ -22,7 +22,7 @@ import typst
 from consistency.referee.document import blocks
 from consistency.referee.document.drawing import Figure
 from consistency.referee.document.wording import written
-from consistency.referee.show import paper
+from consistency.referee.show import with_matplotlib
 
 TEMPLATE = "report.typ"
 MANY = 24  # sheets that take longer to draw than a process to start
@@ -109,7 +109,7 @@ def _figure(figure: Figure, name: str, folder: Path) -> dict[str, Any]:
     images = []
     for number, sheet in enumerate(figure.sheets):
         path = folder / f"{name}-{number}.svg"
-        path.write_bytes(paper.render(sheet))
+        path.write_bytes(with_matplotlib.render(sheet))
         images.append(path.name)
     return {"images": images, "caption": soft(figure.paper or figure.caption), "stacked": figure.stacked}
 

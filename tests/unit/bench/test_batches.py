@@ -21,8 +21,8 @@ from consistency.bench.runs.backends.remote import Part, Worker, pickled_work
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.runs.work import Outcomes, Simulated, TrialWork
-from consistency.bench.store.outcomes import RunOutcome
 from consistency.bench.store.results import open_results
+from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system.machine import this_machine
 
 RUNS = 40

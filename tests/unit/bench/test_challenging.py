@@ -27,7 +27,7 @@ from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space,
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.path import lap_length, planned_path
-from consistency.bench.store.outcomes import outcome_of
+from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.cli import main
 from consistency.referee.errors import InputError
 

@@ -19,8 +19,8 @@ from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.work import Outcomes, Simulated, TrialWork
-from consistency.bench.store.outcomes import RunOutcome
 from consistency.bench.store.results import StoredResults
+from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.types import Trial
 from consistency.referee.system.machine import this_machine
 

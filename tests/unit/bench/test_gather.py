@@ -26,8 +26,8 @@ from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.runs.work import TrialWork
 from consistency.bench.simulation import World
 from consistency.bench.store import parquet
-from consistency.bench.store.outcomes import RunOutcome, outcome_of
 from consistency.bench.store.results import StoredResults, open_results
+from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.bench.types import Trial
 from consistency.referee.document.verdict import document
 from consistency.referee.show.json import render

@@ -19,8 +19,8 @@ from consistency.bench.sweeps.plan import Sweep, load_sweep
 from consistency.bench.sweeps.printing import regime_blocks
 from consistency.bench.sweeps.regime import Regime
 from consistency.referee.document.drawing import Figure, Tiles
-from consistency.referee.show.paper import render
 from consistency.referee.show.terminal import show
+from consistency.referee.show.with_matplotlib import render
 
 LONG = [{"kind": "mismatch", "rate": 0.05}]
 

@@ -27,7 +27,7 @@ from consistency.bench.runs import isolating, supervising
 from consistency.bench.runs.gather import Gathered
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.store.outcomes import outcome_of
+from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Control, Observation
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, and limits of memory")

@@ -27,8 +27,8 @@ from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.simulation import World
 from consistency.bench.store import journal as journals
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.store.outcomes import RunOutcome
 from consistency.bench.store.results import open_results
+from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system import folders, stopping
 from consistency.referee.system.stopping import Stop, stoppable
 from consistency.referee.terminal.progress import progress, say

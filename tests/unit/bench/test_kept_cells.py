@@ -15,7 +15,7 @@ from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.work import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal
-from consistency.bench.store.outcomes import RunOutcome
+from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.sweeps import cell as cells
 from consistency.bench.sweeps import running
 from consistency.bench.sweeps.cell import cost_of

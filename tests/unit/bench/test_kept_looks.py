@@ -18,8 +18,8 @@ from consistency.bench.runs.montecarlo import Interrupted, run_log, simulate_log
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.runs.work import TrialWork
 from consistency.bench.store.log import read_log
-from consistency.bench.store.outcomes import RunOutcome
 from consistency.bench.store.results import StoredResults, open_results
+from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import Record
 from consistency.referee.document.verdict import document

@@ -21,7 +21,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.pages import require_plot, write_monitor_plot
 from consistency.referee.pages.monitor import POINTS, averaged, monitor_plot, sheet
 from consistency.referee.readers.nis import NisLog
-from consistency.referee.show import paper
+from consistency.referee.show import with_matplotlib
 from consistency.referee.show.json import render
 from consistency.referee.show.terminal import show
 from consistency.referee.verdicts.monitoring import Watched, make_monitor, read_innovations, watch, watch_lines
@@ -337,7 +337,7 @@ def test_evidence_is_drawn_with_its_threshold_and_alarm() -> None:
     watched = changed()
     alarm, threshold = watched.alarm, watched.monitor.threshold
     assert alarm is not None
-    axes = paper.draw(sheet(watched)).axes[1]
+    axes = with_matplotlib.draw(sheet(watched)).axes[1]
     line = next(line for line in axes.lines if len(line.get_ydata()) == len(watched.evidence))
     np.testing.assert_array_equal(line.get_ydata(), watched.evidence)
     assert [line.get_ydata()[0] for line in axes.lines if list(line.get_xdata()) == [0, 1]] == [threshold]
@@ -349,4 +349,4 @@ def test_evidence_is_drawn_with_its_threshold_and_alarm() -> None:
     quiet = watch(
         NisLog("f", np.arange(1.0, 6), np.full(5, np.nan), np.full(5, 3.0), np.full(5, 3.0)), make_monitor("optimal")
     )
-    assert not paper.draw(sheet(quiet)).axes[1].patches
+    assert not with_matplotlib.draw(sheet(quiet)).axes[1].patches

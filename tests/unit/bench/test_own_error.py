@@ -17,8 +17,8 @@ import consistency as cs
 from consistency.bench.filters.stepping import run_filter
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.log import read_log
-from consistency.bench.store.outcomes import outcome_of
 from consistency.bench.store.results import OWN_NUMBERS, joined, open_results
+from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.parsing.columns import OWN_COVARIANCE, POINT_COVARIANCE

@@ -48,7 +48,7 @@ from consistency.referee.pages import axes, questions, verdicts
 from consistency.referee.pages.clock import clock_of
 from consistency.referee.parsing.columns import COVARIANCE
 from consistency.referee.show import html, pdf
-from consistency.referee.show.static import STYLE
+from consistency.referee.show.static_html import STYLE
 from consistency.referee.types import Failure
 from consistency.stereo.pages import scenes, stereo_noise
 

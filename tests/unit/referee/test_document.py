@@ -40,7 +40,7 @@ from consistency.referee.document.map import COLUMNS, map_cells, map_lines, map_
 from consistency.referee.document.plan import plan_lines
 from consistency.referee.document.verdict import FURTHER, TERMINAL, cells, document, page, with_values
 from consistency.referee.document.wording import PLAIN, PRINTED, written
-from consistency.referee.show import FORMATS, json, junit, markdown, rendered, static, terminal, text
+from consistency.referee.show import FORMATS, json, junit, markdown, rendered, static_html, terminal, text
 
 INF, NAN = float("inf"), float("nan")
 GOOD = Reason("ekf", "consistent: no fault found", ("mean NEES 3.0",))
@@ -133,7 +133,7 @@ def test_text_puts_what_did_not_pass_below_its_row() -> None:
 
 
 def test_a_static_page_shows_every_block_and_escapes_all_text() -> None:
-    said = static.render(TREE)
+    said = static_html.render(TREE)
     for part in (
         "<h1>Two `filters`</h1>\n<p>One of them is honest.</p>", '<span class="verdict consistent">consistent</span>',
         '<td class="number">2.00</td>', "too small &amp; skewed", "<li>x | y</li><li>z</li>", "<strong>Lead.</strong>",

@@ -32,8 +32,8 @@ from consistency.referee.document.drawing import (
     numbers,
 )
 from consistency.referee.document.looks import BAND, EXPECTED, LIMIT, SHADE, style
-from consistency.referee.show import paper
-from consistency.referee.show.screen import MARKERS, Screen
+from consistency.referee.show import with_matplotlib
+from consistency.referee.show.with_bokeh import MARKERS, Screen
 
 ODD = ("$x^2$ and \\frac", "_hidden", "<script>", "#*@", "$$y$$")
 STEPS = np.arange(1, 6)
@@ -47,7 +47,7 @@ def panel(*marks: Mark, **axes: Axis) -> Panel:
 
 def drawn(*marks: Mark, **axes: Axis):
     """Matplotlib axes of one panel."""
-    return paper.draw(Sheet((panel(*marks, **axes),), 2.0)).axes[0]
+    return with_matplotlib.draw(Sheet((panel(*marks, **axes),), 2.0)).axes[0]
 
 
 def shown(*marks: Mark, limit: int = 100, **axes: Axis):
@@ -205,29 +205,29 @@ def test_axes_of_one_name_are_one():
     first, second = (screen.draw(panel(mark, x=shared)) for _ in range(2))
     assert first.x_range is second.x_range
     assert first.y_range is not second.y_range
-    left, right = paper.draw(Sheet((panel(mark, y=shared), panel(mark, y=shared)), 2.0)).axes
+    left, right = with_matplotlib.draw(Sheet((panel(mark, y=shared), panel(mark, y=shared)), 2.0)).axes
     assert left.get_shared_y_axes().joined(left, right)
     assert (left.get_ylabel(), right.get_ylabel()) == ("step", "")
 
 
 def test_a_panel_with_none_below_it_has_numbers_on_its_axis():
     mark, shared = Points(STEPS, STEPS, style(0)), Axis("step", share="step")
-    axes = paper.draw(Sheet(3 * (panel(mark, x=shared),), 3.0, columns=2)).axes
+    axes = with_matplotlib.draw(Sheet(3 * (panel(mark, x=shared),), 3.0, columns=2)).axes
     assert [a.xaxis.get_tick_params()["labelbottom"] for a in axes[:3]] == [False, True, True]
     assert not axes[3].axison
 
 
 def test_a_map_has_equal_axes_and_height():
     flat = Line(np.array([0.0, 10.0]), np.zeros(2), style(0), path=True)
-    axes = paper.draw(Sheet((replace(panel(flat), equal=True),), 2.0)).axes[0]
+    axes = with_matplotlib.draw(Sheet((replace(panel(flat), equal=True),), 2.0)).axes[0]
     assert axes.get_aspect() == 1.0
-    assert np.ptp(axes.get_ylim()) == pytest.approx(paper.NARROWEST * np.ptp(axes.get_xlim()))
+    assert np.ptp(axes.get_ylim()) == pytest.approx(with_matplotlib.NARROWEST * np.ptp(axes.get_xlim()))
 
 
 def test_a_panel_without_values_says_so():
     lost = replace(panel(Line(STEPS, np.full(5, np.nan), style(0))), empty="no estimate")
     none = replace(panel(), empty="too few")
-    left, right = paper.draw(Sheet((lost, none), 2.0)).axes
+    left, right = with_matplotlib.draw(Sheet((lost, none), 2.0)).axes
     assert [text.get_text() for axes in (left, right) for text in axes.texts] == ["no estimate", "too few"]
     assert left.axison
     assert not right.axison
@@ -239,10 +239,10 @@ def test_a_panel_without_values_says_so():
 def test_names_are_shown_literally():
     keys = tuple(Key(name, style(i)) for i, name in enumerate(ODD))
     sheet = Sheet((replace(panel(Rule("y", 1.0, EXPECTED)), title=ODD[0]),), 2.0, title=ODD[2], keys=keys)
-    figure = paper.draw(sheet)
+    figure = with_matplotlib.draw(sheet)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == list(ODD)
     with mpl.rc_context({"svg.fonttype": "none"}):
-        svg = paper.picture(figure, "svg").decode()
+        svg = with_matplotlib.picture(figure, "svg").decode()
     assert "$x^2$ and \\frac" in svg
     assert "&lt;script&gt;" in svg
 
@@ -253,7 +253,7 @@ def test_a_panel_has_a_legend_of_its_own_and_room_for_it():
         Key("a name that is longer than a panel is wide", SHADE, "band"),
     )
     plain, keyed = panel(Rule("y", 1.0, EXPECTED)), replace(panel(Rule("y", 1.0, EXPECTED)), keys=keys)
-    alone, figure = (paper.draw(Sheet((plain, second), 2.0)) for second in (plain, keyed))
+    alone, figure = (with_matplotlib.draw(Sheet((plain, second), 2.0)) for second in (plain, keyed))
     left, right = figure.axes
     assert left.get_legend() is None
     texts = [text.get_text() for text in right.get_legend().get_texts()]
@@ -266,7 +266,7 @@ def test_a_panel_has_a_legend_of_its_own_and_room_for_it():
 
 def test_the_same_sheet_gives_the_same_bytes():
     sheet = Sheet((panel(Line(STEPS, STEPS, style(0)), y=Axis("value", log=True)),), 2.0, keys=(Key("f", style(0)),))
-    first, second = (paper.render(sheet) for _ in range(2))
+    first, second = (with_matplotlib.render(sheet) for _ in range(2))
     assert first == second
 
 

@@ -11,7 +11,7 @@ from consistency.bench.filters.record import RunRecord
 from consistency.bench.filters.stepping import error_of, name_of, rejects
 from consistency.bench.runs.backends.remote import Part, require_same_versions
 from consistency.bench.runs.work import Outcomes, TrialWork
-from consistency.bench.store.outcomes import RunOutcome, outcome_of
+from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.referee.errors import InputError
 from consistency.referee.system.machine import in_words
 from consistency.referee.terminal.progress import say

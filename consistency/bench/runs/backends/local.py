@@ -10,7 +10,7 @@ from itertools import islice
 
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.runs.work import Outcomes, TrialWork
-from consistency.bench.store.outcomes import RunOutcome
+from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.errors import InputError
 
 AHEAD = 2  # runs that wait for each worker, so that none waits for them

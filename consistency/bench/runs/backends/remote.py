@@ -21,7 +21,7 @@ from joblib.externals.loky.backend.reduction import dumps
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.runs.isolating import dismiss
 from consistency.bench.runs.work import TrialWork
-from consistency.bench.store.outcomes import RunOutcome
+from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.errors import InputError
 from consistency.referee.system.machine import this_machine
 

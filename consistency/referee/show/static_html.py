@@ -165,7 +165,7 @@ def _figure(of: Figure) -> str:
     """Its sheets as one image each, named by its title."""
     if find_spec("matplotlib") is None:
         return ""
-    from consistency.referee.show.paper import render as painted
+    from consistency.referee.show.with_matplotlib import render as painted
 
     sources = (b64encode(painted(sheet, "png", RESOLUTION)).decode() for sheet in of.sheets)
     return "".join(f'<img alt="{escape(of.title)}" src="data:image/png;base64,{source}">' for source in sources)

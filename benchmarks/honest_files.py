@@ -8,6 +8,7 @@ several verdicts of is counted by the verdict that is at fault most often.
 from __future__ import annotations
 
 import argparse
+import runpy
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -25,7 +26,7 @@ from consistency.referee.readers.fixes import axes_at, centred, geodetic
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch
 
-sys.path.append(str(Path(__file__).parents[1] / "tests/helpers"))  # writers of flight logs
+HELPERS = Path(__file__).parents[1] / "tests/helpers"  # writers of flight logs
 
 RUNS, STEPS = 50, 6
 POWERED = 20  # draws with x2 in P, at most
@@ -269,8 +270,7 @@ def uncertain(at: Path, s: Study) -> Drawn:
 
 def px4(at: Path, s: Study) -> Drawn:
     """Innovations of a flight, 400 messages."""
-    from flight import Flight
-
+    Flight = runpy.run_path(str(HELPERS / "flight.py"))["Flight"]
     log, variance = Flight(), np.exp(s.rng.normal(size=(400, 2)))
     own = np.sqrt(_ratio(s) * variance) * s.rng.normal(size=(400, 2))
     for k in range(400):
@@ -280,8 +280,7 @@ def px4(at: Path, s: Study) -> Drawn:
 
 def ardupilot(at: Path, s: Study) -> Drawn:
     """Innovations of body odometry."""
-    from dataflash_log import Flight
-
+    Flight = runpy.run_path(str(HELPERS / "dataflash_log.py"))["Flight"]
     log, variance = Flight("XKFD"), np.exp(s.rng.normal(size=(400, 3)))
     own = np.sqrt(_ratio(s) * variance) * s.rng.normal(size=(400, 3))
     for k in range(400):

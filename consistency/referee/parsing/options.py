@@ -115,6 +115,19 @@ class Reading:
     truth_shared: bool | None = field(
         default=None, metadata=_shown("The estimator has fused the truth.", flag="--truth-shared/")
     )
+    shared: str | None = field(
+        default=None,
+        metadata=_shown(
+            "Take off errors that all estimates share: a vector, one that grows by the second, or by the metre.",
+            "by-vector|by-time|by-distance",
+        ),
+    )
+    shared_from: Path | None = field(
+        default=None, metadata=_shown("Drives that --shared is fitted to [the first half of the estimates].", "DRIVES")
+    )
+    shared_truth: Path | None = field(
+        default=None, metadata=_shown("Truth of these drives [that of --truth].", "TRUTH")
+    )
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

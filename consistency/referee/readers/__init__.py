@@ -33,6 +33,7 @@ from consistency.referee.readers.kitti import BODIES, is_drive
 from consistency.referee.readers.layouts import is_spatial
 from consistency.referee.readers.plane import is_plane
 from consistency.referee.readers.relative import MARGINAL
+from consistency.referee.readers.shared import less_shared, other_drives, require_shared_options
 from consistency.referee.readers.sheet import frame_rows
 from consistency.referee.readers.table import read_tables
 from consistency.referee.readers.text import is_cut, without_end
@@ -57,6 +58,7 @@ CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
     "truth_covariance": "whose covariance is of a declared error too",
+    "shared": "which is fitted to a declared error",
     "relative": "which judges motions in one error; name the conventions one by one",
 }
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
@@ -103,8 +105,8 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Evidence]:
     r = _checked(replace(reading, truth=cast(Any, true)), over)
     _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, "topic", "truth_topic")
     if r.error == GUESS:
-        return guessed("tables", r, lambda kind: _asked(read_tables(sheet, replace(r, error=kind), over), r))
-    return _asked(read_tables(sheet, r, over), r)
+        return guessed("tables", r, lambda kind: _asked(read_tables(sheet, replace(r, error=kind), over), r, over))
+    return _asked(read_tables(sheet, r, over), r, over)
 
 
 def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Evidence]:
@@ -154,8 +156,10 @@ def _read(estimates: Path, r: Reading) -> list[Evidence]:
     over = relative_of(r.relative, bool(r.motions), r.windows)
     r = _checked(r, over)
     if r.error == GUESS:
-        return guessed(str(estimates), r, lambda kind: _asked(_by_kind(estimates, replace(r, error=kind), over), r))
-    return _asked(_by_kind(estimates, r, over), r)
+        return guessed(
+            str(estimates), r, lambda kind: _asked(_by_kind(estimates, replace(r, error=kind), over), r, over)
+        )
+    return _asked(_by_kind(estimates, r, over), r, over)
 
 
 def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]]) -> list[Evidence]:
@@ -177,9 +181,12 @@ def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]])
     return [replace(one, guesses={default: one} | {kind: others[kind][one.name] for kind in kinds}) for one in first]
 
 
-def _asked(records: list[Evidence], r: Reading) -> list[Evidence]:
-    """Records with what is declared of their truth, in pieces where that is asked."""
+def _asked(records: list[Evidence], r: Reading, over: Relative | None) -> list[Evidence]:
+    """Records with what is declared of their truth, in pieces or without what all share where that is asked."""
     pieces, records = pieces_asked(r), declared(records, r)
+    if r.shared is not None:
+        others = None if r.shared_from is None else _by_kind(r.shared_from, other_drives(r), over)
+        return less_shared(records, others, r.shared)
     return records if pieces is None else [in_pieces(record, pieces or None) for record in records]
 
 
@@ -252,6 +259,7 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
     if over is not None and offset == "estimate":
         raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
     require_truth_options(r)
+    require_shared_options(r)
     align = require_alignment(r.align, r.truth or r.truth_topic)
     if over is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")

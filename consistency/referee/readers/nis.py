@@ -14,7 +14,7 @@ from consistency.referee.parsing import MOST_DOF, one_line, require_name
 from consistency.referee.readers.archive import load_arrays, run_lengths, step_times, whole_numbers
 from consistency.referee.readers.record import listed
 from consistency.referee.readers.sheet import TableRows, are_dof, bounded, read_sheet
-from consistency.referee.readers.table import row_order
+from consistency.referee.readers.table_columns import row_order
 from consistency.referee.types import Array
 
 NEEDED = ("nis", "nis_dof")

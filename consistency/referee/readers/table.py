@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,25 +13,30 @@ from consistency.referee.diagnostics.parts import diagonal, each_alone
 from consistency.referee.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error
-from consistency.referee.parsing.columns import COVARIANCE, OWN_COVARIANCE
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.alignment import Aligned, clocks_and_frames
 from consistency.referee.readers.hints import hints
-from consistency.referee.readers.interpolation import Manifold, nearest, truth_at
 from consistency.referee.readers.kitti import drive_sheet, is_drive
 from consistency.referee.readers.matching import common_steps, common_times
-from consistency.referee.readers.naming import DEVIATIONS
 from consistency.referee.readers.plane import planar_sheet
 from consistency.referee.readers.poses import NamedPoses, Poses
-from consistency.referee.readers.record import Track, assemble, count, listed, symmetric
+from consistency.referee.readers.record import Track, assemble
 from consistency.referee.readers.relative import Stretch, relative_recording
-from consistency.referee.readers.sheet import Places, TableRows, are_dof, read_sheet
-from consistency.referee.readers.uncertain import COLUMNS
+from consistency.referee.readers.sheet import Places, TableRows, read_sheet
+from consistency.referee.readers.table_columns import (
+    POSE,
+    cross_covariances,
+    has_own,
+    nis_columns,
+    present_columns,
+    require_columns,
+    row_order,
+    stated_covariance,
+    stated_deviations,
+)
+from consistency.referee.readers.table_truth import Samples, manifold_of, matched, samples_of
 from consistency.referee.readers.windows import Relative
-from consistency.referee.types import Array, Indices
-
-POSE = ("x", "y", "heading")
-OWN_NAMES = {(POSE[i], POSE[j]): name for name, (i, j) in COVARIANCE.items()}
+from consistency.referee.types import Array
 
 
 def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | None = None) -> list[Evidence]:
@@ -50,7 +53,7 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
     convention = _convention(r.error, axes, truth)
     if relative is not None:
         require_poses(estimates, axes, convention, truth)
-    if r.align is not None and _manifold(convention) != "planar":
+    if r.align is not None and manifold_of(convention) != "planar":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     other, notes = None, [note]
     if isinstance(truth, Path) and is_drive(truth):
@@ -135,15 +138,15 @@ def _recording(
     notes: list[str] = []
     moved = Aligned(())
     if truth is None:
-        broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *_present(sheet, axes)])).all(axis=1)
+        broken = ~np.isfinite(np.column_stack([np.zeros(len(runs)), *present_columns(sheet, axes)])).all(axis=1)
         error = None if not broken.any() else np.where(broken, np.nan, 0.0)[:, None]
     else:
-        own = convention != ADDITIVE and axes == POSE and _has_own(sheet)
-        deviations = None if own else _deviations(sheet, axes)
-        covariance = _covariance(sheet, axes, own) if deviations is None else diagonal(deviations)
+        own = convention != ADDITIVE and axes == POSE and has_own(sheet)
+        deviations = None if own else stated_deviations(sheet, axes)
+        covariance = stated_covariance(sheet, axes, own) if deviations is None else diagonal(deviations)
         estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
         estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
-        samples = _samples(truth, axes, key, r.truth_covariance)
+        samples = samples_of(truth, axes, key, r.truth_covariance)
         shift, clocks = 0.0, list[str]()
         if relative is not None and deviations is not None:
             raise InputError(
@@ -162,7 +165,7 @@ def _recording(
                 there = np.isin(runs, np.unique(samples.runs)) if samples.runs is not None else np.ones(len(runs), bool)
                 estimate[there] = np.concatenate([p.estimate for p in moved.runs])
                 covariance[there] = np.concatenate([p.covariance for p in moved.runs])
-        keep, true, of_truth, notes = _matched(
+        keep, true, of_truth, notes = matched(
             name, sheet, truth, samples, runs, keys + shift, key, axes, convention, r.tolerance
         )
         if relative is not None:
@@ -182,7 +185,7 @@ def _recording(
             notes.append(f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error")
         if key == "step":
             keep &= ~_exact_start(keys, covariance)
-    nis, dof = _nis(sheet)
+    nis, dof = nis_columns(sheet)
     numbers = [int(run) for run in np.unique(runs[keep])]
     members = [np.flatnonzero(keep & (runs == run)) for run in numbers]
     if key == "step":
@@ -221,7 +224,7 @@ def _stretches(
 ) -> list[Stretch]:  # fmt: skip
     """Each run before its windows are taken."""
     t = sheet.numbers("t", finite=True) if "t" in sheet else np.full(len(runs), np.nan)
-    cross = None if relative.motions else _cross(sheet)
+    cross = None if relative.motions else cross_covariances(sheet)
     found = []
     for run in np.unique(runs[keep]):
         rows = np.flatnonzero(runs == run)
@@ -233,78 +236,6 @@ def _stretches(
             )
         )  # fmt: skip
     return found
-
-
-def _cross(sheet: TableRows) -> Array | None:
-    """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
-    out, missing = np.empty((len(sheet), 3, 3)), []
-    for (i, a), (j, b) in itertools.product(enumerate(POSE), repeat=2):
-        names = f"C_{a[0]}{b[0]}", f"C_{a}_{b}"
-        there = [name for name in names if name in sheet]
-        if there:
-            out[:, i, j] = sheet.numbers(there[0])
-        else:
-            missing.append(names[0])
-    if missing and len(missing) < len(POSE) ** 2:
-        raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; a cross-covariance is no symmetric matrix")
-    return None if missing else out
-
-
-def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
-    """Rows (N,) by run and then by ``key`` (step or t); ``runs`` (N,) has the run of each row.
-
-    Timestamps must be in order: a jump back is another run or another clock.
-
-    Raises
-    ------
-    InputError
-        A step or a timestamp is there twice, or a timestamp is less than the one before.
-    """
-    values = sheet.numbers(key, finite=True, whole=key == "step")
-    order = np.argsort(runs, kind="stable") if key == "t" else np.lexsort((values, runs))
-    same = np.diff(runs[order]) == 0
-    stuck = np.flatnonzero(same & (np.diff(values[order]) <= 0))
-    if len(stuck):
-        row = int(order[stuck[0] + 1])
-        of = f" of run {runs[row]}" if "run" in sheet else ""
-        what = "is there twice" if values[order[stuck[0]]] == values[row] else "is less than the one before"
-        hint = "" if "run" in sheet else "; several runs need a column 'run'"
-        hint += "" if "filter" in sheet else "; several estimators need a column 'filter'" if "run" in sheet else ""
-        raise InputError(f"{sheet.place(row)}: {key} {values[row]:.10g}{of} {what}{hint}")
-    return order
-
-
-class Samples(NamedTuple):
-    """The truth of all runs, in order of the runs and of time."""
-
-    keys: Array  # (M,), step, or s
-    values: Array  # (M, n)
-    covariance: Array | None  # (M, n, n), of the truth itself
-    row: Indices  # (M,), of the file
-    runs: Indices | None  # (M,); None: it serves all
-
-    def of(self, run: int) -> Samples:
-        """Samples of one run."""
-        if self.runs is None:
-            return self
-        here = self.runs == run
-        P = None if self.covariance is None else self.covariance[here]
-        return Samples(self.keys[here], self.values[here], P, self.row[here], self.runs[here])
-
-
-def _samples(truth: TableRows, axes: tuple[str, ...], key: str, stated: str | None) -> Samples:
-    if stated not in (None, COLUMNS):
-        raise InputError(f"--truth-covariance {stated}: for tables it is '{COLUMNS}', those of the truth")
-    _require(truth, axes)
-    values = np.column_stack([truth.numbers(axis, finite=True) for axis in axes])
-    runs = truth.numbers("run", whole=True).astype(int) if "run" in truth else None
-    order = row_order(truth, runs if runs is not None else np.zeros(len(values), int), key)
-    P = None if stated is None else _covariance(truth, axes)[order]
-    return Samples(truth.numbers(key)[order], values[order], P, order, None if runs is None else runs[order])
-
-
-def _manifold(convention: str) -> Manifold:
-    return "vector" if convention == "vector" else "planar"
 
 
 def _poses(
@@ -326,84 +257,10 @@ def _poses(
             found.append(
                 Poses(
                     place, t[rows], estimate[rows], covariance[rows], np.ones(len(rows), bool), true.keys, true.values,
-                    _manifold(convention), convention, max_dt,
+                    manifold_of(convention), convention, max_dt,
                 )
             )  # fmt: skip
     return found
-
-
-def _matched(
-    name: str,
-    sheet: TableRows,
-    truth: TableRows,
-    samples: Samples,
-    runs: Array,
-    keys: Array,
-    key: str,
-    axes: tuple[str, ...],
-    convention: str,
-    max_dt: float,
-) -> tuple[Array, Array, Array | None, list[str]]:
-    """Which rows have a truth, (N,), that truth, (N, n), its covariance, (N, n, n), and notes on the matching."""
-    true_runs = samples.runs
-    tolerance = 0.0 if key == "step" else max_dt
-    keep, true = np.zeros(len(keys), bool), np.full((len(keys), len(axes)), np.nan)
-    of_truth = None if samples.covariance is None else np.full((*true.shape, len(axes)), np.nan)
-    partner, furthest = np.full(len(keys), -1), 0.0
-    for run in np.unique(runs):
-        rows = np.flatnonzero(runs == run)
-        there = samples.of(run)
-        if not len(there.keys):
-            has = ", ".join(map(str, np.unique(true_runs)[:5])) if true_runs is not None else ""
-            raise InputError(f"{truth.path}: holds no run {run} (it has {has}); without a column 'run' it serves all")
-        if key == "step":
-            own, match = _equal(keys[rows], there.keys)
-            found = there.values[match]
-        else:
-            manifold = _manifold(convention)
-            own, found, match, apart, _ = truth_at(keys[rows], there.keys, there.values, manifold, tolerance)
-            furthest = max(furthest, float(apart.max(initial=0.0)))
-        if not len(own):
-            spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (keys[rows], there.keys)]
-            within = f" within {tolerance:g} s (--max-dt)" if key == "t" else ""
-            raise InputError(
-                f"{sheet.path}: no {key} of run {run} ({spans[0]}) is in {truth.path} ({spans[1]}){within}"
-            )
-        keep[rows[own]], true[rows[own]], partner[rows[own]] = True, found, there.row[match]
-        if of_truth is not None and there.covariance is not None:
-            of_truth[rows[own]] = there.covariance[nearest(keys[rows[own]], there.keys, match)]
-    if key == "step" and "t" in sheet and "t" in truth:
-        _same_instants(sheet, truth, keep, partner, max_dt)
-    notes = []
-    absent = [] if true_runs is None else sorted({int(run) for run in true_runs} - {int(run) for run in runs})
-    if absent:
-        notes.append(
-            f"{name}: no estimates of {count(len(absent), 'run')} of the truth ({listed(absent)}); "
-            "if the filter broke down there, write a row of NaN, so that the failure counts"
-        )
-    if not keep.all():
-        notes.append(f"{name}: {int((~keep).sum())} of {len(keep)} estimates have no truth and are left out")
-    if furthest > 1e-6:
-        notes.append(f"{name}: the truth is interpolated, from samples up to {furthest:.2g} s away")
-    return keep, true, of_truth, notes
-
-
-def _equal(steps: Array, reference: Array) -> tuple[Indices, Indices]:
-    """Indices of equal numbers in two increasing lists."""
-    _, own, match = np.intersect1d(steps, reference, assume_unique=True, return_indices=True)
-    return own, match
-
-
-def _same_instants(sheet: TableRows, truth: TableRows, keep: Array, partner: Array, max_dt: float) -> None:
-    own = sheet.numbers("t")[keep]
-    other = truth.numbers("t")[partner[keep]]
-    off = np.flatnonzero(np.abs(own - other) > max_dt + 1e-6)
-    if len(off):
-        row = int(np.flatnonzero(keep)[off[0]])
-        raise InputError(
-            f"{sheet.place(row)}: t is {own[off[0]]:.10g}, but {other[off[0]]:.10g} in the same step of {truth.path}; "
-            "number the same instants by the same step, or raise --max-dt"
-        )
 
 
 def _exact_start(steps: Array, covariance: Array) -> Array:
@@ -418,80 +275,6 @@ def _is_exact(covariance: Array) -> bool:
     return bool(np.isin(classify(covariance, ROUNDED), (Validity.DEFICIENT, Validity.INDEFINITE)).all())
 
 
-def _has_own(sheet: TableRows) -> bool:
-    """Whether the rows are of a filter of the bench that states the covariance of an error of its own."""
-    return all(name in sheet and not sheet.empty(name).all() for name in OWN_COVARIANCE)
-
-
-def _deviations(sheet: TableRows, axes: tuple[str, ...]) -> Array | None:
-    """Standard deviations (N, n) of a table without cross terms: sigma_x, std_x, sx, or P_x_x alone; None of others."""
-    n = len(axes)
-    pairs = [(axes[i], axes[j]) for i, j in itertools.combinations(range(n), 2)]
-    if any(f"P_{a}_{b}" in sheet or f"P_{b}_{a}" in sheet or OWN_NAMES.get((a, b)) in sheet.data for a, b in pairs):
-        return None
-    variances = [f"P_{a}_{a}" if f"P_{a}_{a}" in sheet else OWN_NAMES.get((a, a), "") for a in axes]
-    if n > 1 and all(name in sheet for name in variances):
-        P = np.column_stack([sheet.numbers(name) for name in variances])
-        return np.asarray(np.sign(P) * np.sqrt(np.abs(P)))
-    for spelling in DEVIATIONS:
-        names = [spelling.format(axis) for axis in axes]
-        if all(name in sheet for name in names) and not any(name in sheet for name in variances):
-            return np.column_stack([sheet.numbers(name) for name in names])
-    return None
-
-
-def _covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False) -> Array:
-    """(N, n, n) from the upper triangle; a lower triangle beside it must agree. ``own``: of the columns own_P_*."""
-    _require(sheet, axes)
-    if own:
-        P = np.empty((len(sheet), 3, 3))
-        for name, (i, j) in OWN_COVARIANCE.items():
-            P[:, i, j] = P[:, j, i] = sheet.numbers(name)
-        return P
-    n = len(axes)
-    out = np.empty((len(sheet), n, n))
-    for i in range(n):
-        for j in range(i, n):
-            upper = [f"P_{axes[i]}_{axes[j]}", *([OWN_NAMES[axes[i], axes[j]]] if axes == POSE else [])]
-            lower = [f"P_{axes[j]}_{axes[i]}"]
-            there = [column for column in (*upper, *lower) if column in sheet]
-            if not there:
-                wanted = upper[-1]
-                raise InputError(
-                    f"{sheet.path}: column '{wanted}' is missing; the covariance of {', '.join(axes)} needs its "
-                    "upper triangle, zeros included"
-                )
-            out[:, i, j], out[:, j, i] = sheet.numbers(there[0]), sheet.numbers(there[-1])
-    return symmetric(out, sheet.place)
-
-
-def _require(sheet: TableRows, axes: tuple[str, ...]) -> None:
-    missing = [axis for axis in axes if axis not in sheet]
-    if missing:
-        hint = "; name other states with --state a,b,c" if axes == POSE else ""
-        raise InputError(f"{sheet.path}: column '{missing[0]}' is missing; there are: {sheet.columns}{hint}")
-
-
-def _present(sheet: TableRows, axes: tuple[str, ...]) -> list[Array]:
-    return [sheet.numbers(axis) for axis in axes if axis in sheet]
-
-
-def _nis(sheet: TableRows) -> tuple[Array | None, Array | None]:
-    if "nis" not in sheet:
-        return None, None
-    if "nis_dof" not in sheet:
-        raise InputError(f"{sheet.path}: column 'nis_dof' is missing; it is the number of measurements in each nis")
-    nis, dof = sheet.numbers("nis"), sheet.numbers("nis_dof")
-    bad = (nis < 0) | np.isinf(nis) | (np.isfinite(nis) & ~are_dof(dof))
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise InputError(
-            f"{sheet.place(row)}: nis {nis[row]:g} with nis_dof {dof[row]:g}; "
-            "nis must be 0 or more, nis_dof a whole number from 0 to below 2^31"
-        )
-    return nis, np.where(np.isfinite(nis), dof, 0.0)
-
-
 # --- poses alone -------------------------------------------------------------------------------------
 
 
@@ -503,9 +286,9 @@ def table_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
     truth = drive_sheet(r.truth, r.body) if is_drive(r.truth) else planar_sheet(r.truth)[0]
     if "filter" in sheet and len(set(sheet.texts("filter"))) > 1:
         raise InputError(f"{estimates}: holds several estimators in its column 'filter'; keep the rows of one")
-    _require(sheet, POSE)
+    require_columns(sheet, POSE)
     key = _key(sheet, truth, r)
-    samples = _samples(truth, POSE, key, None)
+    samples = samples_of(truth, POSE, key, None)
     runs = sheet.numbers("run", whole=True).astype(int) if "run" in sheet else np.zeros(len(sheet), int)
     order = row_order(sheet, runs, key)
     sheet, runs = sheet.rows(order), runs[order]

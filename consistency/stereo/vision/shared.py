@@ -1,20 +1,19 @@
 """Errors that the motions of a drive share: calibration of the rig, mounting and clock of the truth.
 
-Pixel noise is independent from match to match; these are not, and no number of matches averages them out. Each motion's
-error against truth is e = J theta + n: theta, the same for all, has a prior as wide as calibrations usually are, and n
-the propagated covariance plus a floor, the scatter of the truth. Both are fitted to a part of a drive by maximum
-likelihood, with theta integrated out, and predicted for another.
+Pixel noise is independent from match to match; these are not, and no number of matches averages them out.
+:mod:`consistency.referee.diagnostics.shared` fits them to a part of a drive, with a prior as wide as calibrations
+usually are, and predicts them for another.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize
 from scipy.spatial.transform import Rotation
 
+from consistency.referee.diagnostics import shared
+from consistency.referee.diagnostics.shared import SharedError as SharedError
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.vision.bridging import neighbours
@@ -39,28 +38,6 @@ SHARED = {
 }
 RIG = 7  # of these are the rig's
 STEP = 1e-2  # of a prior standard deviation, for derivatives
-LEAST, MOST = 1e-7, 1.0  # m and rad, standard deviations of the floor that are looked at
-FEWEST = 12  # motions: six numbers of the floor beside what is shared
-
-
-@dataclass(frozen=True, eq=False)
-class SharedError:
-    """What the motions of one part of a drive tell about the errors that all share."""
-
-    mean: Array  # (11,), in the order and units of :data:`SHARED`
-    covariance: Array  # (11, 11)
-    floor: Array  # (6,), standard deviations of the truth of a motion, m and rad
-
-    def predict(self, J: Array, S: Array) -> tuple[Array, Array]:
-        """Expected errors (n, 6) of other motions, and their covariances (n, 6, 6).
-
-        Parameters
-        ----------
-        J : (n, 6, 11), of :func:`sensitivities`
-        S : (n, 6, 6), propagated from the noise of the pixels
-        """
-        shared = J @ self.covariance @ np.swapaxes(J, 1, 2)
-        return J @ self.mean, S + shared + np.diag(self.floor**2)
 
 
 def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -> Array:
@@ -98,7 +75,7 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
 
 
 def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
-    """Shared errors and floor of highest likelihood.
+    """Shared errors and floor of highest likelihood (:func:`consistency.referee.diagnostics.shared.fit_shared`).
 
     Parameters
     ----------
@@ -111,45 +88,7 @@ def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
     InputError
         Fewer than 12 motions, or shapes that do not fit.
     """
-    n = len(errors)
-    if errors.shape != (n, 6) or J.shape != (n, 6, len(SHARED)) or S.shape != (n, 6, 6):
-        raise InputError(f"errors, J, S: shapes {errors.shape}, {J.shape}, {S.shape} do not fit")
-    if n < FEWEST:
-        raise InputError(f"errors: of {n} motions, at least {FEWEST} are needed for a floor of six numbers")
-
-    start = np.log(np.clip(errors.std(axis=0), 10.0 * LEAST, 0.1 * MOST))
-    bounds = optimize.Bounds(np.full(6, np.log(LEAST)), np.full(6, np.log(MOST)))
-    best = optimize.minimize(  # type: ignore[call-overload]  # the stubs do not know jac=True
-        lambda x: posterior(np.exp(x), errors, J, S)[2:], start, jac=True, method="L-BFGS-B", bounds=bounds
-    )
-    floor = np.exp(best.x)
-    mean, covariance, *_ = posterior(floor, errors, J, S)
-    return SharedError(mean, covariance, floor)
-
-
-def posterior(floor: Array, errors: Array, J: Array, S: Array) -> tuple[Array, Array, float, Array]:
-    """Mean and covariance of what is shared; minus twice the log-likelihood, and its derivative by log floor.
-
-    The errors (n, 6) have the covariance V = C + J Pi J', with C that of each motion alone and Pi the prior.
-
-    Parameters
-    ----------
-    floor : (6,), standard deviations
-    J : (n, 6, 11)
-    S : (n, 6, 6)
-    """
-    prior = np.array(list(SHARED.values()))
-    C = S + np.diag(floor**2)
-    W = np.linalg.inv(C)
-    WJ = W @ J
-    H = np.einsum("nia,nib->ab", J, WJ) + np.diag(prior**-2.0)
-    covariance = np.linalg.inv(H)
-    mean = covariance @ np.einsum("nia,ni->a", WJ, errors)
-    weighted = np.einsum("nij,nj->ni", W, errors - J @ mean)  # V^-1 e
-    diagonal = np.einsum("nii->ni", W) - np.einsum("nia,ab,nib->ni", WJ, covariance, WJ)  # of V^-1
-    volume = np.linalg.slogdet(C)[1].sum() + np.linalg.slogdet(H * np.outer(prior, prior))[1]
-    slope = 2.0 * floor**2 * (diagonal - weighted**2).sum(axis=0)
-    return mean, covariance, float((errors * weighted).sum() + volume), slope
+    return shared.fit_shared(errors, J, S, np.array(list(SHARED.values())))
 
 
 def _twist(pose: RelativePose) -> Array:

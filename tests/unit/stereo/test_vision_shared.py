@@ -10,19 +10,18 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
+from consistency.referee.diagnostics.shared import posterior
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.vision import RelativePose, StereoRig, refine_reprojection
 from consistency.stereo.vision.bridging import bridged
 from consistency.stereo.vision.motion import RelativeMotion, diagonal
 from consistency.stereo.vision.shared import (
-    FEWEST,
     RIG,
     SHARED,
     SharedError,
     fit_shared,
     perturbed,
-    posterior,
     sensitivities,
 )
 
@@ -30,6 +29,7 @@ K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
 ROTATED = Rotation.from_rotvec([0.01, -0.02, 0.005]).as_matrix()
 TURNED = StereoRig(K, 1.01 * K + np.diag([0.0, 0.0, -0.01]), ROTATED, np.array([0.54, 0.01, -0.02]), (1200, 360))
 POINTS = 40
+FEWEST = 12  # motions: twice the numbers of the floor
 NAMES = list(SHARED)
 PRIOR = np.array(list(SHARED.values()))
 
@@ -143,7 +143,7 @@ def test_the_likelihood_is_that_of_all_errors_together(rng: np.random.Generator)
         V = block_diag(*(S + np.diag(np.exp(2.0 * log_floor)))) + rows @ Pi @ rows.T
         return float(np.linalg.slogdet(V)[1] + errors.ravel() @ np.linalg.solve(V, errors.ravel()))
 
-    mean, covariance, value, slope = posterior(floor, errors, J, S)
+    mean, covariance, value, slope = posterior(floor, errors, J, S, PRIOR)
     assert value == pytest.approx(minus_twice(np.log(floor)), rel=1e-9)
     steps = 1e-5 * np.eye(6)
     by_differences = [(minus_twice(np.log(floor) + h) - minus_twice(np.log(floor) - h)) / 2e-5 for h in steps]

@@ -8,6 +8,7 @@ other data.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -185,7 +186,7 @@ def _some(record: Record, steps: slice) -> Record:
     """Some steps of the arrays that are judged."""
     names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times", "path")
     there = {name: array for name in names if (array := getattr(record, name)) is not None}
-    arrays = {name: np.asarray(array)[:, steps] for name, array in there.items()}
+    arrays: dict[str, Any] = {name: np.asarray(array)[:, steps] for name, array in there.items()}
     return replace(record, **arrays, t=record.t[steps] if len(record.t) else record.t)
 
 

@@ -165,8 +165,7 @@ def _vector_gap(truth: Array, estimate: Array) -> Array:
     angle = np.linalg.norm(true, axis=1, keepdims=True)
     axis = true / np.where(angle > 0.0, angle, 1.0)
     turns = np.rint(((own * axis).sum(axis=1, keepdims=True) - angle) / (2.0 * np.pi))
-    difference: Array = true + 2.0 * np.pi * turns * axis - own
-    return difference.reshape(*shape[:-1], 3)
+    return np.asarray(true + 2.0 * np.pi * turns * axis - own).reshape(*shape[:-1], 3)
 
 
 def se2_log(pose: Array) -> Array:

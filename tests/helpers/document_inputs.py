@@ -164,7 +164,21 @@ def openvins(folder: Path) -> None:
     write_rows(folder / "stamped_groundtruth.txt", poses(PLACE, TURN))
 
 
+def moving(folder: Path) -> None:
+    """states.csv with a covariance 15 wide, and data.csv, the truth of EuRoC, in s."""
+    rest = np.zeros((STEPS, 9))
+    own, sigma = np.hstack([estimated(), rest + 0.01 * RNG.normal(size=(STEPS, 9))]), np.append(SIGMA, np.full(9, 0.01))
+    full = np.broadcast_to(np.diag(sigma**2).ravel(), (STEPS, 225))
+    names = ["t", "x", "y", "z", *(f"q{a}" for a in "xyzw"), *(f"{k}{a}" for k in ("v", "bg", "ba") for a in "xyz")]
+    names += [f"covariance_{k}" for k in range(225)]
+    rows = np.column_stack([T, own, full])
+    table(folder / "states.csv", [dict(zip(names, row, strict=True)) for row in rows.tolist()])
+    true = np.column_stack([T, PLACE, TURN.as_quat()[:, [3, 0, 1, 2]], rest])
+    np.savetxt(folder / "data.csv", true, delimiter=",", fmt="%.12g")
+
+
 def innovations(folder: Path) -> None:
+    import dataflash_log
     import flight
 
     nis = (RNG.normal(size=(300, 2)) ** 2).sum(axis=1)
@@ -173,6 +187,11 @@ def innovations(folder: Path) -> None:
     for k, each in enumerate(RNG.normal(size=300)):
         log.both(1_000_000 + 100_000 * k, {"baro_vpos": (each, 1.0)})
     log.write(folder / "flight.ulg")
+    ratios = dataflash_log.Flight("XKF4", "XKFD").set({"EK3_HGT_I_GATE": 500})
+    for k, each in enumerate(RNG.normal(size=300)):
+        ratios.log("XKF4", 1_000_000 + 100_000 * k, {"SH": abs(each) / 5.0})
+        ratios.log("XKFD", 1_000_000 + 100_000 * k, {"IX": each, "IVX": 1.0})
+    ratios.write(folder / "flight.bin")
 
 
 def images(folder: Path) -> None:
@@ -249,6 +268,7 @@ PREPARE: dict[str, list[Callable[[Path], None]]] = {
     "docs/files.md Tables: .csv and .parquet": [planar],
     "docs/files.md Without the first steps: `--skip`": [started],
     "docs/files.md OpenVINS": [openvins],
+    "docs/files.md Poses with velocity and biases": [moving],
     "docs/files.md KITTI": [kitti],
     "docs/files.md Logs": [log("LOG")],
     "docs/files.md Relative poses": [motions],

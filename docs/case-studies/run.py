@@ -27,7 +27,7 @@ OFTEN, SELDOM = 200, 40  # draws for the rates
 SETS = {
     "new": ["pycolmap==4.2.1", "stonesoup==1.9.1", "filterpy==2.0.0", "gtsam==4.3.0", "pykalman==0.11.2", "ahrs==0.4.0",
             "opencv-python-headless==5.0.0.93", "scikit-learn==1.9.1", "statsmodels==0.15.0", "lmfit==1.3.4",
-            "simdkalman==1.0.4", "dynamax==1.0.3"],
+            "simdkalman==1.0.4", "dynamax==1.0.3", "pytransform3d==3.17.0"],
     "old": ["pycolmap==3.11.1", "numpy<2", "filterpy==1.4.5", "gtsam==4.2.1", "pykalman==0.10.1", "ahrs==0.3.1",
             "opencv-python-headless==4.6.0.66"],
 }  # fmt: skip

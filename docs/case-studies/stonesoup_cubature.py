@@ -4,33 +4,9 @@ import warnings
 
 import numpy as np
 from stonesoup.functions import cubature_transform, gauss2cubature
-from stonesoup.predictor import kalman as predictors
-from stonesoup.types.detection import Detection
-from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
-from stonesoup.updater import kalman as updaters
 from study import Argument, Case
-from tracking_scene import MODEL, SENSORS, START, TIMES, simulate
-
-
-def rows(data, kind):
-    out = {}
-    for side, sensor in SENSORS.items():
-        predict = getattr(predictors, f"{kind}KalmanPredictor")(MODEL).predict
-        update = getattr(updaters, f"{kind}KalmanUpdater")(sensor).update
-        errors, covariances = np.full((2, *data[0].shape, 4), np.nan)  # a run that breaks down is NaN from there on
-        for run, (states, noises) in enumerate(zip(*data, strict=True)):
-            state = START
-            for k, (x, v) in enumerate(zip(states, noises, strict=True)):
-                z = sensor.function(GaussianState(x, START.covar), noise=v[:, None])
-                detection = Detection(z, timestamp=TIMES[k + 1], measurement_model=sensor)
-                try:
-                    state = update(SingleHypothesis(predict(state, timestamp=TIMES[k + 1]), detection))
-                except np.linalg.LinAlgError:
-                    break
-                errors[run, k, :, 0], covariances[run, k] = x - state.mean.astype(float).ravel(), state.covar
-        out[f"{kind}KalmanUpdater, bearings {side}"] = errors[..., 0], covariances
-    return out
+from tracking_scene import SENSORS, START, rows, simulate
 
 
 def second():

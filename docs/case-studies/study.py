@@ -25,7 +25,7 @@ from consistency import Verdict
 
 SEED, LARGEST_ARCHIVE = 20070, 100_000  # bytes
 SETTINGS = {"false_alarm": 0.01, "detect": 1.5, "power": 0.95}
-Rows = dict[str, tuple[Any, Any]]  # name -> errors (runs, [steps,] n), their covariances or variances
+Rows = dict[str, tuple[Any, Any]]  # name -> errors (runs, [steps,] n), their covariances or deviations
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,10 @@ class Case:
         spent, rows = [time.process_time() - began], []
         for role, draw in (("judged", self.judged), ("control", self.control)):
             for name, arrays in draw(data).items():
-                for row, axes, errors, covariances, share in self.parts(name, *arrays):
-                    rows.append({"row": row, "role": role, **told(verdict(row, errors, covariances, axes, share))})
-                    if archives:
-                        keep(archives, archive(Path(sys.argv[0]).stem, self.version, row), errors, covariances, axes)
+                errors, stated, axes = self.rounded(*arrays)
+                rows.append({"row": name, "role": role, **told(verdict(name, errors, stated, axes))})
+                if archives:
+                    keep(archives, archive(Path(sys.argv[0]).stem, self.version, name), errors, stated, axes)
             spent.append(time.process_time() - began)
         arguments = [each.told(rows) for each in self.second()]
         return {
@@ -101,32 +101,28 @@ class Case:
         }  # fmt: skip
 
     def rates(self, draws: int) -> dict[str, Any]:
-        """Draws of each control in which a fault was found, with fresh random numbers of one seed."""
+        """Draws of each control in which a fault was found; cases that share a control draw other random numbers."""
         faults: dict[str, int] = {}
         began = time.process_time()
-        for seed in np.random.SeedSequence(SEED + 1).spawn(draws):
+        own = f"{Path(sys.argv[0]).stem} {self.version}".encode()
+        for seed in np.random.SeedSequence((SEED + 1, *own)).spawn(draws):
             rng = np.random.default_rng(seed)
             for name, arrays in self.control(self.simulate(rng, self.runs)).items():
-                found = [verdict(row, e, P, axes, share) for row, axes, e, P, share in self.parts(name, *arrays)]
-                fault = any(each.status not in ("consistent", "undecided") for each in found)
+                found = verdict(name, *self.rounded(*arrays))
+                fault = found.status not in ("consistent", "undecided")
                 faults[name] = faults.get(name, 0) + fault
         return {
             "version": self.version, "draws": draws, "faults": faults,
             "seconds": round((time.process_time() - began) / draws, 2),
         }  # fmt: skip
 
-    def parts(self, name: str, errors: Any, covariances: Any) -> Iterator[tuple[str, Sequence[str], Any, Any, int]]:
-        """The arrays as (runs, steps, n), rounded as in an archive; of variances alone each component by itself."""
-        e, P = np.float32(errors), np.float32(covariances)
+    def rounded(self, errors: Any, stated: Any) -> tuple[Any, Any, Sequence[str]]:
+        """Errors, covariances or deviations as (runs, steps, ...), rounded as in an archive; names of the axes."""
+        e, stated = np.float32(errors), np.float32(stated)
         if e.ndim == 2:
-            e, P = e[:, None], P[:, None]
+            e, stated = e[:, None], stated[:, None]
         n = e.shape[-1]
-        axes = tuple(self.axes) if len(self.axes) == n else tuple(f"axis {k}" for k in range(n))
-        if P.shape == e.shape:
-            for k, axis in enumerate(axes):
-                yield f"{name}: {axis}", (axis,), e[..., k : k + 1], P[..., k : k + 1, None], n
-        else:
-            yield name, axes, e, P, 1
+        return e, stated, tuple(self.axes) if len(self.axes) == n else tuple(f"axis {k}" for k in range(n))
 
     @property
     def version(self) -> str:
@@ -147,26 +143,26 @@ class Case:
             yield f"  {row}: {count} of {found['draws']} draws found at fault"
 
 
-def verdict(name: str, errors: Any, covariances: Any, axes: Sequence[str], share: int = 1) -> Verdict:
-    """The verdict on (runs, steps, n) and (runs, steps, n, n), one of ``share`` that have a false-alarm rate together.
+def verdict(name: str, errors: Any, stated: Any, axes: Sequence[str]) -> Verdict:
+    """The verdict on errors (runs, steps, n) with covariances (runs, steps, n, n) or deviations (runs, steps, n).
 
     A run with an impossible value fails from there on.
     """
-    P = np.asarray(covariances, float)
+    stated = np.asarray(stated, float)
+    alone = stated.ndim == 3  # no cross terms: each component by itself
+    given = {"deviations": stated} if alone else {"covariances": 0.5 * (stated + np.swapaxes(stated, -1, -2))}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        return cs.judge(
-            errors, 0.5 * (P + np.swapaxes(P, -1, -2)), axes=axes, name=name,
-            **{**SETTINGS, "false_alarm": SETTINGS["false_alarm"] / share},
-        )  # fmt: skip
+        return cs.judge(errors, **given, axes=axes, name=name, **SETTINGS)
 
 
 def told(found: Verdict) -> dict[str, Any]:
     """What is kept of a verdict."""
     axes = {} if found.axes is None else {name: brief(interval) for name, interval in found.axes.inflation.items()}
+    dof = 0 if found.scale is None else found.scale.dof
     return {
         "runs": found.runs, "steps": found.steps, "failed": len(found.failures), "status": found.status,
-        "dof": 0 if found.scale is None else found.scale.dof,
+        "dof": dof // (len(found.parts) or 1), "parts": len(found.parts) or 1,
         "ratio": brief([found.inflation, *found.inflation_interval]), "axes": axes, "sentence": found.reasons[0],
     }  # fmt: skip
 
@@ -182,9 +178,10 @@ def archive(case: str, version: str, row: str) -> str:
     return f"{case}-{version}-{row}.npz".replace(" ", "-").replace(":", "").replace(",", "")
 
 
-def keep(folder: Path, name: str, errors: Any, covariances: Any, axes: Sequence[str]) -> None:
+def keep(folder: Path, name: str, errors: Any, stated: Any, axes: Sequence[str]) -> None:
     folder.mkdir(exist_ok=True)
     path = folder / name
-    np.savez_compressed(path, errors=errors, covariances=covariances, axes=list(axes))
+    key = "covariances" if stated.ndim == 4 else "deviations"
+    np.savez_compressed(path, errors=errors, **{key: stated}, axes=list(axes))
     if path.stat().st_size > LARGEST_ARCHIVE:
         raise SystemExit(f"{path}: has {path.stat().st_size} bytes, {LARGEST_ARCHIVE} are allowed; judge fewer steps")

@@ -15,10 +15,11 @@ ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs/case-studies"
 STUDIES = json.loads((ROOT / "reports/reference/case-studies.json").read_text("utf-8"))["studies"]
 LIVE = {
-    "filterpy_ensemble": "filterpy", "filterpy_linear": "filterpy", "forecast_fitted": "statsmodels",
+    "filterpy_ensemble": "filterpy", "filterpy_imm": "filterpy", "filterpy_linear": "filterpy",
+    "forecast_fitted": "statsmodels",
     "gtsam_combined": "gtsam", "gtsam_imu": "gtsam",
     "opencv_calibration": "opencv-python-headless", "opencv_kalman": "opencv-python-headless",
-    "statsmodels_missing": "statsmodels",
+    "statsmodels_missing": "statsmodels", "stonesoup_kalman": "stonesoup",
 }  # fmt: skip
 
 

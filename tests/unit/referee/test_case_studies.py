@@ -76,7 +76,7 @@ def test_controls_are_consistent_and_second_arguments_agree(key: str) -> None:
     kept = STUDIES[key]
     assert "failed" not in kept
     for row in kept["rows"]:
-        assert row["runs"] >= gate_runs(row["dof"], 1.5, 0.01, 0.95), row
+        assert row["runs"] >= gate_runs(row["dof"], 1.5, 0.01 / row.get("parts", 1), 0.95), row
         if row["role"] == "control":
             assert row["status"] == "consistent", row
         elif row["status"] != "consistent" and not key.startswith(("filterpy_ensemble", "gtsam_isam2")):
@@ -94,14 +94,14 @@ def test_kept_figures_of_gtsam_are_those_of_the_archives(row: str, version: str)
 @pytest.mark.parametrize("path", sorted((FOLDER / "draws").glob("*.npz")), ids=lambda path: path.stem)
 def test_the_referee_says_of_the_draws_what_is_kept(path: Path) -> None:
     with np.load(path) as stored:
-        errors, covariances, axes = stored["errors"], stored["covariances"], stored["axes"].tolist()
+        (key,) = {"covariances", "deviations"} & {*stored}
+        errors, stated, axes = stored["errors"], stored[key], stored["axes"].tolist()
     named = {
         study.archive(key.split()[0], kept["version"], row["row"]): row
         for key, kept in STUDIES.items() for row in kept["rows"]
     }  # fmt: skip
     kept = named[path.name]
-    share = 4 if path.stem.startswith("opencv") else 1
-    found = study.told(study.verdict(kept["row"], errors, covariances, axes, share))
+    found = study.told(study.verdict(kept["row"], errors, stated, axes))
     assert (found["status"], found["failed"], found["runs"]) == (kept["status"], kept["failed"], kept["runs"])
     np.testing.assert_allclose(found["ratio"], kept["ratio"], rtol=1e-3)
     assert path.stat().st_size <= study.LARGEST_ARCHIVE
@@ -156,13 +156,32 @@ def test_a_run_that_breaks_down_is_counted_and_the_rest_is_judged(rng: np.random
     assert found.inflation == pytest.approx(whole.inflation, rel=0.2)
 
 
-def test_variances_alone_are_judged_axis_by_axis_with_one_rate(rng: np.random.Generator) -> None:
-    case = study.Case("numpy", ("a", "b"), 9, None, None, None)  # type: ignore[arg-type]
-    parts = list(case.parts("x", rng.normal(size=(9, 2)), np.ones((9, 2))))
-    assert [(name, axes, e.shape, P.shape, share) for name, axes, e, P, share in parts] == [
-        (f"x: {axis}", (axis,), (9, 1, 1), (9, 1, 1, 1), 2) for axis in "ab"
-    ]
-    assert study.verdict("x", *parts[0][2:4], ("a",), share=2).settings.false_alarm == 0.005
+def test_deviations_alone_are_judged_axis_by_axis_with_one_rate(rng: np.random.Generator, tmp_path: Path) -> None:
+    case = study.Case("numpy", ("a", "b"), 300, None, None, None)  # type: ignore[arg-type]
+    errors, stated, axes = case.rounded(rng.normal(size=(300, 2)) * [1.0, 3.0], np.ones((300, 2)))
+    assert (errors.shape, stated.shape, axes) == ((300, 1, 2), (300, 1, 2), ("a", "b"))
+    found = study.verdict("x", errors, stated, axes)
+    assert found.settings.false_alarm == 0.01
+    assert [name for name, part in found.parts.items() if part.faults] == ["b"]  # by a factor of 9, beyond chance
+    kept = study.told(found)
+    assert (kept["dof"], kept["parts"], kept["status"]) == (1, 2, "overconfident")
+    study.keep(tmp_path, "x.npz", errors, stated, axes)
+    assert {*np.load(tmp_path / "x.npz")} == {"errors", "deviations", "axes"}
+    whole = study.told(study.verdict("x", errors, np.tile(np.eye(2), (300, 1, 1, 1)), axes))
+    assert (whole["dof"], whole["parts"]) == (2, 1)
+
+
+def test_cases_that_share_a_control_draw_other_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    for name in ("one.py", "two.py", "one.py"):
+        monkeypatch.setattr(sys, "argv", [name])
+        seen: list[float] = []
+        case = study.Case(
+            "numpy", ("a",), 9, lambda rng, runs, seen=seen: seen.append(rng.random()), None, lambda _: {}
+        )  # type: ignore[misc, arg-type]
+        assert case.rates(3)["draws"] == len(seen) == 3
+        drawn.append(seen)
+    assert drawn[0] == drawn[2] != drawn[1]
 
 
 def test_second_arguments_are_compared() -> None:

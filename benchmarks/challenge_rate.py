@@ -1,7 +1,12 @@
 """How often does ``consistency challenge`` find a right filter overconfident? Many searches, each with another seed.
 
     python benchmarks/challenge_rate.py                          # the promise: 200 searches of 10 s, some 40 minutes
+    python benchmarks/challenge_rate.py --of map                 # that of the map
     python benchmarks/challenge_rate.py --searches 40 --trials 200   # quicker, and the same on each machine
+    python benchmarks/challenge_rate.py --filter dead-reckoning  # in worlds of a stereo camera, with tilt and height
+
+``kf`` is right in linear worlds, whose sensor has no mount. Dead reckoning ignores the camera, and is right wherever
+the camera stands as long as the odometry is so exact that errors of the heading stay small.
 
 Exit status 1 if more searches found something than a rate as stated explains (binomial, 1 %).
 """
@@ -10,12 +15,58 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import Any
 
+import numpy as np
 from scipy import stats
 
+import consistency as cs
 from consistency.bench.challenging.challenge import Plan, challenge
+from consistency.bench.filters.compiled import Compiled
+from consistency.bench.models.motion import dead_reckoning, unicycle_jacobian, unicycle_noise
+from consistency.bench.types import Estimates
+from consistency.referee.geometry.conventions import ADDITIVE
 
 SURE = 0.01  # chance that a rate exactly as stated is called broken
+EXACT = {"sigma_v": 0.001, "sigma_omega": 0.001}  # m/s, rad/s: in 500 s the heading errs by 0.03 rad at most
+
+
+class DeadReckoning(Compiled):
+    """The odometry added up, with its covariance to first order; observations are ignored.
+
+    It is taken for a filter of the bench, and so run in this process: a start of a process takes a second.
+    """
+
+    def __init__(self) -> None:
+        self.name, self.sensors, self.needs = "dead-reckoning", ("uvd",), ()
+        self.realisable, self.error, self.innovations, self.guard = True, ADDITIVE, None, None
+
+    def is_ready(self, trial: Any, belief: Any) -> bool:
+        return True
+
+    def compile(self, trial: Any, belief: Any) -> None:
+        """There is nothing to compile."""
+
+    def run(self, trial: Any, belief: Any, halt: Any = None) -> Estimates:
+        controls, T = np.asarray(trial.controls, float), trial.steps
+        poses, P = dead_reckoning(trial.start, controls), np.zeros((T + 1, 3, 3))
+        for k, (dt, v, _) in enumerate(controls):
+            heading, F, Q = poses[k, 2], np.eye(3), np.zeros((3, 3))
+            F[0, 2], F[1, 2] = unicycle_jacobian(heading, dt, v)
+            terms = unicycle_noise(heading, dt, belief.motion.sigma_v, belief.motion.sigma_omega)
+            Q[0, 0], Q[0, 1], Q[1, 1], Q[2, 2] = terms
+            Q[1, 0] = Q[0, 1]
+            P[k + 1] = F @ P[k] @ F.T + Q
+        nothing = np.full(T, np.nan), np.zeros(T, np.int64), None
+        return Estimates(self.name, trial.run, poses[1:], P[1:], *nothing)
+
+
+def opponents(name: str) -> tuple[Any, Any]:
+    """A filter by name, and the world from which its worlds differ."""
+    if name != "dead-reckoning":
+        return name, None
+    changes = {f"{half}__motion__{key}": value for half in ("truth", "belief") for key, value in EXACT.items()}
+    return DeadReckoning(), cs.load_scenario("herath2007-stereo").variant("exact-odometry", **changes)
 
 
 def main() -> None:
@@ -25,23 +76,26 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="of each search")
     parser.add_argument("--trials", type=int, help="of each search, in place of --seconds")
     parser.add_argument("--filter", default="kf", help="one that is right in the worlds of its scenario")
+    parser.add_argument("--of", choices=("pose", "map"), default="pose", help="whose covariance is challenged")
     parser.add_argument("--false-alarm", type=float, default=0.05)
     parser.add_argument("--seed", type=int, default=0, help="of the first search")
     parser.add_argument("--jobs", type=int, default=-1)
     options = parser.parse_args()
     minutes = None if options.trials is not None else options.seconds / 60.0
     found, worlds, longest = 0, 0, 0.0
+    filter_, base = opponents(options.filter)
     for seed in range(options.seed, options.seed + options.searches):
         plan = Plan(minutes, options.trials, seed, options.jobs, options.false_alarm)
-        outcome = challenge(options.filter, None, plan)
+        outcome = challenge(filter_, base, plan, part=options.of)
         found, worlds = found + outcome.found, worlds + outcome.worlds
         longest = max(longest, outcome.seconds)
         if outcome.found:
             print(f"seed {seed}: {outcome.verdict.status} in {outcome.space.text(outcome.point)}", flush=True)
     p_value = float(stats.binom.sf(found - 1, options.searches, options.false_alarm))
     high = stats.binomtest(found, options.searches).proportion_ci(0.98, "exact").high
+    print(f"{options.filter}, {options.of}: found in {found} of {options.searches} searches")
     print(
-        f"{options.filter}: found in {found} of {options.searches} searches (at most {high:.1%}, 99 % binomial; stated "
+        f"(at most {high:.1%}, 99 % binomial; stated "
         f"{options.false_alarm:.1%}, p {p_value:.3f}); {worlds / options.searches:.0f} worlds a search, the longest "
         f"{longest:.1f} s"
     )

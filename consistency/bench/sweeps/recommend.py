@@ -12,6 +12,7 @@ from consistency.bench.sweeps.plan import Cell, Sweep, text_of
 from consistency.bench.sweeps.regime import Regime, ranked
 from consistency.bench.sweeps.rig import (
     ALIKE,
+    AT,
     AxisPlace,
     Request,
     Rig,
@@ -204,7 +205,8 @@ def place_in(regime: Regime, rig: Rig, known: Collection[str] = ()) -> MapPlace 
         if axis.home is not None and (axis.key in known or not is_known(value)):
             value = axis.values[axis.home]  # one that is not known is among the differences
         places.append(place_on(axis, value))
-    nearest = sweep.at([place.nearest for place in places])
+    away = [p for p in places if p.axis.home is not None and abs(p.position - p.axis.home) >= AT]
+    nearest = None if len(away) > 1 else sweep.at([place.nearest for place in places])
     if nearest is None:
         return None
     cells = (sweep.at(at) for at in around(places))

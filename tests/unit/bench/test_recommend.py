@@ -334,7 +334,8 @@ def advised(regime: Regime, alone: Regime | None, monkeypatch: pytest.MonkeyPatc
     ({"tilt": 20.0}, "sure", 5), ({"tilt": 10.0}, "sure", 5), ({"dt": 0.2}, "sure", 5), ({"speed": 0.8}, "sure", 4),
     ({"height": 1.0}, "sure", 4), ({"loops": 3.0}, "sure", 5), ({"odometry": 2.0}, "sure", 4),
     ({"tilt": 60.0}, "unsure", 4), ({"dt": 0.5, "tilt": 20.0}, "unsure", 0),
-    ({"odometry": 2.0, "tilt": 20.0}, "unsure", 0), ({"odometry": 0.3, "tilt": 20.0}, "sure", 5),
+    ({"odometry": 2.0, "tilt": 20.0}, "unsure", 0), ({"dt": 0.12, "tilt": 5.0}, "unsure", 0),
+    ({"odometry": 0.3, "tilt": 20.0}, "sure", 5),
 ])  # fmt: skip
 def test_a_rig_that_differs_in_one_thing_is_looked_up(
     regime: Regime, monkeypatch: pytest.MonkeyPatch, changes: dict[str, float], sure: str, around: int

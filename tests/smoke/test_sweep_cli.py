@@ -63,6 +63,7 @@ def test_a_rig_is_looked_up(out: Path) -> None:
     advice = json.loads(consistency(*arguments, cwd=out.parent).stdout)
     assert advice["filters"][0]["filter"] == "ekf-uvd"
     assert advice["axes"]["range"] == {"value": 4.0, "inside": True}
+    assert advice["beyond"] is None
     assert "nearest cell of the map" in consistency("recommend", "small.toml", "--map", "out", cwd=out.parent).stdout
 
 
@@ -77,6 +78,8 @@ BAD = {
     "folder with options": (("sweep", ".", "--share", "1/2"), "only reported again"),
     "no sweep's folder": (("sweep", "."), "manifest.json: missing"),
     "no map": (("recommend", "small.toml", "--map", "none"), "none: cannot be read"),
+    "two grids": (
+        ("recommend", "small.toml", "--map", "out", "--map", "out"), "--map out: the second map must be of a sweep with"),
     "confirm": (("recommend", "small.toml", "--map", "out", "--confirm", "0"), "must be at least 1"),
 }  # fmt: skip
 

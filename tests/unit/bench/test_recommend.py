@@ -499,6 +499,8 @@ def test_options_change_the_rig(regime: Regime) -> None:
     rig = read_rig(Request(BASE, range=7.0, speed=1.0, density=0.25), regime.sweep.base).scenario
     assert (rig.truth.sensor.range[1], rig.truth.path.speed, rig.truth.landmarks.count) == (7.0, 1.0, 64)
     assert advise(regime, speed=1.0).unlike == ("truth.path.speed",)
+    slow = read_rig(Request(BASE, dt=0.2), regime.sweep.base).scenario.truth
+    assert (slow.dt, slow.steps) == (0.2, 250)
 
 
 @pytest.mark.parametrize(("rig", "said", "expected"), [
@@ -506,6 +508,7 @@ def test_options_change_the_rig(regime: Regime) -> None:
     ("nonsense", {}, "unknown scenario 'nonsense'"),
     (BASE, {"range": 0.1}, "--range 0.1: key 'truth.sensor'"),
     (BASE, {"speed": -1.0}, "--speed -1: must be a positive number"),
+    (BASE, {"dt": 0.0}, "--dt 0: must be a positive number"),
     (BASE, {"density": float("nan")}, "--density nan: must be"),
 ])  # fmt: skip
 def test_bad_rigs(regime: Regime, rig: str, said: dict[str, float], expected: str) -> None:

@@ -79,7 +79,7 @@ BAD = {
     "no sweep's folder": (("sweep", "."), "manifest.json: missing"),
     "no map": (("recommend", "small.toml", "--map", "none"), "none: cannot be read"),
     "two grids": (
-        ("recommend", "small.toml", "--map", "out", "--map", "out"), "--map out: the second map must be of a sweep with"),
+        ("recommend", "small.toml", "--map", "out", "--map", "out"), "--map out: the second map must be"),
     "confirm": (("recommend", "small.toml", "--map", "out", "--confirm", "0"), "must be at least 1"),
 }  # fmt: skip
 

@@ -55,6 +55,18 @@ def test_the_documentation_shows_it() -> None:
     assert calibration_rows.markdown(TABLE) in (ROOT / "docs/referee.md").read_text(encoding="utf-8")
 
 
+def test_rows_of_one_module_take_the_place_of_their_questions() -> None:
+    old = ROWS[0]
+    new = replace(old, world="a new world", question="a new question", gates=7, found=1)
+    table = calibration_rows.merged(TABLE, [new], {"a new world": "it", "a new question": "asked"})
+    assert calibration_rows.rows_of(table) == [*ROWS, new]
+    assert (table["seed"], table["wall_time_s"]) == (TABLE["seed"], TABLE["wall_time_s"])
+    assert table["questions"] == TABLE["questions"] | {"a new question": "asked"}
+    again = calibration_rows.merged(table, [replace(new, found=2)], {})
+    assert [row.found for row in calibration_rows.rows_of(again) if row.question == new.question] == [2]
+    assert again["worlds"] == table["worlds"]
+
+
 def test_every_question_and_world_of_the_table_is_explained() -> None:
     assert {row.question for row in ROWS} == set(TABLE["questions"])
     assert {row.world for row in ROWS} == set(TABLE["worlds"])

@@ -28,11 +28,11 @@ def drives(kind: str, rng: np.random.Generator, runs: int = RUNS, ratio: float =
     t = np.arange(STEPS) * 0.5
     speed = rng.uniform(1.0, 2.0, (runs, 1))
     true = np.stack([speed * t, np.zeros((runs, STEPS))], axis=-1)
-    path = np.stack([true, true + 1.0], axis=2)
+    path = np.stack([true, 2.0 * true + 1.0], axis=2)
     g = {"by-vector": np.ones((runs, STEPS)), "by-time": np.tile(t, (runs, 1)), "by-distance": speed * t}[kind]
     noise = rng.normal(size=(runs, STEPS, N)) @ np.linalg.cholesky(ratio * (P + np.diag(FLOOR**2))).T
     covariances = np.broadcast_to(P, (runs, STEPS, N, N))
-    return Evidence("est", g[..., None] * THETA + noise, covariances, path=path, t=t, axes=("x", "y", "z"))
+    return Evidence("est", g[..., None] * THETA + noise, covariances, path=path, t=7.0 + t, axes=("x", "y", "z"))
 
 
 @pytest.mark.parametrize("kind", KINDS)

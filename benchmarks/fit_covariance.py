@@ -25,9 +25,10 @@ from consistency.referee.defaults import DETECT
 from consistency.referee.errors import InputError
 from consistency.referee.fitting.drives import Drive, drive_of
 from consistency.referee.fitting.likelihood import terms_of
+from consistency.referee.fitting.model import decided
 from consistency.referee.fitting.motions import vectors
 from consistency.referee.fitting.noise import fit_noise, intervals
-from consistency.referee.fitting.persistence import persistent
+from consistency.referee.fitting.persistence import doubts, persistent
 from consistency.referee.fitting.ratios import folds_of, judged_by
 from consistency.referee.fitting.refusals import growth_of, require_sound
 from consistency.referee.fitting.windows import Windows, span_of, windows_of
@@ -207,8 +208,12 @@ def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, flo
         noise, folds = folds_of(every, windows, names, True)
     except InputError as error:
         return "refused", np.nan, str(error)
-    status = judged_by(folds, windows, len(every), case.fitted > 1).status
-    warnings = persistent(noise, windows, growth_of(every, windows, False, noise.mean))
+    lasting = persistent(noise, windows)
+    status = decided(
+        judged_by(folds, windows, len(every), case.fitted > 1).status, any(each.decides for each in lasting)
+    )
+    growth = growth_of(every, windows, False, noise.mean)
+    warnings = doubts(noise, windows, growth, lasting)
     nees = noise.nees(fresh)[0]
     means = [nees[fresh.drive == i].mean() for i in range(FRESH)]
     return status, float(np.exp(np.log(means).mean())), warnings[0] if warnings else ""

@@ -19,7 +19,7 @@ from consistency.referee.fitting.drives import Drive
 from consistency.referee.fitting.likelihood import ENOUGH
 from consistency.referee.fitting.motions import record_of, stretches_of
 from consistency.referee.fitting.noise import Noise, intervals, with_jitter
-from consistency.referee.fitting.persistence import SHARED, errors_of_second, persistent
+from consistency.referee.fitting.persistence import SHARED, Lasting, doubts, errors_of_second, persistent
 from consistency.referee.fitting.ratios import DECIDE, HALF, Fold, Judged, Ratio, folds_of, judged_by
 from consistency.referee.fitting.refusals import Growth, growth_of, require_sound
 from consistency.referee.fitting.windows import PIECES, Windows, span_of, windows_of
@@ -50,6 +50,7 @@ class NoiseModel:
     counts: Mapping[str, int]  # windows, and those left out: long, still, jumps
     growth: Growth  # of the squared rotation error over the span
     warnings: tuple[str, ...]
+    lasting: tuple[Lasting, ...] = ()  # errors that differ between drives
     shared: Array | None = None  # (n,), correlation with the errors of the second estimator
     drives: tuple[Drive, ...] = field(default=(), repr=False)
     windows: Windows | None = field(default=None, repr=False)
@@ -64,9 +65,8 @@ class NoiseModel:
     @property
     def status(self) -> str:
         """consistent, overconfident, conservative, inconsistent or undecided."""
-        own = self.spans[0].status
         is_of_truth = self.shared is not None and bool((self.shared > SHARED).any())
-        return "undecided" if own == "consistent" and is_of_truth else own
+        return decided(self.spans[0].status, is_of_truth or any(each.decides for each in self.lasting))
 
     @property
     def stretches(self) -> list[tuple[str, Stretch]]:
@@ -106,6 +106,14 @@ class NoiseModel:
 
     def __repr__(self) -> str:
         return f"<NoiseModel {self.name}: {_shown('wording', 'sentence', self)}>"
+
+
+def decided(status: str, doubted: bool) -> str:
+    """A status at the span: nothing is consistent whose errors are the truth's, or last for a whole drive.
+
+    Such an error has one value a drive, so that a fit to few drives, and its judgement, rest on as few values.
+    """
+    return "undecided" if doubted and status == "consistent" else status
 
 
 def _shown(module: str, function: str, *arguments: Any) -> Any:
@@ -151,7 +159,7 @@ def fit_covariance(
     require_sound(drives, windows, planar, correct)
     noise, folds = folds_of(drives, windows, held_out, correct)
     noise = with_jitter(noise, drives, windows, planar)
-    growth = growth_of(drives, windows, planar, noise.mean)
+    growth, lasting = growth_of(drives, windows, planar, noise.mean), persistent(noise, windows)
     folds = [replace(fold, noise=replace(fold.noise, floor=noise.floor)) for fold in folds]
     is_half = held_out == HALF or (held_out is None and len(drives) == 1)
     if cautious is not None:
@@ -171,7 +179,7 @@ def fit_covariance(
         counts={
             "windows": len(windows.drive), "long": windows.long, "still": windows.still, "jumps": windows.jumps,
         },
-        growth=growth, warnings=tuple(persistent(noise, windows, growth)),
+        growth=growth, warnings=tuple(doubts(noise, windows, growth, lasting)), lasting=lasting,
         shared=None if second is None else errors_of_second(noise, windows, drives, second),
         drives=tuple(drives), windows=windows, folds=tuple(folds), is_planar=planar,
     )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
@@ -19,18 +20,32 @@ from consistency.referee.readers.relative import BENT
 from consistency.referee.types import Array
 
 SURE = 0.01  # chance to name a term where there is none, all terms together
+MOST = 0.5  # share of an axis' variance over the span
 SHARED = 0.7  # correlation of two estimators' errors from which the truth's own are behind both
 TERMS = ("the scale of the way", "the scale of turns", "the drift of the heading with the way")
-UNITS = ("", "", " rad/m")
-ADVICE = "add a state for it to the filter; it is not in the exported covariance"
+UNITS = dict(zip(TERMS, ("", "", " rad/m"), strict=True))
 
 
-def persistent(noise: Noise, windows: Windows, growth: Growth) -> list[str]:
-    """Sentences on terms that differ between drives by more than white noise, from ``ENOUGH`` drives on.
+@dataclass(frozen=True)
+class Lasting:
+    """An error that lasts for a whole drive, and differs between drives."""
 
-    Each drive has means of its own, by generalised least squares; their differences are compared with their errors by
-    Cochran's (1954) chi-square.
-    """
+    term: str
+    sigma: float  # between drives
+    share: float  # of the stated variance of an axis over the span, the largest
+
+    @property
+    def decides(self) -> bool:
+        """Whether few drives, which each have one value of it, do not tell the covariance of others.
+
+        A scale lasts; a drift that is named may last for a part of a drive only, and decides where it is most of an
+        axis.
+        """
+        return self.term in TERMS[:2] or self.share >= MOST
+
+
+def doubts(noise: Noise, windows: Windows, growth: Growth, lasting: Sequence[Lasting]) -> list[str]:
+    """Sentences on errors that outlast a window or (:func:`persistent`) a drive, and on angles beyond first order."""
     found = []
     if growth.persists:
         found.append(
@@ -44,9 +59,26 @@ def persistent(noise: Noise, windows: Windows, growth: Growth) -> list[str]:
             f"the sigma of a rotation over the span is {sigma:.2g} rad: beyond {BENT:g} a covariance to first order is "
             "doubtful, so take a shorter span"
         )
+    return found + [
+        f"{each.term} differs between drives (sigma {each.sigma:.2g}{UNITS[each.term]}): add a state for it to the "
+        "filter; it is not in the exported covariance"
+        for each in lasting
+    ]
+
+
+def persistent(noise: Noise, windows: Windows) -> tuple[Lasting, ...]:
+    """Terms that differ between drives by more than white noise, from ``ENOUGH`` drives on.
+
+    Each drive has means of its own, by generalised least squares; their differences are compared with their errors by
+    Cochran's (1954) chi-square. Of several axes of the drift the first that differs is named.
+    """
     names = np.unique(windows.drive)
     if len(names) < ENOUGH:
-        return found
+        return ()
+    found: dict[str, Lasting] = {}
+    now = noise.mean.applied(windows)
+    effect = (design_of(now.pieces) ** 2).mean(axis=0)  # (n, p), of a term of 1 on the mean square of an axis
+    stated = np.diagonal(noise.covariance(now.pieces), axis1=1, axis2=2).mean(axis=0)
     own = [_means(noise, now.of(windows.drive == name)) for name in names]
     for term in range(own[0][0].shape[0]):
         value, variance = (np.array([each[k][term] for each in own]) for k in (0, 1))
@@ -59,9 +91,11 @@ def persistent(noise: Noise, windows: Windows, growth: Growth) -> list[str]:
             continue
         # DerSimonian & Laird (1986): variance between drives beyond that of the estimates
         between = (statistic - dof) / (weight.sum() - (weight**2).sum() / weight.sum())
-        kind = min(term, len(TERMS) - 1)
-        found.append(f"{TERMS[kind]} differs between drives (sigma {np.sqrt(between):.2g}{UNITS[kind]}): {ADVICE}")
-    return list(dict.fromkeys(found))
+        kind = TERMS[min(term, len(TERMS) - 1)]
+        found.setdefault(
+            kind, Lasting(kind, float(np.sqrt(between)), float((between * effect[:, term] / stated).max()))
+        )
+    return tuple(found.values())
 
 
 def _means(noise: Noise, windows: Windows) -> tuple[Array, Array]:

@@ -56,6 +56,12 @@ def _why(model: NoiseModel) -> str:
             f"errors in {model.noise.axes[worst]} correlate {model.shared[worst]:.2f} with those of the second "
             "estimator: they are the truth's, or the calibration's"
         )
+    if model.spans[0].status == "consistent":
+        parts += [
+            f"{each.term} differs between drives and makes up {each.share:.0%} of the variance of an axis, so that new "
+            "drives may have another covariance"
+            for each in model.lasting if each.decides
+        ]  # fmt: skip
     open_axes = [a for a, axis in zip(model.noise.axes, model.spans[0].axes, strict=True) if axis.status == "undecided"]
     found = [
         f"{a} {axis.status}" for a, axis in zip(model.noise.axes, model.spans[0].axes, strict=True)

@@ -12,11 +12,14 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fitting.drives import Drive
 from consistency.referee.fitting.noise import fit_noise
-from consistency.referee.fitting.persistence import persistent
+from consistency.referee.fitting.persistence import TERMS, Lasting, persistent
+from consistency.referee.fitting.ratios import Ratio
 from consistency.referee.fitting.refusals import Growth, body_turn, growth_of, revisits
 from consistency.referee.fitting.windows import span_of, windows_of
+from consistency.referee.fitting.wording import sentence
 
 SPAN = "10m"
+RIGHT = Ratio(1.0, 0.8, 1.25, 0.1, 6, 600)
 
 
 @pytest.mark.parametrize(
@@ -120,10 +123,22 @@ def test_terms_that_persist_are_named_from_five_drives_on(world: World, word: st
     made = drives(rng, 6, world)
     few = cs.fit_covariance(made[:4], SPAN)
     assert not any("differs between drives" in each for each in few.warnings)
+    assert not few.lasting
     model = cs.fit_covariance(made, SPAN)
     told = [each for each in model.warnings if word in each]
     assert told
     assert "add a state" in told[0]
+    assert [word in each.term and each.decides for each in model.lasting].count(True) == 1
+    right = replace(model, spans=(replace(model.spans[0], whole=RIGHT, axes=(RIGHT,) * 3), *model.spans[1:]))
+    assert right.status == "undecided"
+    assert "of the variance of an axis, so that new drives may have another covariance" in sentence(right)
+    for term, decides in zip(TERMS, (True, True, False), strict=True):
+        small = replace(right, lasting=(Lasting(term, 0.1, 0.2),))
+        assert small.status == ("undecided" if decides else "consistent")
+        assert ("new drives may" in sentence(small)) == decides
+    assert replace(right, lasting=()).status == "consistent"
+    wrong = replace(RIGHT, low=2.0, value=2.5, high=3.0)
+    assert replace(model, spans=(replace(model.spans[0], whole=wrong), *model.spans[1:])).status == "overconfident"
 
 
 def test_no_term_is_named_without_one(rng: np.random.Generator) -> None:
@@ -131,7 +146,7 @@ def test_no_term_is_named_without_one(rng: np.random.Generator) -> None:
     named = 0
     for _ in range(12):
         w = windows_of(drives(rng, 5, length=300.0), span_of(SPAN))
-        named += bool(persistent(fit_noise(w), w, Growth(1.0, 0.1)))
+        named += bool(persistent(fit_noise(w), w))
     assert named <= 2
 
 

@@ -8,9 +8,8 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import Seed
+from consistency.referee.cli.options import AsJson, Seed, require_word
 from consistency.referee.defaults import DETECT, FALSE_ALARM
-from consistency.referee.errors import InputError
 
 
 def challenge(
@@ -47,7 +46,7 @@ def challenge(
         Path | None, typer.Option("--out", help="Scenario file to write [default: challenge-FILTER.toml].")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
     fail_on: Annotated[
         str | None, typer.Option("--fail-on", help="'found': exit 1 if the filter is found overconfident.")
     ] = None,
@@ -57,8 +56,7 @@ def challenge(
     from consistency.bench.challenging.challenge import challenge as challenge_filter
     from consistency.bench.challenging.wording import as_data, lines, require_writable, write_scenario
 
-    if fail_on not in (None, "found"):
-        raise InputError(f"--fail-on must be 'found', got '{fail_on}'")
+    require_word("--fail-on", fail_on, "found")
     if of not in ("pose", "map", "both"):
         raise InputError(f"--of must be 'pose', 'map' or 'both', got '{of}'")
     if minutes is None and trials is None:

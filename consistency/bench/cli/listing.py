@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import Annotated
 
-import typer
-
+from consistency.referee.cli.options import AsJson
 from consistency.referee.extras import missing, remedy
 
 
-def list_(as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
+def list_(as_json: AsJson = False) -> None:
     """Scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
     from consistency.bench.filters.guard.settings import KINDS

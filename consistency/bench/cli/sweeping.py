@@ -9,7 +9,16 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import SCENARIO, BackendName, Jobs, Scheduler, SchedulerWait, Seed, SlurmOptions
+from consistency.referee.cli.options import (
+    SCENARIO,
+    AsJson,
+    BackendName,
+    Jobs,
+    Scheduler,
+    SchedulerWait,
+    Seed,
+    SlurmOptions,
+)
 from consistency.referee.errors import InputError
 
 
@@ -110,7 +119,7 @@ def recommend(
     confirm: Annotated[int, typer.Option("--confirm", help="Filters to confirm, at most, one after another.")] = 4,
     seed: Seed = 0,
     jobs: Jobs = -1,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Which filter to trust on one rig: looked up in a map, and confirmed by runs of that rig."""
     from consistency.bench.sweeps.printing import advice_blocks, advice_json

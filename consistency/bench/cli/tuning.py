@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import SCENARIO, FalseAlarm, Jobs
+from consistency.referee.cli.options import SCENARIO, AsJson, FalseAlarm, Jobs, require_word
 from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.errors import InputError
 
@@ -40,7 +40,7 @@ def tune(
         Path | None, typer.Option("--out", help="Folder for the tuned scenario or sensor.toml, and tuning.json.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an output folder of 'tune'.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
     fail_on: Annotated[
         str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless the tuned filter is consistent.")
     ] = None,
@@ -56,8 +56,7 @@ def tune(
     from consistency.referee.system.folders import require_free
     from consistency.referee.verdicts.options import settings_of
 
-    if fail_on not in (None, "inconsistent"):
-        raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
+    require_word("--fail-on", fail_on, "inconsistent")
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
     if log is not None and (runs is not None or seed is not None):

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from consistency.referee.cli.files import are_files, read_files, reads_files, tell_notes
-from consistency.referee.cli.options import FalseAlarm, Judged, Skip
+from consistency.referee.cli.options import AsJson, FalseAlarm, Judged, Skip, require_word, show
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading, flag_of
@@ -29,17 +29,15 @@ def compare(
     ] = None,
     false_alarm: FalseAlarm = FALSE_ALARM,
     skip: Skip = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'worse': exit 1 if the first is.")] = None,
 ) -> None:
     """Is a filter less consistent than another, or than it was? Run by run on the same trials."""
-    from consistency.referee.show import json, terminal
     from consistency.referee.verdicts.baselines import baseline, is_baseline, read_baseline
     from consistency.referee.verdicts.comparison import compare_filters, compare_with, document
     from consistency.referee.verdicts.options import skip_asked
 
-    if fail_on not in (None, "worse"):
-        raise InputError(f"--fail-on must be 'worse', got '{fail_on}'")
+    require_word("--fail-on", fail_on, "worse")
     if not 0.0 < false_alarm < 1.0:
         raise InputError(f"--false-alarm must lie between 0 and 1, got {false_alarm}")
     first = skip_asked(skip)
@@ -61,10 +59,7 @@ def compare(
     else:
         compared = compare_filters(new, filters or [], false_alarm)
     tell_notes(*read.values())
-    if as_json:
-        print(json.render(document(compared)))
-    else:
-        terminal.show(*document(compared).opening)
+    show(document(compared), as_json)
     if fail_on and any(each.worse for each in compared):
         raise typer.Exit(1)
 

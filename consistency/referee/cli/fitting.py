@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from consistency.referee.cli.files import reads_files
-from consistency.referee.cli.options import ESTIMATES
-from consistency.referee.errors import InputError
+from consistency.referee.cli.options import ESTIMATES, AsJson, require_word, require_written, show
 from consistency.referee.parsing.options import Reading
 
 KEPT = ("truth", "max_dt", "time_offset", "topic", "truth_topic", "body")
@@ -53,7 +52,7 @@ def fit_covariance(
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for noise.toml, motions, snippets, page.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless consistent.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
@@ -63,13 +62,10 @@ def fit_covariance(
     from consistency.referee.fitting.drives import read_drives
     from consistency.referee.fitting.model import fit_covariance as fit
     from consistency.referee.fitting.wording import document
-    from consistency.referee.show import json, terminal
     from consistency.referee.system.folders import require_free
 
-    if fail_on not in (None, "inconsistent"):
-        raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
-    if overwrite and out is None:
-        raise InputError("--overwrite goes with --out: nothing else is written")
+    require_word("--fail-on", fail_on, "inconsistent")
+    require_written(overwrite, out, "--out")
     if out is not None:
         require_free(out, overwrite, "noise")
     drives = read_drives(path, reading=replace(files, motions=motions or None))
@@ -78,17 +74,11 @@ def fit_covariance(
         drives, span, held_out=held_out, axes=axes, correct=not no_correct, cautious=cautious, second=other,
         name=path.stem,
     )  # fmt: skip
-    written = []
+    written: list[Path] = []
     if out is not None:
         from consistency.referee.fitting.writing import write_model
 
         written = write_model(model, out, overwrite)
-    shown = document(model)
-    if as_json:
-        print(json.render(shown))
-    else:
-        terminal.show(*shown.opening)
-        for file in written:
-            print(file)
+    show(document(model), as_json, written)
     if fail_on and model.status != "consistent":
         raise typer.Exit(1)

@@ -14,12 +14,16 @@ from consistency.referee.cli.options import (
     DETECT_HELP,
     ESTIMATES,
     LOST_HELP,
+    AsJson,
     FalseAlarm,
     Judged,
     Power,
     Seed,
     Skip,
     given,
+    require_word,
+    require_written,
+    show,
 )
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
@@ -65,28 +69,26 @@ def analyse(
         Path | None,
         typer.Option("--report", help="Folder for an HTML and a PDF page on files, or FILE.xml (JUnit) or FILE.md."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --report.")] = False,
 ) -> None:
     """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.referee.document.verdict import document
-    from consistency.referee.show import FORMATS, json, terminal
+    from consistency.referee.show import FORMATS
+    from consistency.referee.show import json as as_data
     from consistency.referee.verdicts.judge import analyse as judge
     from consistency.referee.verdicts.options import settings_of, skip_asked
     from consistency.referee.verdicts.sources import source_of
 
-    if fail_on not in (None, "inconsistent"):
-        raise InputError(f"--fail-on must be 'inconsistent', got '{fail_on}'")
-    if innovations not in (None, "optimal"):
-        raise InputError(f"--innovations must be 'optimal', got '{innovations}'")
+    require_word("--fail-on", fail_on, "inconsistent")
+    require_word("--innovations", innovations, "optimal")
     changes = given(confidence=confidence, false_alarm=false_alarm, detect=detect, tolerance=tolerance, lost=lost)
     settings, first = settings_of(**changes) if changes else None, skip_asked(skip)
     written: list[Path] = []
     refused: InputError | None = None  # of a report, said below the verdict
     is_file = report is not None and report.suffix.lower() in FORMATS.keys() - {".html", ".json"}  # a folder has both
-    if overwrite and report is None:
-        raise InputError("--overwrite goes with --report: nothing else is written")
+    require_written(overwrite, report, "--report")
     if are_files(path, files):
         recordings = [recording.without_first(first) for recording in read_files(path, files)]
         verdicts = judge(recordings, filters, settings=settings, optimal_gain=innovations is not None)
@@ -97,7 +99,7 @@ def analyse(
 
             try:
                 require_free(report, overwrite, "verdict", "--report")
-                data = json.render(document(verdicts))
+                data = as_data.render(document(verdicts))
                 written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
                 if missing("report"):
                     print(f"consistency: the interactive page and the PDF need {remedy('report')}", file=sys.stderr)
@@ -125,12 +127,7 @@ def analyse(
             written = [write_text_file(shown, report, overwrite)]
         except InputError as error:
             refused = error
-    if as_json:
-        print(json.render(shown))
-    else:
-        terminal.show(*shown.opening)
-        for file in written:
-            print(file)
+    show(shown, as_json, written)
     is_failed = fail_on is not None and not all(verdict.consistent for verdict in verdicts.values())
     if refused is not None and not is_failed:
         raise refused
@@ -193,7 +190,7 @@ def plan(
         str | None, typer.Option("--allow", help="'conservative': a covariance too large is no fault.")
     ] = None,
     lost: Annotated[float | None, typer.Option("--lost", help=f"{LOST_HELP.capitalize()}.", metavar="P")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """How many runs a verdict takes: however steps depend on each other, or as they do in a pilot."""
     from consistency.referee.document.plan import plan_lines

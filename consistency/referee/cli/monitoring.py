@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.options import given
+from consistency.referee.cli.options import AsJson, given, require_word, show
 from consistency.referee.defaults import GATE_FALSE_ALARM
 from consistency.referee.errors import InputError
 
@@ -47,18 +47,16 @@ def monitor(
     ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="NIS and evidence as .png, .pdf or .svg.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the plot if it exists.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit 1 if there is one.")] = None,
 ) -> None:
     """Watch the NIS of a filter in service: an alarm if it is not what the filter states, and since when."""
     from consistency.referee.document.monitor import monitor_document
     from consistency.referee.pages import require_plot, write_monitor_plot
     from consistency.referee.readers.dataflash import STATED, is_dataflash
-    from consistency.referee.show import json, terminal
     from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch, watch_lines
 
-    if fail_on not in (None, "alarm"):
-        raise InputError(f"--fail-on must be 'alarm', got '{fail_on}'")
+    require_word("--fail-on", fail_on, "alarm")
     if is_dataflash(Path(path)) and filter_name not in STATED:
         if refused := given(fail_on=fail_on, gate=gate, mission=mission):
             option = next(iter(refused)).replace("_", "-")
@@ -80,11 +78,7 @@ def monitor(
         watched = watch(log, watcher)
     if plot is not None:
         write_monitor_plot(plot, watched)
-    document = monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t)
-    if as_json:
-        print(json.render(document))
-    else:
-        terminal.show(*document.opening)
+    show(monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t), as_json)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
 
@@ -96,7 +90,6 @@ def _show_ratios(
     from consistency.referee.document.ratios import ratios_document
     from consistency.referee.pages import require_plot, write_monitor_plot
     from consistency.referee.readers.dataflash import read_ratios
-    from consistency.referee.show import json, terminal
 
     if plot is not None:
         require_plot(plot, overwrite)
@@ -104,11 +97,7 @@ def _show_ratios(
     _print_notes(notes)
     if plot is not None:
         write_monitor_plot(plot, ratios)
-    document = ratios_document(path.stem, ratios)
-    if as_json:
-        print(json.render(document))
-    else:
-        terminal.show(*document.opening)
+    show(ratios_document(path.stem, ratios), as_json)
 
 
 def _print_notes(notes: Iterable[str]) -> None:

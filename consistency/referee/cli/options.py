@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from consistency.referee.errors import InputError
+
+if TYPE_CHECKING:
+    from consistency.referee.document.blocks import Document
 
 Out = Annotated[Path, typer.Option("--out", help="Folder to write; must not exist.")]
 Runs = Annotated[int, typer.Option("--runs", help="Number of Monte Carlo runs.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the noise.")]
 Jobs = Annotated[int, typer.Option("--jobs", help="Workers; -1 is one a core. The result does not depend on it.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output folder of this bench.")]
+AsJson = Annotated[bool, typer.Option("--json", help="For programs.")]
 ESTIMATES = ".csv, .parquet, .npz, TUM, ROS bags"
 Judged = Annotated[Path, typer.Argument(metavar="PATH", help=f"Folder written by 'run', or estimates: {ESTIMATES}.")]
 Power = Annotated[float, typer.Option("--power", help="Chance to find that ratio.")]
@@ -44,3 +51,27 @@ SCENARIO = "Built-in name (see 'list') or path of a .toml file."
 def given(**options: Any) -> dict[str, Any]:
     """Options that were given; the others keep the defaults of what they are handed to."""
     return {name: value for name, value in options.items() if value is not None}
+
+
+def require_word(option: str, value: str | None, word: str) -> None:
+    """Refuse what an option may not hold: it is ``word`` or is not given."""
+    if value not in (None, word):
+        raise InputError(f"{option} must be '{word}', got '{value}'")
+
+
+def require_written(overwrite: bool, out: Path | None, option: str) -> None:
+    """Refuse --overwrite where nothing is written, for want of ``option``."""
+    if overwrite and out is None:
+        raise InputError(f"--overwrite goes with {option}: nothing else is written")
+
+
+def show(document: Document, as_json: bool, written: Sequence[Path] = ()) -> None:
+    """Print a document for programs, or its opening and the files that were written."""
+    from consistency.referee.show import json, terminal
+
+    if as_json:
+        print(json.render(document))
+        return
+    terminal.show(*document.opening)
+    for file in written:
+        print(file)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from consistency.referee.cli.options import AsJson
 from consistency.referee.extras import require
 
 
@@ -38,7 +39,7 @@ def characterise(
         str | None, typer.Option("--distortion", help="Lens model for a board: full, poor or none [full].")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of RANSAC, for images without a board [0].")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: AsJson = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what exists of --out and --report.")] = False,
 ) -> None:
     """Measure a stereo sensor: noise, growth with disparity, bias map, tails, whiteness, each with an interval."""

@@ -25,7 +25,7 @@ from consistency.bench.challenging.shrink import changed, shrink
 from consistency.bench.challenging.wording import as_data, lines, write_scenario
 from consistency.bench.challenging.worlds import Choice, LogScale, Point, Space, space_of
 from consistency.bench.runs.isolating import Isolation
-from consistency.bench.simulation import require_landmarks_in_view
+from consistency.bench.simulation import World, require_landmarks_in_view
 from consistency.bench.simulation.path import lap_length, planned_path
 from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.cli import main
@@ -370,6 +370,7 @@ def test_shrinking_stops_with_the_time() -> None:
         ("undecided", 3.4, (), False),
         ("overconfident", 4.0, ("scale",), True),
         ("heavy-tailed", 3.2, ("outliers",), True),
+        ("overconfident", 3.1, ("scale of pose and map",), True),
         ("biased", 3.5, ("bias", "scale in some step"), True),
         ("biased", 3.5, ("bias",), False),
         ("inconsistent", 3.1, ("shape", "distribution"), False),
@@ -500,6 +501,9 @@ def test_the_score_of_a_map_is_the_joint_nees_given_the_pose() -> None:
         of_pose = score_of_run(isolation, world, 3, 0)
     assert score == pytest.approx(np.log(np.mean(joint) / 3.0))
     assert score != pytest.approx(of_pose)
+    blind = World(STEREO.variant("blind", truth__landmarks__x=(50.0, 60.0)).truth)
+    with Isolation([cs.get_filter("ekf-uvd")], STEREO.belief) as isolation:
+        assert score_of_run(isolation, blind, 0, 0, "map") == 0.0
     halved = {"ekf-uvd": {"joint_nees": np.array([2.0, np.nan, 4.0]), "P_zz": np.zeros(3)}}
     assert map_nees(replace(outcome, maps=halved)).tolist() == [3.0, 6.0]
     assert len(map_nees(replace(outcome, maps={}))) == 0

@@ -154,6 +154,7 @@ def test_axes_that_vary_alone_are_no_product(at: Path) -> None:
     assert [truth.landmarks.count for truth in truths] == [*[plain.landmarks.count] * 3, plain.landmarks.count // 2] * 2
     assert [round(truth.motion.sigma_v / plain.motion.sigma_v) for truth in truths] == [1] * 4 + [2] * 4
     assert [sweep.at(cell.indices) for cell in sweep.cells] == list(sweep.cells)
+    assert [cell.number for cell in sweep.cells] == list(range(8))
     assert sweep.at((0, 1, 0)) is None
     assert len(sweep.cells) == number_of_points(sweep.axes)
     assert sweep_from({"sweep": json.loads(json.dumps(describe(sweep)))}, at) == sweep

@@ -13,6 +13,7 @@ from scipy.stats import truncnorm
 import consistency as cs
 from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.covariance_update.parking import Parking, _is_worth_it, make_clones, unpark
+from consistency.bench.filters.error.invariant_pose import bend
 from consistency.bench.filters.kernel.slam import Frame, State
 from consistency.bench.filters.landmark.inverse_range import curvature
 from consistency.bench.filters.methods import robocentric as rc
@@ -237,6 +238,46 @@ def test_a_robot_moved_by_the_noise_of_its_last_motion_keeps_its_older_error() -
     assert not close(turned, inverse_range.moved(poses[-1], xi), 1e-3)
 
 
+def test_the_covariance_of_a_pose_is_that_of_its_exponential() -> None:
+    """By quadrature, with a heading known to 0.4 rad: that of a linear error is off by 0.09 of its deviations."""
+    pose, root = np.array([3.0, -2.0, 0.7]), np.array([[0.5, 0.0, 0.0], [-0.2, 0.3, 0.0], [-0.15, 0.25, 0.27]])
+    C = root @ root.T
+    nodes, weights = np.polynomial.hermite_e.hermegauss(12)
+    grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+    weight = np.einsum("i,j,k", weights, weights, weights).ravel() / weights.sum() ** 3
+    M = inverse_range.shift_matrix(pose)
+    errors = np.array([inverse_range.moved(pose, M @ root @ x) - pose for x in grid])
+    exact = (weight[:, None] * errors).T @ errors
+    said, size = inverse_range.moments(C), np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
+    assert np.abs((said - exact) / size).max() < 0.02 < 0.05 < np.abs((C - exact) / size).max()
+    kernel = C.copy()
+    bend(kernel)
+    assert close(kernel, said, 1e-15)
+    on_a_line = np.outer([1.0, 2.0, 0.0], [1.0, 2.0, 0.0]) + np.diag([0.0, 0.0, 0.1])
+    bend(kernel := on_a_line.copy())
+    assert np.array_equal(kernel, inverse_range.moments(on_a_line))
+    assert np.array_equal(kernel, on_a_line)  # without full rank, as after the first step
+
+
+def test_nothing_is_parked_where_the_robot_saw_something_lately_and_sees_nothing(small: Small) -> None:
+    lost = {"truth__sensor__effects": [{"kind": "frames", "every": [1, 1, 2, 3]}]}
+    scenario = small("herath2007-stereo", **CLOSING | lost)
+    trial, made = cs.simulate(scenario, run=3), dict[bool, set[int]]()
+    for patience in (True, False):
+        filter_ = textbook.RobotCentredKalman("trial", inverse_range.Corrections(patience=patience))
+        state, made[patience] = filter_.init(problem_of(trial, scenario.belief)), set()
+        for k in range(1, trial.steps + 1):
+            known = set(state.parked)
+            state, _ = filter_.update(filter_.predict(state, trial.control(k)), trial.observation(k))
+            if set(state.parked) - known:
+                made[patience].add(k - max(state.seen.values()))
+        ours, twin = rc.compiled(filter_).run(trial, scenario.belief), step_through(filter_, trial, scenario.belief)
+        assert np.abs(ours.pose - twin.pose).max() < 1e-9
+    assert 0 in made[True]
+    assert not made[True] & set(range(1, textbook.EVERY))
+    assert made[False] & {1, 2}
+
+
 @pytest.mark.parametrize("on", [0, 1, 2])
 def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, on: int) -> None:
     m, clones, number = 2, 3, np.array([2, 0, 1])
@@ -248,7 +289,7 @@ def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, o
     room.number[:], room.on[0], size = number, on, 3 + 3 * (m + clones)
     places = np.array([3 + 3 * (m + c) for c in range(clones)] + [0])[:, None] + np.arange(3)
     room.delta[places] = xi
-    local = make_clones(Parking(50, 20, 4e-4, True), 3, 3, 30, 200, 9)
+    local = make_clones(Parking(50, 20, 4e-4, True, True), 3, 3, 30, 200, 9)
     local.origin[number] = poses[:3]
     state = State(np.append(poses[3], np.zeros(27)), np.zeros((30, 30)), 30, 0, np.zeros(9, int))
     before = room.delta.copy()
@@ -296,7 +337,8 @@ def test_kernel_equals_its_twin_round_a_loop(small: Small, tilted: dict[str, Any
     assert twin.map.joint is not None
     assert np.abs(ours.map.joint - twin.map.joint).max() < 1e-8 * np.abs(twin.map.joint).max()
     whole = rc.compiled(textbook.RobotCentredKalman("trial", inverse_range.Corrections())).run(trial, scenario.belief)
-    assert (left_out == "nothing") == bool(np.array_equal(ours.pose, whole.pose))  # each correction does something
+    same = np.array_equal(ours.covariance, whole.covariance)
+    assert (left_out == "nothing") == bool(same)  # each correction does something
 
 
 @pytest.mark.parametrize("local_from", [10, 40])
@@ -406,7 +448,7 @@ def test_landmarks_are_parked_and_come_back(small: Small) -> None:
 
 
 def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
-    clones = make_clones(Parking(50, 20, 4e-4, True, start=10), 3, 3, 36, 100, 2)
+    clones = make_clones(Parking(50, 20, 4e-4, True, True, start=10), 3, 3, 36, 100, 2)
     clones.factors.Phi[:] = 1.0
     clones.of[:], clones.uses[0], clones.here[0] = 0, 2, 9
     state = State(np.ones(12), np.ones((12, 12)), 12, 9, np.array([3, 6]))
@@ -426,7 +468,7 @@ def test_the_place_of_a_clone_that_is_needed_no_more_is_free_again() -> None:
 
 def test_the_state_is_split_only_where_the_step_has_room() -> None:
     """Room for 18 variables: those of the robot, of four landmarks in use, and of one more."""
-    clones = make_clones(Parking(50, 20, 4e-4, True, start=10), 3, 3, 36, 100, 9)
+    clones = make_clones(Parking(50, 20, 4e-4, True, True, start=10), 3, 3, 36, 100, 9)
     clones.of[4:] = 0
     whole = State(np.ones(36), np.eye(36), 36, 0, np.array([3, 6, 9, 12, 15, 18, -1, -1, -1]))
     assert len(clones.factors.x) == 18

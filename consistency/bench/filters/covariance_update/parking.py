@@ -49,14 +49,16 @@ class Parking(NamedTuple):
     """Steps between two rounds of parking, 0 for none, and without a sight before a landmark is parked.
 
     A return is in doubt where the variance of the turn since the clone is above ``doubt``, rad^2; if ``whole``, a step
-    with such a return works on the whole state. ``start`` is the number of variables in the state from which updates
-    are local.
+    with such a return works on the whole state. With ``patience`` a round is left out where the robot sees
+    nothing, and saw something in one of the last ``every`` steps. ``start`` is the number of variables in the state
+    from which updates are local.
     """
 
     every: int
     unseen: int
     doubt: float
     whole: bool
+    patience: bool
     start: int = LOCAL_FROM
 
 
@@ -123,7 +125,7 @@ def prepare_parked(
     step = local.step[0]
     local.step[0] = step + 1
     due = covariance.every > 0 and step > 0 and step % covariance.every == 0
-    due = due and _is_any_idle(covariance, whole, step, local)
+    due = due and _is_any_idle(covariance, whole, step, local) and not _must_wait(covariance, step, local)
     if state.base > 0 and (due or _is_crowded(whole, state, labels, local)):
         state = _joined(slam, whole, state, local)
     if due:
@@ -215,6 +217,14 @@ def append_active(
 @inner
 def _is_idle(covariance: Parking, whole: State, label: int, step: int, local: Clones) -> bool:
     return whole.offset[label] >= 0 and local.of[label] < 0 and step - local.seen[label] >= covariance.unseen
+
+
+@inner
+def _must_wait(covariance: Parking, step: int, local: Clones) -> bool:
+    last = 0 if covariance.patience else step
+    for label in range(len(local.of)):
+        last = max(last, local.seen[label])
+    return 0 < step - last < covariance.every
 
 
 @inner

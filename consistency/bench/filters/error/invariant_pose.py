@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from consistency.bench.filters.error.planar import exponential, shifted_covariance
 from consistency.bench.filters.kernel.dispatch import implement, part
 from consistency.bench.filters.kernel.jit import inner
 from consistency.bench.filters.kernel.slam import insert_error, pose_covariance, to_error
 from consistency.referee.types import Array
 
+FLAT = 1e-9  # determinant of a covariance of positions over its squared trace, up to which they are on a line
+
 
 @part(motion="Unicycle", landmark="InverseRange")
 class InvariantPose(NamedTuple):
-    """No parameters."""
+    """``moments``: the covariance of the additive error is stated as it is, not as that of a linear one."""
+
+    moments: bool
 
 
 @implement(to_error, InvariantPose)
@@ -30,6 +36,30 @@ def insert_beside_pose(error: InvariantPose, pose: Array, values: Array, Jp: Arr
 @implement(pose_covariance, InvariantPose)
 def invariant_pose_covariance(error: InvariantPose, x: Array, P: Array, out: Array) -> None:
     shifted_covariance(x, P, out)
+    if error.moments:
+        bend(out)
+
+
+@inner
+def bend(C: Array) -> None:
+    """``C`` (3, 3) <- second moments of Exp(xi) T about T, from the covariance of its additive error to first order.
+
+    The equations are those of :func:`consistency.filters.textbook.inverse_range.moments`.
+    """
+    s = C[2, 2]
+    if s <= 0.0:
+        return
+    kx, ky = C[0, 2] / s, C[1, 2] / s
+    a, b, d = C[0, 0] - s * kx * kx, C[0, 1] - s * kx * ky, C[1, 1] - s * ky * ky
+    if a * d - b * b <= FLAT * (a + d) ** 2:
+        return
+    sine, cosine = -0.5 * np.expm1(-2.0 * s), 0.5 * np.expm1(-s) ** 2 + np.expm1(-0.5 * s) ** 2
+    straight, bent, kept = np.exp(-s / 3.0), 0.25 * s * np.exp(-0.5 * s), np.exp(-0.5 * s)
+    C[0, 0] = sine * kx * kx + cosine * ky * ky + straight * a + bent * d
+    C[1, 1] = sine * ky * ky + cosine * kx * kx + straight * d + bent * a
+    C[0, 1] = C[1, 0] = (sine - cosine) * kx * ky + (straight - bent) * b
+    C[0, 2] = C[2, 0] = kept * s * kx
+    C[1, 2] = C[2, 1] = kept * s * ky
 
 
 @inner

@@ -47,9 +47,9 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         waiting = KNOWN if which.waiting else 0.0
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
-            InvariantPose(), Converted(),
+            InvariantPose(which.moments), Converted(),
             Converting(pixels, waiting, passes, chain, clones, which.recency, which.curvature, which.spread),
-            Parking(every, unseen, doubt, which.turning),
+            Parking(every, unseen, doubt, which.turning, which.patience),
         )  # fmt: skip
 
     return Compiled(textbook, parts, sensors=("uvd",), uvd=True)

@@ -19,6 +19,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
 BESIDE = 0.1  # cosine of the angle to the optical axis below which a prediction is in no image
+FLAT = 1e-9  # determinant of a covariance of positions over its squared trace, up to which they are on a line
 BEYOND = 4.0  # standard deviations outside the search range at which a predicted disparity is held
 
 
@@ -36,6 +37,8 @@ class Corrections(NamedTuple):
     curvature: bool = True  # mean of a landmark that moves, to second order in the noise of turn and drive
     promptness: bool = True  # landmarks are parked soon
     spread: bool = True  # covariance of a landmark that moves, to second order in the noise of turn and drive
+    patience: bool = True  # nothing is parked at a pose whose last motions are not yet corrected by a sight
+    moments: bool = True  # the covariance of the pose is that of Exp(xi) T, not of a linear error
 
 
 # --- geometry ----------------------------------------------------------------------------------------
@@ -127,6 +130,29 @@ def moved(pose: Array, xi: Array) -> Array:
     """Exp(xi) T of a pose (3,)."""
     R, t = exponential(xi)
     return np.array([*(R @ pose[:2] + t), pose[2] + xi[2]])
+
+
+def moments(C: Array) -> Array:
+    """Second moments (3, 3) of Exp(xi) T about T, from the covariance C (3, 3) of the additive error to first order.
+
+    With xi = M (d, t), Exp(xi) moves the position by V(t) d, d = k t + w, where w does not depend on the turn t, and
+    V(t) t k = k sin t + J k (1 - cos t) with J the quarter turn. The second moments of sin t and 1 - cos t of a normal
+    t are known in closed form; those of V are E[(sin t / t)^2] = exp(-s / 3) and E[((1 - cos t) / t)^2] =
+    s / 4 exp(-s / 2), to first and second order in the variance s of t. Without full rank C is left as it is: the
+    first step moves the robot along a line.
+    """
+    s = C[2, 2]
+    k = C[:2, 2] / s if s > 0.0 else np.zeros(2)
+    J = np.array([[0.0, -1.0], [1.0, 0.0]])
+    A, across = C[:2, :2] - s * np.outer(k, k), J @ k
+    if np.linalg.det(A) <= FLAT * np.trace(A) ** 2:
+        return C
+    sine, cosine = -0.5 * np.expm1(-2.0 * s), 0.5 * np.expm1(-s) ** 2 + np.expm1(-0.5 * s) ** 2  # of sin t, 1 - cos t
+    out = C.copy()
+    out[:2, :2] = sine * np.outer(k, k) + cosine * np.outer(across, across)
+    out[:2, :2] += np.exp(-s / 3.0) * A + 0.25 * s * np.exp(-0.5 * s) * J @ A @ J.T
+    out[:2, 2] = out[2, :2] = np.exp(-0.5 * s) * C[:2, 2]
+    return out
 
 
 def shift_matrix(pose: Array) -> Array:

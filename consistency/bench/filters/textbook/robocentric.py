@@ -62,6 +62,7 @@ from consistency.bench.filters.textbook.inverse_range import (
     chained,
     converted,
     curvature,
+    moments,
     observed,
     searched,
 )
@@ -159,7 +160,8 @@ class RobotCentredKalman:
             state = self._inserted(state, int(label), z)
         state = replace(state, seen=state.seen | dict.fromkeys(labels, state.step))
         every, unseen = rounds(self.which)
-        if every > 0 and state.step % every == 0:
+        blind = state.step - max(state.seen.values(), default=0)
+        if every > 0 and state.step % every == 0 and not (self.which.patience and 0 < blind < every):
             state = with_parked(state, unseen)
         return state, info
 
@@ -245,7 +247,8 @@ class RobotCentredKalman:
         return without_idle_clones(without_block(replace(state, parked=parked), state.places[landmark]))
 
     def pose(self, state: CentredState) -> Gaussian:
-        return Gaussian(state.x[:3], state.P[:3, :3])
+        P = state.P[:3, :3]
+        return Gaussian(state.x[:3], moments(P) if self.which.moments else P)
 
     def map(self, state: CentredState) -> dict[int, Gaussian]:
         points = {label: world_point(state, label) for label in state.places}

@@ -20,7 +20,10 @@ since a turn about a point is Exp of one xi, and of a sum of many to first order
 What an iterated update finds of the robot's error where nothing is in doubt is mostly the noise nu of the last motion,
 T_true = Exp(xi) Exp(nu) T. The error about Exp(nu) T is xi, and not J_l(nu) xi (*recency*). The noise of turn and
 drive also moves the mean of a landmark by half of its variance times the landmark's second derivative (*curvature*),
-and adds the variance of that term and of the error of rho times the noise of the drive (*spread*).
+and adds the variance of that term and of the error of rho times the noise of the drive (*spread*). A clone that was
+made before its noise nu is known would be turned by nu / 2 when that is found, so that nothing is parked where the
+robot sees nothing and saw something lately (*patience*). The covariance of the pose is that of Exp(xi) T about T
+(*moments*).
 
 Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so
 its mean and variance are those of a truncated normal about what is predicted; and the mean of the conversion is not

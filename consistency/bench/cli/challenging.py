@@ -10,6 +10,7 @@ import typer
 
 from consistency.referee.cli.options import AsJson, Seed, require_word
 from consistency.referee.defaults import DETECT, FALSE_ALARM
+from consistency.referee.errors import InputError
 
 
 def challenge(

@@ -109,6 +109,7 @@ def recommend(
         list[Path] | None,
         typer.Option(
             "--map",
+            metavar="MAP",
             help="Folder of 'sweep', or its map.json; a second one may have axes that vary alone [the shipped maps].",
         ),
     ] = None,

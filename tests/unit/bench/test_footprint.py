@@ -113,7 +113,7 @@ def test_jobs_that_were_asked_for_are_not_made_fewer(
     linear: cs.Scenario, has: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(TrialWork, "compile", lambda *_: None)
-    monkeypatch.setattr("consistency.bench.runs.backends.local.joblib.cpu_count", lambda: 8)
+    monkeypatch.setattr("joblib.cpu_count", lambda: 8)
     trial, filters = cs.simulate(linear), [compiled("kf")]
     has(2.5 * trial_bytes(filters, trial, linear.belief))
     for jobs, workers in ((-1, 2), (4, 4)):

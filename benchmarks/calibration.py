@@ -231,10 +231,10 @@ def _share(folder: Path | None) -> None:
 
 
 def further_rows(
-    quick: bool, seed: int, workers: int = 2, modules: Sequence[str] = MODULES
+    quick: bool, seed: int, workers: int = 2, modules: Sequence[str] | None = None
 ) -> tuple[list[Row], dict[str, str]]:
-    """Rows of other modules, each measured by one worker, and what their worlds and questions are."""
-    there = [name for name in modules if importlib.util.find_spec(name) is not None]
+    """Rows of other ``modules``, of all unless given, each measured by one worker, and what their worlds and questions are."""
+    there = [name for name in modules or MODULES if importlib.util.find_spec(name) is not None]
     rows: list[Row] = []
     about: dict[str, str] = {}
     with ProcessPoolExecutor(workers) as pool:

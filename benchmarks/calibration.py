@@ -233,7 +233,7 @@ def _share(folder: Path | None) -> None:
 def further_rows(
     quick: bool, seed: int, workers: int = 2, modules: Sequence[str] | None = None
 ) -> tuple[list[Row], dict[str, str]]:
-    """Rows of other ``modules``, of all unless given, each measured by one worker, and what their worlds and questions are."""
+    """Rows of other ``modules`` (all unless given), one a worker, and what their worlds and questions are."""
     there = [name for name in modules or MODULES if importlib.util.find_spec(name) is not None]
     rows: list[Row] = []
     about: dict[str, str] = {}

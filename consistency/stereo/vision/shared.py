@@ -75,7 +75,7 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
 
 
 def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
-    """Shared errors and floor of highest likelihood (:func:`consistency.referee.diagnostics.shared.fit_shared`).
+    """Shared errors and floor of highest likelihood (``consistency.referee.diagnostics.shared.fit_shared``).
 
     Parameters
     ----------

@@ -412,7 +412,7 @@ def test_alone_and_in_doubt_a_landmark_waits(small: Small) -> None:
     """Seen beside what is in use it is called back at once, and alone once the turn since its clone is known."""
     scenario = small("herath2007-stereo", **CLOSING | {"truth__landmarks__count": 6})
     filter_, waited, joined = textbook.RobotCentredKalman("trial", inverse_range.Corrections()), 0, 0
-    for run in range(4):
+    for run in range(8):
         trial = cs.simulate(scenario, run=run)
         state = filter_.init(problem_of(trial, scenario.belief))
         for k in range(1, trial.steps + 1):

@@ -56,7 +56,6 @@ PAINTERS = {"show"}
 IN_EXPERIMENTS = {"consistency", "numpy", "pandas", "scipy"}
 # what the bench sets beside ours, and an experiment on images, which draws them
 OTHERS = {
-    "honest_files": {"flight", "dataflash_log"},
     "bench_peers": {"filterpy"},
     "bench_stonesoup": {"stonesoup"},
     "front_end_figures": {"matplotlib"},

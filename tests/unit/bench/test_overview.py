@@ -108,7 +108,7 @@ def test_the_opening_stands_before_the_contents_of_the_page(report: Report) -> N
 
 def test_the_opening_is_printed(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
-    monkeypatch.setattr(pdf.paper, "render", lambda sheet: b"")
+    monkeypatch.setattr(pdf.with_matplotlib, "render", lambda sheet: b"")
     data = json.loads(pdf.render_pdf(compose(report)))
     assert [block["kind"] for block in data["opening"]] == ["Figure", "Table"]
     assert data["opening"][0]["caption"].startswith(overview.TITLE)

@@ -1,0 +1,32 @@
+"""Functions of models: plain Python until a kernel is compiled."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numba
+import pytest
+
+from consistency.bench.models import jitable
+
+
+@jitable.jitable
+def doubled(x: float) -> float:
+    return 2.0 * x
+
+
+def test_numba_knows_what_is_jitable_once_it_is_told() -> None:
+    jitable.register()
+
+    @numba.njit
+    def calls(x: float) -> float:
+        return doubled(x)
+
+    assert calls(1.5) == doubled(1.5) == 3.0
+
+
+@pytest.mark.parametrize(("module", "loads"), [("runs.records", False), ("store.trial_rows", True)])
+def test_a_verdict_on_results_loads_no_numba(module: str, loads: bool) -> None:
+    code = f"import sys, consistency.bench.{module}; sys.exit(('numba' in sys.modules) != {loads})"
+    subprocess.run([sys.executable, "-c", code], check=True)

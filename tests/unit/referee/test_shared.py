@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, judge
 from consistency.referee.diagnostics.questions import BIAS
 from consistency.referee.diagnostics.shared import KINDS, VAGUE, fit_record, growth, halves, without_shared
-from consistency.referee.readers.shared import ONE_LOG
+from consistency.referee.errors import InputError
+from consistency.referee.readers.shared import ONE_LOG, less_shared
 from consistency.referee.types import Array
 
 RUNS, STEPS, N = 40, 12, 3
@@ -80,6 +82,17 @@ def test_other_drives_decide(ratio: float) -> None:
     verdict = judge(record, cs.diagnostics.Settings(false_alarm=1e-6))
     assert ("scale" in verdict.faults) == (ratio > 1.0)
     assert not set(verdict.faults) & set(BIAS)
+
+
+def test_an_estimator_is_matched_by_its_name(rng: np.random.Generator) -> None:
+    a, b = (replace(drives("by-vector", rng), name=name) for name in "ab")
+    found = less_shared([b, a], [a, b], "by-vector")
+    for record, own in zip(found, (b, a), strict=True):
+        np.testing.assert_array_equal(
+            record.error, without_shared(own, fit_record(own, "by-vector"), "by-vector").error
+        )
+    with pytest.raises(InputError, match="--shared-from: holds no estimator 'b'; it has a, c"):
+        less_shared([a, b], [a, replace(b, name="c")], "by-vector")
 
 
 def table(path: Path, errors: Array, t: Array, stated: bool) -> str:

@@ -318,6 +318,16 @@ def test_runs_fail_by_their_innovations(what: str, reason: str, rng: np.random.G
     assert [(each.run, each.step) for each in own.failures] == [(4, 7), (9, 7)]
 
 
+def test_nis_count_nothing_from_the_failure_of_their_run_on(rng: np.random.Generator) -> None:
+    nis = rng.chisquare(2, (20, 8))
+    nis[4, 6] = np.nan
+    record = checked("f", nis=nis, nis_dof=2, optimal_gain=True)
+    assert [(each.run, each.step) for each in record.failures] == [(4, 7)]
+    assert record.nis_dof is not None
+    assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
+    assert (np.delete(record.nis_dof, 4, axis=0) == 2).all()
+
+
 def test_a_run_fails_where_anything_of_it_failed_first(rng: np.random.Generator) -> None:
     errors, covariances = spoilt("error", rng, 20)  # run 4 in step 7
     v, S = rng.normal(size=(20, 8, 1)), np.ones((20, 8, 1, 1))

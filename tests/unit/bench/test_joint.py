@@ -12,6 +12,7 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.records import record_of
+from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.diagnostics import Evidence, JointNees, Settings, Verdict, judge
 from consistency.referee.diagnostics.joint import joint_test, near
 from consistency.referee.diagnostics.landmarks import joint_nees
@@ -222,6 +223,25 @@ def test_the_table_has_the_nees_of_the_joint_error(results: cs.Results, name: st
     for j, label in enumerate(evidence.landmarks):
         mean = rows[rows["landmark"] == label][["x", "y", "z"]].to_numpy()[0]
         np.testing.assert_allclose(evidence.error[2, j], trial.landmarks[label] - mean)
+
+
+def test_landmarks_in_a_plane_have_two_dimensions_in_the_joint_error() -> None:
+    """By differences of the NEES of the first variables; the height of each landmark is none."""
+    scenario = cs.load_scenario("esde-xy").variant("short", truth__steps=20)
+    trial = cs.simulate(scenario, run=0)
+    estimates = get_filter("ekf-xy").run(trial, scenario.belief)
+    m, (outcome,) = estimates.map, outcome_of(trial, [estimates]).maps.values()
+    assert m is not None
+    assert m.joint is not None
+    assert trial.truth is not None
+    assert trial.landmarks is not None
+    error, P = planar_map_error(
+        trial.truth[-1], trial.landmarks[m.landmarks], estimates.pose[-1], m.mean, m.joint, estimates.error
+    )
+    flat = np.append([0, 1, 2], [3 + 3 * k + axis for k in range(len(m.landmarks)) for axis in (0, 1)])
+    error, P = error[flat], P[np.ix_(flat, flat)]
+    nees = [error[:n] @ np.linalg.solve(P[:n, :n], error[:n]) for n in range(3, len(error) + 1, 2)]
+    np.testing.assert_allclose(outcome["joint_nees"], np.diff(nees), rtol=1e-6)
 
 
 def test_results_without_joint_nees_are_judged_and_say_so(results: cs.Results, tmp_path: Path) -> None:

@@ -161,6 +161,13 @@ def test_sizes_as_they_are_shown(text: str, shown: str) -> None:
     assert relative.text == shown
 
 
+def test_a_window_that_cross_covariances_do_not_reach_over_is_named(rng: np.random.Generator) -> None:
+    stretch = pose_stretch(rng, "SE(2)", 8, 5, 1.0, 0)
+    truth = np.column_stack([[0.0, 2.0, 2.5, 3.0, 4.1, 6.2, 7.0, 8.3], np.zeros((8, 2))])  # windows of 1, 3, 1, 2 rows
+    with pytest.raises(cs.InputError, match="row 4: --relative 2m: the window spans 3 rows"):
+        windows_of(replace(stretch, truth=truth), Relative(2.0, "m"))
+
+
 # --- what breaks a run ---------------------------------------------------------------------------------
 
 

@@ -151,7 +151,7 @@ def test_a_covariance_that_is_not_definite_ends_the_run(rng: np.random.Generator
 # --- kernels -----------------------------------------------------------------------------------------
 
 STEPS = 100  # of the trials that Python runs
-TRACKS = {"min_age": 2, "forget_after": 3}
+TRACKS = {"min_age": 2, "forget_after": 2}
 COMPILED = [("ukf-uvd+ransac", "herath2007-stereo"), ("ekf-xy+joint", "esde-xy")]
 INTERPRETED = [
     ("ekf-uvd+gate", "herath2007-stereo"), ("ekf-uvd+joint", "herath2007-stereo"),

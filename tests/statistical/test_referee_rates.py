@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from draws import errs_at_most, identities
 from referee import judge
 from scipy import stats
 
@@ -18,7 +19,6 @@ from consistency.referee.types import Array
 
 pytestmark = pytest.mark.slow
 
-SURE = 1 - 1e-5
 DOF = 3
 
 
@@ -98,8 +98,7 @@ def test_no_question_alarms_more_often_than_it_may(
 def test_the_nis_alone_is_white_far_out_in_the_tail(fresh: np.random.Generator) -> None:
     """Squares have long tails and their correlations too: 3,000 draws at 0.001."""
     dof = np.full((20, 30), 2)
-    count = sum(nis_whiteness(fresh.chisquare(2, (20, 30)), dof).p_value <= 1e-3 for _ in range(3000))
-    assert count <= stats.binom.ppf(SURE, 3000, 1e-3)
+    assert errs_at_most(1e-3, 3000, lambda: nis_whiteness(fresh.chisquare(2, (20, 30)), dof).p_value <= 1e-3)
 
 
 @pytest.mark.parametrize("options", [{}, {"allow": "conservative"}, {"method": "bonferroni"}])
@@ -108,9 +107,9 @@ def test_whole_verdicts_alarm_no_more_than_stated(
     fresh: np.random.Generator, world: Callable[[np.random.Generator], Array], options: dict[str, str]
 ) -> None:
     """200 verdicts at 10 %."""
-    alarms = 0
-    for _ in range(200):
+
+    def alarms() -> bool:
         w = world(fresh)
-        verdict = judge("f", w, np.broadcast_to(np.eye(DOF), (*w.shape, DOF)), false_alarm=0.1, **options)
-        alarms += bool(verdict.faults)
-    assert alarms <= stats.binom.ppf(SURE, 200, 0.1)
+        return bool(judge("f", w, identities(w), false_alarm=0.1, **options).faults)
+
+    assert errs_at_most(0.1, 200, alarms)

@@ -145,7 +145,7 @@ def gauss_newton(cameras: Array | None, z1: Array, z2: Array, W: Array, start: R
     M, N, k = z1.shape
     R, t = np.tile(start.R, (M, 1, 1)), np.tile(start.t, (M, 1))
     q = np.tile(q, (M, 1, 1))
-    for _ in range(5):
+    for _ in range(3):
         turned = q @ np.swapaxes(R, 1, 2)
         h1, J1 = seen(cameras, turned + t[:, None])
         h2, J2 = seen(cameras, q)

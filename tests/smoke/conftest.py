@@ -12,9 +12,4 @@ from command import BEGUN
 def nothing_left_behind() -> Iterator[None]:
     yield
     while BEGUN:
-        process = BEGUN.pop()
-        process.kill()
-        process.wait()
-        for pipe in (process.stdout, process.stderr):
-            if pipe is not None:
-                pipe.close()
+        BEGUN.pop().end()

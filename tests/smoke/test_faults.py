@@ -1,7 +1,7 @@
 """Whatever ends the process, at random moments: finished runs are kept, and a resume gives the bytes of one go.
 
-A process of the command line each; all but the first take a minute or more in all. The same faults inside one process
-are in ``tests/unit/bench/test_journal.py``.
+A process of the command line each: the first of its own, the others forks. The same faults inside one process are in
+``tests/unit/bench/test_journal.py``.
 """
 
 from __future__ import annotations
@@ -9,17 +9,20 @@ from __future__ import annotations
 import os
 import random
 import resource
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from command import COMPILING, LIMIT, begun, size_of
+from command import COMPILING, begun, size_of
+from forks import LIMIT, Program
 
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal
@@ -37,8 +40,8 @@ def at(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("faults")
     text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
     (folder / "world.toml").write_text(text.replace(f"steps = {steps_of(text)}", "steps = 40"))
-    status, error = end(begin(folder, out="whole"), COMPILING)
-    assert status == 0, error
+    done = subprocess.run(words("whole"), cwd=folder, capture_output=True, text=True, timeout=COMPILING)
+    assert done.returncode == 0, done.stderr
     return folder
 
 
@@ -46,18 +49,23 @@ def steps_of(text: str) -> str:
     return next(line.split("=")[1].strip() for line in text.splitlines() if line.startswith("steps"))
 
 
-def begin(at: Path, *options: str, out: str = "out", runs: int = RUNS, **popen: Any) -> subprocess.Popen[str]:
-    command = ("run", "world.toml", "--filter", FILTER, "--out", out, "--runs", str(runs), "--jobs", "2", *options)
-    return begun(*command, cwd=at, **popen)
+def words(out: str = "out", runs: int = RUNS) -> list[str]:
+    """The command as a process of its own."""
+    options = ["--filter", FILTER, "--out", out, "--runs", str(runs), "--jobs", "2"]
+    return [sys.executable, "-m", "consistency", "run", "world.toml", *options]
 
 
-def end(process: subprocess.Popen[str], limit: float = LIMIT) -> tuple[int, str]:
+def begin(at: Path, *options: str, runs: int = RUNS, **how: Any) -> Program:
+    return begun(*words(runs=runs)[3:], *options, cwd=at, **how)
+
+
+def end(process: Program) -> tuple[int, str]:
     """Exit status and what was said on standard error."""
-    error = process.communicate(timeout=limit)[1] or ""
-    return process.returncode, error
+    _, error = process.communicate()
+    return process.wait(), error
 
 
-def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+def wait_for(condition: Callable[[], bool], process: Program | subprocess.Popen[str]) -> None:
     end = time.monotonic() + LIMIT
     while not condition() and process.poll() is None and time.monotonic() < end:
         time.sleep(0.002)
@@ -97,9 +105,8 @@ def require_same(at: Path, out: str = "out") -> None:
 
 
 def resume(at: Path) -> None:
-    process = begin(at, "--resume")
-    _, error = process.communicate(timeout=LIMIT)
-    assert process.returncode == 0, error
+    status, error = end(begin(at, "--resume"))
+    assert status == 0, error
     require_same(at)
 
 
@@ -111,10 +118,11 @@ def one_sentence(error: str) -> str:
 
 
 def test_killed_and_resumed(fresh: Path) -> None:
-    process = begin(fresh)
-    wait_for(working(fresh), process)
-    process.kill()
-    process.communicate(timeout=LIMIT)
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words(), cwd=fresh, stdout=pipe, stderr=pipe, text=True) as process:
+        wait_for(working(fresh), process)
+        process.kill()
+        process.communicate(timeout=LIMIT)
     done = kept(fresh)
     assert 0 < done < RUNS
     resume(fresh)
@@ -125,7 +133,7 @@ def test_killed_and_begun_anew(fresh: Path) -> None:
     process = begin(fresh)
     wait_for(working(fresh), process)
     process.kill()
-    process.communicate(timeout=LIMIT)
+    process.communicate()
     status, error = end(begin(fresh))
     assert status == 2
     said = f"unfinished work is there, with {kept(fresh)} finished runs; add --resume"
@@ -147,7 +155,7 @@ def test_twenty_kills_at_random_moments(fresh: Path) -> None:
         wait_for(tables.exists if late else working(fresh, size + 3_000), process)
         time.sleep(moments.uniform(0.0, 0.15))
         process.kill()
-        process.communicate(timeout=LIMIT)
+        process.communicate()
         if not journal.exists():  # it was just done
             assert open_results(fresh / "out").finished_runs([FILTER]) == set(range(RUNS))
             continue
@@ -167,8 +175,8 @@ def test_a_signal_keeps_what_is_finished(fresh: Path, name: str) -> None:
     if name == "twice":
         time.sleep(0.005)
         os.kill(process.pid, number)
-    _, error = process.communicate(timeout=LIMIT)
-    assert process.returncode == 128 + number, error
+    status, error = end(process)
+    assert status == 128 + number, error
     if "kept where there are any" not in error:  # a machine so busy that the command was ended before it had written
         done = len(open_results(fresh / "out").finished_runs([FILTER]))
         assert one_sentence(error).startswith(f"stopped: {done} finished runs are in out; add --resume")
@@ -179,13 +187,13 @@ def test_a_signal_keeps_what_is_finished(fresh: Path, name: str) -> None:
 @pytest.mark.slow
 def test_a_terminal_that_is_closed(fresh: Path) -> None:
     """SIGHUP to all, and nothing can be written any more."""
-    process = begin(fresh)
+    terminal, theirs = os.pipe()
+    process = begin(fresh, out=theirs, err=theirs)
+    os.close(theirs)
     wait_for(working(fresh), process)
-    for stream in (process.stdout, process.stderr):
-        assert stream is not None
-        stream.close()
+    os.close(terminal)
     os.killpg(process.pid, signal.SIGHUP)
-    assert process.wait(LIMIT) == 129
+    assert process.wait() == 129
     assert open_results(fresh / "out").finished_runs([FILTER])
     resume(fresh)
 
@@ -195,37 +203,37 @@ def test_a_terminal_that_is_closed(fresh: Path) -> None:
 def test_output_that_nobody_reads(fresh: Path, how: str) -> None:
     """As ``2>&1 | head -1`` and ``>&- 2>&-``."""
     if how == "pipe":
-        process = begin(fresh, stderr=subprocess.STDOUT)
-        assert process.stdout is not None
-        process.stdout.close()
-        assert process.wait(LIMIT) == 141
+        with nobody() as pipe:
+            assert begin(fresh, out=pipe, err=pipe).wait() == 141
     else:
-        code = "from consistency.referee.cli import main; main()"
-        command = f"{sys.executable} -c '{code}' run world.toml --filter {FILTER} --out out --runs {RUNS} >&- 2>&-"
+        command = f"{shlex.join(words())} >&- 2>&-"
         assert subprocess.run(["bash", "-c", command], cwd=fresh, timeout=LIMIT, check=False).returncode == 0
     require_same(fresh)
 
 
+@contextmanager
+def nobody() -> Iterator[int]:
+    """The end of a pipe whose other end is closed."""
+    other, pipe = os.pipe()
+    os.close(other)
+    yield pipe
+    os.close(pipe)
+
+
 @pytest.mark.slow
 def test_standard_output_alone_is_closed(fresh: Path) -> None:
-    process = begin(fresh)
-    assert process.stdout is not None
-    process.stdout.close()
-    process.stdout = None
-    _, error = process.communicate(timeout=LIMIT)
-    assert process.returncode == 141
+    with nobody() as pipe:
+        status, error = end(begin(fresh, out=pipe))
+    assert status == 141
     assert [line for line in error.splitlines() if not line.startswith("runs: ")] == []
     require_same(fresh)
 
 
 @pytest.mark.slow
 def test_a_limit_on_the_size_of_files(fresh: Path) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
-
-    process = begin(fresh, preexec_fn=limit)
-    _, error = process.communicate(timeout=LIMIT)
-    assert process.returncode == 2
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))"
+    status, error = end(begin(fresh, before=limit))
+    assert status == 2
     done = kept(fresh)
     said = f"--out out: cannot be written (File too large); {done} finished runs are kept, and the same command"
     assert said in one_sentence(error)
@@ -238,9 +246,8 @@ def test_three_processes_on_one_place(fresh: Path) -> None:
     wait_for(working(fresh), first)
     os.killpg(first.pid, signal.SIGSTOP)  # as a terminal does
     for options in ((), ("--overwrite",), ("--resume",)):
-        other = begin(fresh, *options)
-        _, error = other.communicate(timeout=LIMIT)
-        assert other.returncode == 2
+        status, error = end(begin(fresh, *options))
+        assert status == 2
         assert "another process is at work on it" in one_sentence(error)
     os.killpg(first.pid, signal.SIGCONT)
     assert end(first)[0] == 0
@@ -252,8 +259,8 @@ def test_a_place_that_is_taken_meanwhile(fresh: Path) -> None:
     process = begin(fresh)
     wait_for(working(fresh), process)
     shutil.copytree(fresh / "whole", fresh / "out")
-    _, error = process.communicate(timeout=LIMIT)
-    assert process.returncode == 2
+    status, error = end(process)
+    assert status == 2
     assert one_sentence(error).endswith("the finished work is in out-2")
     require_same(fresh, "out-2")
     assert not (fresh / UNFINISHED).exists()
@@ -266,8 +273,7 @@ def test_results_that_are_removed_meanwhile(fresh: Path) -> None:
     process = begin(fresh, "--resume")
     wait_for(working(fresh), process)
     shutil.rmtree(fresh / "out")
-    process.communicate(timeout=LIMIT)
-    assert process.returncode == 2
+    assert end(process)[0] == 2
     assert kept(fresh) == RUNS - 50
     resume(fresh)
 
@@ -283,9 +289,8 @@ def test_a_full_disk_that_is_freed(fresh: Path, tmp_path: Path) -> None:
     try:
         (disk / "ballast").write_bytes(bytes(11 * 2**20))
         shutil.copy(fresh / "world.toml", disk)
-        process = begin(disk)
-        _, error = process.communicate(timeout=LIMIT)
-        assert process.returncode == 2
+        status, error = end(begin(disk))
+        assert status == 2
         done = kept(disk)
         said = f"--out out: cannot be written (No space left on device); {done} finished runs are kept, and the same"
         assert said in one_sentence(error)
@@ -304,12 +309,13 @@ def test_memory_that_is_taken_away(fresh: Path) -> None:
     """A limit on the address space at what is taken: a sentence, or the C library ends the process; no run is lost."""
     process = begin(fresh)
     wait_for(working(fresh), process)
-    taken = int(Path(f"/proc/{process.pid}/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.prlimit(process.pid, resource.RLIMIT_AS, (taken, resource.RLIM_INFINITY))
+    worker = int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text())
+    taken = int(Path(f"/proc/{worker}/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.prlimit(worker, resource.RLIMIT_AS, (taken, resource.RLIM_INFINITY))
     done = kept_beside(fresh)
-    _, error = process.communicate(timeout=LIMIT)
+    status, error = end(process)
     assert "Traceback" not in error
-    if process.returncode > 0:  # below 0 a library aborted, by a signal
+    if status > 0:  # below 0 a library aborted, by a signal
         assert "memory" in error.lower()
     if (fresh / UNFINISHED).exists():  # else the results are there, and a verdict may be missing
         assert kept(fresh) >= done > 0
@@ -322,7 +328,7 @@ def test_a_journal_that_is_cut_short_anywhere(fresh: Path) -> None:
     process = begin(fresh)
     wait_for(working(fresh), process)
     process.kill()
-    process.communicate(timeout=LIMIT)
+    process.communicate()
     journal, done = fresh / UNFINISHED / "journal", kept(fresh)
     cut = random.Random().randrange(journal.stat().st_size)
     os.truncate(journal, cut)

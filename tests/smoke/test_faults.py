@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -306,13 +306,19 @@ def test_a_full_disk_that_is_freed(fresh: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_memory_that_is_taken_away(fresh: Path) -> None:
-    """A limit on the address space at what is taken: a sentence, or the C library ends the process; no run is lost."""
+    """A limit on the address space at what is taken; no run is lost.
+
+    There is a sentence, or the C library ends the process, or Python waits for ever for a thread that never began.
+    """
     process = begin(fresh)
     wait_for(working(fresh), process)
     worker = int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text())
     taken = int(Path(f"/proc/{worker}/statm").read_text().split()[0]) * resource.getpagesize()
     resource.prlimit(worker, resource.RLIMIT_AS, (taken, resource.RLIM_INFINITY))
     done = kept_beside(fresh)
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(20.0)
+    process.kill()
     status, error = end(process)
     assert "Traceback" not in error
     if status > 0:  # below 0 a library aborted, by a signal

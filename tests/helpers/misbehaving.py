@@ -1,4 +1,4 @@
-"""Filters that do to their process what filters should not; light, because each process imports it."""
+"""Filters and trials that do to their process what they should not; light, because each process imports it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import consistency as cs
-from consistency.bench.types import Control, Gaussian, Observation
+from consistency.bench.types import Control, Gaussian, Observation, Trial
 
 STEP = 7  # in which they misbehave
 MEMORY = 0.0625  # GiB that they have
@@ -195,3 +195,20 @@ KINDS: dict[str, tuple[Callable[..., Any], str]] = {
     "pose of 1e61 m": (answers(mean=np.full(3, 1e61), covariance=1e120 * np.eye(3)), "the pose is beyond 1e+60"),
     "error of 1e160 sigma": (answers(mean=np.full(3, 1e160)), "the NEES is not finite"),
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Deadly:
+    """Trials of which some kill whoever simulates them, but for one process, for good or as long as a file is there."""
+
+    trials: Callable[[int], Trial]
+    runs: tuple[int, ...]
+    spared: int
+    fuse: str = ""
+
+    def __call__(self, run: int) -> Trial:
+        if run in self.runs and os.getpid() != self.spared and (not self.fuse or os.path.exists(self.fuse)):
+            if self.fuse:
+                os.unlink(self.fuse)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self.trials(run)

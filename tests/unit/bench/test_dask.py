@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from cluster import Cluster, free_port
-from misbehaving import KINDS, Still
+from misbehaving import KINDS, Deadly, Still
 
 import consistency as cs
 from consistency.bench.runs.backends import dask
@@ -118,20 +118,6 @@ def test_a_result_that_died_with_the_last_worker_is_not_waited_for(world: cs.Sce
         cluster.kill_workers()
         with pytest.raises(cs.InputError, match=f"^the scheduler {cluster.address} has had no worker for 1 s$"):
             assert not any(engine.events() for _ in range(100))
-
-
-@dataclass(frozen=True)
-class Deadly:
-    """Trials of which some kill whoever simulates them, but for one process."""
-
-    trials: Simulated
-    runs: tuple[int, ...]
-    spared: int
-
-    def __call__(self, run: int) -> Trial:
-        if run in self.runs and os.getpid() != self.spared:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return self.trials(run)
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import pandas as pd
 import pytest
@@ -31,6 +32,7 @@ from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Control, Observation
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, and limits of memory")
+cloudpickle.register_pickle_by_value(sys.modules[__name__])  # no process of a filter imports all of this, for seconds
 
 RUNS, DOOMED = 3, 1  # of the runs the one that misbehaves
 LONG = 60.0  # s, a time-out that is not expected

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from misbehaving import Deadly
 
 import consistency as cs
 from consistency.bench.runs.backends import slurm
@@ -18,7 +17,6 @@ from consistency.bench.runs.backends.slurm import Slurm, options_of
 from consistency.bench.runs.isolating import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.work import Outcomes, Simulated, TrialWork
-from consistency.bench.types import Trial
 
 pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),
@@ -31,23 +29,6 @@ LOCAL = {"cluster": "local", "time": 10}
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slurm, "GLANCE", 0.2)
-
-
-@dataclass(frozen=True)
-class Deadly:
-    """Trials of which some kill whoever simulates them, but for one process, for good or as long as a file is there."""
-
-    trials: Simulated
-    runs: tuple[int, ...]
-    spared: int
-    fuse: str = ""
-
-    def __call__(self, run: int) -> Trial:
-        if run in self.runs and os.getpid() != self.spared and (not self.fuse or os.path.exists(self.fuse)):
-            if self.fuse:
-                os.unlink(self.fuse)
-            os.kill(os.getpid(), signal.SIGKILL)
-        return self.trials(run)
 
 
 def same(outcomes: Outcomes, expected: Outcomes, but: Sequence[int] = ()) -> None:
@@ -79,7 +60,7 @@ def test_a_job_that_dies_once_is_done_again(
     fuse = tmp_path / "fuse"
     fuse.touch()
     work = TrialWork(Deadly(trials, (4,), os.getpid(), str(fuse)), isolation)
-    outcomes = Slurm(tmp_path / "jobs", LOCAL, 2).outcomes(work, range(RUNS))
+    outcomes = Slurm(tmp_path / "jobs", LOCAL, 1).outcomes(work, range(RUNS))
     same(outcomes, LocalThreads(1).outcomes(TrialWork(trials, isolation), range(RUNS)))
     assert f"consistency: 1 jobs died; their logs are in {tmp_path / 'jobs'}\n" == capsys.readouterr().err
 
@@ -88,8 +69,8 @@ def test_a_job_that_dies_once_is_done_again(
 def test_a_run_that_kills_its_job_has_failed(linear: cs.Scenario, tmp_path: Path) -> None:
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
     work = TrialWork(Deadly(trials, (1,), os.getpid()), isolation)
-    outcomes = Slurm(tmp_path / "jobs", LOCAL, 2).outcomes(work, range(4))
-    same(outcomes, LocalThreads(1).outcomes(TrialWork(trials, isolation), range(4)), but=[1])
+    outcomes = Slurm(tmp_path / "jobs", LOCAL, 1).outcomes(work, range(2))
+    same(outcomes, LocalThreads(1).outcomes(TrialWork(trials, isolation), range(2)), but=[1])
 
 
 def test_an_end_in_the_middle_leaves_nothing(

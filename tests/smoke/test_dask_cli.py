@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 from cluster import Cluster
-from command import LIMIT
 from test_faults import at as at
 from test_faults import begin, end, fresh, kept, require_same, resume, wait_for, working
 
@@ -21,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="sign
 
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[Cluster]:
-    with Cluster(tmp_path) as cluster:
+    with Cluster(tmp_path, 1, "--no-nanny") as cluster:
         yield cluster
 
 
@@ -38,7 +37,7 @@ def remaining(session: int) -> bool:
 
 @pytest.mark.parametrize("to_all", [False, True])
 def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(fresh: Path, to_all: bool) -> None:
-    process = begin(fresh, "--backend", "dask")
+    process = begin(fresh, "--backend", "dask", "--jobs", "1")
     wait_for(working(fresh), process)
     (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)  # in a terminal all processes get it
     status, error = end(process)
@@ -53,7 +52,7 @@ def test_a_killed_client_leaves_no_process(fresh: Path) -> None:
     process = begin(fresh, "--backend", "dask")
     wait_for(working(fresh), process)
     process.kill()
-    process.communicate(timeout=LIMIT)
+    process.communicate()
     assert kept(fresh) > 0
     assert not remaining(process.pid)
     resume(fresh)

@@ -8,13 +8,13 @@ from __future__ import annotations
 import os
 import random
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command import LIMIT, begun, consistency, size_of
+from command import begun, consistency, size_of
+from forks import LIMIT, Program
 
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal
@@ -75,14 +75,14 @@ def sizes(folder: Path) -> Iterator[int]:
             yield size_of(Path(at) / "journal")
 
 
-def stopped_once_grown(process: subprocess.Popen[str], out: Path, size: int, number: int, wait: float) -> None:
+def stopped_once_grown(process: Program, out: Path, size: int, number: int, wait: float) -> None:
     """Send the signal some time after the journals below a folder have grown by ``size`` bytes in all."""
     before, end = sum(sizes(out.parent)), time.monotonic() + LIMIT
     while process.poll() is None and sum(sizes(out.parent)) < before + size and time.monotonic() < end:
         time.sleep(0.002)
     time.sleep(wait)
     process.send_signal(number)
-    process.communicate(timeout=LIMIT)
+    process.communicate()
 
 
 @pytest.mark.parametrize("which", ["looks", "log"])
@@ -118,7 +118,7 @@ def test_a_signal_keeps_what_is_finished(at: Path, which: str, name: str, status
             break
         time.sleep(0.002)
     process.send_signal(getattr(signal, name))
-    _, error = process.communicate(timeout=LIMIT)
+    _, error = process.communicate()
     assert process.returncode == status, error
     assert "Traceback" not in error
     said = "the same command goes on" if which == "sweep" else "add --resume to the same command to go on"
@@ -152,6 +152,6 @@ def test_two_processes_on_one_sweep(at: Path) -> None:
     out = at / "two" / "out"
     first, second = (begun("sweep", "grid.toml", "--out", str(out), cwd=at) for _ in range(2))
     stopped_once_grown(first, out, 20_000, signal.SIGKILL, 0.0)
-    _, error = second.communicate(timeout=LIMIT)
+    _, error = second.communicate()
     assert second.returncode == 0, error
     require_same(at, out, "sweep")

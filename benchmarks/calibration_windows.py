@@ -13,7 +13,7 @@ import numpy as np
 from scipy import signal, stats
 
 from consistency.referee.diagnostics import Evidence, judge
-from consistency.referee.diagnostics.independence import ENOUGH, independence
+from consistency.referee.diagnostics.dependence import ENOUGH, independence
 from consistency.referee.types import Array
 
 DOF = 3

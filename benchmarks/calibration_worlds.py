@@ -28,7 +28,7 @@ from calibration_gates import (
 from scipy import special
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.readers import planar_error
+from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.record import Track, assemble, symmetric
 from consistency.referee.types import Array
 

@@ -1,4 +1,4 @@
-"""What the referee calls outside of itself, by name: each is loaded when it is met, and may need an extra."""
+"""Functions that are loaded when they are called, by ``module:function``, and those of the bench by name."""
 
 from __future__ import annotations
 
@@ -6,14 +6,21 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-OUTSIDE = {
-    "results": "consistency.bench.runs.records:source_of",  # of the bench, in memory or in a folder
-    "innovations": "consistency.bench.runs.records:innovations_of",  # of one run in a folder of results
-    "report": "consistency.bench.pages:write_reports",  # of a folder of results
-    "pilot": "consistency.bench.runs.pilots:pilots_in",  # runs in a folder of results, to plan by
-    "pilot runs": "consistency.bench.runs.pilots:pilots_in_world",  # runs of a scenario, to plan by
-    "columns": "consistency.bench.store.parquet:read_columns",  # of a Parquet file
+OUTSIDE = {  # may need an extra
+    "results": "bench.runs.records:source_of",  # of the bench, in memory or in a folder
+    "innovations": "bench.runs.records:innovations_of",  # of one run in a folder of results
+    "report": "bench.pages:write_reports",  # of a folder of results
+    "pilot": "bench.runs.pilots:pilots_in",  # runs in a folder of results, to plan by
+    "pilot runs": "bench.runs.pilots:pilots_in_world",  # runs of a scenario, to plan by
+    "columns": "bench.store.parquet:read_columns",  # of a Parquet file
 }
+
+
+def function_at(target: str) -> Callable[..., Any]:
+    """The function that ``module:function`` names, of a module below ``consistency``."""
+    module, name = target.split(":")
+    function: Callable[..., Any] = getattr(import_module(f"consistency.{module}"), name)
+    return function
 
 
 def outside(name: str) -> Callable[..., Any]:
@@ -24,6 +31,4 @@ def outside(name: str) -> Callable[..., Any]:
     ModuleNotFoundError
         A package of its extra is not installed.
     """
-    module, attribute = OUTSIDE[name].split(":")
-    function: Callable[..., Any] = getattr(import_module(module), attribute)
-    return function
+    return function_at(OUTSIDE[name])

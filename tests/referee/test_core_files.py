@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.geometry.conventions import SPATIAL, se3_log, spatial_error
+from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.geometry.spatial import se3_log, spatial_error
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers import read_recordings
 from consistency.referee.readers.hints import hints

@@ -45,7 +45,7 @@ RANKS = {
     "": {"doors": 0, "testing": 1, "pytest_plugin": 1, "__main__": 1},
 }  # fmt: skip
 ONLY = {  # all that these may import of ours
-    "diagnostics": {"types", "geometry", "errors", "defaults", "diagnostics"},
+    "diagnostics": {"types", "geometry", "errors", "defaults", "extras", "diagnostics"},  # names on first use
     "document": {"types", "geometry", "errors", "diagnostics", "document"},
     "show": {"types", "diagnostics", "document", "show"},
 }

@@ -6,7 +6,6 @@ A command is a function of Typer in a module of a root's ``cli``, and a row here
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from importlib import import_module
 from typing import Any
 
 import typer
@@ -14,6 +13,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.models import CommandInfo
 
 from consistency.referee.extras import is_installed, remedy, require
+from consistency.referee.outside import function_at
 
 HELP = ["-h", "--help"]
 
@@ -98,13 +98,12 @@ class Loaded(Mapping[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         row = COMMANDS[name]
-        module, function = row.target.split(":")
         # below the options; the mark keeps the lines as they are
         epilog = "\b\nExamples:\n" + "\n".join(f"  consistency {line}" for line in row.examples)
         info = CommandInfo(
             name,
             cls=Command,
-            callback=getattr(import_module(f"consistency.{module}"), function),
+            callback=function_at(row.target),
             epilog=epilog if row.examples else None,
         )
         made: Any = typer.main.get_command_from_info(info, pretty_exceptions_short=True, rich_markup_mode=None)

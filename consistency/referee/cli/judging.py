@@ -76,7 +76,6 @@ def analyse(
     """Judge files of an estimator, or results: consistent, overconfident, conservative, undecided ..., and why."""
     from consistency.referee.document.verdict import document
     from consistency.referee.show import FORMATS
-    from consistency.referee.show import json as as_data
     from consistency.referee.verdicts.judge import analyse as judge
     from consistency.referee.verdicts.options import settings_of, skip_asked
     from consistency.referee.verdicts.sources import source_of
@@ -95,6 +94,7 @@ def analyse(
         tell_notes(recordings)
         if report is not None and not is_file:
             from consistency.referee.pages import write_file_reports
+            from consistency.referee.show import json as as_data
             from consistency.referee.system.folders import require_free
 
             try:

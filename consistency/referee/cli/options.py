@@ -67,11 +67,13 @@ def require_written(overwrite: bool, out: Path | None, option: str) -> None:
 
 def show(document: Document, as_json: bool, written: Sequence[Path] = ()) -> None:
     """Print a document for programs, or its opening and the files that were written."""
-    from consistency.referee.show import json, terminal
-
     if as_json:
+        from consistency.referee.show import json
+
         print(json.render(document))
         return
+    from consistency.referee.show import terminal
+
     terminal.show(*document.opening)
     for file in written:
         print(file)

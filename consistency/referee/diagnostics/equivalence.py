@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import special
 
 from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.eprocess import e_process, ever
-from consistency.referee.diagnostics.innovations import NisTest
 from consistency.referee.diagnostics.planning import LARGEST
 from consistency.referee.diagnostics.questions import MAIN, SHARES
 from consistency.referee.diagnostics.scale import FEW, MeanTest, scale_test
-from consistency.referee.diagnostics.verdict_parts import Equivalence, Settings
+from consistency.referee.diagnostics.verdict_parts import Equivalence, Innovations, Settings
 from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.innovations import NisTest
 
 
 def equivalence(
@@ -68,7 +71,9 @@ def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equiva
     return equivalent(below, above, factor, settings, None)
 
 
-def equivalence_of_innovations(test: NisTest, settings: Settings, factor: float | None = None) -> Equivalence:
+def equivalence_of_innovations(
+    test: NisTest | Innovations, settings: Settings, factor: float | None = None
+) -> Equivalence:
     """Equivalence of the scale of the innovations, from the total NIS; innovations are independent over steps too."""
     factor, total = settings.factor if factor is None else factor, test.ratio * test.dof
     if not test.dof:

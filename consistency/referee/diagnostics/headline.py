@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.referee.diagnostics.hypothesis_tests import Tests, ask
-from consistency.referee.diagnostics.joint import JointTest
 from consistency.referee.diagnostics.nees import anees
 from consistency.referee.diagnostics.questions import (
     AXIS,
@@ -25,6 +25,9 @@ from consistency.referee.diagnostics.sample import Sample
 from consistency.referee.diagnostics.scale import scale_test, spreads_more, spreads_more_in_steps
 from consistency.referee.diagnostics.verdict_parts import TINY, Interval, Settings, Verdict
 from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.joint import JointTest
 
 CERTAIN = 0.999  # false-alarm rate, at most
 SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.referee.diagnostics.band import Band, simultaneous_band
 from consistency.referee.diagnostics.bias import Moments, hotelling, moments, t_squared
-from consistency.referee.diagnostics.direction import Largest, largest_direction
 from consistency.referee.diagnostics.nees_distribution import Pit, pit
 from consistency.referee.diagnostics.outliers import Outlier, outliers
 from consistency.referee.diagnostics.questions import AXIS, DIRECTION, MAIN, STEP, answers
@@ -19,6 +19,9 @@ from consistency.referee.diagnostics.shape import mean_shape, sphericity
 from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.diagnostics.whitening import mean_of_runs
 from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.direction import Largest
 
 GRID = 9  # ratios within the tolerance at which the distribution is compared
 
@@ -64,6 +67,8 @@ def ask(sample: Sample, settings: Settings, also: Mapping[str, float], scale: fl
         outlier = outliers(w, in_steps)
         p["outliers"] = outlier.p_value
         if settings.one_sided:
+            from consistency.referee.diagnostics.direction import largest_direction
+
             largest = largest_direction(w)
             p[DIRECTION] = largest.p_value
         else:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from consistency.referee.diagnostics.early_stopping import Design, follow
-from consistency.referee.diagnostics.guessing import judge_guesses
-from consistency.referee.diagnostics.landmarks import map_score
-from consistency.referee.diagnostics.parts import judge_parts
 from consistency.referee.diagnostics.questions import SHARES
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.rejection import rejection_score
-from consistency.referee.diagnostics.uncertain import uncertain_truth
 from consistency.referee.diagnostics.verdict import DEFAULT, judge_alone
 from consistency.referee.diagnostics.verdict_parts import Settings, Verdict
 from consistency.referee.diagnostics.wording import plain
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.early_stopping import Design
 
 POSES = {"heading", "yaw", "pitch", "roll"}  # components that a pose has beside its position
 
@@ -52,21 +50,34 @@ def judge(record: Record, settings: Settings = DEFAULT) -> Verdict:
 def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | None = None) -> Verdict:
     """:func:`judge` without the maps; with a ``design``, the verdict of the look that decides, or of the last one."""
     if design is not None:
+        from consistency.referee.diagnostics.early_stopping import follow
+
         return of_look(*follow(design, record.first_runs, len(record.run_numbers)), record, design)
     if record.guesses:
+        from consistency.referee.diagnostics.guessing import judge_guesses
+
         return replace(judge_guesses(record, settings, judge_runs), notes=tuple(record.notes))
-    runs, truth = record.as_runs, uncertain_truth(record)
+    runs, truth = record.as_runs, None
+    if record.truth_covariance is not None:
+        from consistency.referee.diagnostics.uncertain import uncertain_truth
+
+        truth = uncertain_truth(record)
     if truth is not None:
         runs, record = truth.evidence, replace(record, unshown=record.unshown or truth.unjudged)
     if record.unshown:
         runs = replace(runs, unavailable=tuple(SHARES))
     world = None if record.world is None else judge_alone(record.in_world, settings)
-    verdict = judge_parts(runs, settings) if runs.parts else judge_alone(runs, settings, truth=truth)
-    return _beside(verdict, record, world)
+    if not runs.parts:
+        return _beside(judge_alone(runs, settings, truth=truth), record, world)
+    from consistency.referee.diagnostics.parts import judge_parts
+
+    return _beside(judge_parts(runs, settings), record, world)
 
 
 def of_look(verdict: Verdict, runs: int, record: Record, design: Design) -> Verdict:
     """The verdict of a look at the first ``runs``, with what is known beside them."""
+    from consistency.referee.diagnostics.early_stopping import follow
+
     world = None if record.world is None else follow(design, record.in_world.first_runs, runs)[0]
     return _beside(verdict, record, world, runs)
 
@@ -81,6 +92,8 @@ def with_map(verdict: Verdict, ends: Record, settings: Settings, design: Design 
     landmarks = None if ends.map is None else ends.map()
     if landmarks is None:
         return verdict
+    from consistency.referee.diagnostics.landmarks import map_score
+
     runs = None if design is None else 1 + int(ends.run_numbers[: verdict.runs].max(initial=-1))
     record = None if runs is not None else landmarks.record(None if ends.nees is None else ends.nees[:, 0])
     some = landmarks.of_runs(runs)
@@ -91,6 +104,11 @@ def with_map(verdict: Verdict, ends: Record, settings: Settings, design: Design 
 def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None = None) -> Verdict:
     """The verdict with what the record says beside its arrays; ``runs`` of it were judged, or all."""
     verdict = _unshown(verdict, r.unshown)
+    rejection = None
+    if r.rejections is not None:
+        from consistency.referee.diagnostics.rejection import rejection_score
+
+        rejection = rejection_score(*r.rejections.of_runs(runs)[1:])
     first, *rest = verdict.reasons
     left_out = verdict.left_out_steps
     return replace(
@@ -101,7 +119,7 @@ def _beside(verdict: Verdict, r: Record, world: Verdict | None, runs: int | None
         notes=tuple(r.notes),
         left_out_steps=tuple(sorted({*left_out, *r.left_out_steps})) if r.align else left_out,
         world=world,
-        rejection=None if r.rejections is None else rejection_score(*r.rejections.of_runs(runs)[1:]),
+        rejection=rejection,
     )
 
 

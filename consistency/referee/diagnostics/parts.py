@@ -17,29 +17,8 @@ from consistency.referee.diagnostics.sample import names_of
 from consistency.referee.diagnostics.verdict import judge_alone
 from consistency.referee.diagnostics.verdict_parts import Answer, Settings, Verdict
 from consistency.referee.diagnostics.whitening import entries, squared_length, whiten
-from consistency.referee.types import Array
 
 INNOVATIONS = "innovations"
-
-
-def diagonal(deviations: Array) -> Array:
-    """Covariances of standard deviations without cross terms, (..., n) -> (..., n, n); indefinite of a negative one."""
-    sigma = np.asarray(deviations, float)
-    return np.asarray((sigma * np.abs(sigma))[..., None] * np.eye(sigma.shape[-1]))
-
-
-def each_alone(record: Record) -> Record:
-    """The record with each of its components as a part, so that no cross term of its covariances is used.
-
-    Raises
-    ------
-    ValueError
-        The record has no errors.
-    """
-    if record.error is None:
-        raise ValueError(f"{record.name}: has no errors")
-    n = record.error.shape[-1]
-    return replace(record, parts=tuple((i,) for i in range(n)) if n > 1 else ())
 
 
 def judge_parts(record: Record, settings: Settings) -> Verdict:

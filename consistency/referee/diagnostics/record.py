@@ -258,3 +258,17 @@ def _last_value(nees: Array) -> Array:
         return np.full(len(nees), np.nan)
     last = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
     return np.asarray(nees[np.arange(len(nees)), last])
+
+
+def each_alone(record: Record) -> Record:
+    """The record with each of its components as a part, so that no cross term of its covariances is used.
+
+    Raises
+    ------
+    ValueError
+        The record has no errors.
+    """
+    if record.error is None:
+        raise ValueError(f"{record.name}: has no errors")
+    n = record.error.shape[-1]
+    return replace(record, parts=tuple((i,) for i in range(n)) if n > 1 else ())

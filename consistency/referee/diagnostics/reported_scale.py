@@ -12,7 +12,6 @@ from consistency.referee.diagnostics.planning import detectable_ratio
 from consistency.referee.diagnostics.questions import MAIN, SHARES
 from consistency.referee.diagnostics.sample import Sample
 from consistency.referee.diagnostics.scale import acceptance, ratio_interval
-from consistency.referee.diagnostics.single_log import within
 from consistency.referee.diagnostics.verdict_parts import Equivalence, Location, Scale, Settings
 from consistency.referee.types import Array, Indices
 
@@ -28,6 +27,11 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
     some = bool(judged.any())
     rate = SHARES[MAIN] * settings.false_alarm
     inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
+    of_log = None
+    if len(sample.nees) == 1:
+        from consistency.referee.diagnostics.single_log import within
+
+        of_log = within(sample.nees[0], dof, settings, shown.factor)
     late = means if location.since is None else sample.means(slice(location.since - 1, None))
     return Scale(
         dof=dof,
@@ -43,7 +47,7 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
         worst_run=float(means.max()) * dof if some else np.nan,
         share_inside=float(inside[judged].mean()) if some else np.nan,
         equivalence=shown,
-        within=within(sample.nees[0], dof, settings, shown.factor) if len(sample.nees) == 1 else None,
+        within=of_log,
     )
 
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics.blocks import by_runs, by_steps, of_runs
-from consistency.referee.diagnostics.innovations import nis_of
 from consistency.referee.diagnostics.record import Record, numbered_axes
 from consistency.referee.diagnostics.scale import means_and_counts, run_means
 from consistency.referee.diagnostics.symmetric import Symmetric
@@ -196,6 +195,8 @@ def innovations_of(evidence: Record) -> tuple[Array, Array] | None:
     if evidence.nis is not None and evidence.nis_dof is not None:
         return evidence.nis, evidence.nis_dof
     if evidence.innovations is not None and evidence.innovation_covariances is not None:
+        from consistency.referee.diagnostics.innovations import nis_of
+
         return nis_of(evidence.innovations, evidence.innovation_covariances)
     return None
 

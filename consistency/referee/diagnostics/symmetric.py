@@ -88,3 +88,9 @@ class Symmetric:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         return np.stack([np.stack(row, axis=-1) for row in self._entries], axis=-2).astype(dtype or float, copy=False)
+
+
+def diagonal(deviations: Array) -> Array:
+    """Covariances of standard deviations without cross terms, (..., n) -> (..., n, n); indefinite of a negative one."""
+    sigma = np.asarray(deviations, float)
+    return np.asarray((sigma * np.abs(sigma))[..., None] * np.eye(sigma.shape[-1]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +15,7 @@ from consistency.referee.diagnostics.early_ending import early_ends
 from consistency.referee.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
 from consistency.referee.diagnostics.headline import at_share, deciding_axis, status_of
 from consistency.referee.diagnostics.hypothesis_tests import Tests, ask
-from consistency.referee.diagnostics.innovations import NisTest, nis_test, nis_whiteness, whiteness
 from consistency.referee.diagnostics.intervals import chi2_mean_interval
-from consistency.referee.diagnostics.joint import joint_test, near
 from consistency.referee.diagnostics.location import accuracy_of, axes_of, bias_of, location_of, shape_of, tails_of
 from consistency.referee.diagnostics.lost import lost_of
 from consistency.referee.diagnostics.nees import anees
@@ -32,9 +31,12 @@ from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.reported_scale import scale_of
 from consistency.referee.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.referee.diagnostics.sample import shape_of as shape_of_arrays
-from consistency.referee.diagnostics.uncertain import UncertainTruth
 from consistency.referee.diagnostics.verdict_parts import Answer, Equivalence, Innovations, Settings, Verdict
 from consistency.referee.diagnostics.whitening import entries
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.joint import JointTest
+    from consistency.referee.diagnostics.uncertain import UncertainTruth
 
 DEFAULT = Settings()
 
@@ -60,9 +62,7 @@ def judge_alone(
     settings = replace(settings, allow="conservative") if evidence.reduced else settings
     innovations, p_values = _innovations(evidence, settings)
     sample = sample_of(evidence, settings)
-    joint = None
-    if evidence.joint is not None:
-        joint = joint_test(evidence.joint, settings, evidence.run_numbers, evidence.landmarks)
+    joint, excused = _joint(evidence, settings)
     p_values |= {} if joint is None else joint.p_values
     tests = None
     if sample is not None:
@@ -72,8 +72,7 @@ def judge_alone(
     if look is not None:
         p_values = _at(look, p_values)
     by_question = answers(p_values, settings.false_alarm)
-    excused = {"innovation scale"} if innovations is not None and _near(innovations, settings) else set()
-    excused |= {JOINT} if joint is not None and near(joint, settings) else set()
+    excused |= {"innovation scale"} if innovations is not None and _near(innovations, settings) else set()
     verdict = Verdict(
         evidence.name, "failed", (), runs, steps, settings, _excused(by_question.values(), excused), evidence.failures,
         innovations=innovations, landmarks=evidence.landmarks, joint=None if joint is None else joint.score,
@@ -92,6 +91,16 @@ def judge_alone(
     return replace(verdict, reasons=tuple(wording.reasons(verdict)))
 
 
+def _joint(evidence: Record, settings: Settings) -> tuple[JointTest | None, set[str]]:
+    """Test of pose and map together, where there is a map, and the question that the tolerance excuses."""
+    if evidence.joint is None:
+        return None, set()
+    from consistency.referee.diagnostics.joint import joint_test, near
+
+    test = joint_test(evidence.joint, settings, evidence.run_numbers, evidence.landmarks)
+    return test, {JOINT} if near(test, settings) else set()
+
+
 def _at(look: Look, p_values: dict[str, float]) -> dict[str, float]:
     """p values corrected for the number of looks; the share of the scale stays what it is if it is asked alone."""
     if look.spent is None:
@@ -106,6 +115,8 @@ def _innovations(evidence: Record, settings: Settings) -> tuple[Innovations | No
     nis_and_dof = innovations_of(evidence)
     if nis_and_dof is None:
         return None, {}
+    from consistency.referee.diagnostics.innovations import nis_test, nis_whiteness, whiteness
+
     test = nis_test(*nis_and_dof)
     low_high = chi2_mean_interval(test.dof, CONFIDENCE) if test.dof else (float("nan"), float("nan"))
     if evidence.innovations is not None and evidence.innovation_covariances is not None:
@@ -177,8 +188,7 @@ def _near(innovations: Innovations, settings: Settings) -> bool:
     """Whether the scale of the innovations is shown to lie within the tolerance."""
     if settings.tolerance is None or not innovations.judged:
         return False
-    test = NisTest(innovations.ratio, innovations.dof, float("nan"), float("nan"))
-    return equivalence_of_innovations(test, settings, settings.tolerated).shown
+    return equivalence_of_innovations(innovations, settings, settings.tolerated).shown
 
 
 def _tolerated(sample: Sample, tests: Tests, settings: Settings) -> set[str]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from consistency.referee.document.drawing import Figure, Key
-from consistency.referee.document.looks import Look
+if TYPE_CHECKING:
+    from consistency.referee.document.drawing import Figure, Key
+    from consistency.referee.document.looks import Look
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,7 @@ class Bullets:
     texts: tuple[str, ...]
 
 
-Block: TypeAlias = Figure | Heading | Text | Table | Reasons | Facts | Bullets | Settings | Details
+Block: TypeAlias = "Figure | Heading | Text | Table | Reasons | Facts | Bullets | Settings | Details"
 
 
 @dataclass(frozen=True)
@@ -216,6 +217,8 @@ class Document:
 
     @property
     def figures(self) -> tuple[Figure, ...]:
+        from consistency.referee.document.drawing import Figure
+
         return tuple(block for part in self.parts for block in part if isinstance(block, Figure))
 
     @property

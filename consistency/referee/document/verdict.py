@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,11 +29,11 @@ from consistency.referee.document.blocks import (
     Text,
     table,
 )
-from consistency.referee.document.guard import rejection_text
-from consistency.referee.document.looks import Look
-from consistency.referee.document.map import map_lines, map_summary
 from consistency.referee.document.wording import NONE, brief, number, p_cell
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+
+if TYPE_CHECKING:
+    from consistency.referee.document.looks import Look
 
 
 class Measure(NamedTuple):
@@ -232,8 +232,12 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         rows.insert(0, ("error", f"{v.convention}: {PLANAR[v.convention or ADDITIVE]}"))
         rows.append(("in the world", _in_world(v.world)))
     if v.map is not None:
+        from consistency.referee.document.map import map_summary
+
         rows.append(("map NEES / 3", f"{map_summary(v.map)}"))
     if v.rejection is not None:
+        from consistency.referee.document.guard import rejection_text
+
         rows.append(("rejected", rejection_text(v.rejection)))
     rows.append((f"failed {v.unit}s", f"{len({f.run for f in v.failures})} of {v.runs}"))
     faults = [
@@ -288,6 +292,12 @@ def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
     if worst := [(name, *v.worst_axis) for name, v in verdicts.items() if v.worst_axis is not None]:
         texts = "; ".join(f"{name} {axis}, {plain(ratio)}" for name, axis, ratio in worst)
         lines.append(f"ratio of the worst axis: {texts}")
-    lines += map_lines({name: v.map for name, v in verdicts.items() if v.map is not None})
-    guarded = {name: v.rejection for name, v in verdicts.items() if v.rejection is not None}
-    return lines + [f"{name} rejected {rejection_text(score)}" for name, score in guarded.items()]
+    if maps := {name: v.map for name, v in verdicts.items() if v.map is not None}:
+        from consistency.referee.document.map import map_lines
+
+        lines += map_lines(maps)
+    if guarded := {name: v.rejection for name, v in verdicts.items() if v.rejection is not None}:
+        from consistency.referee.document.guard import rejection_text
+
+        lines += [f"{name} rejected {rejection_text(score)}" for name, score in guarded.items()]
+    return lines

@@ -10,19 +10,22 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import composed, matrices
+from consistency.referee.outside import function_at
 from consistency.referee.parsing.options import Reading
-from consistency.referee.readers.archive import archive_poses
-from consistency.referee.readers.bags import bag_poses, is_bag
 from consistency.referee.readers.interpolation import truth_at
-from consistency.referee.readers.kitti import is_drive
-from consistency.referee.readers.layouts import is_spatial
-from consistency.referee.readers.plane import is_plane
+from consistency.referee.readers.kinds import (
+    TABLES,
+    TRAJECTORIES,
+    is_bag,
+    is_drive,
+    is_plane,
+    is_solution,
+    kind_of,
+    trajectory_files,
+)
 from consistency.referee.readers.poses import NamedPoses
 from consistency.referee.readers.table import table_poses
-from consistency.referee.readers.tum import SUFFIXES, trajectory_files, trajectory_poses
 from consistency.referee.types import Array, Indices
-
-TABLES = (".csv", ".parquet", ".pq")
 
 
 @dataclass(frozen=True)
@@ -99,26 +102,21 @@ def drive_of(
 
 def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
     """Name and poses of each drive."""
-    if is_bag(path):
-        yield from bag_poses(path, r)
-    elif path.is_dir() and not trajectory_files(path):
+    kind = kind_of(path, r)
+    if not is_bag(path) and path.is_dir() and not trajectory_files(path):
         yield from _of_folder(path, r)
-    elif path.suffix.lower() == ".npz":
-        yield from archive_poses(path)
-    elif (path.suffix.lower() in TABLES and not is_spatial(path)) or is_plane(path):
-        yield from table_poses(path, r)
-    elif path.is_dir() or path.suffix.lower() in (*SUFFIXES, ".csv"):
-        yield from trajectory_poses(path, r)
-    else:
-        known = ", ".join((*TABLES, ".npz", ".bag", *SUFFIXES))
+    elif kind is None or is_solution(path):
+        known = ", ".join((*TABLES, ".npz", ".bag", *TRAJECTORIES))
         raise InputError(f"{path}: unknown kind of file; known are {known}")
+    else:
+        yield from function_at(kind.poses)(path, r)
 
 
 def _of_folder(folder: Path, r: Reading) -> Iterator[NamedPoses]:
     """Tables of a folder, one for each drive, with truths of the same names in another."""
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path))
     if not files:
-        raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(SUFFIXES)}) or ROS bags")
+        raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
     for path in files:
         truth = r.truth / path.name if r.truth is not None and r.truth.is_dir() and not is_drive(r.truth) else r.truth
         if truth is not None and not truth.exists():

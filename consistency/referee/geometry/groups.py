@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.geometry.conventions import se2_log, se3_log
+from consistency.referee.geometry.conventions import se2_log
+from consistency.referee.geometry.spatial import se3_log
 from consistency.referee.types import Array
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+COLUMNS = "columns"  # covariance of the truth: of its own file
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
 
 

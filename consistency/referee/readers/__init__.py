@@ -10,49 +10,29 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.pieces import in_pieces
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import (
-    INERTIAL,
-    PLANAR,
-    SPATIAL,
-    planar_error,
-    se2_log,
-    se3_log,
-    spatial_error,
-)
+from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
+from consistency.referee.outside import function_at
 from consistency.referee.parsing import require_name
 from consistency.referee.parsing.options import Reading, flag_of
-from consistency.referee.readers.alignment import ALIGNMENTS, require_alignment
-from consistency.referee.readers.archive import read_archive
-from consistency.referee.readers.bags import is_bag, read_bags
-from consistency.referee.readers.kitti import BODIES, is_drive
-from consistency.referee.readers.layouts import is_spatial
-from consistency.referee.readers.plane import is_plane
-from consistency.referee.readers.relative import MARGINAL
-from consistency.referee.readers.shared import less_shared, other_drives, require_shared_options
-from consistency.referee.readers.sheet import frame_rows
-from consistency.referee.readers.table import read_tables
+from consistency.referee.readers.alignment import require_alignment
+from consistency.referee.readers.kinds import (
+    OF_BAGS,
+    OF_TRAJECTORIES,
+    TABLES,
+    TRAJECTORIES,
+    is_bag,
+    is_drive,
+    kind_of,
+    trajectory_files,
+)
 from consistency.referee.readers.text import is_cut, without_end
-from consistency.referee.readers.tum import ORDERS, SUFFIXES, read_tum, trajectory_files
-from consistency.referee.readers.uncertain import declared, require_truth_options
-from consistency.referee.readers.windows import Relative, relative_of
 
-__all__ = [
-    "ALIGNMENTS",
-    "BODIES",
-    "CONVENTIONS",
-    "ORDERS",
-    "is_recording",
-    "planar_error",
-    "read_recordings",
-    "se2_log",
-    "se3_log",
-    "spatial_error",
-]
+if TYPE_CHECKING:
+    from consistency.referee.readers.windows import Relative
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 GUESS = "guess"  # judge every convention
@@ -61,8 +41,9 @@ NO_GUESS = {
     "shared": "which is fitted to a declared error",
     "relative": "which judges motions in one error; name the conventions one by one",
 }
-OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
-TABLES = (".csv", ".parquet", ".pq")
+OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
+OF_SHARED = ("shared", "shared_from", "shared_truth")
+OF_WINDOWS = ("relative", "motions", "windows")
 
 
 def is_recording(path: Path, reading: Reading) -> bool:
@@ -77,7 +58,7 @@ def is_recording(path: Path, reading: Reading) -> bool:
     if path.is_dir() and not (path / "manifest.json").exists():
         recording = bool(trajectory_files(path)) or is_bag(path) or bool(given)
         if not recording:
-            known = f"trajectories ({', '.join(SUFFIXES)}) or ROS bags"
+            known = f"trajectories ({', '.join(TRAJECTORIES)}) or ROS bags"
             raise InputError(f"{path}: holds no results of 'consistency run', and no {known}")
     else:
         recording = not path.is_dir() and (path.exists() or path.suffix != "")
@@ -99,11 +80,14 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Evidence]:
     InputError
         As :func:`read_recordings`; the tables are called "estimates" and "truth".
     """
-    over = relative_of(reading.relative, bool(reading.motions), reading.windows)
+    from consistency.referee.readers.sheet import frame_rows
+    from consistency.referee.readers.table import read_tables
+
+    over = _windows(reading)
     sheet = frame_rows(estimates, "estimates") if hasattr(estimates, "columns") else Path(estimates)
     true = frame_rows(truth, "truth") if hasattr(truth, "columns") else truth if truth is None else Path(truth)
     r = _checked(replace(reading, truth=cast(Any, true)), over)
-    _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, "topic", "truth_topic")
+    _refuse(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
     if r.error == GUESS:
         return guessed("tables", r, lambda kind: _asked(read_tables(sheet, replace(r, error=kind), over), r, over))
     return _asked(read_tables(sheet, r, over), r, over)
@@ -153,13 +137,22 @@ def _cut_by(reason: str) -> tuple[Path, int] | None:
 
 def _read(estimates: Path, r: Reading) -> list[Evidence]:
     """Recordings of files as they stand, with the options given."""
-    over = relative_of(r.relative, bool(r.motions), r.windows)
+    over = _windows(r)
     r = _checked(r, over)
     if r.error == GUESS:
         return guessed(
             str(estimates), r, lambda kind: _asked(_by_kind(estimates, replace(r, error=kind), over), r, over)
         )
     return _asked(_by_kind(estimates, r, over), r, over)
+
+
+def _windows(r: Reading) -> Relative | None:
+    """Windows that are judged in place of poses."""
+    if not r.given(OF_WINDOWS):
+        return None
+    from consistency.referee.readers.windows import relative_of
+
+    return relative_of(r.relative, bool(r.motions), r.windows)
 
 
 def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]]) -> list[Evidence]:
@@ -183,42 +176,35 @@ def guessed(name: str, r: Reading, read: Callable[[str | None], list[Evidence]])
 
 def _asked(records: list[Evidence], r: Reading, over: Relative | None) -> list[Evidence]:
     """Records with what is declared of their truth, in pieces or without what all share where that is asked."""
-    pieces, records = pieces_asked(r), declared(records, r)
+    pieces = pieces_asked(r)
+    if r.given(OF_TRUTH) or any(record.truth_covariance is not None for record in records):
+        from consistency.referee.readers.uncertain import declared
+
+        records = declared(records, r)
     if r.shared is not None:
+        from consistency.referee.readers.shared import less_shared, other_drives
+
         others = None if r.shared_from is None else _by_kind(r.shared_from, other_drives(r), over)
         return less_shared(records, others, r.shared)
-    return records if pieces is None else [in_pieces(record, pieces or None) for record in records]
+    if pieces is None:
+        return records
+    from consistency.referee.diagnostics.pieces import in_pieces
+
+    return [in_pieces(record, pieces or None) for record in records]
 
 
 def _by_kind(estimates: Path, r: Reading, over: Relative | None) -> list[Evidence]:
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
     require_name(estimates.name, "file")
-    suffix = estimates.suffix.lower()
     if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
         raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
-    if is_bag(estimates):
-        _refuse(estimates, r, "state", "covariance", "covariance_order", "truth", "lever_arm")
-        if over is not None:
-            raise InputError(f"{estimates}: --relative: {MARGINAL}")
-        return read_bags(estimates, r)
-    _refuse(estimates, r, "topic", "truth_topic")
-    if suffix == ".npz":
-        _refuse(
-            estimates, r, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
-            "lever_arm", "truth_covariance",
-        )  # fmt: skip
-        return read_archive(estimates, r.error, over)
-    if (suffix in TABLES and (r.state is not None or not is_spatial(estimates))) or is_plane(estimates):
-        _refuse(estimates, r, *OF_TRAJECTORIES)
-        if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
-            raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
-        return _with_frame(read_tables(estimates, r, over), r)
-    if suffix not in (*SUFFIXES, ".csv", ".pos") and not estimates.is_dir():
-        known = ", ".join((*TABLES, ".npz", ".bag", ".mcap", ".db3", ".pos", *SUFFIXES))
+    kind = kind_of(estimates, r)
+    _refuse(estimates, r, *(OF_BAGS if kind is None else kind.refused))
+    if kind is None:
+        known = ", ".join((*TABLES, ".npz", ".bag", ".mcap", ".db3", ".pos", *TRAJECTORIES))
         raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
-    _refuse(estimates, r, "state")
-    return _with_frame(read_tum(estimates, r, over), r)
+    return _with_frame(function_at(kind.records)(estimates, r, over), r)
 
 
 def pieces_asked(r: Reading) -> int | None:
@@ -231,7 +217,7 @@ def pieces_asked(r: Reading) -> int | None:
     """
     if r.split is None:
         return None
-    for option in ("relative", "motions", "windows"):
+    for option in OF_WINDOWS:
         if getattr(r, option):
             raise InputError(f"--split: does not go with {flag_of(option)}, which cuts the log into windows")
     if r.align not in (None, "none"):
@@ -258,8 +244,14 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
         raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
     if over is not None and offset == "estimate":
         raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
-    require_truth_options(r)
-    require_shared_options(r)
+    if r.given(OF_TRUTH):
+        from consistency.referee.readers.uncertain import require_truth_options
+
+        require_truth_options(r)
+    if r.given(OF_SHARED):
+        from consistency.referee.readers.shared import require_shared_options
+
+        require_shared_options(r)
     align = require_alignment(r.align, r.truth or r.truth_topic)
     if over is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")

@@ -5,33 +5,35 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics import Evidence, Record
-from consistency.referee.diagnostics.parts import diagonal, each_alone
-from consistency.referee.diagnostics.record import numbered_axes
+from consistency.referee.diagnostics.record import each_alone, numbered_axes
+from consistency.referee.diagnostics.symmetric import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
-from consistency.referee.readers.extended import extended_errors, is_extended
+from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.hints import hints, turns
 from consistency.referee.readers.interpolation import Manifold
 from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.record import Track, assemble, symmetric
-from consistency.referee.readers.relative import Stretch, relative_recording
 from consistency.referee.readers.sheet import Places, are_dof, bounded
-from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Failure
+
+if TYPE_CHECKING:
+    from consistency.referee.readers.windows import Relative
 
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
 NEEDED = (("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof"))
+OF_STATES = {"R", "p", "v"}  # of an inertial filter
 OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances", "truth_covariances"}
 
 
-def read_archive(path: Path, convention: str | None, relative: Relative | None = None) -> list[Evidence]:
+def read_archive(path: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
     """The recording of an archive.
 
     ``errors`` (runs, steps, n) with ``covariances`` (runs, steps, n, n); or ``estimates`` and ``truth``, both
@@ -43,11 +45,13 @@ def read_archive(path: Path, convention: str | None, relative: Relative | None =
     inertial filters have keys of their own (:mod:`consistency.referee.readers.extended`).
     """
     arrays = load_arrays(path)
-    if not is_extended(arrays):
-        return [_of_arrays(path, arrays, convention, relative)]
-    errors, note = extended_errors(path, arrays, convention)
+    if not set(arrays) >= OF_STATES:
+        return [_of_arrays(path, arrays, r.error, relative)]
+    from consistency.referee.readers.extended import extended_errors
+
+    errors, note = extended_errors(path, arrays, r.error)
     record = _of_arrays(path, errors, relative=relative)
-    return [replace(record, convention=convention or "", notes=(note, *record.notes))]
+    return [replace(record, convention=r.error or "", notes=(note, *record.notes))]
 
 
 def record_of_arrays(
@@ -183,7 +187,7 @@ def _poses(place: Places, estimate: Array, covariance: Array, truth: Array, conv
     return Poses(place, t, estimate, covariance, stated, t[known], truth[known], manifold, convention, 0.0)
 
 
-def archive_poses(path: Path) -> Iterator[NamedPoses]:
+def archive_poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
     """Planar poses of each run of an archive with the keys ``estimates`` and ``truth``."""
     arrays = load_arrays(path)
     if missing := [key for key in ("estimates", "truth") if key not in arrays]:
@@ -206,6 +210,8 @@ def _relative(
     relative: Relative,
 ) -> Evidence:  # fmt: skip
     """Motions over windows of planar poses, or of motions."""
+    from consistency.referee.readers.relative import Stretch, relative_recording
+
     runs, steps, n = estimates.shape
     if n != 3 or convention == "vector":
         raise InputError(f"{path}: --relative needs poses x, y, heading, with --error so2, left or right")

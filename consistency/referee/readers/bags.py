@@ -16,12 +16,14 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing import reading
-from consistency.referee.parsing.options import Reading
+from consistency.referee.parsing.options import COLUMNS, Reading
 from consistency.referee.readers.fixes import Fixes, localised
+from consistency.referee.readers.kinds import is_one_bag
 from consistency.referee.readers.layouts import POSE
 from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.positions import fixed, position_source, positions
 from consistency.referee.readers.record import symmetric
+from consistency.referee.readers.relative import MARGINAL
 from consistency.referee.readers.sheet import Lines, Places
 from consistency.referee.readers.spatial import (
     ALONE,
@@ -33,7 +35,7 @@ from consistency.referee.readers.spatial import (
     require_axes,
 )
 from consistency.referee.readers.tum import UNIT, unused
-from consistency.referee.readers.uncertain import COLUMNS
+from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance
@@ -42,22 +44,12 @@ ESTIMATES = (*STATED, FIX)
 POSES = (*ESTIMATES, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped")
 TREE = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 SECOND = 1e-9  # s in a nanosecond
-FILES = (".bag", ".mcap", ".db3")
 PART = re.compile(r"(.+)_\d+")  # names of the files of one recording of ROS 2
 UNKNOWN, DIAGONAL = 0, 2  # types of covariance in sensor_msgs/NavSatFix
 ENDLESS = 1e9  # a variance from which on it is not stated
 
 
-def is_bag(path: Path) -> bool:
-    """A file of ROS 1 or 2, a folder of ROS 2, or a folder that holds such."""
-    return _is_one(path) or (path.is_dir() and any(_is_one(part) for part in path.iterdir()))
-
-
-def _is_one(path: Path) -> bool:
-    return (path.suffix in FILES and path.is_file()) or (path.is_dir() and (path / "metadata.yaml").is_file())
-
-
-def read_bags(path: Path, r: Reading) -> list[Evidence]:
+def read_bags(path: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
     """Evidence of one estimator: a bag, or a folder with a bag for each run.
 
     The topic of the estimates is of PoseWithCovarianceStamped, Odometry or NavSatFix, and need not be named where there
@@ -68,10 +60,12 @@ def read_bags(path: Path, r: Reading) -> list[Evidence]:
     InputError
         A bag cannot be read, or lacks the topic; says which there are.
     """
+    if relative is not None:
+        raise InputError(f"{path}: --relative: {MARGINAL}")
     if r.error not in (None, *SPATIAL):
         raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
     require_axes(r.axes)
-    bags = [path] if _is_one(path) else sorted(part for part in path.iterdir() if _is_one(part))
+    bags = [path] if is_one_bag(path) else sorted(part for part in path.iterdir() if is_one_bag(part))
     if twice := _parts_of_one(bags):
         raise InputError(
             f"{path}: {twice} and others are parts of one recording; make its metadata by 'ros2 bag reindex'"
@@ -334,7 +328,7 @@ def _stamp(header: Any) -> float:
 
 def bag_poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
     """Poses of each bag, of a topic with or without covariances, which are not looked at."""
-    for bag in [path] if _is_one(path) else sorted(part for part in path.iterdir() if _is_one(part)):
+    for bag in [path] if is_one_bag(path) else sorted(part for part in path.iterdir() if is_one_bag(part)):
         with _opened(bag) as reader:
             topic = r.topic if r.topic in _topics(reader, POSES) else _chosen(bag, reader, r.topic)
             if r.truth_topic is None:

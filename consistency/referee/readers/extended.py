@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import INERTIAL, state_error
+from consistency.referee.geometry.conventions import INERTIAL
+from consistency.referee.geometry.spatial import state_error
 from consistency.referee.types import Array
 
 AXES = {
@@ -24,11 +25,6 @@ TRUE = "true_"  # before the name of a part
 ROTATION = 1e-3  # largest entry of R R' - I
 
 
-def is_extended(arrays: Mapping[str, Array]) -> bool:
-    """Whether an archive holds such states."""
-    return {"R", "p", "v"} <= set(arrays)
-
-
 def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | None) -> tuple[dict[str, Array], str]:
     """The arrays with ``errors`` (runs, steps, 9 or 15) and ``axes`` in place of the states, and a note.
 
@@ -39,7 +35,7 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
         the parts as they stand in the covariance, R, p, v, bg, ba by default; one run may lack the first dimension
     convention : ``left`` is Log(est^-1 truth) of SE2(3), ``right`` Log(truth est^-1), ``additive`` a difference;
         ``so3`` and ``so3-body`` are additive but for the rotation
-        (:func:`consistency.referee.geometry.conventions.state_error`). Biases are differences.
+        (:func:`consistency.referee.geometry.spatial.state_error`). Biases are differences.
 
     Raises
     ------

@@ -123,11 +123,6 @@ def _plain(lines: Lines, origin: Array | None) -> Lines:
 # --- RTKLIB ------------------------------------------------------------------------------------------
 
 
-def is_solution(path: Path) -> bool:
-    """Whether a file is a solution of RTKLIB, by its suffix."""
-    return path.suffix.lower() == ".pos" and path.is_file()
-
-
 def read_solution(path: Path) -> Fixes:
     """A solution of RTKLIB: latitude, longitude, height; x, y, z from the earth's centre; or east, north, up.
 

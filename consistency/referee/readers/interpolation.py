@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.types import Array, Indices
@@ -63,6 +62,8 @@ def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Arra
         out[:, 2] = wrap(out[:, 2])
     turned = np.flatnonzero(share > 0.0)
     if manifold == "spatial" and len(turned):
+        from scipy.spatial.transform import Rotation  # half of what a planar log would load
+
         first, second = (Rotation.from_quat(values[turned, 3:7]) for values in (start, end))
         turn = Rotation.from_rotvec(share[turned, None] * (first.inv() * second).as_rotvec())
         out[turned, 3:7] = (first * turn).as_quat()

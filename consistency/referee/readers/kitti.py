@@ -24,11 +24,6 @@ BODIES = {"imu": (), "velodyne": ("imu_to_velo",), "camera": ("imu_to_velo", "ve
 LEVEL = ("imu", "velodyne")  # bodies whose x and y are in the plane of the road
 
 
-def is_drive(path: Path) -> bool:
-    """Whether a folder is a drive: it holds oxts/data."""
-    return (path / "oxts" / "data").is_dir()
-
-
 def read_drive(folder: Path, body: str | None = None) -> Lines:
     """Poses of a drive as lines of a TUM trajectory: t, position and quaternion x, y, z, w.
 

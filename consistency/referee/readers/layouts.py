@@ -13,12 +13,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.fixes import is_solution, read_solution
+from consistency.referee.readers.fixes import read_solution
+from consistency.referee.readers.kinds import is_solution
 from consistency.referee.readers.naming import (
     UNIT_NAMES,
     Head,
     Roles,
-    begins_with_numbers,
     fields_of,
     head_of,
     roles_of,
@@ -78,20 +78,6 @@ def read_poses(path: Path, true: bool = False) -> Lines:
     if states is None:
         raise InputError(f"{lines.place(0)}: has {width} columns; should be {LAYOUT}")
     return states
-
-
-def is_spatial(path: Path) -> bool:
-    """Whether a table is of poses in space."""
-    return path.suffix.lower() == ".csv" and path.is_file() and is_poses(path)
-
-
-def is_poses(path: Path) -> bool:
-    """Whether a text file is of poses in space: by the names of its columns, or without names."""
-    head = head_of(path)
-    if head is None:
-        return begins_with_numbers(path)
-    roles = roles_of(head.names, path)
-    return "heading" not in head.names and roles is not None and bool(roles.quaternion)
 
 
 def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.diagnostics.parts import diagonal
+from consistency.referee.diagnostics.symmetric import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.readers.sheet import Lines, read_numbers
 from consistency.referee.types import Array

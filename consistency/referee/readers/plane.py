@@ -10,33 +10,12 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.parsing.columns import COVARIANCE, POSE
+from consistency.referee.readers.kinds import PLACES, SPEEDS, TURNS, is_poses
 from consistency.referee.readers.layouts import POSE as WIDTH
-from consistency.referee.readers.layouts import is_poses, read_named, read_poses, times_of
-from consistency.referee.readers.naming import UNIT_NAMES, begins_with_numbers, clock_of, head_of, places_of
-from consistency.referee.readers.sheet import Lines, TableRows, increasing, read_sheet
+from consistency.referee.readers.layouts import read_named, read_poses, times_of
+from consistency.referee.readers.naming import UNIT_NAMES, clock_of, head_of, places_of
+from consistency.referee.readers.sheet import Lines, TableRows, increasing
 from consistency.referee.types import Array
-
-SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
-TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
-HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
-PLACES = (("x", "tx", "px"), ("y", "ty", "py"), HEADINGS)
-
-
-def is_plane(path: Path) -> bool:
-    """Whether a file has columns of planar poses, or of speeds and turn rates, under names of their own."""
-    head = head_of(path)
-    if head is None or clock_of(head.names) is None or is_poses(path):
-        return False
-    return any(places_of(head.names, each) is not None for each in (PLACES, (SPEEDS, TURNS)))
-
-
-def planar_sheet(path: Path, motions: bool = False) -> tuple[TableRows, str]:
-    """A table of planar poses, and what it was read as where it has no columns x, y, heading."""
-    head = None if path.suffix.lower() in (".parquet", ".pq") or not path.is_file() else head_of(path)
-    named = head is not None and not head.comment and set(POSE) <= set(head.names)
-    if (head is None and not begins_with_numbers(path)) or named or not (is_poses(path) or is_plane(path)):
-        return read_sheet(path), ""
-    return read_plane(path, motions)
 
 
 def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:

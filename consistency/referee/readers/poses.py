@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.referee.geometry.conventions import planar_error, state_error
+from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.interpolation import Known, Manifold, nearest, truth_at
 from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array, Indices
@@ -55,7 +55,9 @@ class Poses:
         estimate = self.estimate[rows]
         finite = np.isfinite(estimate).all(axis=1)
         out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
-        error = state_error if self.manifold == "spatial" else planar_error
+        error = planar_error
+        if self.manifold == "spatial":
+            from consistency.referee.geometry.spatial import state_error as error
         out[finite] = error(truth[finite], estimate[finite], self.convention)
         return out
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.parts import each_alone
+from consistency.referee.diagnostics.record import each_alone
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.parsing.options import Reading
-from consistency.referee.readers.alignment import clocks_and_frames
 from consistency.referee.readers.hints import hints
 from consistency.referee.readers.interpolation import truth_at
 from consistency.referee.readers.matching import common_times
 from consistency.referee.readers.naming import UNIT_NAMES, unit_of
+from consistency.referee.readers.offset import clocks_and_frames
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.record import Track, assemble
 from consistency.referee.readers.relative import Stretch, relative_recording

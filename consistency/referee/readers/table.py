@@ -5,23 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.parts import diagonal, each_alone
+from consistency.referee.diagnostics.record import each_alone
+from consistency.referee.diagnostics.symmetric import diagonal
 from consistency.referee.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error
 from consistency.referee.parsing.options import Reading
-from consistency.referee.readers.alignment import Aligned, clocks_and_frames
+from consistency.referee.readers.alignment import Aligned
 from consistency.referee.readers.hints import hints
-from consistency.referee.readers.kitti import drive_sheet, is_drive
+from consistency.referee.readers.kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.matching import common_steps, common_times
-from consistency.referee.readers.plane import planar_sheet
+from consistency.referee.readers.naming import begins_with_numbers, head_of
 from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.record import Track, assemble
-from consistency.referee.readers.relative import Stretch, relative_recording
 from consistency.referee.readers.sheet import Places, TableRows, read_sheet
 from consistency.referee.readers.table_columns import (
     POSE,
@@ -35,8 +36,11 @@ from consistency.referee.readers.table_columns import (
     stated_deviations,
 )
 from consistency.referee.readers.table_truth import Samples, manifold_of, matched, samples_of
-from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from consistency.referee.readers.relative import Stretch
+    from consistency.referee.readers.windows import Relative
 
 
 def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | None = None) -> list[Evidence]:
@@ -47,6 +51,8 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
     InputError
         A file, column, line or option that cannot be used, and what is allowed.
     """
+    if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
+        raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
     truth, axes = r.truth, tuple(r.state) if r.state else POSE
     sheet, note = _sheet(estimates, axes, bool(r.motions))
     estimates = sheet.path
@@ -56,10 +62,8 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
     if r.align is not None and manifold_of(convention) != "planar":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     other, notes = None, [note]
-    if isinstance(truth, Path) and is_drive(truth):
-        other = drive_sheet(truth, r.body)
-    elif truth is not None:
-        other, note = _sheet(truth, axes)
+    if truth is not None:
+        other, note = _sheet(truth, axes, body=r.body)
         notes.append(note)
     if other is None and not {"nis", "nis_dof"} <= set(sheet.data):
         raise InputError(f"{estimates}: needs --truth FILE, or columns nis and nis_dof to be judged by the NIS alone")
@@ -75,11 +79,28 @@ def read_tables(estimates: Path | TableRows, r: Reading, relative: Relative | No
     return [replace(recordings[0], notes=(*said, *recordings[0].notes)), *recordings[1:]]
 
 
-def _sheet(table: Path | TableRows, axes: tuple[str, ...], motions: bool = False) -> tuple[TableRows, str]:
-    """Rows of a file, or those in memory, and what they were read as."""
+def _sheet(
+    table: Path | TableRows, axes: tuple[str, ...], motions: bool = False, body: str | None = None
+) -> tuple[TableRows, str]:
+    """Rows of a file or a drive, or those in memory, and what they were read as."""
     if isinstance(table, TableRows):
         return table, ""
+    if is_drive(table):
+        from consistency.referee.readers.kitti import drive_sheet
+
+        return drive_sheet(table, body), ""
     return planar_sheet(table, motions) if axes == POSE else (read_sheet(table), "")
+
+
+def planar_sheet(path: Path, motions: bool = False) -> tuple[TableRows, str]:
+    """A table of planar poses, and what it was read as where it has no columns x, y, heading."""
+    head = None if path.suffix.lower() in (".parquet", ".pq") or not path.is_file() else head_of(path)
+    named = head is not None and not head.comment and set(POSE) <= set(head.names)
+    if (head is None and not begins_with_numbers(path)) or named or not (is_poses(path) or is_plane(path)):
+        return read_sheet(path), ""
+    from consistency.referee.readers.plane import read_plane
+
+    return read_plane(path, motions)
 
 
 def _convention(convention: str | None, axes: tuple[str, ...], truth: Path | None) -> str:
@@ -159,6 +180,8 @@ def _recording(
         else:
             reach = r.tolerance if key == "t" else 0.0
             poses = _poses(sheet, samples, runs, keys, estimate, covariance, convention, reach)
+            from consistency.referee.readers.offset import clocks_and_frames
+
             shift, clocks, moved = clocks_and_frames(name, poses, r.time_offset, r.align, range(len(axes)))
             clocks += [*moved.notes, *hints(name, axes, moved.runs, shift)]
             if r.align is not None:
@@ -169,6 +192,8 @@ def _recording(
             name, sheet, truth, samples, runs, keys + shift, key, axes, convention, r.tolerance
         )
         if relative is not None:
+            from consistency.referee.readers.relative import relative_recording
+
             stretches = _stretches(sheet, runs, keep, true, estimate, covariance, convention, relative)
             record = relative_recording(name, str(sheet.path), stretches, axes, range(len(axes)), relative)
             return replace(record, notes=(*notes, *record.notes))
@@ -223,6 +248,8 @@ def _stretches(
     relative: Relative,
 ) -> list[Stretch]:  # fmt: skip
     """Each run before its windows are taken."""
+    from consistency.referee.readers.relative import Stretch
+
     t = sheet.numbers("t", finite=True) if "t" in sheet else np.full(len(runs), np.nan)
     cross = None if relative.motions else cross_covariances(sheet)
     found = []
@@ -282,8 +309,7 @@ def table_poses(estimates: Path, r: Reading) -> Iterator[NamedPoses]:
     """Planar poses of each run of a table; covariances are not looked at."""
     if r.truth is None:
         raise InputError(f"{estimates}: needs --truth FILE, poses in any world")
-    sheet, _ = planar_sheet(estimates, bool(r.motions))
-    truth = drive_sheet(r.truth, r.body) if is_drive(r.truth) else planar_sheet(r.truth)[0]
+    (sheet, _), (truth, _) = _sheet(estimates, POSE, bool(r.motions)), _sheet(r.truth, POSE, body=r.body)
     if "filter" in sheet and len(set(sheet.texts("filter"))) > 1:
         raise InputError(f"{estimates}: holds several estimators in its column 'filter'; keep the rows of one")
     require_columns(sheet, POSE)

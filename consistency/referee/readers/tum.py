@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.parts import diagonal
+from consistency.referee.diagnostics.symmetric import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
-from consistency.referee.parsing.options import Reading
-from consistency.referee.readers.fixes import Fixes, is_solution, localised
-from consistency.referee.readers.kitti import is_drive, read_drive
-from consistency.referee.readers.layouts import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, is_spatial, read_poses
+from consistency.referee.parsing.options import COLUMNS, Reading
+from consistency.referee.readers.fixes import Fixes, localised
+from consistency.referee.readers.kinds import is_drive, trajectory_files
+from consistency.referee.readers.kitti import read_drive
+from consistency.referee.readers.layouts import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, read_poses
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.openvins import LAYOUT, States, read_deviations
 from consistency.referee.readers.poses import NamedPoses, Poses
@@ -34,14 +35,12 @@ from consistency.referee.readers.spatial import (
     recordings_of,
     require_axes,
 )
-from consistency.referee.readers.uncertain import COLUMNS
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array, Indices
 
 ORDERS = ("translation-rotation", "rotation-translation")
 BOTH = 2 * FULL  # and a cross-covariance with the line before
 UNIT = 1e-3  # quaternions of four decimals pass
-SUFFIXES = (".txt", ".tum")
 
 
 def read_tum(estimates: Path, r: Reading, relative: Relative | None = None) -> list[Evidence]:
@@ -148,12 +147,6 @@ def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[P
         own_covariance = None if covariance is None else _same_stem(covariance, path, "--covariance")
         out.append((path, own_truth, own_covariance))
     return out
-
-
-def trajectory_files(folder: Path) -> list[Path]:
-    """Files of a folder that may be trajectories, by name."""
-    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    return [p for p in files if p.suffix.lower() in SUFFIXES] or [p for p in files if is_spatial(p) or is_solution(p)]
 
 
 def _same_stem(folder: Path, path: Path, option: str) -> Path:

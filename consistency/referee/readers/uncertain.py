@@ -14,7 +14,6 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading, flag_of
 from consistency.referee.readers.record import count
 
-COLUMNS = "columns"  # of the truth's own file
 REFUSED = {
     "relative": "neighbouring windows share the truth at their common end, so that its errors are in both",
     "motions": "a motion has the errors of the truth at both ends, whose cross-covariance no file states",

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from consistency.referee.diagnostics import Design, Record, Settings, Verdict
+from consistency.referee.diagnostics import Record, Settings, Verdict
 from consistency.referee.diagnostics.judging import judge_runs, with_map
 from consistency.referee.diagnostics.skipping import Skip
 from consistency.referee.verdicts.options import settings_of, skip_asked
 from consistency.referee.verdicts.sources import Results, Source, source_of
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics import Design
 
 
 def analyse(

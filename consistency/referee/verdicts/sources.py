@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from consistency.referee.diagnostics import Design, Record
+from consistency.referee.diagnostics import Record
 from consistency.referee.errors import InputError
 from consistency.referee.outside import outside
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics import Design
 
 
 class Results(Protocol):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special, stats
 
+from consistency.referee.diagnostics.gaussian import normality
 from consistency.referee.diagnostics.intervals import binomial_interval
-from consistency.referee.diagnostics.normality import normality
 from consistency.referee.types import Array
 
 HEAVIEST = 0.49  # 1 / nu: at 1/2 the variance is infinite

@@ -20,7 +20,7 @@ from recorded import read_recordings
 from scipy import stats
 
 from consistency.referee.diagnostics import nees, nis_of
-from consistency.referee.readers import planar_error
+from consistency.referee.geometry.conventions import planar_error
 
 ROOT = Path(__file__).parents[3]
 TABLE = json.loads((ROOT / "reports/reference/calibration.json").read_text(encoding="utf-8"))

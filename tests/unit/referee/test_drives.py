@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import planar_error, spatial_error
+from consistency.referee.geometry.conventions import planar_error
+from consistency.referee.geometry.spatial import spatial_error
 from consistency.referee.readers.kitti import mercator, read_drive
 from consistency.referee.types import Array
 

@@ -1,0 +1,115 @@
+"""Which kind a file of estimates is, by its name and its first lines, and the reader of each kind.
+
+A reader is loaded when a file of its kind is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from consistency.referee.parsing.options import Reading
+from consistency.referee.readers.naming import begins_with_numbers, clock_of, head_of, places_of, roles_of
+
+TABLES = (".csv", ".parquet", ".pq")
+TRAJECTORIES = (".txt", ".tum")
+BAGS = (".bag", ".mcap", ".db3")
+OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
+OF_BAGS = ("topic", "truth_topic")
+SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
+TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
+HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
+PLACES = (("x", "tx", "px"), ("y", "ty", "py"), HEADINGS)
+
+
+def is_bag(path: Path) -> bool:
+    """A file of ROS 1 or 2, a folder of ROS 2, or a folder that holds such."""
+    return is_one_bag(path) or (path.is_dir() and any(is_one_bag(part) for part in path.iterdir()))
+
+
+def is_one_bag(path: Path) -> bool:
+    """A file of ROS 1 or 2, or a folder of ROS 2."""
+    return (path.suffix in BAGS and path.is_file()) or (path.is_dir() and (path / "metadata.yaml").is_file())
+
+
+def is_drive(path: Path) -> bool:
+    """Whether a folder is a drive of the KITTI raw data: it holds oxts/data."""
+    return (path / "oxts" / "data").is_dir()
+
+
+def is_solution(path: Path) -> bool:
+    """Whether a file is a solution of RTKLIB, by its suffix."""
+    return path.suffix.lower() == ".pos" and path.is_file()
+
+
+def is_spatial(path: Path) -> bool:
+    """Whether a table is of poses in space."""
+    return path.suffix.lower() == ".csv" and path.is_file() and is_poses(path)
+
+
+def is_poses(path: Path) -> bool:
+    """Whether a text file is of poses in space: by the names of its columns, or without names."""
+    head = head_of(path)
+    if head is None:
+        return begins_with_numbers(path)
+    roles = roles_of(head.names, path)
+    return "heading" not in head.names and roles is not None and bool(roles.quaternion)
+
+
+def is_plane(path: Path) -> bool:
+    """Whether a file has columns of planar poses, or of speeds and turn rates, under names of their own."""
+    head = head_of(path)
+    if head is None or clock_of(head.names) is None or is_poses(path):
+        return False
+    return any(places_of(head.names, each) is not None for each in (PLACES, (SPEEDS, TURNS)))
+
+
+def trajectory_files(folder: Path) -> list[Path]:
+    """Files of a folder that may be trajectories, by name."""
+    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    named = [p for p in files if p.suffix.lower() in TRAJECTORIES]
+    return named or [p for p in files if is_spatial(p) or is_solution(p)]
+
+
+def _is_table(path: Path, r: Reading) -> bool:
+    return (path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path))) or is_plane(path)
+
+
+def _is_trajectory(path: Path, r: Reading) -> bool:
+    return path.suffix.lower() in (*TRAJECTORIES, ".csv", ".pos") or path.is_dir()
+
+
+class Kind(NamedTuple):
+    """A kind of files, with ``module:function`` of what reads them and the options that do not go with it."""
+
+    is_one: Callable[[Path, Reading], bool]
+    records: str  # path, options, windows -> records
+    poses: str  # path, options -> poses of each run; covariances are not looked at
+    refused: tuple[str, ...]
+
+
+KINDS = (  # the first that a file is one of
+    Kind(
+        lambda path, r: is_bag(path), "referee.readers.bags:read_bags", "referee.readers.bags:bag_poses",
+        ("state", "covariance", "covariance_order", "truth", "lever_arm"),
+    ),
+    Kind(
+        lambda path, r: path.suffix.lower() == ".npz",
+        "referee.readers.archive:read_archive", "referee.readers.archive:archive_poses",
+        (*OF_BAGS, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
+         "lever_arm", "truth_covariance"),
+    ),
+    Kind(
+        _is_table, "referee.readers.table:read_tables", "referee.readers.table:table_poses",
+        (*OF_BAGS, *OF_TRAJECTORIES),
+    ),
+    Kind(
+        _is_trajectory, "referee.readers.tum:read_tum", "referee.readers.tum:trajectory_poses", (*OF_BAGS, "state"),
+    ),
+)  # fmt: skip
+
+
+def kind_of(path: Path, r: Reading) -> Kind | None:
+    """The kind of a file or folder; None if it is of none."""
+    return next((kind for kind in KINDS if kind.is_one(path, r)), None)

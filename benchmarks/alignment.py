@@ -33,7 +33,6 @@ from consistency.referee.types import Array
 
 SEED, RUNS, STEPS, DRAWS, OFTEN, FEWER, QUICK = 20261123, 60, 400, 500, 400, 100, 20
 FALSE_ALARM = 0.05
-MOST_LOST = 5.0  # points
 QUICK_FAILURE = 1.0 / 5000.0
 DT, SPEED, SPIN = 0.1, 3.0, 0.1  # s, m/s, rad a step by which the heading wanders
 SIGMA = np.array([0.1, 0.15, 0.02])  # m, m, rad

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from calibration_count import row
 
 from consistency.referee.diagnostics import RunSummary, compare
 
@@ -33,11 +34,10 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
             for runs in RUNS:
                 rng = np.random.default_rng((seed, int(slow_first), dof, runs))
                 p = np.array([_p_value(rng, runs, dof, slow_first) for _ in range(max(gates.values()))])
-                for rate, count in gates.items():
-                    table.append({
-                        "world": f"{world}, n = {dof}", "question": QUESTION, "ratio": 1.0, "runs": runs, "looks": 1,
-                        "stated": rate, "bound": "<=", "gates": count, "found": int((p[:count] <= rate).sum()),
-                    })  # fmt: skip
+                table += [
+                    row(f"{world}, n = {dof}", QUESTION, 1.0, runs, rate, "<=", count, int((p[:count] <= rate).sum()))
+                    for rate, count in gates.items()
+                ]
     return table
 
 

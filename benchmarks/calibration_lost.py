@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from calibration_count import row
 
 from consistency.referee.diagnostics import Evidence, Settings, Verdict, follow, gate_runs, judge, sequential_design
 from consistency.referee.types import Array
@@ -49,7 +50,8 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
         rng = np.random.default_rng((seed, zlib.crc32(f"{question} {world}".encode()), runs))
         draws = (WORLDS[world](rng, runs, share) for _ in range(gates))
         said = [judge(Evidence("gate", nees=nees, dof=DOF), settings).consistent for nees in draws]
-        table.append(_row(f"{100 * share:g} % lost, {world}", question, share, runs, stated, bound, said))
+        ratio, name = DETECT if share else 1.0, f"{100 * share:g} % lost, {world}"
+        table.append(row(name, question, ratio, runs, stated, bound, len(said), sum(said)))
 
     for world in WORLDS:
         for runs in (planned, MORE):
@@ -59,7 +61,7 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
         add(RIGHT, world, planned, 0.0, asked, least, ">=")
     rng = np.random.default_rng((seed, 83))
     late = [until_decided(_autoregressive(rng, MOST, SHARE)).consistent for _ in range(decided)]
-    return [*table, _row("5 % lost, AR(.8)", DECIDED, SHARE, MOST, 0.05, "<=", late)]
+    return [*table, row("5 % lost, AR(.8)", DECIDED, DETECT, MOST, 0.05, "<=", len(late), sum(late))]
 
 
 def until_decided(nees: Array) -> Verdict:
@@ -91,12 +93,3 @@ def _lost(rng: np.random.Generator, runs: int, share: float) -> Array:
 WORLDS: dict[str, Callable[[np.random.Generator, int, float], Array]] = {
     "independent": _independent, "AR(.8)": _autoregressive, "offset": _offset,
 }  # fmt: skip
-
-
-def _row(
-    world: str, question: str, share: float, runs: int, stated: float, bound: str, said: list[bool]
-) -> dict[str, Any]:
-    return {
-        "world": world, "question": question, "ratio": DETECT if share else 1.0, "runs": runs, "looks": 1,
-        "stated": stated, "bound": bound, "gates": len(said), "found": sum(said),
-    }  # fmt: skip

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from calibration_count import row
 
 from consistency.referee.diagnostics import Evidence, JointNees, Verdict, judge
 from consistency.referee.types import Array
@@ -36,19 +37,13 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
     for runs in RUNS:
         rng = np.random.default_rng((seed, 77, runs))
         p = np.array([verdict(rng, runs).p_value for _ in range(max(gates.values()))])
-        table += [_row(WORLD, ALARM, 1.0, runs, rate, "<=", p[:count] <= rate) for rate, count in gates.items()]
+        found = {rate: int((p[:count] <= rate).sum()) for rate, count in gates.items()}
+        table += [row(WORLD, ALARM, 1.0, runs, rate, "<=", gates[rate], found[rate]) for rate in gates]
     for world, whole in ((WORLD, True), (RELATIVE, False)):
         rng, count = np.random.default_rng((seed, 78, int(whole))), POWER_GATES // (5 if quick else 1)
-        found = [bool(verdict(rng, POWER_RUNS, RATIO, whole).faults) for _ in range(count)]
-        table.append(_row(world, POWER, RATIO, POWER_RUNS, 0.95, ">=", np.array(found)))
+        wrong = sum(bool(verdict(rng, POWER_RUNS, RATIO, whole).faults) for _ in range(count))
+        table.append(row(world, POWER, RATIO, POWER_RUNS, 0.95, ">=", count, wrong))
     return table
-
-
-def _row(world: str, question: str, ratio: float, runs: int, stated: float, bound: str, found: Array) -> dict[str, Any]:
-    return {
-        "world": world, "question": question, "ratio": ratio, "runs": runs, "looks": 1, "stated": stated,
-        "bound": bound, "gates": len(found), "found": int(found.sum()),
-    }  # fmt: skip
 
 
 def verdict(rng: np.random.Generator, runs: int, ratio: float = 1.0, whole: bool = True) -> Verdict:

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from calibration_count import row, show
 from numpy.typing import NDArray
 
 from consistency.referee.diagnostics.monitor import EXPONENT, LARGEST, bet_on, rest_after_rejection, start_share
@@ -159,9 +160,9 @@ def first_alarms(
     thresholds = 1.0 / np.array(rates)[:, None]
     for step in range(1, steps + 1):
         nis = ratio * world.nis()
-        for row, monitor in enumerate(monitors):
-            found = (monitor.update(nis) >= thresholds) & np.isinf(first[row])
-            first[row][found] = step
+        for i, monitor in enumerate(monitors):
+            found = (monitor.update(nis) >= thresholds) & np.isinf(first[i])
+            first[i][found] = step
         world.move(nis <= monitors[0].limit)
         if step % 50 == 0 and np.isfinite(first).all():
             break
@@ -189,11 +190,10 @@ def false_alarms(name: str, gate: float | None, missions: dict[float, int], seed
     filters, monitors = _start(name, gate, count, np.random.default_rng((seed, 1, *map(ord, name), gate is None)))
     first = first_alarms(filters, monitors, STEPS, 1.0, list(missions))
     return [
-        {
-            "world": name if gate is None else f"{name}, gate {gate:g}", "question": ALARM[monitor.tolerance],
-            "ratio": 1.0, "runs": STEPS, "looks": 1, "stated": rate, "bound": "<=",
-            "gates": of, "found": int(np.isfinite(steps[:of]).sum()),
-        }
+        row(
+            name if gate is None else f"{name}, gate {gate:g}", ALARM[monitor.tolerance], 1.0, STEPS, rate, "<=", of,
+            int(np.isfinite(steps[:of]).sum()),
+        )
         for monitor, by_rate in zip(monitors, first, strict=True)
         for (rate, of), steps in zip(missions.items(), by_rate, strict=True)
     ]  # fmt: skip
@@ -233,8 +233,7 @@ def _start(
 
 def main() -> None:
     """Print false alarms, and median and 95 % quantile of the delays."""
-    for row in rows(quick=False, seed=SEED):
-        print(f"{row['world']}, {row['question']} {row['stated']:g}: {100 * row['found'] / row['gates']:.2f} %")
+    show(rows(quick=False, seed=SEED))
     for name in WORLDS:
         for gate in GATES:
             for (tolerance, ratio, since), steps in delays(name, gate).items():

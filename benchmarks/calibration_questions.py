@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from calibration_count import row
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, Verdict, judge, mean_shape
@@ -100,7 +101,7 @@ def _shape_rows(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
                 rng = np.random.default_rng((seed, 93, k, n, runs))
                 draws = range(QUICK_DRAWS if quick else DRAWS)
                 p = np.array([mean_shape(whitened(rng, name, runs, n))[1] for _ in draws])
-                yield _row(_shape_world(name, n), SHAPE, runs, RATES[0] * SHARES[SHAPE], p)
+                yield _of_p(_shape_world(name, n), SHAPE, runs, RATES[0] * SHARES[SHAPE], p)
 
 
 def _of_gates(world: str, question: str, runs: int, verdicts: list[Verdict]) -> list[dict[str, Any]]:
@@ -108,14 +109,11 @@ def _of_gates(world: str, question: str, runs: int, verdicts: list[Verdict]) -> 
     p = np.array([verdict.p_value for verdict in verdicts])
     of_question = np.array([next(a.p_value for a in v.answers if a.question == question) for v in verdicts])
     share = RATES[0] * SHARES[question]
-    return [*(_row(world, ALARM, runs, rate, p) for rate in RATES), _row(world, question, runs, share, of_question)]
+    return [*(_of_p(world, ALARM, runs, rate, p) for rate in RATES), _of_p(world, question, runs, share, of_question)]
 
 
-def _row(world: str, question: str, runs: int, stated: float, p: Array) -> dict[str, Any]:
-    return {
-        "world": world, "question": question, "ratio": 1.0, "runs": runs, "looks": 1, "stated": stated, "bound": "<=",
-        "gates": len(p), "found": int((p <= stated).sum()),
-    }  # fmt: skip
+def _of_p(world: str, question: str, runs: int, stated: float, p: Array) -> dict[str, Any]:
+    return row(world, question, 1.0, runs, stated, "<=", len(p), int((p <= stated).sum()))
 
 
 def _of_innovations(rng: np.random.Generator, dof: tuple[int, ...], runs: int, steps: int) -> Verdict:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from calibration_count import row, show
 from scipy import signal, stats
 
 from consistency.referee.diagnostics import Evidence, judge
@@ -61,28 +62,14 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
         for rho in MEMORIES:
             rng, gates = np.random.default_rng((seed, runs, round(100 * rho))), QUICK_GATES if quick else GATES
             found = sum(undoubted(windows_of(rng, runs, rho)) for _ in range(gates))
-            table.append(_row(f"sizes AR({rho:g})", UNDOUBTED, runs, 0.05, gates, found))
+            table.append(row(f"sizes AR({rho:g})", UNDOUBTED, 1.0, runs, 0.05, "<=", gates, found))
     for runs in FEW:
         for n in (1, 3):
             rng, gates = np.random.default_rng((seed, runs, n)), QUICK_RIGHT if quick else RIGHT
             found = sum(independence(rng.standard_normal((runs, n))).doubtful for _ in range(gates))
-            table.append(_row(f"independent windows, n = {n}", DOUBTED, runs, 0.005, gates, found))
+            table.append(row(f"independent windows, n = {n}", DOUBTED, 1.0, runs, 0.005, "<=", gates, found))
     return table
 
 
-def _row(world: str, question: str, runs: int, stated: float, gates: int, found: int) -> dict[str, Any]:
-    return {
-        "world": world, "question": question, "ratio": 1.0, "runs": runs, "looks": 1, "stated": stated, "bound": "<=",
-        "gates": gates, "found": found,
-    }  # fmt: skip
-
-
-def main() -> None:
-    """Print the rows."""
-    for row in rows(quick=False, seed=20070101):
-        share = 100 * row["found"] / row["gates"]
-        print(f"{row['question']}, {row['world']}, {row['runs']}: {share:.2f} %", flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    show(rows(quick=False, seed=20070101))

@@ -18,8 +18,6 @@ from consistency.referee.readers.uncertain import declared, require_truth_option
 from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import settings_of, skip_asked
 
-Judgement = Verdict  # name of earlier versions
-
 
 def read(
     estimates: str | Path | Any,

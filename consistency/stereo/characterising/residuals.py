@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -140,9 +140,3 @@ def _local_spread(e: Array, data: Residuals) -> Array:
         if own.sum() >= FEW:
             out[own] = _spread(e[own])[0]
     return out
-
-
-def of_part(data: Residuals, moving: bool) -> Residuals:
-    """Rows while the sensor moved, or while it stood; a track is one of each."""
-    part = data.keep(data.moving == moving)
-    return replace(part, track=part.track)

@@ -198,6 +198,7 @@ class Sheet:
 
     panels: tuple[Panel, ...]
     height: float  # inches
+    width: float = 6.7  # inches, the text width of the page
     columns: int = 0  # panels in a row; 0: all in one
     widths: tuple[float, ...] = ()  # of the panels, relative
     title: str = ""

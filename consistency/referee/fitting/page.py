@@ -21,6 +21,7 @@ from consistency.referee.fitting.wording import document
 from consistency.referee.types import Array
 
 SHOWN = 3  # spans with a panel of errors
+WIDTH, HEIGHT = 3.0, 2.7  # inches, of a panel
 CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 
 
@@ -41,22 +42,21 @@ def figures(model: NoiseModel) -> tuple[Figure, ...]:
         ),
         (
             "Growth and ratios",
-            "Left and middle: mean squared error of each axis over the span (markers) beside the model, which "
-            "is fitted at the shortest span alone (lines). Right: ratio of true to stated covariance of each judged "
-            "drive.",
+            "Mean squared error of each axis over the span (markers) beside the model, which is fitted at the shortest "
+            "span alone (lines); and the ratio of true to stated covariance of each judged drive.",
         ),
     )
     return tuple(
-        Figure(title, caption, (), (sheet,)) for (title, caption), sheet in zip(captions, sheets(model), strict=True)
+        Figure(title, caption, (), tuple(Sheet((panel,), HEIGHT, WIDTH) for panel in shown))
+        for (title, caption), shown in zip(captions, panels(model), strict=True)
     )
 
 
-def sheets(model: NoiseModel) -> tuple[Sheet, Sheet]:
-    """Panels of errors by span; panels of growth and of ratios by drive."""
-    errors = tuple(_errors(model, judged) for judged in model.spans[:SHOWN])
+def panels(model: NoiseModel) -> tuple[tuple[Panel, ...], ...]:
+    """Errors by span; growth, and ratios by drive."""
     d = 2 if len(model.noise.axes) == 3 else 3
     growth = (_growth(model, range(d), "m²"), _growth(model, range(d, len(model.noise.axes)), "rad²"))
-    return Sheet(errors, 2.4), Sheet((*growth, _drives(model)), 2.6, widths=(1.0, 1.0, 1.1))
+    return tuple(_errors(model, judged) for judged in model.spans[:SHOWN]), (*growth, _drives(model))
 
 
 def plot(model: NoiseModel, path: str | Path | None) -> Any:
@@ -64,8 +64,8 @@ def plot(model: NoiseModel, path: str | Path | None) -> Any:
     require("a plot", "plot")
     from consistency.referee.show.with_matplotlib import drawn, picture
 
-    errors, rest = sheets(model)
-    figure = drawn(Sheet((*errors.panels, *rest.panels), 5.0, columns=3))
+    errors, rest = panels(model)
+    figure = drawn(Sheet((*errors, *rest), 5.0, columns=3))
     if path is not None:
         from consistency.referee.pages import require_plot, write_file
 

@@ -115,7 +115,8 @@ def _table(model: NoiseModel) -> Table:
         sizes.append(f"{np.sqrt(model.noise.floor[i]):.2g} {unit}")
         rows.append((axis, *sizes, *(_cell(each.axes[i]) for each in model.spans)))
     rows.append(("all", "", "", "", *(_cell(each.whole) for each in model.spans)))
-    return table(tuple(heads), rows, "Noise of each axis, and ratios of true to stated covariance over spans")
+    label = "Noise of each axis, and ratios of true to stated covariance over spans"
+    return table(tuple(heads), rows, label, style="plain")
 
 
 def _cell(ratio: Ratio) -> Cell:

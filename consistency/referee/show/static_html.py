@@ -5,6 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
+from importlib.resources import files
 from importlib.util import find_spec
 
 from consistency.referee.document.blocks import (
@@ -26,35 +27,7 @@ from consistency.referee.document.drawing import Figure
 from consistency.referee.document.wording import PLAIN, written
 
 RESOLUTION = 110  # dots an inch
-
-# colours of the bench's report, and lighter ones on dark ground with a contrast above 4.5
-STYLE = """
-:root { color-scheme: light dark; --ink: #1a1a1a; --ground: #fff; --line: #d5d5d5; --faint: #444;
-  --consistent: #00664a; --overconfident: #a84300; --conservative: #00507d; --biased: #8a2a63; --undecided: #4d4d4d; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e8e8e8; --ground: #16181a; --line: #44484c; --faint: #b5b5b5;
-  --consistent: #4fd1a5; --overconfident: #ff9d5c; --conservative: #6cb8f0; --biased: #f09cc8; --undecided: #b5b5b5; } }
-body { margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 96rem; color: var(--ink); background: var(--ground);
-  font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .9rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .5rem; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
-thead th { border-bottom: 2px solid var(--ink); }
-tbody th { font-weight: 600; overflow-wrap: anywhere; min-width: 12rem; }
-tbody td:last-child { min-width: 22rem; }
-.number { text-align: right; white-space: nowrap; }
-.verdict { display: inline-block; padding: 0 .5em; border: 1.5px solid currentColor; border-radius: .7em;
-  font-weight: 600; white-space: nowrap; }
-.consistent, .not-worse { color: var(--consistent); }
-.overconfident, .worse { color: var(--overconfident); }
-.conservative { color: var(--conservative); border-style: dashed; }
-.biased { color: var(--biased); }
-.heavy-tailed { color: var(--biased); border-style: dashed; }
-.inconsistent { color: var(--overconfident); border-style: dashed; }
-.undecided { color: var(--undecided); border-style: dotted; }
-.failed { color: var(--ground); background: var(--ink); border-color: var(--ink); }
-summary { cursor: pointer; }
-ul { margin: .25rem 0; padding-left: 1.2rem; color: var(--faint); }
-"""
+STYLE = files(__package__).joinpath("templates").joinpath("report.css").read_text(encoding="utf-8")
 
 
 def render(document: Document) -> str:
@@ -78,7 +51,7 @@ def page(title: str, *body: str) -> str:
 <title>{escape(title)}</title>
 <style>{STYLE}</style>
 </head>
-<body>
+<body class="static">
 <main>
 <h1>{escape(title)}</h1>
 {inside}
@@ -135,8 +108,10 @@ def _reason(entry: Reason) -> str:
 def _table(of: Table) -> str:
     head = "".join(f'<th scope="col"{_class(column)}>{escape(column.head)}</th>' for column in of.columns)
     rows = "\n".join(_row(of.columns, cells) for cells in of.rows)
+    wide = " wide" * (len(of.columns) > 4)
     return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(of.label)}">\n<table>\n'
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(of.label)}">\n'
+        f'<table class="{of.style}{wide}">\n'
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>\n</div>"
     )
 
@@ -144,7 +119,9 @@ def _table(of: Table) -> str:
 def _row(columns: Sequence[Column], cells: Sequence[Cell]) -> str:
     first, *others = cells
     pairs = zip(columns[1:], others, strict=False)
-    body = "".join(f"<td{_class(column)}>{_cell(cell)}</td>" for column, cell in pairs)
+    body = "".join(
+        f'<td{_class(column)} data-head="{escape(column.head)}">{_cell(cell)}</td>' for column, cell in pairs
+    )
     return f'<tr><th scope="row">{_cell(first)}</th>{body}</tr>'
 
 
@@ -162,10 +139,11 @@ def _cell(cell: Cell) -> str:
 
 
 def _figure(of: Figure) -> str:
-    """Its sheets as one image each, named by its title."""
+    """Its sheets as one image each, named by its title, with the caption below."""
     if find_spec("matplotlib") is None:
         return ""
     from consistency.referee.show.with_matplotlib import render as painted
 
     sources = (b64encode(painted(sheet, "png", RESOLUTION)).decode() for sheet in of.sheets)
-    return "".join(f'<img alt="{escape(of.title)}" src="data:image/png;base64,{source}">' for source in sources)
+    images = "".join(f'<img alt="{escape(of.title)}" src="data:image/png;base64,{source}">' for source in sources)
+    return f"<figure>{images}<figcaption>{escape(of.caption)}</figcaption></figure>"

@@ -47,7 +47,6 @@ from consistency.referee.show.frames import (
 )
 
 Drawn: TypeAlias = Figure  # for rooms that do not draw themselves
-WIDTH = 6.7  # inches, the text width of the page
 NARROWEST = 0.15  # span of one axis of a map over that of the other, at least: room for the tick labels
 BOUND = 0.9  # points, width of the lines at plus and minus a bound
 POINTS = 72  # in an inch, the resolution of an SVG
@@ -93,9 +92,9 @@ def draw(sheet: Sheet) -> Figure:
     """The panels of a sheet with its title and legend."""
     panels, columns = sheet.panels, sheet.columns or len(sheet.panels)
     rows = -(-len(panels) // columns)
-    own = [panel_labels(panel.keys, WIDTH / columns) for panel in panels]
+    own = [panel_labels(panel.keys, sheet.width / columns) for panel in panels]
     room = SMALL * sum(max(lines for *_, lines in own[row * columns :][:columns]) for row in range(rows))
-    figure = Figure(figsize=(WIDTH, sheet.height + room), layout="constrained")
+    figure = Figure(figsize=(sheet.width, sheet.height + room), layout="constrained")
     shared = {f"share{side}": _same([getattr(panel, side) for panel in panels]) for side in "xy"}
     options: dict[str, Any] = {"squeeze": False, "width_ratios": sheet.widths or None} | shared
     grid = figure.subplots(rows, columns, **options)

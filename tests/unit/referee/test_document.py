@@ -136,9 +136,10 @@ def test_a_static_page_shows_every_block_and_escapes_all_text() -> None:
     said = static_html.render(TREE)
     for part in (
         "<h1>Two `filters`</h1>\n<p>One of them is honest.</p>", '<span class="verdict consistent">consistent</span>',
-        '<td class="number">2.00</td>', "too small &amp; skewed", "<li>x | y</li><li>z</li>", "<strong>Lead.</strong>",
+        '<td class="number" data-head="n">2.00</td>', "too small &amp; skewed", "<li>x | y</li><li>z</li>",
+        "<strong>Lead.</strong>",
         "<p><strong>ekf</strong> is consistent: no fault found</p><ul><li>mean NEES 3.0</li></ul>", "<h3>More</h3>",
-        "<section>\n", "<li>one</li><li>two</li>", '<th style="text-align:left">runs</th>',
+        "<section>\n", "<li>one</li><li>two</li>", '<th style="text-align:left">runs</th>', ".wide td::before",
     ):  # fmt: skip
         assert part in said
     assert "a<b>" not in said

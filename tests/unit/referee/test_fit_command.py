@@ -20,6 +20,7 @@ from fit_covariance import drives
 import consistency as cs
 from consistency.referee.cli.app import main
 from consistency.referee.diagnostics.export import flat, plain
+from consistency.referee.extras import is_installed
 from consistency.referee.fitting.drives import Drive, drive_of
 from consistency.referee.fitting.model import NoiseModel
 from consistency.referee.fitting.motions import vectors
@@ -210,6 +211,12 @@ def test_the_command_on_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "noise.toml", "motions.csv", "truth.csv", "robot_localization_noise.py", "gtsam_noise.py", "ceres_noise.h",
         "verdict.json", "report.html", "manifest.json",
     }  # fmt: skip
+    page = (tmp_path / "noise" / "report.html").read_text()
+    assert '<table class="plain wide">' in page  # on a narrow screen each axis by itself
+    assert '<td data-head="held-out 10 m">' in page
+    if is_installed("plot"):
+        assert page.count("<img ") == 6
+        assert "<figcaption>Errors of corrected motions" in page
     code, out, _ = run(capsys, *words, "--json", "--held-out", "run 3")
     said = json.loads(out)
     assert said["fitted_drives"] == ["run 1", "run 2"]

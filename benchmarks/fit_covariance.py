@@ -3,11 +3,11 @@
     python benchmarks/fit_covariance.py                # 200 draws a case, about an hour on one core
     python benchmarks/fit_covariance.py --draws 20     # quicker
 
-Drives are simulated, of 1 km, and of 500 m for verdicts: an odometry that errs as white noise a metre and a radian, or
-also by a scale that persists in a drive, by noise with a memory, by jumps, by loops that are closed, by a scale that is
-not metric, in another body frame. Each is fitted and judged as ``consistency fit-covariance --span 10m`` does. Exit
-status 1 if a promise is broken
-(binomial, 1 % for all rows together).
+Drives are simulated, of 1 km, and of 500 m for verdicts: an odometry that errs as white noise a metre and a radian, in
+the plane, on a road that winds, and in space, or in the plane also by a scale that persists in a drive, by noise with a
+memory, by jumps, by loops that are closed, by a scale that is not metric, in another body frame. Each is fitted and
+judged as ``consistency fit-covariance --span 10m`` does. Exit status 1 if a promise is broken (binomial, 1 % for all
+rows together).
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from consistency.referee.defaults import DETECT
 from consistency.referee.errors import InputError
@@ -31,14 +32,14 @@ from consistency.referee.fitting.noise import fit_noise, intervals
 from consistency.referee.fitting.persistence import doubts, persistent
 from consistency.referee.fitting.ratios import folds_of, judged_by
 from consistency.referee.fitting.refusals import growth_of, require_sound
-from consistency.referee.fitting.windows import Windows, span_of, windows_of
-from consistency.referee.geometry.groups import composed
+from consistency.referee.fitting.windows import PLANE, SPACE, Windows, span_of, windows_of
+from consistency.referee.geometry.groups import composed, matrices
 from consistency.referee.types import Array
 
 SPAN, STEP, LENGTH = "10m", 0.5, 1000.0  # m
 SHORT = 500.0  # m, of drives whose verdicts are counted
-PER_M = np.array([4e-4, 2e-4, 4e-6])  # m^2/m and rad^2/m: x, y, yaw
-PER_RAD = np.array([4e-4, 1e-4, 2e-5])  # m^2/rad and rad^2/rad
+PER_M = (4e-4, 2e-4, 4e-6)  # m^2/m and rad^2/m: x, y, yaw
+PER_RAD = (4e-4, 1e-4, 2e-5)  # m^2/rad and rad^2/rad
 WITHIN, SHARE, OWN = (0.7, 1.5), 0.80, 0.5  # of the true variance; of fits; of the variance of a window
 COVERED = (0.90, 0.98)
 WRONG, SURE = 0.05, 0.01  # share of wrong "consistent"; chance that a promise kept exactly is called broken
@@ -47,8 +48,12 @@ FRESH = 40  # drives that tell the true ratio of a fit
 
 @dataclass(frozen=True)
 class World:
-    """How the odometry of a drive errs beyond white noise."""
+    """Where a drive goes, and how its odometry errs: as white noise, and beyond it."""
 
+    per_m: tuple[float, ...] = PER_M  # 3, or 6 in space: x, y, z, roll, pitch, yaw
+    per_rad: tuple[float, ...] = PER_RAD
+    times: float = 1.0  # factor on both
+    winds: bool = False  # the road
     scale: float = 0.0  # sd of the scale of the way between drives
     spread: float = 0.0  # sd of the logarithm of the variance between drives
     memory: float = 0.0  # m, over which an additional error of the heading rate decays
@@ -60,49 +65,63 @@ class World:
     offset: float = 0.0  # m along x at both ends: jitter
 
 
-def steps_of(rng: np.random.Generator, length: float) -> Array:
-    """True motions (N, 3) of a drive: straight roads, and corners of up to a right angle."""
-    n = round(length / STEP)
-    turn = np.zeros(n)
-    k = 0
-    while k < n:
-        k += int(rng.integers(10, 80))
-        corner = int(rng.integers(8, 24))
-        turn[k : k + corner] = rng.uniform(-np.pi / 2, np.pi / 2) / corner
-        k += corner
-    return np.column_stack([np.full(n, STEP), np.zeros(n), turn])
+ROADS = (  # that known noise is recovered on
+    ("", World()),
+    ("winding, ", World(per_rad=(2e-2, 2e-2, 1e-4), winds=True)),  # wheels that slip where they turn
+    ("in space, ", World((4e-4, 2e-4, 3e-4, 2e-6, 3e-6, 4e-6), (4e-4, 1e-4, 2e-4, 1e-5, 1e-5, 2e-5))),
+)
+ROWS = 24  # of terms on these roads
 
 
-def matrices_of(motions: Array) -> Array:
-    """Matrices of motions x, y, heading (N, 3)."""
-    c, s = np.cos(motions[:, 2]), np.sin(motions[:, 2])
-    out = np.zeros((len(motions), 3, 3))
-    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = c, -s, s, c
-    out[:, :2, 2], out[:, 2, 2] = motions[:, :2], 1.0
+def steps_of(rng: np.random.Generator, length: float, world: World) -> Array:
+    """True motions (N, 3) of a drive: straight roads, and corners of up to a right angle; (N, 6) in space.
+
+    There the road rises, falls and banks as it turns, by a fifth of the angles.
+    """
+    n, straight = round(length / STEP), (0, 10) if world.winds else (10, 80)
+    axes = len(world.per_m)
+    out = np.zeros((n, axes))
+    out[:, 0] = STEP
+    for axis, share in ((2, 1.0),) if axes == 3 else ((5, 1.0), (4, 0.2), (3, 0.2)):
+        k = 0
+        while k < n:
+            k += int(rng.integers(*straight))
+            corner = int(rng.integers(8, 24))
+            out[k : k + corner, axis] = share * rng.uniform(-np.pi / 2, np.pi / 2) / corner
+            k += corner
     return out
 
 
+def matrices_of(motions: Array) -> Array:
+    """Matrices of motions x, y, heading (N, 3), or of a position and a rotation vector (N, 6)."""
+    if motions.shape[1] == 6:
+        motions = np.column_stack([motions[:, :3], Rotation.from_rotvec(motions[:, 3:]).as_quat()])
+    return matrices(motions)
+
+
 def drive(rng: np.random.Generator, world: World = World(), name: str = "drive", length: float = LENGTH) -> Drive:
-    """One drive; the estimate has half the true noise of a step before it and half after it."""
-    true = steps_of(rng, length)
+    """One drive, whose estimate errs at the end of each step."""
+    true = steps_of(rng, length, world)
+    turn = np.linalg.norm(true[:, -3:] if true.shape[1] == 6 else true[:, -1:], axis=1, keepdims=True)
+    variance = world.times * (STEP * np.array(world.per_m) + turn * np.array(world.per_rad))
     factor = np.exp(0.5 * world.spread * rng.normal())
-    sigma = factor * np.sqrt(PER_M * STEP + PER_RAD * np.abs(true[:, 2:]))
-    error = sigma * rng.normal(size=true.shape)
+    error = factor * np.sqrt(variance) * rng.normal(size=true.shape)
     if world.memory:
         keep = np.exp(-STEP / world.memory)
         rate = world.coloured * np.sqrt(1 - keep**2) * rng.normal(size=len(true))
         rate[0] = world.coloured * rng.normal()
         for k in range(1, len(rate)):
             rate[k] += keep * rate[k - 1]
-        error[:, 2] += STEP * rate
+        error[:, -1] += STEP * rate
     if world.jumps:
         error[rng.choice(len(true), world.jumps, replace=False), 1] += rng.choice([-1.0, 1.0], world.jumps)
-    start = np.eye(3)[None]
-    truth = composed(np.concatenate([start, matrices_of(true)]))
-    estimated = true * [1.0 + world.scale * rng.normal(), 1.0, 1.0] / [world.metric, 1.0, 1.0]
-    T = composed(np.concatenate([start, matrices_of(estimated) @ matrices_of(error)]))
+    motions = matrices_of(true)
+    start = np.eye(motions.shape[-1])[None]
+    truth = composed(np.concatenate([start, motions]))
+    motions[:, 0, -1] *= (1.0 + world.scale * rng.normal()) / world.metric
+    T = composed(np.concatenate([start, motions @ matrices_of(error)]))
     if world.closed:
-        T = truth @ matrices_of(np.sqrt(10 * PER_M) * rng.normal(size=(len(truth), 3)))
+        T = truth @ matrices_of(np.sqrt(10 * np.array(PER_M)) * rng.normal(size=(len(truth), 3)))
     if world.turned:
         T = T @ matrices_of(np.array([[0.0, 0.0, world.turned]]))
     if world.offset:
@@ -118,34 +137,34 @@ def drives(rng: np.random.Generator, number: int, world: World = World(), length
 # --- recovery ------------------------------------------------------------------------------------------
 
 
-def recovery(rng: np.random.Generator, number: int, draws: int) -> tuple[Array, Array, list[str]]:
+def recovery(rng: np.random.Generator, world: World, number: int, draws: int) -> tuple[Array, Array, list[str]]:
     """Fitted over true variance (draws, p), whether the interval holds it, and names; of terms that make up an axis."""
-    theta = np.concatenate([PER_M, PER_RAD])
-    names = [f"{axis} per {unit}" for unit in ("m", "rad") for axis in ("x", "y", "yaw")]
-    ratios, covered, main = [], [], np.zeros(len(theta))
+    theta, n = np.array([*world.per_m, *world.per_rad]), len(world.per_m)
+    names = [f"{axis} per {unit}" for unit in ("m", "rad") for axis in (PLANE if n == 3 else SPACE)]
+    ratios, covered, main = [], [], np.zeros(2 * n)
     for _ in range(draws):
-        made = drives(rng, number)
-        windows = windows_of(made, span_of(SPAN))
-        F = terms_of(windows.pieces).mean(axis=0)
-        total = np.diag(np.tensordot(theta, F, 1))
-        main += np.array([theta[p] * F[p, p % 3, p % 3] / total[p % 3] for p in range(len(theta))]) / draws
-        per_m, per_rad = intervals(fit_noise(windows), windows)
-        ratios.append([each.value / true for each, true in zip((*per_m, *per_rad), theta, strict=True)])
-        covered.append([each.holds(true) for each, true in zip((*per_m, *per_rad), theta, strict=True)])
+        windows = windows_of(drives(rng, number, world), span_of(SPAN))
+        own = np.diagonal(terms_of(windows.pieces).mean(axis=0), axis1=1, axis2=2)  # (2 n, n)
+        main += theta * own[np.arange(2 * n), np.arange(2 * n) % n] / np.tile(theta @ own, 2) / draws
+        found = [each for part in intervals(fit_noise(windows), windows) for each in part]
+        ratios.append([each.value / true for each, true in zip(found, theta, strict=True)])
+        covered.append([each.holds(true) for each, true in zip(found, theta, strict=True)])
     keep = main >= OWN
     return np.array(ratios)[:, keep], np.array(covered)[:, keep], [n for n, k in zip(names, keep, strict=True) if k]
 
 
-def recovery_rows(draws: int, seed: int, tests: int, numbers: Sequence[int]) -> bool:
+def recovery_rows(draws: int, seed: int, tests: int, only: str) -> bool:
     """Print recovery and coverage; whether both promises hold."""
     held = True
     print(f"\nknown noise, {draws} draws; terms with at least {OWN:g} of their axis' variance over {SPAN}")
     print(
         "| drives | term | fitted over true, 5 % to 95 % | within 0.7 to 1.5 | covered (0.95) |\n|---|---|---|---|---|"
     )
-    for number in numbers:
-        rng = np.random.default_rng([seed, number])
-        ratios, covered, names = recovery(rng, number, draws)
+    for row, number in product(range(len(ROADS)), (1, 10)):
+        road, world = ROADS[row]
+        if only not in f"known noise, {road}{number} drives":
+            continue
+        ratios, covered, names = recovery(np.random.default_rng([seed, 1000 * row + number]), world, number, draws)
         for p, name in enumerate(names):
             inside = int(((ratios[:, p] >= WITHIN[0]) & (ratios[:, p] <= WITHIN[1])).sum())
             least = stats.beta.ppf(SURE, inside, draws - inside + 1) if inside else 0.0
@@ -154,8 +173,8 @@ def recovery_rows(draws: int, seed: int, tests: int, numbers: Sequence[int]) -> 
             held &= bool(least >= SHARE or draws < 200) and low <= COVERED[1] and high >= COVERED[0]
             five, rest = np.quantile(ratios[:, p], [0.05, 0.95])
             print(
-                f"| {number} | {name} | {five:.2f} to {rest:.2f} | {inside / draws:.3f}, at least {least:.3f} (99 %) | "
-                f"{cover / draws:.3f} |",
+                f"| {road}{number} | {name} | {five:.2f} to {rest:.2f} | {inside / draws:.3f}, "
+                f"at least {least:.3f} (99 %) | {cover / draws:.3f} |",
                 flush=True,
             )
     return held
@@ -173,6 +192,11 @@ class Case:
     fitted: int = 5
     judged: int = 0
     times: float = 1.0  # variance of the judged drives over that of the fitted ones
+
+    @property
+    def later(self) -> World:
+        """Of the judged drives."""
+        return replace(self.world, times=self.times)
 
 
 CASES = (
@@ -200,7 +224,7 @@ def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, flo
     The parts of :func:`consistency.fit_covariance` that decide, without those that describe.
     """
     made = drives(rng, case.fitted, case.world, SHORT)
-    judged = [scaled(rng, case, f"judged {i}") for i in range(case.judged)]
+    judged = [drive(rng, case.later, f"judged {i}", SHORT) for i in range(case.judged)]
     names, every = ",".join(each.name for each in judged) or None, [*made, *judged]
     try:
         windows = windows_of(every, span_of(SPAN))
@@ -219,25 +243,6 @@ def told(rng: np.random.Generator, case: Case, fresh: Windows) -> tuple[str, flo
     return status, float(np.exp(np.log(means).mean())), warnings[0] if warnings else ""
 
 
-def scaled(rng: np.random.Generator, case: Case, name: str) -> Drive:
-    """A drive of the judged kind."""
-    world = case.world
-    if case.times == 1.0:
-        return drive(rng, world, name, SHORT)
-    return with_noise(case.times, lambda: drive(rng, world, name, SHORT))
-
-
-def with_noise(times: float, make: Callable[[], Drive]) -> Drive:
-    """What ``make`` gives while all variances are ``times`` as large."""
-    global PER_M, PER_RAD
-    kept = PER_M, PER_RAD
-    PER_M, PER_RAD = times * PER_M, times * PER_RAD
-    try:
-        return make()
-    finally:
-        PER_M, PER_RAD = kept
-
-
 def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
     """Print statuses and wrong ones; whether no case has too many."""
     held = True
@@ -247,7 +252,7 @@ def verdict_rows(draws: int, seed: int, tests: int, only: str) -> bool:
         if only not in case.name:
             continue
         rng = np.random.default_rng([seed, 100 + number])
-        fresh = windows_of([scaled(rng, case, f"fresh {i}") for i in range(FRESH)], span_of(SPAN))
+        fresh = windows_of([drive(rng, case.later, f"fresh {i}", SHORT) for i in range(FRESH)], span_of(SPAN))
         found = [told(rng, case, fresh) for _ in range(draws)]
         ratio = np.array([each[1] for each in found])
         outside = (ratio < 1 / DETECT) | (ratio > DETECT)
@@ -277,9 +282,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="rows with this in their names; the numbers are the same")
     arguments = parser.parse_args()
-    draws, seed, only, tests = arguments.draws, arguments.seed, arguments.only, len(CASES) + 10
-    numbers = [number for number in (1, 10) if only in f"known noise, {number} drives"]
-    held = recovery_rows(draws, seed, tests, numbers) if numbers else True
+    draws, seed, only, tests = arguments.draws, arguments.seed, arguments.only, len(CASES) + ROWS
+    roads = any(only in f"known noise, {road}{number} drives" for road, _ in ROADS for number in (1, 10))
+    held = recovery_rows(draws, seed, tests, only) if roads else True
     if any(only in case.name for case in CASES):
         held &= verdict_rows(draws, seed, tests, only)
     print("\nall promises hold" if held else "\na promise is broken")

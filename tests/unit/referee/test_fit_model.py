@@ -60,7 +60,7 @@ def test_a_jump_is_cut_and_counted(rng: np.random.Generator) -> None:
 def test_jumps_are_those_of_their_own_drive() -> None:
     """A drive that errs a hundred times as much has none."""
     rng = np.random.default_rng(1)
-    rough = world.with_noise(1e4, lambda: drives(rng, 1)[0])
+    rough = drives(rng, 1, World(times=1e4))[0]
     assert windows_of([*drives(rng, 4), rough], span_of("10m")).jumps == 0
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+from scipy import optimize, special
 
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.blocks import blocks
 from consistency.referee.diagnostics.nees import anees
-from consistency.referee.diagnostics.roots import brent
 from consistency.referee.diagnostics.scale import FEW
 from consistency.referee.types import Array, Indices
 
@@ -73,7 +72,7 @@ def simultaneous_band(
             return sides * len(judged) * float(special.ndtr(-c))
         return sides * float(special.ndtr(-c) + 2.0 * special.owens_t(c, slopes).sum())
 
-    c = float(brent(lambda x: exceedance(x) - min(false_alarm, 0.999 * exceedance(0.0)), 0.0, 38.0))
+    c = float(optimize.brentq(lambda x: exceedance(x) - min(false_alarm, 0.999 * exceedance(0.0)), 0.0, 38.0))
     curve, k = anees(nees), alive[judged] * dof
     upper, lower = laws.chi2.sf(alive[judged] * curve[judged], k), laws.chi2.cdf(alive[judged] * curve[judged], k)
     smallest = float(upper.min() if sides == 1 else min(upper.min(), lower.min()))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from scipy import special
+from scipy.optimize import brentq
 
 from consistency.referee.diagnostics import laws
-from consistency.referee.diagnostics.roots import brent
 
 TINY = 1e-290  # below, a distribution function is taken from its series
 WIDEST = 1e3  # scale up to which one is looked for
@@ -49,4 +49,4 @@ def gated_scale(mean: float, dof: float, gate: float | None) -> float:
     low, high = 0.5 * mean / dof, WIDEST  # behind a gate the mean is never above scale times dof
     if gated_mean(high, dof, limit) <= mean:
         return math.inf
-    return float(brent(lambda scale: gated_mean(scale, dof, limit) - mean, low, high, relative=1e-9))
+    return float(brentq(lambda scale: gated_mean(scale, dof, limit) - mean, low, high, rtol=1e-9))

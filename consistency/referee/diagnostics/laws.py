@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import special
+from scipy import optimize, special
 
-from consistency.referee.diagnostics.roots import brent
 from consistency.referee.types import Array
 
 EXACT = 140  # values up to which Kolmogorov's distribution is computed here; SciPy approximates it for more
@@ -113,7 +112,7 @@ class Kolmogorov:
         outer = min(1.0, float(special.smirnovi(N, p / 2.0)))  # never smaller: both sides may exceed it
         if Kolmogorov.sf(outer, N) >= p:
             return outer
-        return float(brent(lambda d: Kolmogorov.sf(d, N) - p, 0.5 / N, outer, 1e-15, 1e-14))
+        return float(optimize.brentq(lambda d: Kolmogorov.sf(d, N) - p, 0.5 / N, outer, xtol=1e-15, rtol=1e-14))
 
 
 def _within(distance: float, N: int) -> float:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import special
+from scipy import optimize, special
 
 from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.bias import Moments, moments, t_squared
 from consistency.referee.diagnostics.blocks import by_runs
-from consistency.referee.diagnostics.roots import brent
 from consistency.referee.diagnostics.whitening import all_finite
 from consistency.referee.types import Array
 
@@ -128,7 +127,7 @@ def weighted_chi_square_tail(value: float, weights: Array) -> float:
         return float((weights / (1.0 - 2.0 * s * weights)).sum()) - value
 
     end = 0.5 / weights.max() - 0.25 / value  # where the term of the largest weight alone is twice the value
-    s = float(brent(slope, 0.0, end, 1e-14 * end))
+    s = float(optimize.brentq(slope, 0.0, end, xtol=1e-14 * end))
     left = 1.0 - 2.0 * s * weights
     w = np.sqrt(2.0 * s * value + np.log(left).sum())
     v = s * np.sqrt(2.0 * np.square(weights / left).sum())

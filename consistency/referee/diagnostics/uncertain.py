@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import optimize
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import laws
@@ -17,7 +18,6 @@ from consistency.referee.diagnostics.headline import at_share
 from consistency.referee.diagnostics.hypothesis_tests import least
 from consistency.referee.diagnostics.location import accuracy_of, bias_of
 from consistency.referee.diagnostics.questions import AXIS, BIAS, MAIN, SHARES
-from consistency.referee.diagnostics.roots import brent
 from consistency.referee.diagnostics.sample import Sample, sample_of
 from consistency.referee.diagnostics.scale import scale_test
 from consistency.referee.diagnostics.shape import weighted_chi_square_tail
@@ -280,7 +280,7 @@ class UncertainTruth:
         high = (
             low
             if upper_tail(low, weights) <= rate
-            else float(brent(lambda x: upper_tail(x, weights) - rate, low, 1e6 * low))
+            else float(optimize.brentq(lambda x: upper_tail(x, weights) - rate, low, 1e6 * low))
         )
         return 0.0, high * self._together * self.total.dof
 

@@ -71,29 +71,6 @@ print("runs" in run("plan", "--dof", "3"))
     assert others == ["True"] * 4
 
 
-def test_a_verdict_loads_what_it_needs(folder: Path) -> None:
-    """Not readers of other files, questions that are not asked, nor the half of SciPy that these need."""
-    code = """
-from consistency.referee.cli import main
-
-with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
-    main(["analyse", "est.csv", "--truth", "truth.csv"])
-names = [name.removeprefix("consistency.referee.") for name in sys.modules]
-print(sum(name.startswith("consistency") for name in sys.modules))
-print(*(name for name in names if name.partition(".")[0] in ("readers", "diagnostics")))
-print(*{".".join(name.split(".")[:2]) for name in names if name.startswith("scipy.")})
-"""
-    count, ours, scipy = said(folder, code).splitlines()
-    assert int(count) <= 90
-    assert {"readers.table", "diagnostics.scale"} <= {*ours.split()}
-    assert not {*ours.split()} & {
-        "readers.bags", "readers.tum", "readers.archive", "readers.relative", "readers.guesses", "readers.residuals",
-        "diagnostics.monitor", "diagnostics.comparison", "diagnostics.uncertain", "diagnostics.joint",
-    }  # fmt: skip
-    assert "scipy.special" in scipy.split()
-    assert not {*scipy.split()} & {"scipy.optimize", "scipy.spatial", "scipy.linalg", "scipy.stats"}
-
-
 def test_gates_and_records(folder: Path) -> None:
     code = """
 import numpy as np

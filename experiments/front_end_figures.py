@@ -26,7 +26,7 @@ def matches_png(image: Array, uv: Array, covariances: Array, resolution: int = 2
     """
     with mpl.rc_context(with_matplotlib.RC):
         figure = Figure(
-            figsize=(with_matplotlib.WIDTH, with_matplotlib.WIDTH * image.shape[0] / image.shape[1]),
+            figsize=(Sheet.width, Sheet.width * image.shape[0] / image.shape[1]),
             layout="constrained",
         )
         axes = figure.subplots()
@@ -53,7 +53,7 @@ def samples_png(samples: Array, centre: Array, covariance: Array, resolution: in
             Points(*xy(mean[None]), MEAN),
         )
         panels.append(Panel(Axis(labels[0]), Axis(labels[1]), marks, f"{labels[0]} and {labels[1]} of the poses"))
-    return with_matplotlib.render(Sheet(tuple(panels), with_matplotlib.WIDTH / 3), "png", resolution)
+    return with_matplotlib.render(Sheet(tuple(panels), Sheet.width / 3), "png", resolution)
 
 
 def ellipse(centre: Array, covariance: Array, scale: float, look: Look) -> Line:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import select
@@ -101,8 +102,8 @@ def begun(imports: str, code: str, *words: str, cwd: Path, out: int | None = Non
     Standard output and error go to the files with the numbers ``out`` and ``err``, or into files of the program. The
     environment is that of now, for the imports too.
     """
-    environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
-    link, _ = _server(imports, tuple(environment.items()))
+    changing = ("PYTEST_CURRENT_TEST", "KMP_")  # by pytest, and by libraries as they are loaded
+    link = _server(imports, tuple(item for item in os.environ.items() if not item[0].startswith(changing)))
     streams = [tempfile.TemporaryFile() if number is None else None for number in (out, err)]  # noqa: SIM115
     numbers = [number if file is None else file.fileno() for number, file in zip((out, err), streams, strict=True)]
     ours, theirs = os.pipe()
@@ -123,7 +124,7 @@ def done(imports: str, code: str, *words: str, cwd: Path, timeout: float = LIMIT
 
 
 @cache
-def _server(imports: str, environment: tuple[tuple[str, str], ...]) -> tuple[socket.socket, subprocess.Popen[bytes]]:
+def _server(imports: str, environment: tuple[tuple[str, str], ...]) -> socket.socket:
     """The link to a process that ends with this one."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
@@ -131,4 +132,6 @@ def _server(imports: str, environment: tuple[tuple[str, str], ...]) -> tuple[soc
             [sys.executable, "-c", SERVER.format(imports=imports)],
             stdin=theirs, stdout=subprocess.DEVNULL, start_new_session=True, env=dict(environment),
         )  # fmt: skip
-    return ours, process
+    atexit.register(process.wait)
+    atexit.register(ours.close)
+    return ours

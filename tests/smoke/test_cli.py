@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from command import consistency
+from command import begun, consistency
 from documents import blocks
 from scipy import stats
 
@@ -200,42 +200,47 @@ class ThrowsInRun7:
 def test_a_failed_run_is_in_results_verdict_and_report(tmp_path: Path) -> None:
     scenario = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     mark = float(cs.simulate(scenario, run=7, seed=0).observation(20).z.sum())
-    results = cs.run_trials(scenario, [ThrowsInRun7(mark), "ekf-uvd"], runs=50, jobs=1)
+    results = cs.run_trials(scenario, [ThrowsInRun7(mark), "ekf-uvd"], runs=12, jobs=1)
     assert results.failures.values.tolist() == [["throws-in-run-7", 7, 20, "RuntimeError: diverged"]]
     verdict = cs.analyse(results)["throws-in-run-7"]
     assert not verdict.consistent
-    assert any("1 of 50 runs failed, first run 7 in step 20" in reason for reason in verdict.reasons)
+    assert any("1 of 12 runs failed, first run 7 in step 20" in reason for reason in verdict.reasons)
     results.write(tmp_path / "out")
     consistency("report", "out", "--html", "r.html", cwd=tmp_path)
     assert "RuntimeError: diverged" in (tmp_path / "r.html").read_text()
 
 
+LONG_LOOP = ("run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--out")
+
+
+@pytest.fixture(scope="module")
+def long_loop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Estimates of one go."""
+    at = tmp_path_factory.mktemp("whole")
+    consistency(*LONG_LOOP, "whole", cwd=at)
+    return at / "whole/estimates.parquet"
+
+
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, name: str) -> None:
+def test_ctrl_c_keeps_what_is_finished(tmp_path: Path, long_loop: Path, name: str) -> None:
     """Interrupted after the first runs, then resumed: the bytes of an uninterrupted run."""
-    code = f"""
-import signal, sys
-from consistency.referee.cli import main
+    interrupted = f"""
 from consistency.bench.runs.work import TrialWork
 one, count = TrialWork.__call__, []
-signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell runs in the background
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup
 def interrupt(work, run):
     count.append(run)
     if len(count) == 4:
         signal.raise_signal(signal.{name})
     return one(work, run)
 TrialWork.__call__ = interrupt
-main({["run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--jobs", "1", "--out", "out"]!r})
 """
-    stopped = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert stopped.returncode == 128 + getattr(signal, name), stopped.stderr
-    assert "--resume" in stopped.stderr
+    stopped = begun(*LONG_LOOP, "out", "--jobs", "1", cwd=tmp_path, before=interrupted)
+    _, error = stopped.communicate()
+    assert stopped.returncode == 128 + getattr(signal, name), error
+    assert "--resume" in error
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     done = cs.read_results(tmp_path / "out").manifest["finished_runs"]
     assert 0 < done < 6
-    command = ("run", "long-loop", "--filter", "ekf-xyz", "--runs", "6", "--out")
-    consistency(*command, "out", "--resume", cwd=tmp_path)
-    consistency(*command, "whole", cwd=tmp_path)
-    assert (tmp_path / "out/estimates.parquet").read_bytes() == (tmp_path / "whole/estimates.parquet").read_bytes()
+    consistency(*LONG_LOOP, "out", "--resume", cwd=tmp_path)
+    assert (tmp_path / "out/estimates.parquet").read_bytes() == long_loop.read_bytes()

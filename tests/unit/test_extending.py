@@ -31,6 +31,10 @@ def copy(tmp_path: Path) -> Path:
     ignore = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
     for name in ("consistency", "scenarios"):
         shutil.copytree(PACKAGE.parent / name, tmp_path / name, ignore=ignore)
+    (tmp_path / "est.csv").write_text(
+        "run,step,a,P_a_a\n" + "".join(f"{r},{k},{r},1\n" for r in (3, 7) for k in (1, 2))
+    )
+    (tmp_path / "truth.csv").write_text("step,a\n1,0\n2,0\n")
     return tmp_path
 
 
@@ -50,8 +54,6 @@ def test_the_command_of_the_document_works(copy: Path) -> None:
     first = "    # the laboratory\n"
     assert table.read_text(encoding="utf-8").count(first) == 1
     table.write_text(table.read_text(encoding="utf-8").replace(first, f"{row.rstrip()},\n{first}"), encoding="utf-8")
-    (copy / "est.csv").write_text("run,step,a,P_a_a\n" + "".join(f"{r},{k},{r},1\n" for r in (3, 7) for k in (1, 2)))
-    (copy / "truth.csv").write_text("step,a\n1,0\n2,0\n")
     told = python(
         copy,
         "import sys\nfrom consistency.referee.cli import main\n"
@@ -114,8 +116,6 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
     module, row = code("Add a renderer")
     (copy / "consistency/referee/show/csv.py").write_text(module, encoding="utf-8")
     changed(copy / "consistency/referee/show/__init__.py", "FORMATS = {", f"FORMATS = {row.strip()[:-1]}, ")
-    (copy / "est.csv").write_text("run,step,a,P_a_a\n" + "".join(f"{r},{k},{r},1\n" for r in (3, 7) for k in (1, 2)))
-    (copy / "truth.csv").write_text("step,a\n1,0\n2,0\n")
     words = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a", "--report", "out.csv"]
     done = python(copy, f"from consistency.referee.cli import main\nmain({words})")
     assert done.stdout.endswith("out.csv\n"), done.stderr
@@ -128,11 +128,25 @@ def test_the_renderer_of_the_document_works(copy: Path) -> None:
     assert ".csv" in python(copy, refusal).stdout
 
 
+def test_the_kind_of_files_of_the_document_is_read(copy: Path) -> None:
+    """One file and a row; what is refused of it is refused, and what is broken is said."""
+    module, row = code("Add a kind of files")
+    (copy / "consistency/referee/readers/json_lines.py").write_text(module, encoding="utf-8")
+    last = ")  # fmt: skip\nSUFFIXES"
+    changed(copy / "consistency/referee/readers/kinds.py", last, f"    {row.strip()},\n{last}")
+    lines = [f'{{"errors": [[{run}], [{run}]], "covariances": [[[1]], [[1]]]}}' for run in (3, 7)]
+    (copy / "est.jsonl").write_text("\n".join(lines), encoding="utf-8")
+    (copy / "bad.jsonl").write_text("\n".join([*lines, "{}"]), encoding="utf-8")
+    call = "from consistency.referee.cli import main\nmain({})"
+    assert "overconfident  29.00" in python(copy, call.format(["analyse", "est.jsonl"])).stdout
+    refused = python(copy, call.format(["analyse", "est.jsonl", "--truth", "truth.csv"])).stderr
+    assert "--truth: does not go with est.jsonl" in refused
+    assert "each line must be an object" in python(copy, call.format(["analyse", "bad.jsonl"])).stderr
+
+
 def test_a_default_stands_once(copy: Path) -> None:
     """One file: the command line, its help, Python and the gates have it."""
     changed(copy / "consistency/referee/defaults.py", "FALSE_ALARM = 0.05", "FALSE_ALARM = 0.037")
-    (copy / "est.csv").write_text("run,step,a,P_a_a\n" + "".join(f"{r},{k},{r},1\n" for r in (3, 7) for k in (1, 2)))
-    (copy / "truth.csv").write_text("step,a\n1,0\n2,0\n")
     asked = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a"]
     for words in (asked, ["analyse", "--help"]):
         assert "0.037" in python(copy, f"from consistency.referee.cli import main\nmain({words})").stdout

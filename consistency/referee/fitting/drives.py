@@ -105,7 +105,7 @@ def _poses(path: Path, r: Reading) -> Iterator[NamedPoses]:
     kind = kind_of(path, r)
     if not is_bag(path) and path.is_dir() and not trajectory_files(path):
         yield from _of_folder(path, r)
-    elif kind is None or is_solution(path):
+    elif kind is None or not kind.poses or is_solution(path):
         known = ", ".join((*TABLES, ".npz", ".bag", *TRAJECTORIES))
         raise InputError(f"{path}: unknown kind of file; known are {known}")
     else:

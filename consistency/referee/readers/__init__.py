@@ -22,7 +22,7 @@ from consistency.referee.readers.alignment import require_alignment
 from consistency.referee.readers.kinds import (
     OF_BAGS,
     OF_TRAJECTORIES,
-    TABLES,
+    SUFFIXES,
     TRAJECTORIES,
     is_bag,
     is_drive,
@@ -202,8 +202,8 @@ def _by_kind(estimates: Path, r: Reading, over: Relative | None) -> list[Evidenc
     kind = kind_of(estimates, r)
     _refuse(estimates, r, *(OF_BAGS if kind is None else kind.refused))
     if kind is None:
-        known = ", ".join((*TABLES, ".npz", ".bag", ".mcap", ".db3", ".pos", *TRAJECTORIES))
-        raise InputError(f"{estimates}: unknown kind of file; known are {known} (TUM trajectories)")
+        known = f"{', '.join(SUFFIXES)} (TUM trajectories)"
+        raise InputError(f"{estimates}: unknown kind of file; known are {known}")
     return _with_frame(function_at(kind.records)(estimates, r, over), r)
 
 

@@ -81,33 +81,39 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 
 class Kind(NamedTuple):
-    """A kind of files, with ``module:function`` of what reads them and the options that do not go with it."""
+    """A kind of files: how one is told, options that do not go with it, and ``module:function`` of what reads it."""
 
     is_one: Callable[[Path, Reading], bool]
-    records: str  # path, options, windows -> records
-    poses: str  # path, options -> poses of each run; covariances are not looked at
     refused: tuple[str, ...]
+    records: str  # path, options, windows -> records
+    poses: str = ""  # path, options -> poses of each run; covariances are not looked at
 
 
-KINDS = (  # the first that a file is one of
+KINDS = (  # a file is of the first that knows it
     Kind(
-        lambda path, r: is_bag(path), "referee.readers.bags:read_bags", "referee.readers.bags:bag_poses",
+        lambda path, r: is_bag(path),
         ("state", "covariance", "covariance_order", "truth", "lever_arm"),
+        "referee.readers.bags:read_bags",
+        "referee.readers.bags:bag_poses",
     ),
     Kind(
         lambda path, r: path.suffix.lower() == ".npz",
-        "referee.readers.archive:read_archive", "referee.readers.archive:archive_poses",
-        (*OF_BAGS, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
-         "lever_arm", "truth_covariance"),
+        (
+            *OF_BAGS, "state", "max_dt", "covariance", "covariance_order", "truth", "time_offset", "axes", "align",
+            "lever_arm", "truth_covariance",
+        ),
+        "referee.readers.archive:read_archive",
+        "referee.readers.archive:archive_poses",
     ),
     Kind(
-        _is_table, "referee.readers.table:read_tables", "referee.readers.table:table_poses",
+        _is_table,
         (*OF_BAGS, *OF_TRAJECTORIES),
+        "referee.readers.table:read_tables",
+        "referee.readers.table:table_poses",
     ),
-    Kind(
-        _is_trajectory, "referee.readers.tum:read_tum", "referee.readers.tum:trajectory_poses", (*OF_BAGS, "state"),
-    ),
+    Kind(_is_trajectory, (*OF_BAGS, "state"), "referee.readers.tum:read_tum", "referee.readers.tum:trajectory_poses"),
 )  # fmt: skip
+SUFFIXES = (*TABLES, ".npz", *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
 
 
 def kind_of(path: Path, r: Reading) -> Kind | None:

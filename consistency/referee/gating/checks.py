@@ -13,7 +13,7 @@ from consistency.referee.diagnostics import Record, nis_of
 from consistency.referee.diagnostics.skipping import Skip, skip_of
 from consistency.referee.errors import InputError
 from consistency.referee.readers.archive import in_memory, record_of_arrays
-from consistency.referee.readers.record import Track, judged_rows, symmetric
+from consistency.referee.readers.record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array, Failure, Indices
 from consistency.referee.verdicts.sources import Results, source_of
@@ -202,16 +202,19 @@ def _vectors(
     there: Array = np.asarray(~(absent if gone is None else absent | gone))
     _require_some("innovations", there, np.asarray(np.isfinite(v).all(axis=-1)))
     _require_some("innovation_covariances", there, np.asarray(np.isfinite(S).all(axis=(-2, -1))))
-    used, failures = np.zeros(there.shape, bool), []
-    S = S.copy()
+    used, tracks, failures, S = np.zeros(there.shape, bool), [], [], S.copy()
     for run, steps in enumerate(there):
         k = np.flatnonzero(steps)
         place = Places(lambda row, run=run: f"innovation_covariances, run {run}, step {row + 1}", k)  # type: ignore[misc]
         S[run, k] = symmetric(S[run, k], place.__getitem__)
-        start, end, reason = judged_rows(Track(run, k, place, v[run, k], S[run, k]), "innovation")
-        used[run, k[start:end]] = True
+        tracks.append(Track(run, k, place, v[run, k], S[run, k]))
+    longest = longest_start(tracks)
+    for track in tracks:
+        k, (start, end, reason) = track.column, judged_rows(track, longest, "innovation")
+        used[track.run, k[start:end]] = True
         if reason:
-            failures.append(Failure(name, run, int(k[end]) + 1, reason.replace("covariance", "innovation covariance")))
+            reason = reason.replace("covariance", "innovation covariance")
+            failures.append(Failure(name, track.run, int(k[end]) + 1, reason))
     return _without(~used, v), _without(~used, S), failures
 
 

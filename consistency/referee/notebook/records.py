@@ -127,9 +127,9 @@ def judge(
     ----------
     record : of :func:`read`; or a path, which is read without options; or errors (runs, steps, n), truth minus
         estimate. A run whose error is not finite, or whose covariance is not positive definite, has failed in that
-        step: it is counted, and the others are judged. Steps in which the covariance of a run is singular, as at a
-        start that is known exactly, are left out up to the first of full rank. Steps without a truth are masked
-        (``numpy.ma``) and do not count.
+        step: it is counted, and the others are judged. Where every run begins with singular covariances, as at a
+        start that is known exactly, its steps are left out up to the first of full rank. Steps without a truth are
+        masked (``numpy.ma``) and do not count.
     covariances : (runs, steps, n, n), beside errors
     deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
         judged by itself, at a false-alarm rate that all share (Holm)

@@ -70,9 +70,10 @@ def record_of_arrays(
         Shapes that do not fit, a covariance that is not symmetric, a step that is not finite in any run.
     """
     first = next(iter(given))
-    arrays = {
-        key: in_memory(key, value)[:, None] if independent else in_memory(key, value) for key, value in given.items()
-    }
+    arrays = {key: in_memory(key, value) for key, value in given.items()}
+    if independent:
+        _require_rows({key: array.shape for key, array in arrays.items()})
+        arrays = {key: array[:, None] for key, array in arrays.items()}
     shape, wanted = arrays[first].shape, ("runs", "steps", "n")[: 3 if first == "errors" else 2]
     if len(shape) != len(wanted) or 0 in shape:
         text = f"{first} has shape {shape}, needs ({', '.join(wanted)})"
@@ -103,6 +104,27 @@ def record_of_arrays(
     record = record if sigma is None else each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
+
+
+def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse errors and what is stated of them, each row a run, if their shapes do not fit."""
+    shape = shapes["errors"]
+    if len(shape) != 2 or 0 in shape:
+        text = f"errors has shape {shape}, needs (N, n) with independent=True"
+        if len(shape) == 1:
+            stated = "deviations[:, None]" if "deviations" in shapes else "covariances[:, None, None] of its variances"
+            text += f"; one component is errors[:, None] and {stated}"
+        raise InputError(text)
+    for key, own in shapes.items():
+        needs = (*shape, shape[1]) if key.endswith("covariances") else shape
+        if own == needs:
+            continue
+        remedy = ""
+        if own == needs[1:]:
+            remedy = f"; one for all rows is np.broadcast_to({key}, {needs})"
+        elif own == shape:
+            remedy = f"; variances are {key}[:, :, None] * np.eye({shape[1]}), standard deviations go into deviations="
+        raise InputError(f"{key} has shape {own}, needs {needs} beside errors of shape {shape}{remedy}")
 
 
 def in_memory(key: str, value: ArrayLike) -> Array:

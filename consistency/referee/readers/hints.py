@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from consistency.referee.readers.guesses import Guess
 
 MOST = 4000  # estimates that are looked at, of all runs together
+MOST_RUNS = 200  # that are looked at, evenly over all
 MOST_FITTED = 1000  # of which so many are, where less than a decade is wrong
 WRONG = 1.0  # decades that the NEES is off, from which a mix-up is looked for
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
@@ -37,6 +38,7 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
     """
     if not runs:
         return []
+    runs = runs[:: -(-len(runs) // MOST_RUNS)]
     some = [poses.later(shift).some(max(MOST // len(runs), 20)).sound() for poses in runs]
     if _same(some):
         return [

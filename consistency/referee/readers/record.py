@@ -70,8 +70,9 @@ def assemble(
     _require_different(file, tracks)
     notes = list(notes)
     failures, parts, skipped = [], [], 0
+    longest = longest_start(tracks)
     for track in tracks:
-        start, end, reason = judged_rows(track)
+        start, end, reason = judged_rows(track, longest)
         if reason:
             failures.append(Failure(name, track.run, int(track.column[end]) + 1, f"{reason} ({track.place[end]})"))
         skipped += start
@@ -146,13 +147,32 @@ def symmetric(covariance: Array, place: Callable[[int], str]) -> Array:
     return out
 
 
-def judged_rows(track: Track, what: str = "estimate") -> tuple[int, int, str]:
-    """First row with a covariance of full rank, first broken row, and why it is broken: ``what`` is not finite, ..."""
+def longest_start(tracks: Sequence[Track]) -> int:
+    """Rows that a start known exactly may take, in which a covariance is singular; 0 where a run begins otherwise."""
+    starts = [(_first_full(track), len(track.column)) for track in tracks]
+    ended = [start for start, rows in starts if start < rows]
+    if not ended:
+        return max((rows for _, rows in starts), default=0)
+    return max(ended) if min(start for start, _ in starts) > 0 else 0
+
+
+def _first_full(track: Track) -> int:
+    """First row with a covariance of full rank; the number of rows without any."""
+    if track.covariance is None or not len(track.column):
+        return 0
+    if classify(track.covariance[:1], ROUNDED)[0] == Validity.VALID:
+        return 0
+    full = classify(track.covariance, ROUNDED) == Validity.VALID
+    return int(np.argmax(full)) if full.any() else len(full)
+
+
+def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int, int, str]:
+    """First row that is judged, first broken row, and why it is broken: ``what`` is not finite, ..."""
     rows = len(track.column)
     error_ok: Array = np.all(np.isfinite(np.zeros((rows, 1)) if track.error is None else track.error), axis=1)
     kind = np.zeros(rows, int) if track.covariance is None else classify(track.covariance, ROUNDED)
     full: Array = np.asarray(kind == Validity.VALID)
-    start = int(np.argmax(full)) if full.any() else rows
+    start = min(int(np.argmax(full)) if full.any() else rows, longest)
     bad: Array = ~error_ok | ~full
     bad[:start] = ~error_ok[:start] | (kind[:start] != Validity.DEFICIENT)
     if not bad.any():

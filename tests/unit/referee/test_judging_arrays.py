@@ -106,6 +106,49 @@ def test_rows_are_runs_only_where_that_is_said(rng: np.random.Generator) -> None
     assert cs.judge(error[None], P[None]).runs == 1
 
 
+def test_a_covariance_of_zero_is_a_known_start_only_where_all_runs_begin_so(rng: np.random.Generator) -> None:
+    error = independent(rng, 300, 1, 2)[:, 0]
+    P = np.array(identities(error))
+    P[:20] = 0.0
+    verdict = cs.judge(error, P, independent=True, false_alarm=SURE)
+    assert (verdict.status, len(verdict.failures)) == ("failed", 20)
+    P[:20] = np.diag([1.0, 0.0])
+    assert cs.judge(error, P, independent=True, false_alarm=SURE).status == "failed"
+    sigma = np.ones(error.shape)
+    sigma[7, 1] = 0.0
+    assert cs.judge(error, deviations=sigma, independent=True, false_alarm=SURE).status == "failed"
+
+
+@pytest.mark.parametrize(("first", "failed"), [([0, 1, 2], [1]), ([1, 1, 2], []), ([2, 1, STEPS], [3])])
+def test_how_long_a_known_start_may_be(error: Array, first: list[int], failed: list[int]) -> None:
+    """``first``: steps of singular covariances at the beginning of runs 1, 2 and 3; of all others one, if any has."""
+    P = np.array(identities(error))
+    P[:, : min(first)] = 0.0
+    for run, steps in enumerate(first, start=1):
+        P[run, :steps] = 0.0
+    verdict = cs.judge(error, P, false_alarm=SURE)
+    expected = [run for run, steps in enumerate(first, start=1) if steps > 0] if min(first) == 0 else failed
+    assert [failure.run for failure in verdict.failures] == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda e, P: (e[:, 0], P[:, 0, 0]), r"errors has shape \(300,\), needs \(N, n\).*errors\[:, None\]"),
+        (lambda e, P: (e, P[0]), r"covariances has shape \(2, 2\), needs \(300, 2, 2\).*np.broadcast_to"),
+        (lambda e, P: (e, P[:, 0]), r"covariances has shape \(300, 2\), needs .* deviations="),
+        (lambda e, P: (e, P[1:]), r"covariances has shape \(299, 2, 2\), needs \(300, 2, 2\) beside errors"),
+    ],
+)
+def test_rows_that_do_not_fit_are_told_as_they_were_given(
+    change: Callable[..., tuple[Array, Array]], why: str, rng: np.random.Generator
+) -> None:
+    error = independent(rng, 300, 1, 2)[:, 0]
+    errors, P = change(error, identities(error))
+    with pytest.raises(cs.InputError, match=why):
+        cs.judge(errors, P, independent=True)
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [

@@ -22,10 +22,11 @@ class Doubled(ast.NodeTransformer):
 
 def edit(folder: str) -> None:
     """Load the modules in a folder of the package's filters with other numbers, and leave no bytecode of them."""
-    get_code = SourceFileLoader.get_code
+    get_code, inside = SourceFileLoader.get_code, f"consistency.bench.filters.{folder}."
+    assert not [name for name in sys.modules if name.startswith(inside)]
 
     def edited(self: SourceFileLoader, name: str) -> Any:
-        if not name.startswith(f"consistency.bench.filters.{folder}."):
+        if not name.startswith(inside):
             return get_code(self, name)
         tree = ast.fix_missing_locations(Doubled().visit(ast.parse(self.get_data(self.path))))
         return compile(tree, self.path, "exec")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 import sys
 import textwrap
 import time
@@ -115,7 +114,7 @@ def script(tmp_path: Path) -> Path:
 
 
 IMPORTS = """
-import numba
+import numba, pandas, pydantic, scipy.stats
 from consistency.bench.filters.kernel.jit import Kernel
 
 numba.njit(lambda x: x + 1.0)(1.0)  # the first of a process takes long
@@ -262,8 +261,8 @@ def with_something(x: complex) -> float:
 
 def keys_with_other_numbers(folder: str) -> dict[str, str]:
     """Keys of the kernels of built-in filters, with every number in a folder of the filters doubled."""
-    command = [sys.executable, kernel_keys.__file__, folder]
-    out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240).stdout
+    code = "import runpy; runpy.run_path(sys.argv[0], None, '__main__')"
+    out, _ = ended(forks.begun(IMPORTS, code, kernel_keys.__file__, folder, cwd=Path.cwd()))
     keys: dict[str, str] = json.loads(out)
     return keys
 

@@ -5,6 +5,7 @@ Tables, plots and files do not belong here.
 
 from consistency.referee.diagnostics.coverage import coverage as coverage
 from consistency.referee.diagnostics.equivalence import equivalence as equivalence
+from consistency.referee.diagnostics.independence import independence as independence
 from consistency.referee.diagnostics.nees import nees as nees
 from consistency.referee.diagnostics.outliers import outliers as outliers
 from consistency.referee.extras import lazy_names

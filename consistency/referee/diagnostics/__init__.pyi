@@ -14,8 +14,6 @@ from .coverage import coverage as coverage
 from .coverage import coverage_interval as coverage_interval
 from .coverage import rmse as rmse
 from .credibility import noncredibility as noncredibility
-from .dependence import Independence as Independence
-from .dependence import independence as independence
 from .direction import Largest as Largest
 from .direction import largest_direction as largest_direction
 from .early_ending import EarlyEnds as EarlyEnds
@@ -31,6 +29,8 @@ from .eprocess import ever as ever
 from .equivalence import equivalence as equivalence
 from .gaussian import Normality as Normality
 from .gaussian import normality as normality
+from .independence import Independence as Independence
+from .independence import independence as independence
 from .innovations import NisTest as NisTest
 from .innovations import Whiteness as Whiteness
 from .innovations import nis_of as nis_of

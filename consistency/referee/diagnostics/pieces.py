@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.dependence import independence
+from consistency.referee.diagnostics.independence import independence
 from consistency.referee.diagnostics.questions import BIAS
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.scale import run_means

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.dependence import ENOUGH, Independence, independence
+from consistency.referee.diagnostics.independence import ENOUGH, Independence, independence
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.diagnostics.wording import p_text
 from consistency.referee.errors import InputError

@@ -71,6 +71,24 @@ print("runs" in run("plan", "--dof", "3"))
     assert others == ["True"] * 4
 
 
+def test_a_verdict_loads_what_it_needs(folder: Path) -> None:
+    """Not readers of other files, nor questions that are not asked."""
+    code = """
+from consistency.referee.cli import main
+
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    main(["analyse", "est.csv", "--truth", "truth.csv"])
+print(*(name.removeprefix("consistency.referee.") for name in sys.modules if name.startswith("consistency")))
+"""
+    ours = said(folder, code).split()
+    assert len(ours) <= 90
+    assert {"readers.table", "diagnostics.scale"} <= {*ours}
+    assert not {*ours} & {
+        "readers.bags", "readers.tum", "readers.archive", "readers.relative", "readers.guesses", "readers.residuals",
+        "diagnostics.monitor", "diagnostics.comparison", "diagnostics.uncertain", "diagnostics.joint",
+    }  # fmt: skip
+
+
 def test_gates_and_records(folder: Path) -> None:
     code = """
 import numpy as np

@@ -17,8 +17,8 @@ from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stre
 import consistency as cs
 from consistency.referee.cli import main as command
 from consistency.referee.diagnostics import Evidence, Verdict
-from consistency.referee.diagnostics.dependence import ENOUGH
 from consistency.referee.diagnostics.export import plain
+from consistency.referee.diagnostics.independence import ENOUGH
 from consistency.referee.geometry.groups import carried, composed, matrices, to_left
 from consistency.referee.readers.relative import Stretch, windows_of
 from consistency.referee.readers.windows import Relative

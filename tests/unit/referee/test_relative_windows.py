@@ -12,7 +12,7 @@ from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stre
 
 import consistency as cs
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.dependence import ENOUGH
+from consistency.referee.diagnostics.independence import ENOUGH
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, to_left
 from consistency.referee.geometry.spatial import spatial_error

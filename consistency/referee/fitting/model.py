@@ -19,7 +19,7 @@ from consistency.referee.fitting.drives import Drive
 from consistency.referee.fitting.likelihood import ENOUGH
 from consistency.referee.fitting.motions import record_of, stretches_of
 from consistency.referee.fitting.noise import Noise, intervals, with_jitter
-from consistency.referee.fitting.persistence import SHARED, Lasting, doubts, errors_of_second, persistent
+from consistency.referee.fitting.persistence import Lasting, Second, doubts, errors_of_second, persistent
 from consistency.referee.fitting.ratios import DECIDE, HALF, Fold, Judged, Ratio, folds_of, judged_by
 from consistency.referee.fitting.refusals import Growth, growth_of, require_sound
 from consistency.referee.fitting.windows import PIECES, Windows, span_of, windows_of
@@ -51,7 +51,7 @@ class NoiseModel:
     growth: Growth  # of the squared rotation error over the span
     warnings: tuple[str, ...]
     lasting: tuple[Lasting, ...] = ()  # errors that differ between drives
-    shared: Array | None = None  # (n,), correlation with the errors of the second estimator
+    second: Second | None = None  # errors of the second estimator
     drives: tuple[Drive, ...] = field(default=(), repr=False)
     windows: Windows | None = field(default=None, repr=False)
     folds: tuple[Fold, ...] = field(default=(), repr=False)
@@ -65,7 +65,7 @@ class NoiseModel:
     @property
     def status(self) -> str:
         """consistent, overconfident, conservative, inconsistent or undecided."""
-        is_of_truth = self.shared is not None and bool((self.shared > SHARED).any())
+        is_of_truth = self.second is not None and bool(self.second.is_shared.any())
         return decided(self.spans[0].status, is_of_truth or any(each.decides for each in self.lasting))
 
     @property
@@ -180,7 +180,7 @@ def fit_covariance(
             "windows": len(windows.drive), "long": windows.long, "still": windows.still, "jumps": windows.jumps,
         },
         growth=growth, warnings=tuple(doubts(noise, windows, growth, lasting)), lasting=lasting,
-        shared=None if second is None else errors_of_second(noise, windows, drives, second),
+        second=None if second is None else errors_of_second(noise, windows, drives, second),
         drives=tuple(drives), windows=windows, folds=tuple(folds), is_planar=planar,
     )  # fmt: skip
 

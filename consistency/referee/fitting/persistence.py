@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -14,7 +15,7 @@ from consistency.referee.fitting.likelihood import ENOUGH
 from consistency.referee.fitting.means import design_of
 from consistency.referee.fitting.noise import Noise
 from consistency.referee.fitting.refusals import Growth
-from consistency.referee.fitting.windows import Windows
+from consistency.referee.fitting.windows import Windows, in_plane
 from consistency.referee.geometry.groups import inverse, log
 from consistency.referee.readers.relative import BENT
 from consistency.referee.types import Array
@@ -110,8 +111,25 @@ def _means(noise: Noise, windows: Windows) -> tuple[Array, Array]:
     return scaled @ (g / size) / size, np.where(known, np.diag(scaled) / size**2, np.inf)
 
 
-def errors_of_second(noise: Noise, windows: Windows, drives: Sequence[Drive], second: Sequence[Drive]) -> Array:
-    """Correlation (n,) of the errors of two estimators over the same windows.
+class Second(NamedTuple):
+    """Errors of a second estimator over the same windows, for each of n axes."""
+
+    correlation: Array  # (n,), with those of the first
+    size: Array  # (n,), standard deviation over that of the first
+
+    @property
+    def is_shared(self) -> Array:
+        """Which errors both have, (n,) bool: they are those of the truth, or of what both use."""
+        return np.asarray(self.correlation > SHARED)
+
+    @property
+    def is_rough(self) -> Array:
+        """Where the second errs so much more that even a truth with all errors of the first would not be seen."""
+        return np.asarray(self.size > 1.0 / SHARED)
+
+
+def errors_of_second(noise: Noise, windows: Windows, drives: Sequence[Drive], second: Sequence[Drive]) -> Second:
+    """Errors of another estimator beside the corrected ones.
 
     Raises
     ------
@@ -131,6 +149,7 @@ def errors_of_second(noise: Noise, windows: Windows, drives: Sequence[Drive], se
         T = twin.estimate
         D = inverse(T[place[0][both]]) @ T[place[1][both]]
         true = windows.true[rows][both]
+        D = in_plane(D) if windows.d == 2 and twin.d == 3 else D
         if D.shape[1:] != true.shape[1:]:
             raise InputError("--second: needs poses of the same kind, in the plane or in space")
         error = log(inverse(D) @ true)
@@ -140,8 +159,8 @@ def errors_of_second(noise: Noise, windows: Windows, drives: Sequence[Drive], se
     if len(a) < 8:
         raise InputError(f"--second: has {len(a)} windows in common; its times must be those of the estimates")
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    scale = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    return np.asarray((a * b).sum(axis=0) / np.where(scale > 0, scale, 1.0))
+    own_size, size = (np.maximum(np.sqrt((each**2).mean(axis=0)), 1e-300) for each in (a, b))
+    return Second((a * b).mean(axis=0) / (own_size * size), size / own_size)
 
 
 def _at(twin: Drive, drive: Drive, rows: Array) -> Array:

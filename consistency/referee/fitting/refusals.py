@@ -97,13 +97,14 @@ def body_turn(windows: Windows) -> tuple[float, float, float]:
     both = [D[:, :d, d], M[:, :d, d]]
     if d == 3:
         both = [np.concatenate([each, turn]) for each, turn in zip(both, (_vectors(D), _vectors(M)), strict=True)]
-    U, _, V = np.linalg.svd(both[1].T @ both[0])
-    sign = np.eye(d)
-    sign[-1, -1] = np.sign(np.linalg.det(U @ V))
-    B = np.eye(d + 1)
-    B[:d, :d] = (U @ sign @ V).T
-    turned = replace(windows, pieces=inverse(B) @ windows.pieces @ B)
-    before, after = (_squared(each) for each in (windows, turned))
+    before, after = _squared(windows), 0.0
+    for _ in range(2):  # what is left holds the turn about a straight way, which nothing tells, at none
+        U, _, V = np.linalg.svd(both[1].T @ both[0] + after * np.eye(d))
+        sign = np.eye(d)
+        sign[-1, -1] = np.sign(np.linalg.det(U @ V))
+        B = np.eye(d + 1)
+        B[:d, :d] = (U @ sign @ V).T
+        after = _squared(replace(windows, pieces=inverse(B) @ windows.pieces @ B))
     cosine = (np.trace(B[:d, :d]) - (d - 2)) / 2.0
     angles, rest = (1, d * len(D) - 4) if d == 2 else (3, d * len(D) - 8)
     gain = max(before - after, 0.0) / max(after, 1e-300)

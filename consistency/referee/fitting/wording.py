@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from consistency.referee.diagnostics.wording import plural, short
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fitting.likelihood import ENOUGH
 from consistency.referee.fitting.model import NoiseModel
-from consistency.referee.fitting.persistence import SHARED
+from consistency.referee.fitting.persistence import SHARED, Second
 from consistency.referee.fitting.ratios import DECIDE, HALF, Ratio
 from consistency.referee.fitting.windows import span_of
 
@@ -50,11 +51,11 @@ def _why(model: NoiseModel) -> str:
         parts.append("halves of a drive show nothing about a new one; give drives that are not fitted")
     elif r.drives < ENOUGH and r.windows < DECIDE:
         parts.append(f"too few to decide, which takes {ENOUGH} drives or {DECIDE} windows")
-    if model.shared is not None and (model.shared > SHARED).any():
-        worst = int(np.argmax(model.shared))
+    if model.second is not None and model.second.is_shared.any():
+        worst = int(np.argmax(model.second.correlation))
         parts.append(
-            f"errors in {model.noise.axes[worst]} correlate {model.shared[worst]:.2f} with those of the second "
-            "estimator: they are the truth's, or the calibration's"
+            f"errors in {model.noise.axes[worst]} correlate {model.second.correlation[worst]:.2f} with those of the "
+            "second estimator: they are the truth's, or the calibration's"
         )
     if model.spans[0].status == "consistent":
         parts += [
@@ -145,11 +146,21 @@ def lines(model: NoiseModel) -> list[str]:
         out.append(
             f"cautious: all covariances are raised x{model.noise.factor:.3g}, so that a new drive seldom has more"
         )
+    if model.second is not None:
+        out.append(_of_second(model.second, model.noise.axes))
     out += model.warnings
     out.append(
         f"analyse counts each judged motion as a run, though those of a drive depend: {model.verdict.reasons[0]}"
     )
     return out
+
+
+def _of_second(second: Second, axes: Sequence[str]) -> str:
+    """How errors of both correlate, and where the second errs too much to tell."""
+    shown = ", ".join(f"{axis} {each:.2f}" for axis, each in zip(axes, second.correlation, strict=True))
+    rough = ", ".join(np.array(axes)[second.is_rough])
+    text = f"correlation with errors of the second estimator: {shown}; above {SHARED:g} they are the truth's"
+    return text + (f"; it errs too much to tell in {rough}" if rough else "")
 
 
 def _interval(value: Interval) -> list[float | None]:
@@ -176,7 +187,8 @@ def data(model: NoiseModel) -> dict[str, Any]:
             "per_rad_interval": [_interval(each) for each in model.per_rad],
         },
         "growth": None if np.isnan(model.growth.power) else model.growth.power, "warnings": list(model.warnings),
-        "second_correlation": None if model.shared is None else model.shared.tolist(),
+        "second_correlation": None if model.second is None else model.second.correlation.tolist(),
+        "second_size": None if model.second is None else model.second.size.tolist(),
         "spans": [
             {"span": each.span, "whole": _ratio(each.whole),
              **{axis: _ratio(of) for axis, of in zip(n.axes, each.axes, strict=True)},

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fit_covariance import World, drives
+from fit_covariance import PER_M, World, drives, matrices_of
 
 import consistency as cs
 from consistency.referee.errors import InputError
@@ -16,7 +16,8 @@ from consistency.referee.fitting.persistence import TERMS, Lasting, persistent
 from consistency.referee.fitting.ratios import Ratio
 from consistency.referee.fitting.refusals import Growth, body_turn, growth_of, revisits
 from consistency.referee.fitting.windows import span_of, windows_of
-from consistency.referee.fitting.wording import sentence
+from consistency.referee.fitting.wording import lines, sentence
+from consistency.referee.geometry.groups import composed, inverse
 
 SPAN = "10m"
 RIGHT = Ratio(1.0, 0.8, 1.25, 0.1, 6, 600)
@@ -162,19 +163,50 @@ def test_a_second_estimator_with_the_same_errors(rng: np.random.Generator) -> No
     """Errors of the truth are in both; of another odometry they are not."""
     made = drives(rng, 5, length=500.0)
     same = cs.fit_covariance(made, SPAN, second=made)
-    assert same.shared is not None
-    np.testing.assert_allclose(same.shared, 1.0, atol=0.05)
+    assert same.second is not None
+    np.testing.assert_allclose(same.second.correlation, 1.0, atol=0.05)
+    np.testing.assert_allclose(same.second.size, 1.0, atol=0.05)
     assert same.status != "consistent"
     assert "correlate" in repr(same)
-    # another estimate of the same truth: noise of its own
-    twins = []
-    for drive in made:
-        error = np.cumsum(rng.normal(size=(len(drive.t), 3)) * [0.02, 0.02, 0.001], axis=0)
-        E = np.tile(np.eye(3), (len(error), 1, 1))
-        E[:, :2, 2] = error[:, :2]
-        twins.append(replace(drive, estimate=drive.truth @ E))
-    other = cs.fit_covariance(made, SPAN, second=twins)
-    assert other.shared is not None
-    assert np.abs(other.shared).max() < 0.4
+
+    def twins(times: float) -> list[Drive]:
+        """Another estimate of the same truth, with noise of its own: in x and y ``times`` as large."""
+        found = []
+        for drive in made:
+            motions = inverse(drive.truth[:-1]) @ drive.truth[1:]
+            error = np.sqrt(0.5 * np.array(PER_M)) * [times, times, 1.0] * rng.normal(size=(len(motions), 3))
+            T = composed(np.concatenate([drive.truth[:1], motions @ matrices_of(error)]))
+            found.append(replace(drive, estimate=T))
+        return found
+
+    other, rough = (cs.fit_covariance(made, SPAN, second=twins(times)) for times in (1.0, 5.0))
+    assert other.second is not None
+    assert rough.second is not None
+    assert np.abs(other.second.correlation).max() < 0.4
+    assert other.second.is_rough.tolist() == [False] * 3
+    assert rough.second.is_rough.tolist() == [True, True, False]
+    assert lines(rough)[1].endswith("above 0.7 they are the truth's; it errs too much to tell in x, y")
+    assert "too much" not in lines(other)[1]
     with pytest.raises(InputError, match="--second"):
-        cs.fit_covariance(made, SPAN, second=[replace(each, name="else") for each in twins])
+        cs.fit_covariance(made, SPAN, second=[replace(each, name="else") for each in made])
+
+
+def test_a_second_estimator_in_space_beside_three_axes(rng: np.random.Generator) -> None:
+    made = drives(rng, 2, World(per_m=(1e-3,) * 3 + (1e-5,) * 3, per_rad=(1e-9,) * 6), 400.0)
+    model = cs.fit_covariance(made, SPAN, axes=3, second=made)
+    assert model.second is not None
+    assert (model.second.correlation > 0.8).all()
+
+
+def test_the_turn_of_a_straight_drive_is_the_least(rng: np.random.Generator) -> None:
+    """A camera that looks 3 degrees to the side on a straight road, which tells nothing of a roll."""
+    world = World(per_m=(1e-5,) * 3 + (1e-7,) * 3, per_rad=(1e-9,) * 6)
+    made = drives(rng, 1, world, 400.0)[0]
+    T = np.tile(np.eye(4), (len(made.t), 1, 1))
+    T[:, 0, 3] = np.arange(len(made.t))
+    noise = inverse(made.truth) @ made.estimate
+    side = matrices_of(np.array([[0.0, 0, 0, 0, 0, np.deg2rad(3.0)]]))
+    straight = replace(made, truth=T, estimate=inverse(side) @ T @ noise @ side)
+    angle, share, _ = body_turn(windows_of([straight], span_of(SPAN)))
+    assert np.rad2deg(angle) == pytest.approx(3.0, abs=0.3)
+    assert share > 0.5

@@ -174,6 +174,34 @@ def test_ceres_header_whitens(full: NoiseModel, tmp_path: Path) -> None:
     np.testing.assert_allclose(L @ straight(full) @ L.T, np.eye(6), atol=1e-8)
 
 
+def test_an_axis_that_never_moved_has_a_covariance_in_each_export(rng: np.random.Generator, tmp_path: Path) -> None:
+    """z, roll and pitch of a drive on a plane, at rest and moving."""
+
+    def raised(T: Array) -> Array:
+        out = np.tile(np.eye(4), (len(T), 1, 1))
+        out[:, :2, :2], out[:, :2, 3] = T[:, :2, :2], T[:, :2, 2]
+        return out
+
+    flat = [replace(d, estimate=raised(d.estimate), truth=raised(d.truth)) for d in drives(rng, 2, length=400.0)]
+    model = cs.fit_covariance(flat, SPAN)
+    n = model.noise
+    assert (n.per_m[2:5] < 1e-12).all()
+    assert (n.floor > 0).all()
+    C = model.covariance([0.0, 0, 0, 0, 0, 0, 1])
+    np.testing.assert_allclose(C, np.diag(n.floor))
+    twist = loaded(robot_localization(model), tmp_path).twist_covariance
+    for v in (0.0, 1.0):
+        np.testing.assert_array_less(
+            n.floor[2:5] / seconds(model) / 0.1 * (1 - 1e-9), np.array(twist(v, 0.0, 0.1))[[14, 21, 28]]
+        )
+    L = np.array(ceres(model).split("{")[1].split("}")[0].replace(",", " ").split(), float).reshape(6, 6)
+    np.testing.assert_allclose(np.diag(np.linalg.inv(L.T @ L))[2:5], n.floor[2:5], rtol=1e-6)
+    for _, stretch in model.stretches:
+        assert (np.linalg.eigvalsh(stretch.covariance[1:]) > 0).all()
+    snippet = gtsam(model)
+    assert all(f"{each:.17g}" in snippet for each in n.floor)
+
+
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="tomllib is of Python 3.11")
 def test_noise_toml_has_all_figures(planar: NoiseModel) -> None:
     import tomllib

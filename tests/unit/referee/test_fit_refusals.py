@@ -102,6 +102,8 @@ def test_growth_of_white_noise_and_of_a_persistent_drift(rng: np.random.Generato
         growth = growth_of(made, w, False, fit_noise(w).mean)
         assert low < growth.power < high
         assert growth.persists == (low > 1)
+        told = [each for each in cs.fit_covariance(made, SPAN).warnings if "errors last longer than a window" in each]
+        assert len(told) == (low > 1)
         assert not growth.shrinks
     short = drives(rng, 1, length=150.0)
     w = windows_of(short, span_of(SPAN))

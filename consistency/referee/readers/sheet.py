@@ -360,7 +360,9 @@ def increasing(lines: Lines) -> Lines:
     if len(wrong):
         row = int(wrong[0]) + 1
         what = "is there twice" if lines.t[row] == lines.t[row - 1] else "is less than the one before"
-        raise InputError(f"{lines.place(row)}: timestamp {lines.t[row]:.10g} {what}; they must increase, so leave the row out")
+        raise InputError(
+            f"{lines.place(row)}: timestamp {lines.t[row]:.10g} {what}; they must increase, so leave the row out"
+        )
     return lines
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
+import forks
 import numpy as np
 import pytest
 
@@ -16,7 +15,7 @@ HEAVY = (
 )  # fmt: skip
 RUNS, STEPS = 30, 12
 WITHOUT = f"""
-import contextlib, io, sys
+import contextlib, io, numpy, scipy.stats, scipy.linalg, scipy.special, typer
 
 sys.modules |= dict.fromkeys({HEAVY})  # neither found nor imported
 """
@@ -44,9 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def said(folder: Path, code: str) -> str:
     """Standard output of code where the heavy packages are not found."""
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT + code], cwd=folder, capture_output=True, text=True, timeout=120
-    )
+    done = forks.done(WITHOUT, code, "-c", cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -135,6 +135,9 @@ def test_a_joint_scale_within_the_tolerance_is_excused(ratio: float) -> None:
         test = joint_test(joint, settings)
         assert test.p_values[JOINT] < 1e-10
         assert near(test, settings) == excused
+        nees = np.random.default_rng(8).chisquare(3, (50, 1))
+        v = judge(Evidence("map", nees=nees, dof=3, joint=joint, landmarks=np.arange(1)), settings)
+        assert [(a.found, a.tolerated) for a in v.answers if a.question == JOINT] == [(True, excused)]
 
 
 def test_the_pose_alone_shows_in_its_part() -> None:

@@ -405,6 +405,9 @@ def test_a_table_and_an_archive_state_it(tmp_path: Path) -> None:
     (archive,) = read_recordings(tmp_path / "e.npz", truth_errors="common")
     np.testing.assert_array_equal(archive.truth_covariance, one.truth_covariance)
     assert archive.truth_errors == "common"
+    np.savez(tmp_path / "bad.npz", errors=v, covariances=P2, truth_covariances=-one.truth_covariance)
+    with pytest.raises(cs.InputError, match=r"bad: the covariance of the truth in run 0, step 1 is no covariance"):
+        read_recordings(tmp_path / "bad.npz")
     in_memory = cs.judge(v, P2, truth_covariances=one.truth_covariance, truth_errors="common")
     assert in_memory.truth is not None
     assert in_memory.truth.errors == "common"

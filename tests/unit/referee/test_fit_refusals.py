@@ -11,6 +11,7 @@ from fit_covariance import PER_M, World, drives, matrices_of
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fitting.drives import Drive
+from consistency.referee.fitting.motions import vectors
 from consistency.referee.fitting.noise import fit_noise
 from consistency.referee.fitting.persistence import TERMS, Lasting, persistent
 from consistency.referee.fitting.ratios import Ratio
@@ -18,6 +19,7 @@ from consistency.referee.fitting.refusals import Growth, body_turn, growth_of, r
 from consistency.referee.fitting.windows import span_of, windows_of
 from consistency.referee.fitting.wording import lines, sentence
 from consistency.referee.geometry.groups import composed, inverse
+from consistency.referee.types import Array
 
 SPAN = "10m"
 RIGHT = Ratio(1.0, 0.8, 1.25, 0.1, 6, 600)
@@ -171,17 +173,25 @@ def test_a_second_estimator_with_the_same_errors(rng: np.random.Generator) -> No
     assert same.status != "consistent"
     assert "correlate" in repr(same)
 
-    def twins(times: float) -> list[Drive]:
-        """Another estimate of the same truth, with noise of its own: in x and y ``times`` as large."""
-        found = []
-        for drive in made:
-            motions = inverse(drive.truth[:-1]) @ drive.truth[1:]
-            error = np.sqrt(0.5 * np.array(PER_M)) * [times, times, 1.0] * rng.normal(size=(len(motions), 3))
-            T = composed(np.concatenate([drive.truth[:1], motions @ matrices_of(error)]))
-            found.append(replace(drive, estimate=T))
-        return found
+    def steps(T: Array) -> Array:
+        return inverse(T[:-1]) @ T[1:]
 
-    other, rough = (cs.fit_covariance(made, SPAN, second=twins(times)) for times in (1.0, 5.0))
+    def twin(drive: Drive, error: Array) -> Drive:
+        """Another estimate of the same truth, with errors (N - 1, 3) of its steps."""
+        T = np.concatenate([drive.truth[:1], steps(drive.truth) @ matrices_of(error)])
+        return replace(drive, estimate=composed(T))
+
+    def own(times: float) -> list[Drive]:
+        """With noise of its own: in x and y ``times`` as large."""
+        sigma = np.sqrt(0.5 * np.array(PER_M)) * [times, times, 1.0]
+        return [twin(drive, sigma * rng.normal(size=(len(drive.t) - 1, 3))) for drive in made]
+
+    larger = [twin(d, 3 * vectors(inverse(steps(d.truth)) @ steps(d.estimate))) for d in made]
+    found = cs.fit_covariance(made, SPAN, second=larger).second
+    assert found is not None
+    np.testing.assert_allclose(found.correlation, 1.0, atol=0.1)
+    np.testing.assert_allclose(found.size, 3.0, rtol=0.1)
+    other, rough = (cs.fit_covariance(made, SPAN, second=own(times)) for times in (1.0, 5.0))
     assert other.second is not None
     assert rough.second is not None
     assert np.abs(other.second.correlation).max() < 0.4
@@ -206,9 +216,10 @@ def test_the_turn_of_a_straight_drive_is_the_least(rng: np.random.Generator) -> 
     made = drives(rng, 1, world, 400.0)[0]
     T = np.tile(np.eye(4), (len(made.t), 1, 1))
     T[:, 0, 3] = np.arange(len(made.t))
+    T[:, 1:3, 3] = 0.001 * rng.normal(size=(len(T), 2))
     noise = inverse(made.truth) @ made.estimate
     side = matrices_of(np.array([[0.0, 0, 0, 0, 0, np.deg2rad(3.0)]]))
     straight = replace(made, truth=T, estimate=inverse(side) @ T @ noise @ side)
     angle, share, _ = body_turn(windows_of([straight], span_of(SPAN)))
-    assert np.rad2deg(angle) == pytest.approx(3.0, abs=0.3)
+    assert 2.0 < np.rad2deg(angle) < 5.0
     assert share > 0.5

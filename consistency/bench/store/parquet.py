@@ -28,6 +28,7 @@ OPTIONAL = {  # columns of a table that may be missing
 }
 NULLABLE = {"nees", "nis", *OPTIONAL["estimates"], *OPTIONAL["map"]}
 GIVEN = {"truth", "landmarks", "controls", "observations"}  # tables of the world, which no filter makes diverge
+SQUARES = {"nees", "own_nees"}  # never negative
 UNBOUNDED = {"joint_nees"}  # infinite where the joint covariance of a run is not positive definite
 BY_FILTER = {"estimates", "map"}  # tables whose row groups hold one filter each
 REPEATED = {"t", "dt"}  # floating-point columns of few different values
@@ -301,6 +302,9 @@ def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) 
         row = int(np.argmin(right))
         value, what = one_line(column.iloc[row], 60), "too large a" if np.isfinite(values[row]) else "not a finite"
         raise InputError(f"{path}: column '{column.name}', row {first + row}: {what} number ({value})")
+    if column.name in SQUARES and (values < 0).any():
+        row = int(np.argmax(values < 0))
+        raise InputError(f"{path}: column '{column.name}', row {first + row}: negative ({values[row]:g})")
     if kind == "int64" and ((values != np.round(values)) | (np.abs(values) > WHOLE)).any():
         row = int(np.flatnonzero((values != np.round(values)) | (np.abs(values) > WHOLE))[0])
         raise InputError(f"{path}: column '{column.name}', row {first + row}: not a whole number ({values[row]})")

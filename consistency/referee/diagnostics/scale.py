@@ -152,7 +152,7 @@ def ratio_interval(means: Array, dof: int = 1, confidence: float = CONFIDENCE) -
     if not means.max() > 0:
         return Interval(ratio, ratio, ratio)
     nu, spread = float(dof), float("inf")
-    if len(means) > 1 and means.std() > 0:
+    if len(means) > 1 and means.max() > means.min():
         log_nu, left_out = _log_nu_of_means(means)
         if len(means) >= FEW:
             variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
@@ -176,6 +176,7 @@ def _log_nu(means: Array) -> tuple[float, float]:
 
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:
     """log(2 / CV^2) of the runs' means (runs,), less its first-order bias, and the same with each run left out."""
+    means = np.ldexp(means, -np.frexp(means.max())[1])  # exact, and no square leaves the range of numbers
     runs, mean, left = len(means), means.mean(), _left_out_mean(means)
     squares = np.square(means).sum()
     cv = max(means.var(ddof=1) / mean**2, 1e-12)

@@ -19,6 +19,7 @@ from edited import accept_changes
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.runs.records import record_of
+from consistency.bench.store.parquet import check_column
 from consistency.bench.types import Control, Gaussian, Observation
 from consistency.referee.parsing.columns import COLUMNS
 from consistency.referee.system.folders import require_free
@@ -360,3 +361,10 @@ def test_resuming_keeps_what_the_user_put_there(folder: Path) -> None:
     assert (folder / "notes.txt").read_text() == "mine"
     results.write(folder, overwrite=True)
     assert not (folder / "notes.txt").exists()
+
+
+def test_a_square_is_not_negative() -> None:
+    squares = pd.Series([1.0, np.nan, -2.0], name="nees")
+    with pytest.raises(cs.InputError, match="column 'nees', row 12: negative"):
+        check_column(Path("map.parquet"), squares, "float64", 10)
+    check_column(Path("map.parquet"), squares.rename("x").fillna(0.0), "float64")

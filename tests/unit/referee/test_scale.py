@@ -347,3 +347,13 @@ def test_digamma_equation_holds() -> None:
         assert test.effective_dof <= 2.0 * a * np.exp(-error) * (1 + 1e-6)
         if oracle(means, 1, 10**9, gaussian=False).by_likelihood < oracle(means, 1, 10**9, False).by_spread:
             assert test.effective_dof == pytest.approx(2.0 * a * np.exp(-error), rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-170, 1e170, 1e300])
+def test_means_of_any_size_have_an_interval(size: float) -> None:
+    one, all_ = np.ones(30), np.full(30, size)
+    one[3] = size
+    for means in (one, all_):
+        found = ratio_interval(means, 3)
+        assert found.low <= found.value <= found.high
+    assert ratio_interval(all_, 3).low == pytest.approx(size * ratio_interval(np.ones(30), 3).low)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
-from importlib.resources import files
 from importlib.util import find_spec
+from pathlib import Path
 
 from consistency.referee.document.blocks import (
     Block,
@@ -27,7 +27,7 @@ from consistency.referee.document.drawing import Figure
 from consistency.referee.document.wording import PLAIN, written
 
 RESOLUTION = 110  # dots an inch
-STYLE = files(__package__).joinpath("templates").joinpath("report.css").read_text(encoding="utf-8")
+STYLE = (Path(__file__).parent / "templates" / "report.css").read_text(encoding="utf-8")
 
 
 def render(document: Document) -> str:

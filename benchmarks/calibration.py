@@ -47,6 +47,7 @@ from consistency.referee.diagnostics import (
 from consistency.referee.types import Array
 
 BATCH = 25  # gates handed to a worker at once
+CLEAR = 50  # gates after which a quick row ends where its promise is kept as far as it has come
 CHUNK = 2000  # runs of the Kalman filter in memory at once
 POOLED, QUICK_POOLED = 54_000, 6_000  # of them in all: as many as the false alarms at 1 % take
 MODULES = (
@@ -173,8 +174,14 @@ def run_means(gate: Gate) -> Array:
 # --- rows ---------------------------------------------------------------------------------------------------
 
 
-def measure(every: Sequence[Case], seed: int = SEED, workers: int = 2, pooled: int = POOLED) -> Iterator[Row]:
-    """Rows of the cases, in their order, as they are done."""
+def measure(
+    every: Sequence[Case], seed: int = SEED, workers: int = 2, pooled: int = POOLED, quick: bool = False
+) -> Iterator[Row]:
+    """Rows of the cases, in their order, as they are done.
+
+    Quick ones end when no share is on the wrong side of its promise, after 50 gates at the earliest: that breaks no
+    promise which is kept, and a rate of 15 % for 5 % then passes once in 70 rows.
+    """
     wanted = max((case.gates * case.runs for case in every if case.world == "linear-gaussian"), default=0)
     with tempfile.TemporaryDirectory() as folder:
         pool_file = _kalman_runs(min(wanted, pooled), seed, Path(folder)) if wanted else None
@@ -187,7 +194,18 @@ def measure(every: Sequence[Case], seed: int = SEED, workers: int = 2, pooled: i
                 for case in every
             ]
             for case, futures in zip(every, batches, strict=True):
-                yield from rows_of_case(case, [outcome for future in futures for outcome in future.result()])
+                outcomes: list[Outcome] = []
+                for future in futures:
+                    if quick and len(outcomes) >= CLEAR and all(map(is_kept_so_far, rows_of_case(case, outcomes))):
+                        future.cancel()
+                    else:
+                        outcomes += future.result()
+                yield from rows_of_case(case, outcomes)
+
+
+def is_kept_so_far(row: Row) -> bool:
+    share = row.found / row.gates
+    return share <= row.stated if row.bound == "<=" else share >= row.stated
 
 
 def rows_of_case(case: Case, outcomes: Sequence[Outcome]) -> list[Row]:
@@ -287,7 +305,8 @@ def _measured(options: argparse.Namespace, seed: int) -> tuple[list[Row], dict[s
         ]
     )
     rows = []
-    for row in measure(every, seed, options.workers, QUICK_POOLED if options.quick else POOLED):
+    pooled = QUICK_POOLED if options.quick else POOLED
+    for row in measure(every, seed, options.workers, pooled, options.quick):
         rows.append(row)
         print(said(row), flush=True)
     modules = options.module or MODULES

@@ -19,7 +19,7 @@ RUNS, STEPS, DOF = 50, 20, 3
 SHARES = (0.2, 0.4)
 DECLARED = {"white": "independent", "AR(.9)": "independent", "constant per run": "per-run", "common to all": "common"}
 SIGNS = "common to all but for its sign"  # of each run: nothing can be declared
-GATES, QUICK_GATES = 2000, 60
+GATES, QUICK_GATES = 2000, 40
 POWER = 0.3  # of what is not declared, at least: about half of it is found
 FALSE, POWERS, BOUNDED, CONSISTENT = (
     "uncertain truth, false alarm", "uncertain truth, power", "uncertain truth, power without a declaration",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -351,6 +352,13 @@ def test_rows_do_not_depend_on_the_number_of_workers() -> None:
     one, two = (list(calibration.measure([replace(CASE, gates=30)], 5, workers)) for workers in (1, 2))
     assert one == two
     assert [row.question for row in one] == ["false alarm", "all-clear"]
+
+
+def test_quick_rows_end_where_nothing_is_doubtful() -> None:
+    of = partial(calibration.measure, seed=5, workers=1)
+    assert list(of([replace(CASE, gates=75)], quick=True)) == list(of([replace(CASE, gates=50)]))
+    wrong = replace(CASE, gates=75, ratio=3.0)
+    assert list(of([wrong], quick=True)) == list(of([wrong]))
 
 
 def test_rows_of_other_modules_join_the_table(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,7 +143,19 @@ def test_a_suspect_runs_alone_where_workers_share_their_fate(work: TrialWork) ->
         for count, runs in zip(engine.together[-6:], engine.sent[-6:], strict=True)
         if len(runs) == 1 and runs in engine.sent[:-1]
     )
-    assert engine.sent.count((20,)) == 1
+    assert engine.sent.count((20,)) == 2
+
+
+def test_a_suspect_that_a_dying_worker_was_given_is_tried_again() -> None:
+    batches = Batches([7], 1.0)
+    (batch,) = batches.take(3)
+    assert batches.lost(batch) == []
+    (suspect,) = batches.take(3)
+    assert batches.lost(suspect) == []
+    (again,) = batches.take(3)
+    assert again.is_suspect
+    assert batches.lost(again) == [7]
+    assert batches.are_done
 
 
 def test_a_loss_after_progress_is_no_second_loss() -> None:

@@ -34,6 +34,7 @@ from consistency.referee.diagnostics.fitted import (
 from consistency.referee.diagnostics.questions import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
+from consistency.referee.readers import offset, residuals
 from consistency.referee.readers.alignment import Aligned
 from consistency.referee.readers.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.frames import WorldTransform, moved
@@ -595,10 +596,10 @@ def test_clock_and_frame_are_found_in_turn_until_the_clock_settles(
     shifts: list[float], said: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To 0.1 ms, or five times."""
-    module, then = "consistency.referee.readers.alignment", iter(shifts)
-    monkeypatch.setattr(f"{module}.frames_of", lambda *_: [])
-    monkeypatch.setattr(f"{module}.clock_shift", lambda *_: (next(then), []))
-    monkeypatch.setattr(f"{module}.aligned", lambda *_: Aligned([]))
+    then = iter(shifts)
+    monkeypatch.setattr(residuals, "frames_of", lambda *_: [])
+    monkeypatch.setattr(offset, "clock_shift", lambda *_: (next(then), []))
+    monkeypatch.setattr(residuals, "aligned", lambda *_: Aligned([]))
     assert clocks_and_frames("est", [], "estimate", "posyaw", range(3))[0] == said
 
 

@@ -65,7 +65,7 @@ class Batches:
     seconds : of work in a batch; None for equal shares
     retries : how often a lost batch is sent again as it was
     shares : whether the death of one batch takes others with it. Then a suspect is sent when nothing else is, so that
-        no run is blamed for the death of another
+        no run is blamed for the death of another, and a second time before it is
     """
 
     def __init__(
@@ -126,9 +126,11 @@ class Batches:
         """Who did a batch is dead; the runs that have failed by it, as they were tried often enough."""
         self._in_flight.remove(batch)
         left, losses = tuple(batch.left), batch.losses + 1
-        if not left or batch.is_suspect:
+        if not left or (batch.is_suspect and (losses > 1 or not self._shares)):
             return list(left)
-        if losses <= self._retries:
+        if batch.is_suspect:  # those that had it may have been dying of another
+            self._suspects.append(Batch(left, losses, is_suspect=True))
+        elif losses <= self._retries:
             self._again.append(Batch(left, losses))
         else:
             self._suspects.extend(Batch((run,), is_suspect=True) for run in left)

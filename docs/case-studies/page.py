@@ -100,6 +100,19 @@ def table(studies: Studies, name: str) -> str:
     return "\n".join(lines) if len(lines) > 2 else "None."
 
 
+def rates(found: dict[str, Any]) -> str:
+    """How often the controls are found at fault, and where most often."""
+    counts = [
+        (count, study["draws"], name, key) for key, study in found.items() for name, count in study["faults"].items()
+    ]
+    count, draws, name, key = max(counts, key=lambda each: each[0] / each[1])
+    faults, of = sum(each[0] for each in counts), sum(each[1] for each in counts)
+    return (
+        f"{faults} of {of:,} draws of the controls are found at fault ({100 * faults / of:.2f} %, 1 % is stated); "
+        f"most, {count} of {draws}, of *{name}* ({key.split()[0].replace('_', ' ')})"
+    )
+
+
 def rendered(template: str, kept: dict[str, Any]) -> str:
     studies: Studies = kept["studies"]
 
@@ -107,6 +120,8 @@ def rendered(template: str, kept: dict[str, Any]) -> str:
         parts = [part.strip() for part in match[1].split("|")]
         if parts[0].startswith("table "):
             return table(studies, parts[0].split()[1])
+        if parts == ["rates"]:
+            return rates(kept["rates"])
         return SEARCHED if parts == ["searched"] else figure(studies, *parts)
 
     return re.sub(r"\{\{(.*?)\}\}", value, template)

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.geometry.spatial import spatial_error
+from consistency.referee.readers import hints as readers_hints
 from consistency.referee.readers.bodies import BodyTransform, fitted_body, on_body
 from consistency.referee.readers.fits import FACTOR, ReadingFit, fit_of
 from consistency.referee.readers.frames import WorldTransform, carried, fitted_frame, moved
@@ -281,6 +282,15 @@ def test_independent_estimates_by_hand() -> None:
     assert 0.8 * expected < fit(*np.split(slow, 10)).size < 1.15 * expected
     constant = [np.full((50, 2), value) for value in rng.normal(size=5)]
     assert fit(*constant).size <= 5.0 * 1.05
+
+
+def test_few_of_many_runs_are_looked_at(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = list[int]()
+    monkeypatch.setattr(readers_hints, "_same", lambda some: bool(looked.append(len(some))) or True)
+    run = planar(rng)[0]
+    for runs in (1, 200, 201, 2000, 2001):
+        hints("f", ("x", "y", "heading"), [run] * runs)
+    assert looked == [1, 200, 101, 200, 182]
 
 
 def test_simple_faults_explain_what_they_make() -> None:

@@ -280,6 +280,20 @@ def test_innovations_end_with_a_failed_run(rng: np.random.Generator) -> None:
             assert_consistent(np.nan_to_num(errors), covariances, **arrays, false_alarm=RARE)
 
 
+def test_innovations_of_a_start_without_rank(rng: np.random.Generator) -> None:
+    """Left out where every run begins so; a run that alone does has failed."""
+    v, S = rng.normal(size=(40, 8, 2)), np.broadcast_to(np.eye(2), (40, 8, 2, 2)).copy()
+    S[:, 0] = 0.0
+    record = checked("f", innovations=v, innovation_covariances=S, **OPTIMAL)
+    assert record.failures == ()
+    assert record.innovations is not None
+    assert np.isnan(record.innovations[:, 0]).all()
+    assert np.isfinite(record.innovations[:, 1:]).all()
+    S[:, 0], S[6, 0] = np.eye(2), 0.0
+    failures = checked("f", innovations=v, innovation_covariances=S, **OPTIMAL).failures
+    assert [(failure.run, failure.step) for failure in failures] == [(6, 1)]
+
+
 def broken_innovations(what: str, rng: np.random.Generator) -> tuple[Array, Array]:
     """Right innovations but for runs 4 and 9, which break down in step 7."""
     v, S = rng.normal(size=(40, 50, 2)), np.broadcast_to(np.eye(2), (40, 50, 2, 2)).copy()

@@ -19,7 +19,7 @@ from consistency.referee.gating.wording import fault_text, few_to_compare, undec
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.sources import Results
+    from consistency.referee.verdicts.judge import Results
 
 
 class ConsistencyError(AssertionError):

@@ -26,7 +26,7 @@ from consistency.referee.parsing import LARGEST_NUMBER, one_line
 from consistency.referee.parsing.columns import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
 from consistency.referee.readers.nis import NisLog, checked_dof, choose
 from consistency.referee.types import Array, Failure, Indices
-from consistency.referee.verdicts.sources import Source
+from consistency.referee.verdicts.judge import Source
 
 INNOVATIONS = ["run", "step", "t", "nis", "nis_dof"]
 POINT = ("x", "y", "z")

@@ -7,8 +7,18 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.files import are_files, read_files, reads_files, tell_notes
-from consistency.referee.cli.options import AsJson, FalseAlarm, Judged, Skip, require_word, show
+from consistency.referee.cli.options import (
+    AsJson,
+    FalseAlarm,
+    Judged,
+    Skip,
+    are_files,
+    read_files,
+    reads_files,
+    require_word,
+    show,
+    tell_notes,
+)
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading, flag_of

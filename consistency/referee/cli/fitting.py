@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.files import reads_files
-from consistency.referee.cli.options import ESTIMATES, AsJson, require_word, require_written, show
+from consistency.referee.cli.options import ESTIMATES, AsJson, reads_files, require_word, require_written, show
 from consistency.referee.parsing.options import Reading
 
 KEPT = ("truth", "max_dt", "time_offset", "topic", "truth_topic", "body")

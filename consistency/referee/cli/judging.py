@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-from consistency.referee.cli.files import are_files, read_files, reads_files, tell_notes
 from consistency.referee.cli.options import (
     DETECT_HELP,
     ESTIMATES,
@@ -20,10 +19,14 @@ from consistency.referee.cli.options import (
     Power,
     Seed,
     Skip,
+    are_files,
     given,
+    read_files,
+    reads_files,
     require_word,
     require_written,
     show,
+    tell_notes,
 )
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
@@ -77,8 +80,8 @@ def analyse(
     from consistency.referee.document.verdict import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.judge import analyse as judge
+    from consistency.referee.verdicts.judge import source_of
     from consistency.referee.verdicts.options import settings_of, skip_asked
-    from consistency.referee.verdicts.sources import source_of
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")

@@ -10,7 +10,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.band import Band, simultaneous_band
 from consistency.referee.diagnostics.bias import Moments, hotelling, moments, t_squared
-from consistency.referee.diagnostics.nees_distribution import Pit, pit
+from consistency.referee.diagnostics.nees import Pit, pit
 from consistency.referee.diagnostics.outliers import Outlier, outliers
 from consistency.referee.diagnostics.questions import AXIS, DIRECTION, MAIN, STEP, answers
 from consistency.referee.diagnostics.sample import Sample

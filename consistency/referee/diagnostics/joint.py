@@ -9,7 +9,7 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.landmarks import POSE
-from consistency.referee.diagnostics.nees_distribution import kolmogorov
+from consistency.referee.diagnostics.nees import kolmogorov
 from consistency.referee.diagnostics.questions import JOINT, JOINT_DISTRIBUTION
 from consistency.referee.diagnostics.record import JointNees
 from consistency.referee.diagnostics.scale import ratio_interval

@@ -16,9 +16,8 @@ from consistency.referee.diagnostics.credibility import noncredibility
 from consistency.referee.diagnostics.hypothesis_tests import Tests
 from consistency.referee.diagnostics.nees import anees
 from consistency.referee.diagnostics.questions import BIAS, MAIN, SCALE, SHAPE, STEP
-from consistency.referee.diagnostics.reported_scale import pointwise_band
 from consistency.referee.diagnostics.sample import ATTITUDE, POSITION, Errors, Sample
-from consistency.referee.diagnostics.scale import ratio_interval, run_means
+from consistency.referee.diagnostics.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.verdict_parts import (
     Accuracy,

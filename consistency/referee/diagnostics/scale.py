@@ -10,14 +10,16 @@ from scipy import special
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.blocks import by_runs, by_steps
+from consistency.referee.diagnostics.intervals import anees_interval
 from consistency.referee.diagnostics.verdict_parts import Interval
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 
 FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete
 LARGE = 1e6  # shape of a Gamma distribution beyond which its information is 1/2 and rounding would rule
 LEAST = 4.0  # degrees of freedom of Student's t in an interval: with fewer it says nothing at all
 REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
 UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
+NOTHING = (float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
@@ -230,3 +232,9 @@ def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
         return float(upper), float(lower)
     above, below = (special.stdtr(spread, float(special.ndtri(p))) for p in (upper, lower))
     return float(above), float(below)
+
+
+def pointwise_band(alive: Indices, dof: int) -> Array:
+    """95 % interval of the ANEES of each single step, (steps,) -> (steps, 2); NaN without a run."""
+    intervals = {int(m): anees_interval(dof, int(m), CONFIDENCE) for m in set(alive[alive > 0])}
+    return np.array([intervals.get(int(m), NOTHING) for m in alive]).reshape(-1, 2)

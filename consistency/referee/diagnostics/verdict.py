@@ -19,19 +19,21 @@ from consistency.referee.diagnostics.intervals import chi2_mean_interval
 from consistency.referee.diagnostics.location import accuracy_of, axes_of, bias_of, location_of, shape_of, tails_of
 from consistency.referee.diagnostics.lost import lost_of
 from consistency.referee.diagnostics.nees import anees
-from consistency.referee.diagnostics.questions import (
-    AXIS,
-    DIRECTION,
-    JOINT,
-    MAIN,
-    STEP,
-    answers,
-)
+from consistency.referee.diagnostics.planning import detectable_ratio
+from consistency.referee.diagnostics.questions import AXIS, DIRECTION, JOINT, MAIN, SHARES, STEP, answers
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.reported_scale import scale_of
 from consistency.referee.diagnostics.sample import Sample, impossible, innovations_of, sample_of
 from consistency.referee.diagnostics.sample import shape_of as shape_of_arrays
-from consistency.referee.diagnostics.verdict_parts import Answer, Equivalence, Innovations, Settings, Verdict
+from consistency.referee.diagnostics.scale import acceptance, pointwise_band, ratio_interval
+from consistency.referee.diagnostics.verdict_parts import (
+    Answer,
+    Equivalence,
+    Innovations,
+    Location,
+    Scale,
+    Settings,
+    Verdict,
+)
 from consistency.referee.diagnostics.whitening import entries
 
 if TYPE_CHECKING:
@@ -147,7 +149,7 @@ def _with_records(verdict: Verdict, evidence: Record, sample: Sample, tests: Tes
         rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
         band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     location = location_of(sample, band, by_question, ordered=evidence.landmarks is None, detect=settings.factor)
-    scale = scale_of(sample, tests, at_share(verdict), location, shown)
+    scale = _scale_of(sample, tests, at_share(verdict), location, shown)
     if sample.errors is None or evidence.error is None or evidence.covariance is None:
         return replace(verdict, scale=scale, location=location, tails=tails_of(tests, evidence.run_numbers))
     odd = impossible(evidence, sample.counted)
@@ -207,3 +209,36 @@ def _tolerated(sample: Sample, tests: Tests, settings: Settings) -> set[str]:
     curve = anees(sample.nees)
     outside = (curve > band.high * R) | (curve < band.low / R)
     return tolerated if outside.any() else tolerated | {STEP}
+
+
+def _scale_of(sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence) -> Scale:
+    """Assemble the record of the scale; the inflation is that since the fault began, if it began late."""
+    dof, means = sample.dof, sample.means()
+    alive = sample.counted.sum(axis=0)
+    curve, band = anees(sample.nees), pointwise_band(alive, dof)
+    judged = alive > 0
+    some = bool(judged.any())
+    rate = SHARES[MAIN] * settings.false_alarm
+    inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
+    of_log = None
+    if len(sample.nees) == 1:
+        from consistency.referee.diagnostics.single_log import within
+
+        of_log = within(sample.nees[0], dof, settings, shown.factor)
+    late = means if location.since is None else sample.means(slice(location.since - 1, None))
+    return Scale(
+        dof=dof,
+        anees=curve,
+        alive=alive,
+        band=band,
+        mean_anees=tests.main.ratio * dof,
+        accepted=acceptance(tests.main, dof, rate, settings.allow),
+        effective_dof=tests.main.effective_dof,
+        inflation=ratio_interval(late, dof, CONFIDENCE),
+        detectable=detectable_ratio(dof, len(means), rate, two_sided=not settings.one_sided) if some else np.nan,
+        median_run=float(np.median(means)) * dof if some else np.nan,
+        worst_run=float(means.max()) * dof if some else np.nan,
+        share_inside=float(inside[judged].mean()) if some else np.nan,
+        equivalence=shown,
+        within=of_log,
+    )

@@ -12,7 +12,6 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import composed, matrices
 from consistency.referee.outside import function_at
 from consistency.referee.parsing.options import Reading
-from consistency.referee.readers.interpolation import truth_at
 from consistency.referee.readers.kinds import (
     TABLES,
     TRAJECTORIES,
@@ -23,6 +22,7 @@ from consistency.referee.readers.kinds import (
     kind_of,
     trajectory_files,
 )
+from consistency.referee.readers.matching import truth_at
 from consistency.referee.readers.poses import NamedPoses
 from consistency.referee.readers.table import table_poses
 from consistency.referee.types import Array, Indices

@@ -16,7 +16,7 @@ from consistency.referee.readers.archive import in_memory, record_of_arrays
 from consistency.referee.readers.record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array, Failure, Indices
-from consistency.referee.verdicts.sources import Results, source_of
+from consistency.referee.verdicts.judge import Results, source_of
 
 
 def checked(

@@ -17,7 +17,7 @@ from consistency.referee.parsing.columns import POSE
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.sources import Results
+    from consistency.referee.verdicts.judge import Results
 
 
 NONE_FAILED = FailedRuns(0, 0)

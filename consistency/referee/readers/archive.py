@@ -18,7 +18,7 @@ from consistency.referee.geometry.conventions import PLANAR, planar_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.hints import hints, turns
-from consistency.referee.readers.interpolation import Manifold
+from consistency.referee.readers.matching import Manifold
 from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.record import Track, assemble, symmetric
 from consistency.referee.readers.sheet import Places, are_dof, bounded

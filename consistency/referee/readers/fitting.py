@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.readers.frames import IDENTITY, WorldTransform, fitted_frame, moved, turned_frame
-from consistency.referee.readers.interpolation import Known
+from consistency.referee.readers.matching import Known
 from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array, Indices
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.interpolation import Manifold
+from consistency.referee.readers.matching import Manifold
 from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 

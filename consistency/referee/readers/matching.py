@@ -1,12 +1,18 @@
-"""Matching of estimates to the truth, and to the steps of other runs, by step or by time."""
+"""Matching of estimates to the truth, which is interpolated on its manifold, and to the steps of other runs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from consistency.referee.geometry import wrap
 from consistency.referee.types import Array, Indices
+
+Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
+BRIDGED = 0.1  # s between two samples of the truth that are always interpolated: a period of 10 Hz
+ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
 
 
 def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
@@ -18,7 +24,7 @@ def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
     return [np.searchsorted(numbers, own).astype(np.int64) for own in steps], numbers
 
 
-def common_times(times: Sequence[Array], tolerance: float = 1e-6) -> tuple[list[Indices], Array]:
+def common_times(times: Sequence[Array], tolerance: float = ROUNDING) -> tuple[list[Indices], Array]:
     """Columns of every run and the time of every column, from timestamps in s.
 
     (k,) times for each run -> (k,) columns for each run, and (steps,) times. Where every run keeps to the timestamps of
@@ -47,7 +53,74 @@ def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, I
     nearest = np.where(np.abs(reference[left] - times) <= np.abs(reference[right] - times), left, right)
     distance = np.abs(reference[nearest] - times)
     order = np.lexsort((distance, nearest))
-    order = order[distance[order] <= max_dt + 1e-6]  # a double holds the seconds since 1970 to a quarter of that
+    order = order[distance[order] <= max_dt + ROUNDING]
     _, first = np.unique(nearest[order], return_index=True)
     own = np.sort(order[first])
     return own, nearest[own]
+
+
+class Known(NamedTuple):
+    """Estimates whose truth is known, k of N."""
+
+    rows: Indices  # (k,), which of the estimates
+    truth: Array  # (k, m)
+    before: Indices  # (k,), the sample of the truth at or before each
+    apart: Array  # (k,), s to the nearest sample
+    bend: Array  # (k,), what the interpolation may be off by in the first three components, or two in the plane
+
+
+def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, max_dt: float) -> Known:
+    """The truth at ``times`` (N,), s, from samples at ``reference`` (M,), increasing, with ``values`` (M, m).
+
+    Between two samples at most ``BRIDGED`` apart, and between any two where the nearer one is within ``max_dt``, the
+    truth moves evenly: straight, and about one axis (Shoemake 1985 for quaternions). Before the first and after the
+    last one it is that sample, up to ``max_dt``.
+    """
+    last = len(reference) - 1
+    before = np.clip(np.searchsorted(reference, times, side="right") - 1, 0, last)
+    after = np.minimum(before + 1, last)
+    gap = reference[after] - reference[before]
+    inside = (times >= reference[before]) & (times <= reference[after]) & (gap > 0)
+    apart = np.minimum(np.abs(times - reference[before]), np.abs(reference[after] - times))
+    rows = np.flatnonzero((apart <= max_dt + ROUNDING) | (inside & (gap <= BRIDGED + ROUNDING)))
+    before, after, gap, inside, apart = before[rows], after[rows], gap[rows], inside[rows], apart[rows]
+    share = np.where(inside, (times[rows] - reference[before]) / np.where(gap > 0, gap, 1.0), 0.0)
+    later = ~inside & (np.abs(times[rows] - reference[after]) < np.abs(times[rows] - reference[before]))
+    truth = _between(values[np.where(later, after, before)], values[after], share, manifold)
+    bend = _bends(values[:, : 2 if manifold == "planar" else 3], before) * 4.0 * share * (1.0 - share)
+    return Known(rows, truth, before, apart, bend)
+
+
+def nearest(times: Array, reference: Array, before: Indices) -> Indices:
+    """The nearest sample to each of ``times`` (k,), from the one at or before it."""
+    after = np.minimum(before + 1, len(reference) - 1)
+    return np.where(np.abs(times - reference[after]) < np.abs(times - reference[before]), after, before)
+
+
+def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Array:
+    """Values (k, m) a ``share`` (k,) of the way from ``start`` to ``end``; the bits of ``start`` at its beginning."""
+    step = end - start
+    if manifold == "planar":
+        step[:, 2] = wrap(step[:, 2])
+    out = start + share[:, None] * step
+    if manifold == "planar":
+        out[:, 2] = wrap(out[:, 2])
+    turned = np.flatnonzero(share > 0.0)
+    if manifold == "spatial" and len(turned):
+        from scipy.spatial.transform import Rotation  # half of what a planar log would load
+
+        first, second = (Rotation.from_quat(values[turned, 3:7]) for values in (start, end))
+        turn = Rotation.from_rotvec(share[turned, None] * (first.inv() * second).as_rotvec())
+        out[turned, 3:7] = (first * turn).as_quat()
+    out[share == 0.0] = start[share == 0.0]
+    return np.asarray(out)
+
+
+def _bends(position: Array, after: Indices) -> Array:
+    """Greatest distance (k,) between a path of even acceleration and its chord, after some samples of (M, d)."""
+    last = len(position) - 2  # the last sample with a second difference
+    if last < 1:
+        return np.zeros(len(after))
+    both = [np.clip(after + side, 1, last) for side in (0, 1)]
+    second = [np.linalg.norm(position[i + 1] - 2.0 * position[i] + position[i - 1], axis=1) for i in both]
+    return np.asarray(np.maximum(*second) / 8.0)

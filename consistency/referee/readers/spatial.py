@@ -14,8 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.hints import hints
-from consistency.referee.readers.interpolation import truth_at
-from consistency.referee.readers.matching import common_times
+from consistency.referee.readers.matching import common_times, truth_at
 from consistency.referee.readers.naming import UNIT_NAMES, unit_of
 from consistency.referee.readers.offset import clocks_and_frames
 from consistency.referee.readers.poses import Poses

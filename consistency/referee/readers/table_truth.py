@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import COLUMNS
-from consistency.referee.readers.interpolation import Manifold, nearest, truth_at
+from consistency.referee.readers.matching import Manifold, nearest, truth_at
 from consistency.referee.readers.record import count, listed
 from consistency.referee.readers.sheet import TableRows
 from consistency.referee.readers.table_columns import require_columns, row_order, stated_covariance

@@ -20,8 +20,8 @@ from consistency.referee.parsing import HUGE, read_json, reading
 from consistency.referee.parsing.columns import POSE
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
+from consistency.referee.verdicts.judge import Results, Source, source_of
 from consistency.referee.verdicts.options import skip_asked
-from consistency.referee.verdicts.sources import Results, Source, source_of
 
 HIGHEST_DOF = 1000  # of an error in a baseline
 FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")

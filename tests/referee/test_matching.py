@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.interpolation import BRIDGED, truth_at
+from consistency.referee.readers.matching import BRIDGED, truth_at
 from consistency.referee.types import Array
 
 T = 100.0 + 0.1 * np.arange(30)

@@ -28,7 +28,9 @@ def simulate(rng, runs):
     return (*STEADY.simulate(rng, runs), rng.integers(2**32, size=runs))
 
 
-CASE = Case("filterpy", AXES, 117, simulate, lambda data: rows(data, 8) | rows(data, 100), lambda data: textbook(data[:2]))
+CASE = Case(
+    "filterpy", AXES, 117, simulate, lambda data: rows(data, 8) | rows(data, 100), lambda data: textbook(data[:2])
+)
 
 if __name__ == "__main__":
     CASE.main()

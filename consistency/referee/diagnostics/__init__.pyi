@@ -44,10 +44,10 @@ from .landmarks import map_score as map_score
 from .lost import lost_bound as lost_bound
 from .monitor import Alarm as Alarm
 from .monitor import Monitor as Monitor
+from .nees import Pit as Pit
 from .nees import anees as anees
 from .nees import nees as nees
-from .nees_distribution import Pit as Pit
-from .nees_distribution import pit as pit
+from .nees import pit as pit
 from .outliers import Outlier as Outlier
 from .outliers import outliers as outliers
 from .planning import PilotPlan as PilotPlan

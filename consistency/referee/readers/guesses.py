@@ -41,10 +41,10 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
     guesses = [*_covariances()]
     if kind == "spatial":
         own = [*_orders(convention), *_quaternions(), *guesses, *_permuted(axes, 3)]
-        return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_frames(runs), *_bodies(runs)]
+        return [*own, *_units(3, slice(3, 6)), *_ned(convention), *_positions(3), *_frames(runs), *_bodies(runs)]
     if kind == "planar":
         own = [*_sides(convention), *_headings(), *guesses, *_permuted(axes, 3)]
-        return [*own, *_units(2, slice(2, 3)), _mirrored(convention), *_frames(runs), *_bodies(runs)]
+        return [*own, *_units(2, slice(2, 3)), _mirrored(convention), *_positions(2), *_frames(runs), *_bodies(runs)]
     return [*guesses, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
 
 
@@ -70,6 +70,21 @@ def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator
         yield Guess(f"{what}; write them as {', '.join(axes[:width])}", change)
 
 
+def _positions(width: int) -> Iterator[Guess]:
+    """Coordinates of the estimates of poses in another order, with the blocks of their covariance or without."""
+    axes = "xyz"[:width]
+    for order in itertools.permutations(range(width)):
+        if order == tuple(range(width)):
+            continue
+        there = ", ".join(axes[order.index(slot)] for slot in range(width))
+        words = f"of the estimates are in the order {there}; write them as {', '.join(axes)}"
+        rest = [3, 4, 5] if width == 3 else [2]
+        alone = _reordered_estimates([*order, *rest, 6][: 7 if width == 3 else 3])
+        both = _reordered([*order, *rest])
+        yield Guess(f"the positions {words}", alone, fine=False)
+        yield Guess(f"positions and covariance {words}", lambda p, a=alone, b=both: b(a(p)), fine=False)
+
+
 def _swap(width: int, i: int, j: int) -> tuple[int, ...]:
     order = list(range(width))
     order[i], order[j] = j, i
@@ -78,6 +93,10 @@ def _swap(width: int, i: int, j: int) -> tuple[int, ...]:
 
 def _reordered(order: list[int]) -> Change:
     return lambda p: replace(p, covariance=p.covariance[:, order][:, :, order])
+
+
+def _reordered_estimates(order: list[int]) -> Change:
+    return lambda p: replace(p, estimate=p.estimate[:, order])
 
 
 def _reordered_states(order: list[int]) -> Change:

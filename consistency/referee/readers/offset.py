@@ -23,6 +23,7 @@ CAP = 100.0  # NEES over its degrees of freedom, beyond which an estimate counts
 GROSS = 4.0  # mean NEES over its degrees of freedom that a right single run hardly has
 ROUNDS, SETTLED = 5, 1e-4  # of clocks and frames in turn, and the change of the offset, s, that ends them
 RATE = 1e-4  # chance that an offset is named where there is none
+LEAST = 0.01  # share of the NEES that it makes, at least
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Offset:
 
     @property
     def found(self) -> bool:
-        return self.p_value <= RATE and not self.alone
+        return self.p_value <= RATE and self.explained >= LEAST and not self.alone
 
     def __str__(self) -> str:
         return f"{self.value:.4g} s [{self.low:.4g}, {self.high:.4g}]"

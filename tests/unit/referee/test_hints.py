@@ -137,6 +137,20 @@ MIXED: dict[str, tuple[Make, Mess, str]] = {
     ),
     "deviations": (lambda rng: spatial(rng, plain=True), deviations, "its diagonal holds standard deviations"),
     "information": (spatial, lambda p: replace(p, covariance=np.linalg.inv(p.covariance)), "information matrix"),
+    "y before x": (
+        spatial, lambda p: replace(p, estimate=p.estimate[:, [1, 0, 2, 3, 4, 5, 6]]),
+        "the positions of the estimates are in the order y, x, z; write them as x, y, z",
+    ),
+    "z before x in all": (
+        spatial,
+        lambda p: replace(p, estimate=p.estimate[:, [2, 0, 1, 3, 4, 5, 6]],
+                          covariance=p.covariance[:, [2, 0, 1, 3, 4, 5]][:, :, [2, 0, 1, 3, 4, 5]]),
+        "positions and covariance of the estimates are in the order z, x, y; write them as x, y, z",
+    ),
+    "y before x in the plane": (
+        planar, lambda p: replace(p, estimate=p.estimate[:, [1, 0, 2]]),
+        "the positions of the estimates are in the order y, x; write them as x, y",
+    ),
     "turned world": (spatial, lambda p: moved(p, WorldTransform.about_z(-np.pi / 4.5, FAR)), "turned by 40."),
     "headings in degrees": (
         planar, lambda p: replace(p, estimate=p.estimate * ANGLES), "the headings of the estimates are in degrees",

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 Result = TypeVar("Result")
 GLANCE = 0.1  # s between looks, for a signal that another thread was given
 PATIENCE = 0.5  # s for what was told to stop
-AT_EXIT = 1.5  # s for all that was given up
+AT_EXIT = 1.0  # s for all that was given up: two seconds after a signal nothing is left
 _given_up: list[_thread.LockType] = []
 
 

@@ -23,9 +23,9 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.challenging.challenge import Plan, challenge
 from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.kernel.jit import Outlook
 from consistency.bench.models.motion import dead_reckoning, unicycle_jacobian, unicycle_noise
 from consistency.bench.types import Estimates
-from consistency.referee.geometry.conventions import ADDITIVE
 
 SURE = 0.01  # chance that a rate exactly as stated is called broken
 EXACT = {"sigma_v": 0.001, "sigma_omega": 0.001}  # m/s, rad/s: in 500 s the heading errs by 0.03 rad at most
@@ -38,14 +38,17 @@ class DeadReckoning(Compiled):
     """
 
     def __init__(self) -> None:
-        self.name, self.sensors, self.needs = "dead-reckoning", ("uvd",), ()
-        self.realisable, self.error, self.innovations, self.guard = True, ADDITIVE, None, None
+        ekf = cs.get_filter("ekf-uvd")  # whose memory is more than enough
+        assert isinstance(ekf, Compiled)
+        super().__init__(ekf.textbook, ekf.parts, sensors=ekf.sensors, uvd=True)
+        self.name = "dead-reckoning"
 
     def is_ready(self, trial: Any, belief: Any) -> bool:
         return True
 
-    def compile(self, trial: Any, belief: Any) -> None:
+    def outlook(self, trial: Any, belief: Any) -> Outlook:
         """There is nothing to compile."""
+        return Outlook(self.name, is_ready=True, is_shared=True, seconds=0.0)
 
     def run(self, trial: Any, belief: Any, halt: Any = None) -> Estimates:
         controls, T = np.asarray(trial.controls, float), trial.steps

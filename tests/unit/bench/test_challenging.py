@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import challenge_rate
 import numpy as np
 import pytest
 
@@ -690,3 +691,10 @@ def test_unusable_input_ends_in_one_line_and_status_2(
     assert complaint in said
     assert len(said.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_dead_reckoning_is_right_in_worlds_with_a_camera() -> None:
+    """The filter by which benchmarks/challenge_rate.py counts searches over tilts and heights."""
+    outcome = challenge(*challenge_rate.opponents("dead-reckoning"), Plan(None, 40, 3, 1, 1e-4))
+    assert outcome.worlds > 5
+    assert not outcome.found

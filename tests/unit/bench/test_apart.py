@@ -112,3 +112,23 @@ def test_the_end_of_a_study_gives_up_its_trials(linear: cs.Scenario) -> None:
         isolation.run(trial)
     with isolation:
         assert isolation.run(trial)[0].failure is None
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc")
+@pytest.mark.parametrize(("seconds", "status"), [(0.2, -signal.SIGABRT), (30.0, 3)])
+def test_destructors_of_libraries_are_left_out_while_something_works(seconds: float, status: int) -> None:
+    """Those of LLVM would crash a compiler that goes on; Python's own handlers run, and the status stays."""
+    program = f"""
+import atexit, ctypes, os, signal, sys, time
+libc = ctypes.CDLL(None)
+libc.on_exit(libc.abort, None)  # in place of a destructor
+atexit.register(print, "handled")
+from consistency.bench.filters.kernel.apart import apart
+signal.signal(signal.SIGINT, signal.default_int_handler)
+try:
+    apart(lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep({seconds})))
+except KeyboardInterrupt:
+    sys.exit(3)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=20)
+    assert (done.returncode, done.stdout) == (status, "handled\n"), done.stderr

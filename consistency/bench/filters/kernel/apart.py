@@ -2,16 +2,19 @@
 
 Python's handlers run in the main thread. One that raises where Numba turns arguments into machine values, or results
 back, finds code that expects no exception, and Python crashes. It also aborts where compiled code ends while Python
-shuts down, so what was given up is waited for at exit.
+shuts down, so what was given up is waited for at exit. What then still compiles goes on until the process is gone, and
+crashes where the destructors of LLVM go first: they are left out, and the system takes all back.
 """
 
 from __future__ import annotations
 
 import _thread
 import atexit
+import ctypes
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
@@ -61,5 +64,7 @@ def apart(call: Callable[..., Result], *args: Any, stop: Callable[[], None] | No
 @atexit.register
 def _wait_for_given_up() -> None:
     until = time.monotonic() + AT_EXIT
-    for working in _given_up:
-        working.acquire(timeout=max(0.0, until - time.monotonic()))
+    if not all(working.acquire(timeout=max(0.0, until - time.monotonic())) for working in _given_up):
+        with suppress(AttributeError, OSError):  # glibc alone; what is registered last is called first, with the status
+            libc = ctypes.CDLL(None)
+            libc.on_exit(libc._exit, None)

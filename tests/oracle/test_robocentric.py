@@ -431,6 +431,21 @@ def test_alone_and_in_doubt_a_landmark_waits(small: Small) -> None:
     assert joined > 5
 
 
+def test_passes_that_lead_nowhere_are_given_up() -> None:
+    """Slow steps and lost images; in step 173 no passes settle, and the last of them is 8 m and 140 degrees off."""
+    landmarks = {"layout": "uniform", "count": 120, "seed": 2007, "x": (-8, 8), "y": (-8, 8), "z": (-1.25, 1.25)}
+    path = {"shape": "circle", "radius": 4.0, "start": (4.0, 0.0), "heading": np.pi / 2.0, "speed": 0.5}
+    scenario = cs.load_scenario("herath2007-stereo").variant(
+        "lost", truth__path=path, truth__landmarks=landmarks, truth__dt=0.5, truth__steps=200,
+        truth__sensor__effects=[{"kind": "frames", "every": [1, 1, 2, 3]}],
+    )  # fmt: skip
+    trial, filter_ = cs.simulate(scenario, run=49, seed=603), cs.get_filter("parked-ekf-uvd")
+    ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
+    sigma = np.sqrt(np.einsum("kii->ki", twin.covariance))
+    assert (np.abs(ours.pose - twin.pose) / np.maximum(sigma, 1e-9))[5:].max() < 1e-6
+    assert np.abs(ours.pose - trial.truth[1:])[:, :2].max() < 1.5
+
+
 def test_landmarks_are_parked_and_come_back(small: Small) -> None:
     scenario = small("herath2007-stereo", **CLOSING)
     trial, filter_ = cs.simulate(scenario, run=3), textbook.RobotCentredKalman("trial", inverse_range.Corrections())

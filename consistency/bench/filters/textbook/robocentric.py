@@ -82,6 +82,7 @@ DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a
 KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 12  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
+FAR = 10.0  # standard deviations that the pose has gone where passes that have not settled lead nowhere
 TEMPERED = 2.0  # decades by which the noise of a return in doubt is raised in the first pass; then half a decade less
 
 
@@ -95,6 +96,7 @@ class Solution(NamedTuple):
     W: Array  # (n, k)
     innovation: Array  # (k,)
     is_settled: bool
+    is_lost: bool  # neither settled nor near
 
 
 def rounds(which: Corrections) -> tuple[int, int]:
@@ -185,6 +187,8 @@ class RobotCentredKalman:
             found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, passes)
             if found.is_settled:
                 break
+        if passes > 1 and found.is_lost:
+            found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, 1)
         after, turned = moved_by(state, found.delta), np.eye(len(state.x))
         if chart is not separate:
             (after, _), turned = charted(state, found.delta, chart), found.C
@@ -221,7 +225,8 @@ class RobotCentredKalman:
             is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))
             if is_settled:
                 break
-        return Solution(delta, C, H, S, W, innovation, is_settled)
+        is_lost = not is_settled and bool(np.any(np.abs(delta[:3]) > FAR * deviation[:3]))
+        return Solution(delta, C, H, S, W, innovation, is_settled, is_lost)
 
     def _is_in_doubt(self, state: CentredState, label: int) -> bool:
         """Whether the turn since the clone of a parked landmark was little known before the motion of this step."""

@@ -66,7 +66,7 @@ def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator
             what = f"the components of the estimates and of their covariance are {words}, beside those of the truth"
         else:
             what = f"the components of the covariance are {words}"
-        change = _reordered_states(whole) if states else _reordered(whole)
+        change = _reordered_states(whole, whole) if states else _reordered(whole)
         yield Guess(f"{what}; write them as {', '.join(axes[:width])}", change)
 
 
@@ -79,10 +79,9 @@ def _positions(width: int) -> Iterator[Guess]:
         there = ", ".join(axes[order.index(slot)] for slot in range(width))
         words = f"of the estimates are in the order {there}; write them as {', '.join(axes)}"
         rest = [3, 4, 5] if width == 3 else [2]
-        alone = _reordered_estimates([*order, *rest, 6][: 7 if width == 3 else 3])
-        both = _reordered([*order, *rest])
-        yield Guess(f"the positions {words}", alone, fine=False)
-        yield Guess(f"positions and covariance {words}", lambda p, a=alone, b=both: b(a(p)), fine=False)
+        place = [*order, *rest, 6][: 7 if width == 3 else 3]
+        yield Guess(f"the positions {words}", _reordered_estimates(place), fine=False)
+        yield Guess(f"positions and covariance {words}", _reordered_states(place, [*order, *rest]), fine=False)
 
 
 def _swap(width: int, i: int, j: int) -> tuple[int, ...]:
@@ -99,8 +98,8 @@ def _reordered_estimates(order: list[int]) -> Change:
     return lambda p: replace(p, estimate=p.estimate[:, order])
 
 
-def _reordered_states(order: list[int]) -> Change:
-    return lambda p: replace(_reordered(order)(p), estimate=p.estimate[:, order])
+def _reordered_states(estimate: list[int], covariance: list[int]) -> Change:
+    return lambda p: _reordered(covariance)(_reordered_estimates(estimate)(p))
 
 
 def _ned(convention: str) -> Iterator[Guess]:

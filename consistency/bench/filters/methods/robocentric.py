@@ -18,6 +18,7 @@ from consistency.bench.filters.sensor.growth import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched
 from consistency.bench.filters.textbook.robocentric import (
     DOUBT,
+    FAR,
     KNOWN,
     PASSES,
     PASSES_CHAINED,
@@ -44,11 +45,11 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         every, unseen = rounds(which)
         doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if every > 0 else 0
         passes, chain = PASSES if which.iteration else 1, PASSES_CHAINED if which.turning else 0
-        waiting = KNOWN if which.waiting else 0.0
+        waiting, far = KNOWN if which.waiting else 0.0, FAR if which.retreat else np.inf
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
             InvariantPose(which.moments), Converted(),
-            Converting(pixels, waiting, passes, chain, clones, which.recency, which.curvature, which.spread),
+            Converting(pixels, waiting, passes, chain, clones, which.recency, which.curvature, which.spread, far),
             Parking(every, unseen, doubt, which.turning, which.patience),
         )  # fmt: skip
 

@@ -96,7 +96,7 @@ class Solution(NamedTuple):
     W: Array  # (n, k)
     innovation: Array  # (k,)
     is_settled: bool
-    is_lost: bool  # neither settled nor near
+    is_lost: bool  # neither settled nor near (*retreat*)
 
 
 def rounds(which: Corrections) -> tuple[int, int]:
@@ -225,7 +225,7 @@ class RobotCentredKalman:
             is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))
             if is_settled:
                 break
-        is_lost = not is_settled and bool(np.any(np.abs(delta[:3]) > FAR * deviation[:3]))
+        is_lost = self.which.retreat and not is_settled and bool(np.any(np.abs(delta[:3]) > FAR * deviation[:3]))
         return Solution(delta, C, H, S, W, innovation, is_settled, is_lost)
 
     def _is_in_doubt(self, state: CentredState, label: int) -> bool:

@@ -37,6 +37,7 @@ class Converting(NamedTuple):
     update at most, and of one in a ``chain``, tried first, 0 for none; ``clones`` at most, and no more than landmarks.
     ``recency``: a moved robot keeps the errors from before its last motion; ``curvature``: a motion moves landmarks
     by the mean of its noise to second order; ``spread``: and adds to their covariance what that noise spreads them.
+    Passes that have not settled and move the pose by more than ``far`` standard deviations are given up for the first.
     """
 
     pixels: Pixels
@@ -47,6 +48,7 @@ class Converting(NamedTuple):
     recency: bool
     curvature: bool
     spread: bool
+    far: float
 
 
 @part(update="Converting")

@@ -28,7 +28,6 @@ from consistency.bench.filters.update.retraction_chain import (
 )
 from consistency.referee.types import Array, Indices
 
-FAR = 10.0  # standard deviations that the pose has gone where passes that have not settled lead nowhere
 SETTLED = 1e-3  # change in standard deviations that ends an iteration
 TEMPERED = 2.0  # decades by which the noise of a return in doubt is raised in the first pass; then half a decade less
 
@@ -240,7 +239,7 @@ def _iterate(
         is_settled = i >= least and _is_settled(size, room)
         if is_settled:
             break
-    is_lost = not is_settled and _has_gone_far(room)
+    is_lost = not is_settled and _has_gone_far(update.far, room)
     copy(room.before[:size], delta)
     if is_chained:
         aim_chained(state, m, clones, local, room)
@@ -372,10 +371,10 @@ def _is_settled(size: int, room: ConvertingRoom) -> bool:
 
 
 @inner
-def _has_gone_far(room: ConvertingRoom) -> bool:
+def _has_gone_far(most: float, room: ConvertingRoom) -> bool:
     far = False
     for j in range(3):
-        far = far or abs(room.delta[j]) > FAR * np.sqrt(room.among[j, j])
+        far = far or abs(room.delta[j]) > most * np.sqrt(room.among[j, j])
     return far
 
 

@@ -13,7 +13,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.offset import clock_shift, offset_of, steps_of
+from consistency.referee.readers.offset import Offset, clock_shift, offset_of, steps_of
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.sheet import Places
 from consistency.referee.types import Array
@@ -250,3 +250,11 @@ def test_what_has_truth_is_judged_at_every_offset(rng: np.random.Generator, monk
     offset_of([replace(run, true_t=run.true_t[within], truth=run.truth[within])])
     assert len(asked) > 20
     assert all(asked)
+
+
+@pytest.mark.parametrize(
+    ("explained", "alone", "found"), [(0.02, False, True), (0.004, False, False), (0.02, True, False)]
+)
+def test_an_offset_that_makes_next_to_nothing_is_not_named(explained: float, alone: bool, found: bool) -> None:
+    """However sure: x and y exchanged looked like clocks that differ by 0.01 s, which made 0 % of the NEES."""
+    assert Offset(-0.01, -0.014, -0.006, 1e-9, explained, alone).found == found

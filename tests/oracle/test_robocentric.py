@@ -432,7 +432,7 @@ def test_alone_and_in_doubt_a_landmark_waits(small: Small) -> None:
 
 
 def test_passes_that_lead_nowhere_are_given_up() -> None:
-    """Slow steps and lost images; in step 173 no passes settle, and the last of them is 8 m and 140 degrees off."""
+    """Slow steps and lost images; in step 172 no passes settle, and the last of them is 8 m and 140 degrees off."""
     landmarks = {"layout": "uniform", "count": 120, "seed": 2007, "x": (-8, 8), "y": (-8, 8), "z": (-1.25, 1.25)}
     path = {"shape": "circle", "radius": 4.0, "start": (4.0, 0.0), "heading": np.pi / 2.0, "speed": 0.5}
     scenario = cs.load_scenario("herath2007-stereo").variant(

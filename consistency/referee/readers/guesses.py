@@ -78,10 +78,10 @@ def _positions(width: int) -> Iterator[Guess]:
             continue
         there = ", ".join(axes[order.index(slot)] for slot in range(width))
         words = f"of the estimates are in the order {there}; write them as {', '.join(axes)}"
-        rest = [3, 4, 5] if width == 3 else [2]
-        place = [*order, *rest, 6][: 7 if width == 3 else 3]
+        turned, rest = ([3, 4, 5, 6], [3, 4, 5]) if width == 3 else ([2], [2])
+        place, both = [*order, *turned], [*order, *rest]
         yield Guess(f"the positions {words}", _reordered_estimates(place), fine=False)
-        yield Guess(f"positions and covariance {words}", _reordered_states(place, [*order, *rest]), fine=False)
+        yield Guess(f"positions and covariance {words}", _reordered_states(place, both), fine=False)
 
 
 def _swap(width: int, i: int, j: int) -> tuple[int, ...]:

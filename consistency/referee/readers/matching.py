@@ -47,16 +47,14 @@ def associate(times: Array, reference: Array, max_dt: float) -> tuple[Indices, I
     Pairs further apart than ``max_dt`` are left out. Where two timestamps have the same neighbour the nearer one
     keeps it.
     """
-    right = np.clip(np.searchsorted(reference, times), 1, max(len(reference) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(reference) - 1)
-    nearest = np.where(np.abs(reference[left] - times) <= np.abs(reference[right] - times), left, right)
-    distance = np.abs(reference[nearest] - times)
-    order = np.lexsort((distance, nearest))
+    before = np.clip(np.searchsorted(reference, times, side="right") - 1, 0, None)
+    found = nearest(times, reference, before)
+    distance = np.abs(reference[found] - times)
+    order = np.lexsort((distance, found))
     order = order[distance[order] <= max_dt + ROUNDING]
-    _, first = np.unique(nearest[order], return_index=True)
+    _, first = np.unique(found[order], return_index=True)
     own = np.sort(order[first])
-    return own, nearest[own]
+    return own, found[own]
 
 
 class Known(NamedTuple):

@@ -96,7 +96,6 @@ class Solution(NamedTuple):
     W: Array  # (n, k)
     innovation: Array  # (k,)
     is_settled: bool
-    is_lost: bool  # neither settled nor near (*retreat*)
 
 
 def rounds(which: Corrections) -> tuple[int, int]:
@@ -187,7 +186,8 @@ class RobotCentredKalman:
             found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, passes)
             if found.is_settled:
                 break
-        if passes > 1 and found.is_lost:
+        is_far = bool(np.any(np.abs(found.delta[:3]) > FAR * np.sqrt(np.diag(P)[:3])))
+        if self.which.retreat and passes > 1 and not found.is_settled and is_far:
             found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, 1)
         after, turned = moved_by(state, found.delta), np.eye(len(state.x))
         if chart is not separate:
@@ -225,8 +225,7 @@ class RobotCentredKalman:
             is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))
             if is_settled:
                 break
-        is_lost = self.which.retreat and not is_settled and bool(np.any(np.abs(delta[:3]) > FAR * deviation[:3]))
-        return Solution(delta, C, H, S, W, innovation, is_settled, is_lost)
+        return Solution(delta, C, H, S, W, innovation, is_settled)
 
     def _is_in_doubt(self, state: CentredState, label: int) -> bool:
         """Whether the turn since the clone of a parked landmark was little known before the motion of this step."""

@@ -25,6 +25,7 @@ from consistency.bench.filters.textbook import robocentric as textbook
 from consistency.bench.filters.textbook.sensors import heading_matrix
 from consistency.bench.filters.update.converting import Converting, converting_room
 from consistency.bench.filters.update.retraction_chain import aim_chained, cast_columns, cast_rows, unchain
+from consistency.bench.runs.records import record_of
 from consistency.bench.types import Control
 from consistency.referee.types import Array
 
@@ -284,7 +285,7 @@ def test_the_chain_of_the_kernel_is_that_of_its_twin(rng: np.random.Generator, o
     poses, xi = rng.normal(size=(4, 3)), 0.3 * rng.normal(size=(4, 3))
     moved, C = inverse_range.chained(poses, xi, on=on)
     pixels = Pixels(1.0, 1.0, 1.0, Growth(np.ones(1), np.ones(1)), 0.0, 0.0, False, False, False)
-    update = Converting(pixels, 0.03, 20, 12, clones, True, True, True, 10.0)
+    update = Converting(pixels, 0.03, 20, 12, clones, True, True, True, 0.0, 1.0, 10.0)
     room = converting_room(update, 3, 3, 3, m, 30)
     room.number[:], room.on[0], size = number, on, 3 + 3 * (m + clones)
     places = np.array([3 + 3 * (m + c) for c in range(clones)] + [0])[:, None] + np.arange(3)
@@ -452,6 +453,32 @@ def test_passes_that_lead_nowhere_are_given_up() -> None:
         worst.append(np.abs(ours.pose - trial.truth[1:])[:, :2].max())
     assert worst[0] < 1.5
     assert worst[1] > 5.0
+
+
+def test_a_return_whose_place_is_hardly_known_finds_the_robot() -> None:
+    """One landmark, 2 m away, returns where the robot is known to 2.5 m and 0.5 rad."""
+    landmarks = {"layout": "uniform", "count": 44, "seed": 2007, "x": (-8, 8), "y": (-8, 8), "z": (-1.25, 1.25)}
+    tilted = {"position": (0.0, 0.0, 0.0), "rotation": (0.0, np.deg2rad(40.0), 0.0)}
+    noise = {"sigma_v": 0.07, "sigma_omega": np.deg2rad(7.0)}
+    scenario = cs.load_scenario("herath2007-stereo").variant(
+        "hardly known", truth__landmarks=landmarks, truth__dt=0.42, truth__steps=130, truth__sensor__range=(0.5, 2.5),
+        **{f"{side}__motion__{key}": value for side in ("truth", "belief") for key, value in noise.items()},
+        **{f"{side}__sensor__mount": tilted for side in ("truth", "belief")},
+    )  # fmt: skip
+    lost = []
+    for tempering in (True, False):
+        which = inverse_range.Corrections(tempering=tempering)
+        filter_ = rc.compiled(textbook.RobotCentredKalman("trial", which))
+        runs = cs.run_trials(scenario, [filter_], 100, 778, 1)
+        nees = record_of(runs, "trial").nees
+        assert nees is not None
+        lost.append(int((nees[:, -1] > 300.0).sum()))
+        trial = cs.simulate(scenario, run=3, seed=778)
+        ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
+        sigma = np.sqrt(np.einsum("kii->ki", twin.covariance))
+        assert (np.abs(ours.pose - twin.pose) / np.maximum(sigma, 1e-9))[5:].max() < 1e-6
+    assert lost[0] == 0
+    assert lost[1] >= 4
 
 
 def test_landmarks_are_parked_and_come_back(small: Small) -> None:

@@ -81,9 +81,10 @@ EVERY_LATE, UNSEEN_LATE = 50, 20  # without promptness
 DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
 KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
-PASSES_CHAINED = 12  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
+PASSES_CHAINED = 16  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
+COOLING = 1.0  # decades a pass by which the raised noise of a return in doubt becomes less
 FAR = 10.0  # standard deviations that the pose has gone where passes that have not settled lead nowhere
-TEMPERED = 2.0  # decades by which the noise of a return in doubt is raised in the first pass; then half a decade less
+PASSES_EARLY, TEMPERED, COOLING_EARLY = 12, 2.0, 0.5  # without tempering, where it is raised by so many decades
 
 
 class Solution(NamedTuple):
@@ -103,6 +104,12 @@ def rounds(which: Corrections) -> tuple[int, int]:
     if not which.parking:
         return 0, 0
     return (EVERY, UNSEEN) if which.promptness else (EVERY_LATE, UNSEEN_LATE)
+
+
+def raised(HPH: Array, R: Array, which: Array) -> float:
+    """Decades by which the noise (m, 3, 3) of some of the observations is below the variance (3 m, 3 m) predicted."""
+    ratio = np.diag(HPH).reshape(-1, 3) / np.diagonal(R, axis1=1, axis2=2)
+    return float(np.log10(max(1.0, ratio[which].max())))
 
 
 class RobotCentredKalman:
@@ -179,7 +186,7 @@ class RobotCentredKalman:
             state = settled_clones(state)
             held = [state.parked[label] for label in np.array(seen)[in_doubt & ~new]]
             chain = partial(chained, on=sorted(state.clones).index(min(held, default=max(state.clones))))
-            attempts.insert(0, (chain, PASSES_CHAINED))
+            attempts.insert(0, (chain, PASSES_CHAINED if self.which.tempering else PASSES_EARLY))
         T = shifts_of(state)
         P = T @ state.P @ T.T  # of the pose, too, by xi from here on
         for chart, passes in attempts:
@@ -207,21 +214,24 @@ class RobotCentredKalman:
         delta, expected, deviation = np.zeros(len(P)), np.zeros((len(seen), 3)), np.sqrt(np.diag(P))
         is_chained = self.which.turning and bool(in_doubt.any())  # tried, or given up: all clones are in the update
         involved = indices_of(state, state.clones if is_chained else clones_of(state, seen), seen)
-        is_tempered, is_settled = bool((in_doubt & new).any()), False
+        is_tempered, is_settled, decades = bool((in_doubt & new).any()), False, 0.0
+        cooling = COOLING if self.which.tempering else COOLING_EARLY
         for i in range(passes):
             here, C = charted(state, delta, chart)
             h, H = expectation(here, seen)
             H = H @ C
             expected = np.where(is_parked[:, None] | (i == 0), h, expected)
             y, R = observed(z, shift, expected, state.problem.belief.sensor, self.which)
-            if is_tempered:
-                R[in_doubt] *= max(1.0, 10.0 ** (TEMPERED - 0.5 * i))
+            if is_tempered and i == 0:
+                decades = raised(H @ P @ H.T, R, in_doubt) if self.which.tempering else TEMPERED
+            factor = max(1.0, 10.0 ** (decades - cooling * i))
+            R[in_doubt] *= factor
             gap = y - h
             gap[:, 0] = wrap(gap[:, 0])
             innovation = gap.ravel() + H @ delta
             S, W = basics.gain(P, H, basics.block_diagonal(R))
             before, delta = delta, W @ innovation
-            is_settled = i >= (2 * TEMPERED if is_tempered else 1)
+            is_settled = i > 0 and factor == 1.0
             is_settled = is_settled and bool(np.all((np.abs(delta - before) <= SETTLED * deviation)[involved]))
             if is_settled:
                 break

@@ -29,7 +29,6 @@ from consistency.bench.filters.update.retraction_chain import (
 from consistency.referee.types import Array, Indices
 
 SETTLED = 1e-3  # change in standard deviations that ends an iteration
-TEMPERED = 2.0  # decades by which the noise of a return in doubt is raised in the first pass; then half a decade less
 
 
 @implement(correct, Converting)
@@ -209,7 +208,7 @@ def _iterate(
     ``room`` has the last linearisation, ``delta`` where it was made.
     """
     room, size, is_settled = work.room, 3 + 3 * (m + clones), False
-    least = 2.0 * TEMPERED if local.new[0] else 1.0
+    decades, factor = 0.0, 1.0
     among, cast, delta = room.among[:size, :size], room.cast[:size, :size], room.delta[:size]
     for i in range(size):
         for j in range(size):
@@ -227,7 +226,13 @@ def _iterate(
             aim_apart(state, m, clones, update.recency, local, room)
         _expect(update, slam, state, data, i == 0, m, clones, local, work)
         if local.new[0]:
-            _temper(m, max(1.0, 10.0 ** (TEMPERED - 0.5 * i)), local, work)
+            if i == 0:
+                decades = update.decades
+                if decades == 0.0:
+                    _innovate(cast, size, room.place, m, work)
+                    decades = _decades(m, local, work)
+            factor = max(1.0, 10.0 ** (decades - update.cooling * i))
+            _temper(m, factor, local, work)
         total = _innovate(cast, size, room.place, m, work)
         code, _, _ = divide_by_root(alone, 3 * m, work, total)
         if code > 0:
@@ -236,7 +241,7 @@ def _iterate(
         add_transposed_times(work.A[: 3 * m, :size], work.A[: 3 * m, size], delta)
         if is_chained:
             unchain(delta, m, clones, room)
-        is_settled = i >= least and _is_settled(size, room)
+        is_settled = i > 0 and factor == 1.0 and _is_settled(size, room)
         if is_settled:
             break
     is_lost = not is_settled and _has_gone_far(update.far, room)
@@ -300,6 +305,17 @@ def _times(weight: float, A: Array, B: Array, C: Array) -> None:
     for a in range(3):
         for b in range(3):
             C[a, b] = weight * (A[a, 0] * B[0, b] + A[a, 1] * B[1, b] + A[a, 2] * B[2, b])
+
+
+@inner
+def _decades(m: int, local: Clones, work: Work[ConvertingRoom]) -> float:
+    """By which the noise of what is in doubt is below the variance that is predicted of it."""
+    ratio = 1.0
+    for j in range(m):
+        if is_in_doubt(work.label[j], local):
+            for a in range(3):
+                ratio = max(ratio, work.S[3 * j + a, 3 * j + a] / work.room.R[j, a, a] - 1.0)
+    return float(np.log10(ratio))
 
 
 @inner

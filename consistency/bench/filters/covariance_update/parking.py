@@ -49,8 +49,8 @@ class Parking(NamedTuple):
     """Steps between two rounds of parking, 0 for none, and without a sight before a landmark is parked.
 
     A return is in doubt where the variance of the turn since the clone is above ``doubt``, rad^2; if ``whole``, a step
-    with such a return works on the whole state. With ``patience`` a round is left out where the robot sees
-    nothing, and saw something in one of the last ``every`` steps. ``start`` is the number of variables in the state
+    with such a return works on the whole state. With ``patience`` a round waits while the robot sees
+    nothing, and saw something less than ``unseen`` steps ago. ``start`` is the number of variables in the state
     from which updates are local.
     """
 
@@ -77,6 +77,7 @@ class Clones(NamedTuple):
     new: Indices  # (1,) 1 if one of these was not seen in the step before
     origin: Array  # (clones, 3) pose T of each
     step: Indices  # (1,) steps so far
+    due: Indices  # (1,) 1 while a round of parking is due
     rows: Array  # (9, n)
     factors: Factors
 
@@ -109,6 +110,7 @@ def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landm
         integers(1, 0),
         filled_matrix(most, 3, 0.0),
         integers(1, 0),
+        integers(1, 0),
         filled_matrix(9, n, 0.0),
         make_factors(c, n if is_local else r, c // w),
     )
@@ -124,8 +126,12 @@ def prepare_parked(
     """Parks first where that is due; settles the active part before that, or where it has grown too large."""
     step = local.step[0]
     local.step[0] = step + 1
-    due = covariance.every > 0 and step > 0 and step % covariance.every == 0
-    due = due and _is_any_idle(covariance, whole, step, local) and not _must_wait(covariance, step, local)
+    if covariance.every > 0 and step > 0 and step % covariance.every == 0:
+        local.due[0] = 1
+    due = local.due[0] == 1 and not _must_wait(covariance, step, local)
+    if due:
+        local.due[0] = 0
+    due = due and _is_any_idle(covariance, whole, step, local)
     if state.base > 0 and (due or _is_crowded(whole, state, labels, local)):
         state = _joined(slam, whole, state, local)
     if due:
@@ -224,7 +230,7 @@ def _must_wait(covariance: Parking, step: int, local: Clones) -> bool:
     last = 0 if covariance.patience else step
     for label in range(len(local.of)):
         last = max(last, local.seen[label])
-    return 0 < step - last < covariance.every
+    return 0 < step - last < covariance.unseen
 
 
 @inner

@@ -20,7 +20,6 @@ from consistency.bench.filters.textbook.robocentric import (
     COOLING,
     COOLING_EARLY,
     DOUBT,
-    FAR,
     KNOWN,
     PASSES,
     PASSES_CHAINED,
@@ -50,13 +49,13 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if every > 0 else 0
         passes, chain = PASSES if which.iteration else 1, PASSES_CHAINED if which.tempering else PASSES_EARLY
         decades, cooling = (0.0, COOLING) if which.tempering else (TEMPERED, COOLING_EARLY)
-        waiting, far = KNOWN if which.waiting else 0.0, FAR if which.retreat else np.inf
+        waiting = KNOWN if which.waiting else 0.0
         return Slam(
             motion_of(problem.belief), sensor_of(problem.belief, uvd=True), InverseRange(sensor.mount.packed()),
             InvariantPose(which.moments), Converted(),
             Converting(
                 pixels, waiting, passes, chain if which.turning else 0, clones, which.recency, which.curvature,
-                which.spread, decades, cooling, far,
+                which.spread, decades, cooling,
             ),
             Parking(every, unseen, doubt, which.turning, which.patience),
         )  # fmt: skip

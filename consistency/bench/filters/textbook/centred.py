@@ -26,6 +26,7 @@ class CentredState:
     P: Array  # (n, n), of dp, dheading; and of the errors of these
     problem: Problem
     step: int = 0
+    is_due: bool = False  # a round of parking
     noise: Array = field(default_factory=lambda: np.zeros((3, 2)))  # (n, 2), what the last motion added to the errors
     places: dict[int, int] = field(default_factory=dict)  # offset of each landmark by label
     seen: dict[int, int] = field(default_factory=dict)  # step at which each was seen last

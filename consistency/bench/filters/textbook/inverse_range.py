@@ -40,7 +40,6 @@ class Corrections(NamedTuple):
     patience: bool = True  # nothing is parked at a pose whose last motions are not yet corrected by a sight
     moments: bool = True  # the covariance of the pose is that of Exp(xi) T, not of a linear error
     tempering: bool = True  # the noise of a return in doubt begins at what is not known of it
-    retreat: bool = True  # passes that have not settled and lead far away are given up for the first one
 
 
 # --- geometry ----------------------------------------------------------------------------------------

@@ -83,7 +83,6 @@ KNOWN = 0.03  # relative standard deviation of its distance up to which a landma
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 16  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
 COOLING = 1.0  # decades a pass by which the raised noise of a return in doubt becomes less
-FAR = 10.0  # standard deviations that the pose has gone where passes that have not settled lead nowhere
 PASSES_EARLY, TEMPERED, COOLING_EARLY = 12, 2.0, 0.5  # without tempering, where it is raised by so many decades
 
 
@@ -172,9 +171,11 @@ class RobotCentredKalman:
         state = replace(state, seen=state.seen | dict.fromkeys(labels, state.step))
         every, unseen = rounds(self.which)
         blind = state.step - max(state.seen.values(), default=0)
-        if every > 0 and state.step % every == 0 and not (self.which.patience and 0 < blind < every):
+        is_due = every > 0 and (state.is_due or state.step % every == 0)
+        waits = self.which.patience and 0 < blind < unseen
+        if is_due and not waits:
             state = with_parked(state, unseen)
-        return state, info
+        return replace(state, is_due=is_due and waits), info
 
     def _correct(self, state: CentredState, seen: list[int], z: Array, shift: Array) -> tuple[CentredState, Info]:
         is_parked = np.array([label in state.parked for label in seen])
@@ -193,9 +194,6 @@ class RobotCentredKalman:
             found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, passes)
             if found.is_settled:
                 break
-        is_far = bool(np.any(np.abs(found.delta[:3]) > FAR * np.sqrt(np.diag(P)[:3])))
-        if self.which.retreat and passes > 1 and not found.is_settled and is_far:
-            found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, 1)
         after, turned = moved_by(state, found.delta), np.eye(len(state.x))
         if chart is not separate:
             (after, _), turned = charted(state, found.delta, chart), found.C

@@ -39,7 +39,6 @@ class Converting(NamedTuple):
     by the mean of its noise to second order; ``spread``: and adds to their covariance what that noise spreads them.
     The noise of a new return in doubt is raised by so many ``decades`` at first, 0 for as many as it is below what is
     predicted, and by ``cooling`` less in each pass.
-    Passes that have not settled and move the pose by more than ``far`` standard deviations are given up for the first.
     """
 
     pixels: Pixels
@@ -52,7 +51,6 @@ class Converting(NamedTuple):
     spread: bool
     decades: float
     cooling: float
-    far: float
 
 
 @part(update="Converting")

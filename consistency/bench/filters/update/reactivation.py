@@ -109,11 +109,9 @@ def _aim(
         recentre(state, local)
     clones, code = _gather(state, m, chained, local, work), 0
     if chained:
-        code, chained, _ = _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
+        code, chained = _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
     if code == 0 and not chained and clones > 0 and update.passes > 1:
-        code, _, is_lost = _iterate(update, slam, state, data, m, clones, update.passes, False, local, work)
-        if code == 0 and is_lost:
-            code, _, _ = _iterate(update, slam, state, data, m, clones, 1, False, local, work)
+        code, _ = _iterate(update, slam, state, data, m, clones, update.passes, False, local, work)
     if code > 0:
         return code, clones, chained, np.nan
     if clones == 0 or update.passes == 1:
@@ -200,10 +198,8 @@ def _iterate(
     is_chained: bool,
     local: Clones,
     work: Work[ConvertingRoom],
-) -> tuple[int, bool, bool]:
-    """Gauss-Newton on what the update involves.
-
-    Returns a code of REASONS, whether it settled in so many ``passes``, and whether instead the pose went far.
+) -> tuple[int, bool]:
+    """Gauss-Newton on what the update involves; returns a code of REASONS, and whether it settled in ``passes``.
 
     ``room`` has the last linearisation, ``delta`` where it was made.
     """
@@ -236,7 +232,7 @@ def _iterate(
         total = _innovate(cast, size, room.place, m, work)
         code, _, _ = divide_by_root(alone, 3 * m, work, total)
         if code > 0:
-            return code, False, False
+            return code, False
         fill(delta, 0.0)
         add_transposed_times(work.A[: 3 * m, :size], work.A[: 3 * m, size], delta)
         if is_chained:
@@ -244,11 +240,10 @@ def _iterate(
         is_settled = i > 0 and factor == 1.0 and _is_settled(size, room)
         if is_settled:
             break
-    is_lost = not is_settled and _has_gone_far(update.far, room)
     copy(room.before[:size], delta)
     if is_chained:
         aim_chained(state, m, clones, local, room)
-    return 0, is_settled, is_lost
+    return 0, is_settled
 
 
 @inner
@@ -384,14 +379,6 @@ def _is_settled(size: int, room: ConvertingRoom) -> bool:
     for j in range(size):
         settled = settled and abs(room.delta[j] - room.before[j]) <= SETTLED * np.sqrt(room.among[j, j])
     return settled
-
-
-@inner
-def _has_gone_far(most: float, room: ConvertingRoom) -> bool:
-    far = False
-    for j in range(3):
-        far = far or abs(room.delta[j]) > most * np.sqrt(room.among[j, j])
-    return far
 
 
 @inner

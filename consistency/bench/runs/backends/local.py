@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
+from queue import Empty, SimpleQueue
 
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.runs.work import Outcomes, TrialWork
@@ -63,17 +65,23 @@ class LocalThreads:
 
 
 def _in_threads(work: TrialWork, runs: Sequence[int], workers: int) -> Outcomes:
-    pool, todo = ThreadPoolExecutor(workers), iter(runs)
+    pool, todo, under_way = ThreadPoolExecutor(workers), iter(runs), 0
+    finished = SimpleQueue[Future[RunOutcome]]()  # unlike a condition it bears a signal while one waits for it
     try:
         with work.isolation:  # left first, so that no thread waits for a process that hangs
-            waiting: set[Future[RunOutcome]] = set()
             while True:
-                waiting |= {pool.submit(work, run) for run in islice(todo, AHEAD * workers - len(waiting))}
-                if not waiting:
+                for run in islice(todo, AHEAD * workers - under_way):
+                    pool.submit(work, run).add_done_callback(finished.put)
+                    under_way += 1
+                if not under_way:
                     break
-                done, waiting = wait(waiting, GLANCE, FIRST_COMPLETED)
-                ready = sorted(done, key=_failed, reverse=True)  # what is finished counts, whatever ends the rest
-                del done  # an outcome that was handed on is kept by nobody here
+                ready = list[Future[RunOutcome]]()
+                with suppress(Empty):
+                    ready.append(finished.get(timeout=GLANCE))
+                    while True:
+                        ready.append(finished.get_nowait())
+                under_way -= len(ready)
+                ready.sort(key=_failed, reverse=True)  # what is finished counts, whatever ends the rest
                 while ready:
                     yield ready.pop().result()
     finally:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 import tracemalloc
 import weakref
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -364,8 +366,13 @@ def test_what_ends_together_with_an_error_counts(monkeypatch: pytest.MonkeyPatch
                 raise RuntimeError("out of ideas")
             return run
 
-    wait = local.wait
-    monkeypatch.setattr(local, "wait", lambda futures, *_: wait(futures))
+    class Together(SimpleQueue[Any]):
+        def get(self, block: bool = True, timeout: float | None = None) -> Any:
+            while self.qsize() < 4:
+                time.sleep(0.01)
+            return super().get(block, timeout)
+
+    monkeypatch.setattr(local, "SimpleQueue", Together)
     outcomes = local.LocalThreads(2).outcomes(Fails(), range(4))  # type: ignore[arg-type]
     assert {next(outcomes), next(outcomes)} == {1, 3}
     with pytest.raises(RuntimeError, match="out of ideas"):

@@ -70,8 +70,12 @@ ROADS = (  # that known noise is recovered on
     ("", World()),
     ("winding, ", World(per_rad=(2e-2, 2e-2, 1e-4), winds=True)),  # wheels that slip where they turn
     ("in space, ", World((4e-4, 2e-4, 3e-4, 2e-6, 3e-6, 4e-6), (4e-4, 1e-4, 2e-4, 1e-5, 1e-5, 2e-5))),
+    (
+        "winding in space, ",
+        World((4e-4, 2e-4, 3e-4, 2e-6, 3e-6, 4e-6), (2e-2, 2e-2, 2e-2, 1e-4, 1e-4, 1e-4), winds=True),
+    ),
 )
-ROWS = 24  # of terms on these roads
+ROWS = 36  # of terms on these roads
 
 
 def steps_of(rng: np.random.Generator, length: float, world: World) -> Array:

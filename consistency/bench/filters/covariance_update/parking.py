@@ -74,7 +74,6 @@ class Clones(NamedTuple):
     uses: Indices  # (clones,) landmarks parked at each
     made: Indices  # (clones,) step at which each was made
     doubted: Indices  # (clones,) 1 if a return there is in doubt in this step, 2 if it was in the last, too
-    new: Indices  # (1,) 1 if one of these was not seen in the step before
     origin: Array  # (clones, 3) pose T of each
     step: Indices  # (1,) steps so far
     due: Indices  # (1,) 1 while a round of parking is due
@@ -107,7 +106,6 @@ def make_clones(covariance: Parking, r: int, w: int, n: int, steps: int, n_landm
         integers(most, 0),
         integers(most, 0),
         integers(most, 0),
-        integers(1, 0),
         filled_matrix(most, 3, 0.0),
         integers(1, 0),
         integers(1, 0),
@@ -157,7 +155,6 @@ def withhold_parked(
 ) -> None:
     """What is rejected was not seen, and no return of it is in doubt."""
     fill(local.doubted, 0)
-    local.new[0] = 0
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
         if anew[i] and local.of[label] >= 0:
@@ -172,8 +169,6 @@ def withhold_parked(
 def _note_doubt(label: int, local: Clones) -> None:
     number = local.of[label]
     local.doubted[number] = max(local.doubted[number], local.doubt[label])
-    if local.doubt[label] == 1:
-        local.new[0] = 1
 
 
 @inner
@@ -190,7 +185,6 @@ def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clon
     """Finds what of the ``labels`` returns in doubt, and whether that takes the whole state."""
     P, step, any_doubted = state.P, local.step[0] - 1, False
     fill(local.doubted, 0)
-    local.new[0] = 0
     for label in labels:
         number = local.of[label]
         if number >= 0:
@@ -201,6 +195,12 @@ def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clon
                 local.doubt[label] = 2 if local.seen[label] == step else 1
                 _note_doubt(label, local)
     return any_doubted and covariance.whole
+
+
+@inner
+def is_new(label: int, local: Clones) -> bool:
+    """Whether a landmark of this step was not seen in the last one."""
+    return local.step[0] - local.earlier[label] > 1
 
 
 @inner

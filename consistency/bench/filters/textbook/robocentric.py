@@ -82,8 +82,8 @@ DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a
 KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 16  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
-COOLING = 1.0  # decades a pass by which the raised noise of a return in doubt becomes less
-PASSES_EARLY, TEMPERED, COOLING_EARLY = 12, 2.0, 0.5  # without tempering, where it is raised by so many decades
+COOLING = 1.0  # decades a pass by which the raised noise of a return becomes less
+PASSES_EARLY, TEMPERED, COOLING_EARLY = 12, 2.0, 0.5  # without tempering: decades, of a return in doubt alone
 
 
 class Solution(NamedTuple):
@@ -212,7 +212,8 @@ class RobotCentredKalman:
         delta, expected, deviation = np.zeros(len(P)), np.zeros((len(seen), 3)), np.sqrt(np.diag(P))
         is_chained = self.which.turning and bool(in_doubt.any())  # tried, or given up: all clones are in the update
         involved = indices_of(state, state.clones if is_chained else clones_of(state, seen), seen)
-        is_tempered, is_settled, decades = bool((in_doubt & new).any()), False, 0.0
+        unsure = is_parked if self.which.tempering else in_doubt
+        is_tempered, is_settled, decades = passes > 1 and bool((unsure & new).any()), False, 0.0
         cooling = COOLING if self.which.tempering else COOLING_EARLY
         for i in range(passes):
             here, C = charted(state, delta, chart)
@@ -221,9 +222,9 @@ class RobotCentredKalman:
             expected = np.where(is_parked[:, None] | (i == 0), h, expected)
             y, R = observed(z, shift, expected, state.problem.belief.sensor, self.which)
             if is_tempered and i == 0:
-                decades = raised(H @ P @ H.T, R, in_doubt) if self.which.tempering else TEMPERED
+                decades = raised(H @ P @ H.T, R, unsure) if self.which.tempering else TEMPERED
             factor = max(1.0, 10.0 ** (decades - cooling * i))
-            R[in_doubt] *= factor
+            R[unsure] *= factor
             gap = y - h
             gap[:, 0] = wrap(gap[:, 0])
             innovation = gap.ravel() + H @ delta

@@ -37,8 +37,8 @@ class Converting(NamedTuple):
     update at most, and of one in a ``chain``, tried first, 0 for none; ``clones`` at most, and no more than landmarks.
     ``recency``: a moved robot keeps the errors from before its last motion; ``curvature``: a motion moves landmarks
     by the mean of its noise to second order; ``spread``: and adds to their covariance what that noise spreads them.
-    The noise of a new return in doubt is raised by so many ``decades`` at first, 0 for as many as it is below what is
-    predicted, and by ``cooling`` less in each pass.
+    The noise of a new return in doubt is raised by so many ``decades`` at first, that of any return by as many as it is
+    below what is predicted if these are 0, and by ``cooling`` less in each pass.
     """
 
     pixels: Pixels

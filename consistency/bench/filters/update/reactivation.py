@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.bench.filters.covariance_update.parking import Clones, is_in_doubt, recentre, unpark
+from consistency.bench.filters.covariance_update.parking import Clones, is_in_doubt, is_new, recentre, unpark
 from consistency.bench.filters.error.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill
 from consistency.bench.filters.kernel.blas import add_transposed_times
@@ -204,7 +204,9 @@ def _iterate(
     ``room`` has the last linearisation, ``delta`` where it was made.
     """
     room, size, is_settled = work.room, 3 + 3 * (m + clones), False
-    decades, factor = 0.0, 1.0
+    decades, factor, is_raised = 0.0, 1.0, False
+    for j in range(m):
+        is_raised = is_raised or (_is_unsure(update, j, local, work) and is_new(work.label[j], local))
     among, cast, delta = room.among[:size, :size], room.cast[:size, :size], room.delta[:size]
     for i in range(size):
         for j in range(size):
@@ -221,14 +223,14 @@ def _iterate(
         else:
             aim_apart(state, m, clones, update.recency, local, room)
         _expect(update, slam, state, data, i == 0, m, clones, local, work)
-        if local.new[0]:
+        if is_raised:
             if i == 0:
                 decades = update.decades
                 if decades == 0.0:
                     _innovate(cast, size, room.place, m, work)
-                    decades = _decades(m, local, work)
+                    decades = _decades(update, m, local, work)
             factor = max(1.0, 10.0 ** (decades - update.cooling * i))
-            _temper(m, factor, local, work)
+            _temper(update, m, factor, local, work)
         total = _innovate(cast, size, room.place, m, work)
         code, _, _ = divide_by_root(alone, 3 * m, work, total)
         if code > 0:
@@ -303,21 +305,26 @@ def _times(weight: float, A: Array, B: Array, C: Array) -> None:
 
 
 @inner
-def _decades(m: int, local: Clones, work: Work[ConvertingRoom]) -> float:
-    """By which the noise of what is in doubt is below the variance that is predicted of it."""
+def _is_unsure(update: Converting, j: int, local: Clones, work: Work[ConvertingRoom]) -> bool:
+    return is_in_doubt(work.label[j], local) if update.decades > 0.0 else work.room.clone[j] >= 0
+
+
+@inner
+def _decades(update: Converting, m: int, local: Clones, work: Work[ConvertingRoom]) -> float:
+    """By which the noise of what is unsure is below the variance that is predicted of it."""
     ratio = 1.0
     for j in range(m):
-        if is_in_doubt(work.label[j], local):
+        if _is_unsure(update, j, local, work):
             for a in range(3):
                 ratio = max(ratio, work.S[3 * j + a, 3 * j + a] / work.room.R[j, a, a] - 1.0)
     return float(np.log10(ratio))
 
 
 @inner
-def _temper(m: int, factor: float, local: Clones, work: Work[ConvertingRoom]) -> None:
-    """R of what is in doubt, worked out in this pass, is raised."""
+def _temper(update: Converting, m: int, factor: float, local: Clones, work: Work[ConvertingRoom]) -> None:
+    """R of what is unsure, worked out in this pass, is raised."""
     for j in range(m):
-        if is_in_doubt(work.label[j], local):
+        if _is_unsure(update, j, local, work):
             for a in range(3):
                 for b in range(3):
                     work.room.R[j, a, b] *= factor

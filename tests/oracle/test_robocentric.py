@@ -461,6 +461,24 @@ def test_a_return_whose_place_is_hardly_known_finds_the_robot() -> None:
     assert lost[1] >= 4
 
 
+def test_a_return_whose_distance_is_hardly_known_turns_nothing_around() -> None:
+    """A landmark that was seen 8 m away by a baseline of 5 cm is parked, and seen again as the robot passes it."""
+    path = {"shape": "rounded-rectangle", "length": 8.0, "width": 5.0, "corner_radius": 1.0, "speed": 0.5}
+    landmarks = {"layout": "uniform", "count": 49, "seed": 2008, "x": (-8, 8), "y": (-6.5, 6.5), "z": (-1.25, 1.25)}
+    scenario = cs.load_scenario("herath2007-stereo").variant(
+        "passed", truth__path=path | {"start": (0.0, -2.5), "heading": 0.0}, truth__landmarks=landmarks,
+        truth__sensor__range=(0.5, 8.0), truth__sensor__B=0.05, belief__sensor__B=0.05,
+    )  # fmt: skip
+    trial, worst = cs.simulate(scenario, run=75, seed=805), []
+    assert trial.truth is not None
+    for tempering in (True, False):
+        which = inverse_range.Corrections(tempering=tempering)
+        ours = rc.compiled(textbook.RobotCentredKalman("trial", which)).run(trial, scenario.belief)
+        worst.append(np.abs(ours.pose - trial.truth[1:])[324:330, 2].max())
+    assert worst[0] < 0.1
+    assert worst[1] > 1.0
+
+
 def test_landmarks_are_parked_and_come_back(small: Small) -> None:
     scenario = small("herath2007-stereo", **CLOSING)
     trial, filter_ = cs.simulate(scenario, run=3), textbook.RobotCentredKalman("trial", inverse_range.Corrections())

@@ -31,7 +31,7 @@ from action import FILE, STEP_KEYS, STEPS
 
 REPOSITORY = ROOT / "docs/examples/repository"
 WORKFLOWS = [ROOT / ".github/workflows/ci.yml", REPOSITORY / ".github/workflows/consistency.yml"]
-OF_THE_GATE = "import consistency.referee.show.markdown"
+OF_THE_GATE = "import consistency.referee.show.as_md"
 EXPRESSION = re.compile(r"\$\{\{\s*(.*?)\s*\}\}")
 
 

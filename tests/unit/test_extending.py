@@ -112,10 +112,9 @@ for order in (np.arange(n), np.arange(n) * 37 % n):
 
 
 def test_the_renderer_of_the_document_works(copy: Path) -> None:
-    """One file and a row; the command line and the gates have the format at once."""
-    module, row = code("Add a renderer")
-    (copy / "consistency/referee/show/csv.py").write_text(module, encoding="utf-8")
-    changed(copy / "consistency/referee/show/__init__.py", "FORMATS = {", f"FORMATS = {row.strip()[:-1]}, ")
+    """One file; the command line and the gates have the format at once."""
+    (module,) = code("Add a renderer")
+    (copy / "consistency/referee/show/as_csv.py").write_text(module, encoding="utf-8")
     words = ["analyse", "est.csv", "--truth", "truth.csv", "--state", "a", "--report", "out.csv"]
     done = python(copy, f"from consistency.referee.cli import main\nmain({words})")
     assert done.stdout.endswith("out.csv\n"), done.stderr

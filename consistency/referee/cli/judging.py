@@ -97,12 +97,12 @@ def analyse(
         tell_notes(recordings)
         if report is not None and not is_file:
             from consistency.referee.pages import write_file_reports
-            from consistency.referee.show import json as as_data
+            from consistency.referee.show.as_json import render
             from consistency.referee.system.folders import require_free
 
             try:
                 require_free(report, overwrite, "verdict", "--report")
-                data = as_data.render(document(verdicts))
+                data = render(document(verdicts))
                 written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
                 if missing("report"):
                     print(f"consistency: the interactive page and the PDF need {remedy('report')}", file=sys.stderr)

@@ -74,9 +74,9 @@ def require_written(overwrite: bool, out: Path | None, option: str) -> None:
 def show(document: Document, as_json: bool, written: Sequence[Path] = ()) -> None:
     """Print a document for programs, or its opening and the files that were written."""
     if as_json:
-        from consistency.referee.show import json
+        from consistency.referee.show.as_json import render
 
-        print(json.render(document))
+        print(render(document))
         return
     from consistency.referee.show import terminal
 

@@ -10,7 +10,7 @@ from consistency.referee.fitting.motions import write_motions
 from consistency.referee.fitting.page import page
 from consistency.referee.fitting.snippets import snippets
 from consistency.referee.fitting.wording import document
-from consistency.referee.show import json, static_html
+from consistency.referee.show import as_html, as_json
 from consistency.referee.system.folders import write_folder
 from consistency.referee.system.provenance import manifest_of
 
@@ -26,8 +26,8 @@ def write_model(model: NoiseModel, folder: Path, overwrite: bool = False) -> lis
         The folder exists or cannot be written.
     """
     texts = snippets(model)
-    texts["verdict.json"] = json.render(document(model)) + "\n"
-    texts["report.html"] = static_html.render(page(model, with_pictures=is_installed("plot")))
+    texts["verdict.json"] = as_json.render(document(model)) + "\n"
+    texts["report.html"] = as_html.render(page(model, with_pictures=is_installed("plot")))
     names: list[str] = []
 
     def contents(at: Path) -> None:

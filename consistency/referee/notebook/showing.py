@@ -11,7 +11,7 @@ from consistency.referee.diagnostics.wording import plural
 from consistency.referee.document.blocks import Bullets, Facts
 from consistency.referee.document.verdict import summary
 from consistency.referee.extras import require
-from consistency.referee.show import static_html, text
+from consistency.referee.show import as_html, text
 from consistency.referee.system.atomic import write_whole
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def record_html(record: Record) -> str:
         ("runs", str(len(record.run_numbers))), ("steps", str(len(record.t))), ("error", record.convention or "-"),
         ("components", ", ".join(record.axes)), ("failed runs", str(len(record.failures))),
     )  # fmt: skip
-    table, notes = (static_html.block(each) for each in (Facts(rows), Bullets(record.notes)))
+    table, notes = (as_html.block(each) for each in (Facts(rows), Bullets(record.notes)))
     return f"<div><strong>{escape(record.name)}</strong>{table}{notes}</div>"
 
 
@@ -45,7 +45,7 @@ def verdict_html(verdict: Verdict) -> str:
     from consistency.referee.pages.plain import picture
 
     pictures = () if verdict.record is None else picture(verdict.record, verdict)
-    return static_html.fragment(*summary(verdict)) + "".join(map(static_html.block, pictures))
+    return as_html.fragment(*summary(verdict)) + "".join(map(as_html.block, pictures))
 
 
 def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Drawn:

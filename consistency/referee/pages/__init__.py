@@ -100,7 +100,7 @@ def _pages(
 
 def _static_page(records: Sequence[Evidence], judged: Mapping[str, Verdict], title: str) -> Callable[[Path], None]:
     from consistency.referee.pages.plain import compose_plain
-    from consistency.referee.show.static_html import render
+    from consistency.referee.show.as_html import render
 
     text = render(compose_plain(records, judged, title))
     return lambda at: write_file(at / "report.html", text.encode("utf-8"))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from consistency.referee.diagnostics.blocks import by_runs
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.readers.frames import IDENTITY, WorldTransform, fitted_frame, moved, turned_frame
@@ -39,7 +40,7 @@ def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sou
 
 def _whitened(p: Poses, rows: Indices, error: Array, judged: Sequence[int]) -> Array:
     index = list(judged)
-    return whiten(error[:, index], p.covariance[rows][:, index][:, :, index])
+    return by_runs(lambda e, at: whiten(e[:, index], p.covariance[at][:, index][:, :, index]), error, rows)
 
 
 def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array:
@@ -52,12 +53,16 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
     ----------
     free : (d, 6), directions in which the world moves: shift, then rotation vector
     """
-    k, d = len(sound.rows), len(free)
-    truth = [_small(side * motion).placed(sound.truth, p.manifold) for side in (-STEP, STEP) for motion in free]
-    errors = p.error_of(np.tile(sound.rows, 2 * d), np.concatenate(truth))
-    after, before = errors.reshape(2, d * k, errors.shape[-1])
-    change = _whitened(p, np.tile(sound.rows, d), (after - before) / (2.0 * STEP), judged)
-    return np.moveaxis(change.reshape(d, k, len(judged)), 0, -1)
+
+    def of_block(truth: Array, rows: Indices) -> Array:
+        k, d = len(rows), len(free)
+        there = [_small(side * motion).placed(truth, p.manifold) for side in (-STEP, STEP) for motion in free]
+        errors = p.error_of(np.tile(rows, 2 * d), np.concatenate(there))
+        after, before = errors.reshape(2, d * k, errors.shape[-1])
+        change = _whitened(p, np.tile(rows, d), (after - before) / (2.0 * STEP), judged)
+        return np.moveaxis(change.reshape(d, k, len(judged)), 0, -1)
+
+    return by_runs(of_block, sound.truth, sound.rows)
 
 
 def _small(motion: Array) -> WorldTransform:

@@ -27,7 +27,7 @@ from consistency.referee.document.map import map_text
 from consistency.referee.document.verdict import document
 from consistency.referee.gating.checks import of_results
 from consistency.referee.parsing.columns import OWN_COVARIANCE
-from consistency.referee.show.json import render
+from consistency.referee.show.as_json import render
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Failure
 from consistency.referee.verdicts.baselines import baseline

@@ -22,7 +22,7 @@ from consistency.referee.diagnostics.sample import sample_of
 from consistency.referee.diagnostics.symmetric import Symmetric
 from consistency.referee.diagnostics.whitening import all_finite, squared_length
 from consistency.referee.document.verdict import document
-from consistency.referee.show.json import render
+from consistency.referee.show.as_json import render
 from consistency.referee.verdicts.judge import analyse
 
 STEPS = 200

@@ -31,7 +31,7 @@ from consistency.referee.diagnostics import clustered_share, rejection_score
 from consistency.referee.document.blocks import Name, Table
 from consistency.referee.document.verdict import document
 from consistency.referee.document.wording import brief, written
-from consistency.referee.show.json import render
+from consistency.referee.show.as_json import render
 
 WRONG = [{"kind": "wrong-match", "rate": 0.05}]
 

@@ -23,7 +23,7 @@ from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import Record
 from consistency.referee.document.verdict import document
-from consistency.referee.show.json import render
+from consistency.referee.show.as_json import render
 
 OPEN: dict[str, Any] = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "seed": 3, "jobs": 1}  # looks at 12 to 20
 

@@ -22,7 +22,7 @@ from consistency.referee.pages import require_plot, write_monitor_plot
 from consistency.referee.pages.monitor import POINTS, averaged, monitor_plot, sheet
 from consistency.referee.readers.nis import NisLog
 from consistency.referee.show import with_matplotlib
-from consistency.referee.show.json import render
+from consistency.referee.show.as_json import render
 from consistency.referee.show.terminal import show
 from consistency.referee.verdicts.monitoring import Watched, make_monitor, read_innovations, watch, watch_lines
 

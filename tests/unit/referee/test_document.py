@@ -40,7 +40,7 @@ from consistency.referee.document.map import COLUMNS, map_cells, map_lines, map_
 from consistency.referee.document.plan import plan_lines
 from consistency.referee.document.verdict import FURTHER, TERMINAL, cells, document, page, with_values
 from consistency.referee.document.wording import PLAIN, PRINTED, written
-from consistency.referee.show import FORMATS, json, junit, markdown, rendered, static_html, terminal, text
+from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal, text
 
 INF, NAN = float("inf"), float("nan")
 GOOD = Reason("ekf", "consistent: no fault found", ("mean NEES 3.0",))
@@ -96,7 +96,7 @@ def test_what_was_judged_is_found_wherever_it_stands() -> None:
 
 
 def test_junit_has_a_case_for_each_verdict() -> None:
-    suite = ET.fromstring(junit.render(TREE))[0]
+    suite = ET.fromstring(as_xml.render(TREE))[0]
     assert suite.attrib == {"name": "Two `filters`", "tests": "3", "failures": "1", "errors": "0", "skipped": "0"}
     bad, good, _ = suite
     assert (bad.attrib, good.attrib) == (
@@ -111,7 +111,7 @@ def test_junit_has_a_case_for_each_verdict() -> None:
 
 
 def test_markdown_escapes_what_would_be_markup() -> None:
-    said = markdown.render(TREE)
+    said = as_md.render(TREE)
     assert said.startswith("## Two \\`filters\\`\n\nOne of them is honest.\n\n| filter | verdict | n |  |\n| --- | ---")
     assert "| ekf | consistent | 2.00 |  |" in said
     assert "| g | overconfident: covariance too small &amp; skewed |" in said
@@ -121,7 +121,7 @@ def test_markdown_escapes_what_would_be_markup() -> None:
 
 
 def test_json_holds_the_data_and_no_word_more() -> None:
-    assert standard.loads(json.render(TREE)) == {"a": [1.0, None], "b": [2, None]}
+    assert standard.loads(as_json.render(TREE)) == {"a": [1.0, None], "b": [2, None]}
 
 
 def test_text_puts_what_did_not_pass_below_its_row() -> None:
@@ -133,7 +133,7 @@ def test_text_puts_what_did_not_pass_below_its_row() -> None:
 
 
 def test_a_static_page_shows_every_block_and_escapes_all_text() -> None:
-    said = static_html.render(TREE)
+    said = as_html.render(TREE)
     for part in (
         "<h1>Two `filters`</h1>\n<p>One of them is honest.</p>", '<span class="verdict consistent">consistent</span>',
         '<td class="number" data-head="n">2.00</td>', "too small &amp; skewed", "<li>x | y</li><li>z</li>",
@@ -183,13 +183,13 @@ def test_columns_without_any_value_are_left_out() -> None:
 def test_one_document_says_the_same_on_the_terminal_and_in_files() -> None:
     verdicts = {"good": verdict_of(1.0), "bad": verdict_of(2.0)}
     tree = document(verdicts, "a.csv")
-    assert standard.loads(json.render(tree))["bad"]["reasons"] == list(verdicts["bad"].reasons)
-    suite = ET.fromstring(junit.render(tree))[0]
+    assert standard.loads(as_json.render(tree))["bad"]["reasons"] == list(verdicts["bad"].reasons)
+    suite = ET.fromstring(as_xml.render(tree))[0]
     assert [len(case.findall("failure")) for case in suite] == [0, 1]
     assert suite[1][0].get("message") == verdicts["bad"].reasons[0]
     for name, v in verdicts.items():
         assert f"{name} is {v.reasons[0]}" in text.fragment(*tree.opening)
-        assert f"**{name}** is {v.reasons[0]}" in markdown.render(tree)
+        assert f"**{name}** is {v.reasons[0]}" in as_md.render(tree)
     assert not list(document(verdicts, reasons=False).reasons)
 
 

@@ -190,7 +190,7 @@ def test_the_page_stands_alone(session: pytest.Pytester) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--consistency-report=gates.txt"], "must end in .json or .html"),
+        (["--consistency-report=gates.txt"], "must end in .html or .json or .md or .xml"),
         (["--consistency-report=nowhere/gates.json"], "nowhere does not exist; make it first"),
         (["--consistency-report=folder.json"], "is a folder"),
         (["--consistency-runs=0"], "--consistency-runs must be at least 1, got 0"),

@@ -10,7 +10,7 @@ import tracemalloc
 import weakref
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -357,26 +357,40 @@ def test_a_run_that_takes_long_keeps_no_other_from_the_journal(
     assert content(tmp_path / "out") == content(written)
 
 
+class Together(SimpleQueue[Any]):
+    """Gives nothing before four are there."""
+
+    def get(self, block: bool = True, timeout: float | None = None) -> Any:
+        while self.qsize() < 4:
+            time.sleep(0.01)
+        return super().get(block, timeout)
+
+
+@dataclass
+class Work:
+    """Runs that give their number, or fail."""
+
+    failing: tuple[int, ...] = ()
+    isolation = nullcontext()
+
+    def __call__(self, run: int) -> int:
+        if run in self.failing:
+            raise RuntimeError("out of ideas")
+        return run
+
+
 def test_what_ends_together_with_an_error_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Fails:
-        isolation = nullcontext()
-
-        def __call__(self, run: int) -> int:
-            if run in (0, 2):
-                raise RuntimeError("out of ideas")
-            return run
-
-    class Together(SimpleQueue[Any]):
-        def get(self, block: bool = True, timeout: float | None = None) -> Any:
-            while self.qsize() < 4:
-                time.sleep(0.01)
-            return super().get(block, timeout)
-
     monkeypatch.setattr(local, "SimpleQueue", Together)
-    outcomes = local.LocalThreads(2).outcomes(Fails(), range(4))  # type: ignore[arg-type]
+    outcomes = local.LocalThreads(2).outcomes(Work((0, 2)), range(4))  # type: ignore[arg-type]
     assert {next(outcomes), next(outcomes)} == {1, 3}
     with pytest.raises(RuntimeError, match="out of ideas"):
         next(outcomes)
+
+
+def test_what_ends_together_leaves_room_for_as_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "SimpleQueue", Together)
+    outcomes = local.LocalThreads(2).outcomes(Work(), range(8))  # type: ignore[arg-type]
+    assert sorted(map(int, outcomes)) == list(range(8))  # type: ignore[call-overload]
 
 
 def test_rows_out_of_order_are_not_resumed(uvd: cs.Scenario, written: Path) -> None:

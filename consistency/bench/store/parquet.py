@@ -242,11 +242,6 @@ def _plain(table: Any) -> Any:
     return table.replace_schema_metadata(None)
 
 
-def columns_of(folder: Path, name: str) -> list[str]:
-    """Names of the columns of a table; refused as :func:`require_table` does."""
-    return list(require_table(folder, name).schema_arrow.names)
-
-
 def _filters_of(path: Path) -> tuple[frozenset[str], ...]:
     """Names of the filters in each row group of a table, which is passed over where a filter is not in it.
 

@@ -18,6 +18,7 @@ from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.folders import writing
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation
 from consistency.stereo.characterising.wording import counted, interval, sentences
@@ -129,19 +130,14 @@ def require_free_file(path: Path, overwrite: bool) -> None:
         raise InputError(f"--out {path}: must end in .toml")
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
-            pass
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
+    with writing(path), tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+        pass
 
 
 def write_sensor(path: Path, text: str) -> None:
     """Write the file whole or not at all."""
-    try:
+    with writing(path):
         write_whole(path, text.encode("utf-8"))
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
 
 
 def _pair(key: str, values: Any) -> str:

@@ -200,10 +200,10 @@ def open_parquet(path: Path, refusal: str = "cannot be read, damaged or cut shor
     return file
 
 
-def read_frame(path: Path, refusal: str) -> pd.DataFrame:
+def read_frame(path: Path) -> pd.DataFrame:
     """Read a whole Parquet file of unknown columns, by columns alone; raises :class:`InputError`."""
-    file = open_parquet(path, refusal)
-    with reading(path, refusal):
+    file = open_parquet(path)
+    with reading(path):
         table: pd.DataFrame = _plain(file.read()).to_pandas()
         return table
 

@@ -65,7 +65,7 @@ def _changed(trial: Trial, scenario: Scenario, of: Real) -> Trial:
     assert isinstance(sensor, UvdSensor)
     assert trial.truth is not None
     assert trial.landmarks is not None
-    step = np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
+    step = trial.step
     body = point.to_robot(*trial.truth[step].T, *trial.landmarks[trial.landmark].T)
     ideal = np.stack(stereo.project(*point.to_sensor(*body, sensor.mount.packed()), *sensor.rig), axis=-1)
     noise = trial.z - ideal

@@ -28,13 +28,12 @@ from consistency.referee.errors import InputError
 from consistency.referee.fitting.drives import Drive, drive_of
 from consistency.referee.fitting.likelihood import terms_of
 from consistency.referee.fitting.model import decided
-from consistency.referee.fitting.motions import vectors
 from consistency.referee.fitting.noise import fit_noise, intervals
 from consistency.referee.fitting.persistence import doubts, persistent
 from consistency.referee.fitting.ratios import folds_of, judged_by
 from consistency.referee.fitting.refusals import growth_of, require_sound
 from consistency.referee.fitting.windows import PLANE, SPACE, Windows, span_of, windows_of
-from consistency.referee.geometry.groups import composed, matrices
+from consistency.referee.geometry.groups import composed, matrices, vectors
 from consistency.referee.types import Array
 
 SPAN, STEP, LENGTH = "10m", 0.5, 1000.0  # m

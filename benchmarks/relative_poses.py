@@ -23,7 +23,7 @@ from scipy.linalg import expm
 from consistency.referee.diagnostics import Evidence, Verdict
 from consistency.referee.diagnostics.planning import power_of
 from consistency.referee.diagnostics.questions import MAIN, SHARES
-from consistency.referee.geometry.groups import carried, composed, to_left
+from consistency.referee.geometry.groups import carried, composed, to_left, vectors
 from consistency.referee.readers.relative import Stretch, relative_recording
 from consistency.referee.readers.sheet import Places
 from consistency.referee.readers.windows import relative_of
@@ -82,15 +82,6 @@ def drive(rng: np.random.Generator, group: str, steps: int, ratio: float = 1.0, 
     errors = np.sqrt(ratio) * rng.normal(size=(steps, n)) @ mixing.T
     truth = composed(np.concatenate([np.eye(motions.shape[-1])[None], motions @ exp(errors)]))
     return Log(group, motions, truth, np.broadcast_to(covariance, (steps, n, n)))
-
-
-def vectors(T: Array) -> Array:
-    """Poses as files have them: (N, 3), or (N, 7) with a quaternion."""
-    if T.shape[-1] == 3:
-        return np.column_stack([T[:, :2, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
-    from scipy.spatial.transform import Rotation
-
-    return np.column_stack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
 
 
 def motion_stretch(log: Log, run: int = 0) -> Stretch:

@@ -112,7 +112,7 @@ def white_twin(trial: Trial, belief: Any, rng: np.random.Generator) -> Trial:
     speed = (move[:, 0] * np.cos(heading) + move[:, 1] * np.sin(heading)) / dt
     exact = np.column_stack([dt, speed, np.diff(trial.truth[:, 2]) / dt])
     path = dead_reckoning(trial.start, exact)
-    pose = path[np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))]
+    pose = path[trial.step]
     _, born = np.unique(trial.landmark, return_index=True)
     (u, v, d), (x, y, heading) = trial.z[born].T, pose[born].T
     seen = point.from_sensor(*stereo.triangulate(u, v, d, sensor.f, sensor.B), mount)
@@ -170,7 +170,7 @@ def are_better(cut: Sequence[Measured], left_in: Measured) -> bool:
 
 def unlinked_steps(trial: Trial) -> Array:
     """Steps that no landmark links to the one before: none is seen both before the step and in it or later."""
-    step = np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
+    step = trial.step
     sights = pd.Series(step).groupby(trial.landmark).agg(["min", "max"]).to_numpy()
     linked = np.zeros(trial.steps + 1, dtype=bool)
     for first, last in sights:

@@ -23,7 +23,6 @@ LONG = True
 
 SKIPPED = 5  # steps: the peers take NEES from step 6 on
 ESDE, IEKF, OCEKF = "CAOR-MINES-ParisTech/esde", "mbrossar/iekf-slam", "rpng/ocekf-slam"
-NOISES = (0.01, 0.02, 0.03)  # s of esde: sigma_v = s / sqrt(2), sigma_omega = 2 sqrt(2) s
 MAPS = (42, 43, 44, 45, 46)  # seeds of rings of landmarks: the peer's map is one draw of another generator
 FALSE_ALARM = 0.01  # of one verdict
 

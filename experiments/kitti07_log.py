@@ -171,7 +171,7 @@ def trial_of(data: Recording, rows: pd.DataFrame) -> Trial:
 
 def rows_of(trial: Trial) -> pd.DataFrame:
     """Rows (piece, step, z0, z1, z2) of a trial, a piece of a track for each landmark."""
-    step = np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
+    step = trial.step
     rows = pd.DataFrame(trial.z, columns=PIXELS).assign(piece=trial.landmark, step=step)
     return rows.sort_values(["piece", "step"], ignore_index=True)
 

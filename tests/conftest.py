@@ -114,3 +114,11 @@ def dense() -> Iterator[None]:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20070)
+
+
+@pytest.fixture
+def fresh() -> np.random.Generator:
+    """Numbers that no other run of the test has; the seed is printed where it fails."""
+    seed = np.random.SeedSequence().entropy
+    print(f"seed {seed}")
+    return np.random.default_rng(seed)

@@ -95,6 +95,11 @@ class Trial:
         return np.concatenate([[0.0], np.cumsum(self.controls[:, 0])])
 
     @property
+    def step(self) -> Indices:
+        """Step 1..T of a row, shape (M,)."""
+        return np.repeat(np.arange(1, self.steps + 1), np.diff(self.first))
+
+    @property
     def spurious(self) -> Array:
         """Whether a row is not of the landmark that it states, shape (M,)."""
         return np.zeros(len(self.landmark), bool) if self.source is None else self.source != self.landmark

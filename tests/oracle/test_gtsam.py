@@ -63,7 +63,7 @@ class Dense:
         self.trial, self.belief = trial, scenario.belief
         self.labels = np.unique(trial.landmark)
         self.sigma_motion = np.array([self.belief.motion.sigma_v, self.belief.motion.sigma_omega])
-        self.rows = np.repeat(np.arange(trial.steps), np.diff(trial.first))
+        self.rows = trial.step - 1
         assert trial.landmarks is not None
         self.start = np.concatenate([np.zeros(2 * trial.steps), trial.landmarks[self.labels].ravel()])
 

@@ -253,7 +253,7 @@ def test_a_landmark_that_was_parked_begins_anew(small: Small, name: str) -> None
     """
     scenario = small("herath2007-stereo", truth__steps=500)
     whole = cs.simulate(scenario, run=2)
-    step = np.repeat(np.arange(whole.steps), np.diff(whole.first))
+    step = whole.step - 1
     keep, z = np.ones(len(step), bool), whole.z.copy()
     for label, again in AGAIN.items():
         sighted = np.flatnonzero(whole.landmark == label)

@@ -109,12 +109,12 @@ def test_one_compiled_signature_serves_every_caller(uvd: cs.Scenario) -> None:
     """Arrays from a table are often column-major; a second signature would cost half a minute to compile."""
     trial = cs.simulate(uvd)
     ours = compiled("ekf-uvd", trial, uvd.belief)
-    signatures = len(trial_kernel.signatures)
+    signatures = len(trial_kernel._entries)
     turned = replace(trial, controls=np.asfortranarray(trial.controls), z=np.asfortranarray(trial.z))
     turned.controls.flags.writeable = False
     again = compiled("ekf-uvd", turned, uvd.belief)
     assert np.array_equal(again.pose, ours.pose)
-    assert len(trial_kernel.signatures) == signatures
+    assert len(trial_kernel._entries) == signatures
 
 
 def test_sigma_points_matter(small: Small) -> None:

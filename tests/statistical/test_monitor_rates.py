@@ -18,13 +18,6 @@ RATES = (0.05, 0.01)
 MISSIONS, STEPS = 1000, 5000
 
 
-@pytest.fixture
-def fresh() -> np.random.Generator:
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
-
-
 @pytest.mark.parametrize("gate", [None, 0.99, 0.95])
 @pytest.mark.parametrize("name", list(calibration.WORLDS))
 def test_right_filters_alarm_no_more_often_than_stated(

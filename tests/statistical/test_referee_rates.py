@@ -22,13 +22,6 @@ pytestmark = pytest.mark.slow
 DOF = 3
 
 
-@pytest.fixture
-def fresh() -> np.random.Generator:
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
-
-
 # --- single questions where they are hardest -------------------------------------------------------------
 
 RUNS, STEPS = 20, 40

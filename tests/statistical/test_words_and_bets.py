@@ -20,13 +20,6 @@ pytestmark = pytest.mark.slow
 DRAWS, STEPS = 500, 100
 
 
-@pytest.fixture
-def fresh() -> np.random.Generator:
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
-
-
 # --- heavy tails -------------------------------------------------------------------------------------------
 
 

@@ -13,6 +13,7 @@ from consistency.referee.diagnostics.export import plain
 from consistency.referee.diagnostics.wording import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.folders import writing
 
 
 def lines(outcome: Challenge, out: Path) -> list[str]:
@@ -118,10 +119,8 @@ def write_scenario(outcome: Challenge, out: Path) -> None:
     text = scenario_text(
         outcome.world.variant(out.stem, summary=summary), f"Found by a challenge; again: {command(outcome, out)}"
     )
-    try:
+    with writing(out):
         write_whole(out, text.encode("utf-8"))
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from None
 
 
 def _duration(seconds: float) -> str:

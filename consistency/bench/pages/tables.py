@@ -31,7 +31,7 @@ def extra_table(
     """
     if not path.exists():
         return None
-    table = read_frame(path, "cannot be read, damaged or cut short")
+    table = read_frame(path)
     wanted = [*numbers, *texts]
     if absent := [column for column in wanted if column not in table.columns]:
         raise InputError(f"{path}: column '{absent[0]}' is missing; needed: {', '.join(wanted)}")

@@ -82,8 +82,10 @@ def read_table(path: Path, model: type[T], **extra: Any) -> T:
             raise InputError(f"{path}: {explain(error, model)}") from None
 
 
-def explain(error: ValidationError, model: type[Table]) -> str:
+def explain(error: ValueError, model: type[Table]) -> str:
     """One complaint of pydantic in one line: key, what is wrong, what is allowed; unknown keys first."""
+    if not isinstance(error, ValidationError):
+        return str(error)
     complaints = sorted(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
     first, more = complaints[0], len(complaints) - 1
     keys = [one_line(key, 60) for key in _keys(first["loc"])]

@@ -90,7 +90,7 @@ def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
             pd.DataFrame(
                 {
                     "run": np.full(len(t.landmark), t.run),
-                    "step": np.repeat(np.arange(1, t.steps + 1), np.diff(t.first)),
+                    "step": t.step,
                     "landmark": t.landmark,
                     **dict(zip(["z0", "z1", "z2"], t.z.T, strict=False)),
                     **({"source": t.landmark if t.source is None else t.source} if labelled else {}),

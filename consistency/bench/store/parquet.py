@@ -200,10 +200,10 @@ def open_parquet(path: Path, refusal: str = "cannot be read, damaged or cut shor
     return file
 
 
-def read_frame(path: Path, refusal: str) -> pd.DataFrame:
+def read_frame(path: Path) -> pd.DataFrame:
     """Read a whole Parquet file of unknown columns, by columns alone; raises :class:`InputError`."""
-    file = open_parquet(path, refusal)
-    with reading(path, refusal):
+    file = open_parquet(path)
+    with reading(path):
         table: pd.DataFrame = _plain(file.read()).to_pandas()
         return table
 
@@ -240,11 +240,6 @@ def _cells(name: str, column: Any) -> Array:
 def _plain(table: Any) -> Any:
     """A table or batch without the notes of other programs, which may turn columns into an index or other types."""
     return table.replace_schema_metadata(None)
-
-
-def columns_of(folder: Path, name: str) -> list[str]:
-    """Names of the columns of a table; refused as :func:`require_table` does."""
-    return list(require_table(folder, name).schema_arrow.names)
 
 
 def _filters_of(path: Path) -> tuple[frozenset[str], ...]:

@@ -14,7 +14,7 @@ import pandas as pd
 from pydantic import ValidationError
 
 from consistency.bench.scenario import Scenario, explain
-from consistency.bench.store.parquet import OPTIONAL, Columns, columns_of, read_batches, read_parquet, require_table
+from consistency.bench.store.parquet import OPTIONAL, Columns, read_batches, read_parquet, require_table
 from consistency.bench.store.soundness import require_manifest, require_rows
 from consistency.bench.store.storage import require_unchanged, write_folder
 from consistency.referee.errors import InputError
@@ -168,7 +168,9 @@ class StoredResults(Tables):
 
     @property
     def has_joint(self) -> bool:
-        return "map" in self.manifest.get("tables", []) and JOINT in columns_of(self.folder, "map")
+        return (
+            "map" in self.manifest.get("tables", []) and JOINT in require_table(self.folder, "map").schema_arrow.names
+        )
 
     @property
     def estimates(self) -> pd.DataFrame:

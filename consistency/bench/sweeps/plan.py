@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.montecarlo import resolve_filters
@@ -292,8 +292,8 @@ def _require_cells(sweep: Sweep) -> None:
             try:
                 changes = axis.changes(sweep.base, value)
                 with_changes(sweep.base, sweep.base.name, "", changes)
-            except (ValidationError, ValueError) as error:
-                text = explain(error, Scenario) if isinstance(error, ValidationError) else str(error)
+            except ValueError as error:
+                text = explain(error, Scenario)
                 raise InputError(f"key '{axis.table}.{axis.key}', value {value!r}: {text}") from None
         for key in changes:
             if key in taken:
@@ -307,8 +307,7 @@ def _require_cells(sweep: Sweep) -> None:
         raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
     try:
         names = [cell.name for cell in sweep.cells]
-    except (ValidationError, ValueError) as error:
-        text = explain(error, Scenario) if isinstance(error, ValidationError) else str(error)
-        raise InputError(f"key 'grid': some values do not go together: {text}") from None
+    except ValueError as error:
+        raise InputError(f"key 'grid': some values do not go together: {explain(error, Scenario)}") from None
     if twice := sorted(name for name, times in Counter(names).items() if times > 1):
         raise InputError(f"key 'grid': two values are too much alike to be told apart ({twice[0]})")

@@ -29,13 +29,6 @@ from consistency.referee.verdicts.judge import analyse
 
 CONFIRM = 4  # filters that are confirmed at most: each may have to be compiled
 OPEN = ("consistent", "undecided")  # what confirming runs say where they find no fault
-SURENESS = {
-    "sure": "the rig lies inside the map, all cells around it agree, and runs of the rig show the filter consistent",
-    "fairly sure": "the nearest cell says so, but not everything else does",
-    "unsure": "the map does not reach this rig",
-    "no": "runs of the rig itself contradict the map",
-    "": "not consistent in the nearest cell, or not run on the rig",
-}
 
 
 @dataclass(frozen=True)
@@ -47,7 +40,7 @@ class NearFilter:
     agreeing: int  # cells around the rig in which it is consistent
     around: int  # cells around the rig; one that the map does not have yet does not agree
     verdict: Verdict | None = None  # of the confirming runs
-    sure: str = ""  # one of SURENESS
+    sure: str = ""  # sure | fairly sure | unsure | no: the runs find a fault | "": not consistent in the nearest cell
     beyond: CellResult | None = None  # in the nearest cell of the second map, where that is looked at
 
     @property

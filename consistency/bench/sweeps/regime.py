@@ -17,8 +17,8 @@ from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.folder import SweepFolder, describe, open_sweep, sweep_from
 from consistency.bench.sweeps.plan import Cell, Sweep
 from consistency.referee.errors import InputError
+from consistency.referee.pages import write_file
 from consistency.referee.parsing import read_json, reading
-from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 
 MAP_KIND = "map"
@@ -92,10 +92,7 @@ def write_regime(regime: Regime, out: Path) -> list[Path]:
         table.to_parquet(compression="zstd", index=False),
     )  # fmt: skip
     for path, content in zip(paths, contents, strict=True):
-        try:
-            write_whole(path, content, 0o644)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        write_file(path, content)
     return paths
 
 

@@ -133,9 +133,8 @@ def _with_options(scenario: Scenario, request: Request) -> Scenario:
         try:
             changes = QUANTITIES[option].changes(scenario, value * factor)
             scenario = with_changes(scenario, scenario.name, scenario.summary, changes)
-        except (ValidationError, ValueError) as error:
-            text = explain(error, Scenario) if isinstance(error, ValidationError) else str(error)
-            raise InputError(f"--{option} {value:g}: {text}") from None
+        except ValueError as error:
+            raise InputError(f"--{option} {value:g}: {explain(error, Scenario)}") from None
     return scenario
 
 

@@ -114,8 +114,6 @@ def part_of(trial: Trial, start: int, end: int) -> Trial:
     )  # fmt: skip
 
 
-def with_belief(scenario: Scenario, belief: Belief, name: str | None = None, summary: str | None = None) -> Scenario:
+def with_belief(scenario: Scenario, belief: Belief, name: str | None = None) -> Scenario:
     """The scenario with another belief."""
-    return scenario.variant(
-        name or scenario.name, belief=belief.model_dump(), summary=scenario.summary if summary is None else summary
-    )
+    return scenario.variant(name or scenario.name, belief=belief.model_dump(), summary=scenario.summary)

@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.independence import independence
 from consistency.referee.diagnostics.questions import BIAS
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.scale import run_means
-from consistency.referee.diagnostics.single_log import APART, MOST, REACH
+from consistency.referee.diagnostics.single_log import APART, MOST, correlation_time
 from consistency.referee.diagnostics.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -55,23 +55,10 @@ def memory_of(whitened: Array) -> Memory:
     """
     w = whitened[np.isfinite(whitened).all(axis=1)]
     sizes = np.square(w).sum(axis=1)
-    found = [_time(series) for series in (*w.T, sizes - sizes.mean())] if len(w) > 1 else []
+    found = [correlation_time(series) for series in (*w.T, sizes - sizes.mean())] if len(w) > 1 else []
     z = float(special.ndtri(CONFIDENCE))
     uppers = [time * np.exp(z * np.sqrt(2.0 * (2.0 * reach + 1.0) / len(w))) for time, reach in found]
     return Memory(len(whitened), max((time for time, _ in found), default=np.inf), max(uppers, default=np.inf))
-
-
-def _time(series: Array) -> tuple[float, int]:
-    """Integrated correlation time of a series (T,) about zero, at least 1, and the lag up to which it was summed."""
-    T = len(series)
-    transform = np.fft.rfft(series, 2 * T)
-    covariance = np.fft.irfft(transform * transform.conj(), 2 * T)[:T]
-    if not covariance[0] > 0:
-        return 1.0, 1
-    tau = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
-    enough = np.arange(T) >= REACH * tau
-    lag = int(np.argmax(enough)) if enough.any() else T - 1
-    return max(1.0, float(tau[lag])), max(lag, 1)
 
 
 def in_pieces(record: Record, count: int | None = None) -> Record:

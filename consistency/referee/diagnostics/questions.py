@@ -12,10 +12,8 @@ MAIN, STEP, AXIS, DIRECTION = "scale", "scale in some step", "scale of an axis",
 SCALE = (MAIN, STEP, AXIS, DIRECTION)
 BIAS = ("bias", "bias in some step")
 SHAPE = ("shape", "shape in some step")
-TAILS = ("outliers", "distribution")
 INNOVATIONS = ("innovation scale", "innovation whiteness")
 JOINT, JOINT_DISTRIBUTION = "scale of pose and map", "distribution of pose and map"
-OF_MAP = (JOINT, JOINT_DISTRIBUTION)  # asked of maps alone
 # Share of the false-alarm rate of each question; those that are asked share what the main one leaves. Half goes to
 # the mean over the trajectory, so that the number of runs planned for a covariance ratio does not depend on what
 # else is asked.

@@ -40,7 +40,7 @@ def within(nees: Array, dof: int, settings: Settings, factor: float, confidence:
     values = nees[np.isfinite(nees)] / dof
     if len(values) < LONG or not values.std() > 0:
         return None
-    tau, reach = correlation_time(values)
+    tau, reach = correlation_time(values - values.mean())
     steps = len(values)
     if steps < LONG * tau:
         return None
@@ -58,11 +58,13 @@ def within(nees: Array, dof: int, settings: Settings, factor: float, confidence:
     return Within(Interval(ratio, ratio / high, ratio / max(low, 1e-300)), tau, nu, needed, pieces)
 
 
-def correlation_time(values: Array) -> tuple[float, int]:
-    """Integrated autocorrelation time of a series (T,), at least 1, and the lag up to which it was summed."""
-    T, x = len(values), values - values.mean()
-    transform = np.fft.rfft(x, 2 * T)
+def correlation_time(series: Array) -> tuple[float, int]:
+    """Integrated correlation time of a series (T,) about zero, at least 1, and the lag up to which it was summed."""
+    T = len(series)
+    transform = np.fft.rfft(series, 2 * T)
     covariance = np.fft.irfft(transform * transform.conj(), 2 * T)[:T]
+    if not covariance[0] > 0:
+        return 1.0, 1
     tau = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
     enough = np.arange(T) >= REACH * tau
     lag = int(np.argmax(enough)) if enough.any() else T - 1

@@ -111,11 +111,11 @@ def blocks_of(drive: Indices) -> list[Indices]:
     return [part for part in np.array_split(np.arange(len(drive)), min(BLOCKS, len(drive))) if len(part)]
 
 
-def interval_of(value: float, left_out: Sequence[float], confidence: float = CONFIDENCE) -> Interval:
+def interval_of(value: float, left_out: Sequence[float]) -> Interval:
     """Interval of a variance from its values with each block left out, in cube roots (Wilson & Hilferty 1931)."""
     roots, k = np.cbrt(np.asarray(left_out)), len(left_out)
     error = float(np.sqrt((k - 1) / k * ((roots - roots.mean()) ** 2).sum()))
-    reach = float(stats.t.isf(0.5 * (1.0 - confidence), k - 1)) * error if k > 1 else np.inf
+    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1)) * error if k > 1 else np.inf
     if not error > 0:  # 0 with any block left out: its upper end is not known
         return Interval(value, 0.0, float("nan"))
     low, high = float(np.cbrt(value)) - reach, float(np.cbrt(value)) + reach

@@ -6,18 +6,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Record
 from consistency.referee.fitting.drives import Drive
 from consistency.referee.fitting.ratios import Fold
 from consistency.referee.fitting.windows import Windows
-from consistency.referee.geometry.groups import carried, composed, to_left
+from consistency.referee.geometry.groups import carried, composed, to_left, vectors
 from consistency.referee.parsing.columns import COVARIANCE
 from consistency.referee.readers.relative import Stretch, relative_recording
 from consistency.referee.readers.sheet import Places
 from consistency.referee.readers.windows import Relative
-from consistency.referee.types import Array
 
 CONVENTIONS = {3: "so2", 6: "so3"}  # the defaults of files, so that they are read without further options
 HEAD = ("run", "step", "t", "x", "y", "heading")
@@ -54,13 +52,6 @@ def record_of(stretches: Sequence[tuple[str, Stretch]], axes: Sequence[str]) -> 
     one = Relative(1.0, "step", motions=True, independent=True)
     names = ("x", "y", "heading") if len(axes) == 3 else axes
     return relative_recording("motions", "motions", [each for _, each in stretches], names, range(len(axes)), one)
-
-
-def vectors(T: Array) -> Array:
-    """Poses as files have them, x, y, heading (N, 3), or x, y, z and a quaternion (N, 7), of matrices."""
-    if T.shape[-1] == 3:
-        return np.column_stack([T[:, :2, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
-    return np.column_stack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
 
 
 def write_motions(stretches: Sequence[tuple[str, Stretch]], folder: Path) -> list[str]:

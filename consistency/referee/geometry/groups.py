@@ -27,6 +27,14 @@ def matrices(pose: Array) -> Array:
     return out
 
 
+def vectors(T: Array) -> Array:
+    """Poses (N, 3) or (N, 7) of homogeneous matrices, the inverse of :func:`matrices`."""
+    if T.shape[-1] == 3:
+        return np.column_stack([T[:, :2, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
+    turn = Rotation.from_matrix(T[:, :3, :3]).as_quat() if len(T) else np.empty((0, 4))
+    return np.column_stack([T[:, :3, 3], turn])
+
+
 def inverse(T: Array) -> Array:
     """T^-1 of homogeneous matrices (..., d + 1, d + 1)."""
     d = T.shape[-1] - 1
@@ -49,11 +57,7 @@ def composed(motions: Array) -> Array:
 
 def log(T: Array) -> Array:
     """Log of homogeneous matrices (N, d + 1, d + 1) -> twists (N, n), m and rad."""
-    d = T.shape[-1] - 1
-    if d == 2:
-        return se2_log(np.column_stack([T[:, :2, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])]))
-    turn = Rotation.from_matrix(T[:, :3, :3]).as_quat() if len(T) else np.empty((0, 4))
-    return se3_log(np.column_stack([T[:, :3, 3], turn]))
+    return (se2_log if T.shape[-1] == 3 else se3_log)(vectors(T))
 
 
 def adjoint(T: Array) -> Array:

@@ -20,9 +20,9 @@ POINTS = 600  # at most, of the NIS: few enough to see a change among them
 FAULT = replace(style(1), dash=(), width=1.1)
 
 
-def monitor_plot(shown: Watched | Sequence[GateRatios], kind: str, resolution: int = 200) -> bytes:
+def monitor_plot(shown: Watched | Sequence[GateRatios], kind: str) -> bytes:
     """NIS / dof above, the e-value below, over the steps of the file, or test ratios; ``kind`` is png, pdf or svg."""
-    return with_matplotlib.render(sheet(shown) if isinstance(shown, Watched) else ratios_sheet(shown), kind, resolution)
+    return with_matplotlib.render(sheet(shown) if isinstance(shown, Watched) else ratios_sheet(shown), kind)
 
 
 def ratios_sheet(ratios: Sequence[GateRatios]) -> Sheet:

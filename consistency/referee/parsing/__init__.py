@@ -67,7 +67,7 @@ def one_line(value: object, longest: int = _SHOWN) -> str:
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
-def require_name(name: str, where: str, remedy: str = "rename it") -> str:
+def require_name(name: str, where: str) -> str:
     """A name of something, as it is, which can be printed: on one line, and to a terminal.
 
     Raises
@@ -76,7 +76,7 @@ def require_name(name: str, where: str, remedy: str = "rename it") -> str:
         It has a line break or another control character.
     """
     if any(unicodedata.category(char) in UNPRINTABLE for char in name):
-        raise InputError(f"{where}: the name {one_line(ascii(name), 60)} has a control character; {remedy}")
+        raise InputError(f"{where}: the name {one_line(ascii(name), 60)} has a control character; rename it")
     return name
 
 

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.gate_ratios import GateRatios
+from consistency.referee.diagnostics.numbers_in_words import plural
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.nis import NisLog, choose
-from consistency.referee.readers.record import count, listed
+from consistency.referee.readers.record import listed
 from consistency.referee.readers.ulog import MICRO, Pairs, nis_of
 from consistency.referee.types import Array
 
@@ -84,7 +85,7 @@ def read_ratios(path: Path, sensor: str | None = None, core: int | None = None) 
     if sensor is not None:
         there = [each.sensor for each in ratios]
         ratios = [ratios[there.index(choose(path, "filter", there, sensor, "sensor"))]]
-    notes = [f"{path}: read as test ratios of {message}, {count(len(rows), 'message')}"]
+    notes = [f"{path}: read as test ratios of {message}, {plural(len(rows), 'message')}"]
     if bare := [each.sensor for each in ratios if np.isnan(each.gate)]:
         notes.append(f"{path}: PARM holds no gate of {listed(bare)}; what a right filter would exceed is not known")
     return ratios, notes
@@ -113,7 +114,7 @@ def read_stated(path: Path, sensor: str, core: int | None = None) -> NisLog:
         at = int(np.argmax(low[0][1] < 0))
         raise InputError(f"{path}: {message} at {t[at]:.10g} s: {low[0][1][at]:.4g} is below 0, beside {low[0][0]}")
     nis, dof, held = nis_of(Pairs(t, own, {part: values**power for part, values in of.items()}, 0), parts)
-    note = f"{path}: {sensor}: {int((dof > 0).sum())} innovations in {count(len(rows), 'message')} {message}"
+    note = f"{path}: {sensor}: {int((dof > 0).sum())} innovations in {plural(len(rows), 'message')} {message}"
     note += f"; {held} repeat the innovation before" * bool(held)
     return NisLog(sensor, np.arange(1.0, len(nis) + 1), t, nis, dof, (note,))
 

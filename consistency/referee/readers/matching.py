@@ -24,7 +24,7 @@ def common_steps(steps: Sequence[Array]) -> tuple[list[Indices], Array]:
     return [np.searchsorted(numbers, own).astype(np.int64) for own in steps], numbers
 
 
-def common_times(times: Sequence[Array], tolerance: float = ROUNDING) -> tuple[list[Indices], Array]:
+def common_times(times: Sequence[Array]) -> tuple[list[Indices], Array]:
     """Columns of every run and the time of every column, from timestamps in s.
 
     (k,) times for each run -> (k,) columns for each run, and (steps,) times. Where every run keeps to the timestamps of
@@ -34,8 +34,8 @@ def common_times(times: Sequence[Array], tolerance: float = ROUNDING) -> tuple[l
     longest = max(times, key=len)
     columns = []
     for own in times:
-        near = np.clip(np.searchsorted(longest, own - tolerance), 0, len(longest) - 1)
-        if (np.abs(longest[near] - own) > tolerance).any():
+        near = np.clip(np.searchsorted(longest, own - ROUNDING), 0, len(longest) - 1)
+        if (np.abs(longest[near] - own) > ROUNDING).any():
             return [np.arange(len(each)) for each in times], np.full(len(longest), np.nan)
         columns.append(near.astype(np.int64))
     return columns, longest

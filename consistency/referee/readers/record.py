@@ -10,6 +10,7 @@ import numpy as np
 
 from consistency.referee.diagnostics import Evidence, nees
 from consistency.referee.diagnostics.blocks import of_runs
+from consistency.referee.diagnostics.numbers_in_words import plural
 from consistency.referee.diagnostics.validity import ROUNDED, Validity, asymmetric, classify
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
@@ -85,7 +86,7 @@ def assemble(
     short = [run for run in short if run not in {failure.run for failure in failures}]
     if short:
         notes.append(
-            f"{name}: {count(len(short), 'run')} of {len(parts)} ({listed(short)}) end before step {len(t)}; "
+            f"{name}: {plural(len(short), 'run')} of {len(parts)} ({listed(short)}) end before step {len(t)}; "
             "if the filter broke down there, write a row of NaN, so that the failure counts"
         )
 
@@ -215,10 +216,6 @@ def _without(axes: tuple[str, ...], none: Array) -> str:
     """Advice on the option that leaves out components whose variance is zero."""
     left = ",".join(axis for axis, zero in zip(axes, none, strict=True) if not zero)
     return f"judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
-
-
-def count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def listed(numbers: Sequence[object]) -> str:

@@ -13,12 +13,13 @@ import numpy as np
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.independence import ENOUGH, Independence, independence
+from consistency.referee.diagnostics.numbers_in_words import plural
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.diagnostics.wording import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
 from consistency.referee.readers.matching import common_times
-from consistency.referee.readers.record import Track, assemble, count
+from consistency.referee.readers.record import Track, assemble
 from consistency.referee.readers.sheet import Places
 from consistency.referee.readers.windows import Relative, windows
 from consistency.referee.types import Array, Indices
@@ -188,7 +189,7 @@ def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention:
     of = "motions" if relative.motions else "poses, with cross-covariances,"
     group = "SE(2)" if len(axes) == 3 else "SE(3)"
     notes = [
-        f"{name}: relative poses over {count(total, 'window')} of {relative.text}; the error is Log(estimated^-1 true "
+        f"{name}: relative poses over {plural(total, 'window')} of {relative.text}; the error is Log(estimated^-1 true "
         f"motion) of {group}, in the frame of the body at the end of a window; covariances of {of} are of the error "
         f"{convention}",
         f"{name}: what is constant over a window, or drifts more slowly than it, is not seen; longer windows see more",
@@ -203,7 +204,7 @@ def _notes(name: str, found: Sequence[Windows], axes: Sequence[str], convention:
             "--windows independent makes each a run"
         )
     if left_out:
-        notes.append(f"{name}: {count(left_out, 'window')} left out, too long because rows or truth are missing")
+        notes.append(f"{name}: {plural(left_out, 'window')} left out, too long because rows or truth are missing")
     wide = _widest(found)
     if wide > BENT:
         notes.append(
@@ -253,6 +254,7 @@ def _too_few(of: Independence, relative: Relative) -> str:
     if relative.motions or of.pieces >= ENOUGH:
         return ""
     return (
-        f"{count(of.pieces, 'window')} {'is' if of.pieces == 1 else 'are'} too few windows to show independence, which "
-        f"takes {ENOUGH}; without --windows independent they are steps of their run, however they depend on each other"
+        f"{plural(of.pieces, 'window')} {'is' if of.pieces == 1 else 'are'} too few windows to show independence, "
+        f"which takes {ENOUGH}; without --windows independent they are steps of their run, however they depend on "
+        "each other"
     )

@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.referee.diagnostics.numbers_in_words import plural
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import COLUMNS
 from consistency.referee.readers.matching import Manifold, nearest, truth_at
-from consistency.referee.readers.record import count, listed
+from consistency.referee.readers.record import listed
 from consistency.referee.readers.sheet import TableRows
 from consistency.referee.readers.table_columns import require_columns, row_order, stated_covariance
 from consistency.referee.types import Array, Indices
@@ -96,7 +97,7 @@ def matched(
     absent = [] if true_runs is None else sorted({int(run) for run in true_runs} - {int(run) for run in runs})
     if absent:
         notes.append(
-            f"{name}: no estimates of {count(len(absent), 'run')} of the truth ({listed(absent)}); "
+            f"{name}: no estimates of {plural(len(absent), 'run')} of the truth ({listed(absent)}); "
             "if the filter broke down there, write a row of NaN, so that the failure counts"
         )
     if not keep.all():

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from consistency.referee.diagnostics.numbers_in_words import plural
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.nis import NisLog, choose
-from consistency.referee.readers.record import count
 from consistency.referee.types import Array, Indices
 
 TOPICS = ("estimator_innovations", "estimator_innovation_variances")
@@ -196,16 +196,16 @@ def _notes(path: Path, name: str, pairs: Pairs, dof: Array, held: int, log: Any)
     """Notes on left-out messages, and on data missing in the log."""
     notes = [f"{path}: {name}: {int((dof > 0).sum())} innovations in {len(dof)} messages"]
     if held:
-        notes[0] += f"; {count(held, 'message')} repeat the innovation before, as no measurement came between"
+        notes[0] += f"; {plural(held, 'message')} repeat the innovation before, as no measurement came between"
     if pairs.alone:
-        notes.append(f"{path}: {count(pairs.alone, 'message')} have no partner in the other topic and are left out")
+        notes.append(f"{path}: {plural(pairs.alone, 'message')} have no partner in the other topic and are left out")
     step = np.diff(pairs.t)
     gaps = step[step > GAP * np.median(step)] if len(step) else step
     if len(gaps):
-        notes.append(f"{path}: {count(len(gaps), 'gap')} in the messages, the longest of {gaps.max():.3g} s")
+        notes.append(f"{path}: {plural(len(gaps), 'gap')} in the messages, the longest of {gaps.max():.3g} s")
     if log.dropouts:
         lost = sum(each.duration for each in log.dropouts) / 1e3
-        notes.append(f"{path}: the logger lost messages {count(len(log.dropouts), 'time')}, {lost:.3g} s in all")
+        notes.append(f"{path}: the logger lost messages {plural(len(log.dropouts), 'time')}, {lost:.3g} s in all")
     if log.file_corruption:
         notes.append(f"{path}: is damaged or cut short; what could be read of it is judged")
     return notes

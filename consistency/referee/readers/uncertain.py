@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence
+from consistency.referee.diagnostics.numbers_in_words import plural
 from consistency.referee.diagnostics.uncertain import DECLARED
 from consistency.referee.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading, flag_of
-from consistency.referee.readers.record import count
 
 REFUSED = {
     "relative": "neighbouring windows share the truth at their common end, so that its errors are in both",
@@ -71,7 +71,7 @@ def declared(records: Sequence[Evidence], r: Reading) -> list[Evidence]:
         missing = int((np.isnan(P).any(axis=(2, 3)) & np.isfinite(record.nees)).sum()) if record.nees is not None else 0
         if missing and not np.isfinite(P).any():
             raise InputError(f"{record.name}: the truth has a covariance in none of the steps that are judged")
-        note = f"{record.name}: {count(missing, 'estimate')} whose truth has no covariance are left out"
+        note = f"{record.name}: {plural(missing, 'estimate')} whose truth has no covariance are left out"
         notes = (*record.notes, note) if missing else record.notes
         found.append(replace(record, truth_errors=r.truth_errors, truth_shared=bool(r.truth_shared), notes=notes))
     return found

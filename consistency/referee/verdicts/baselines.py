@@ -19,6 +19,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading
 from consistency.referee.parsing.columns import POSE
 from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.folders import writing
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 from consistency.referee.verdicts.judge import Results, Source, source_of
 from consistency.referee.verdicts.options import skip_asked
@@ -115,10 +116,8 @@ def write_baseline(of: Results | Baseline, path: Path, overwrite: bool = False) 
             for name, s in base.filters.items()
         },
     )
-    try:
+    with writing(path):
         write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"))
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
 
 
 def is_baseline(path: Path) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.nodes import hats
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate
@@ -18,7 +19,7 @@ from consistency.stereo.characterising.bias import GRID, BiasEstimate, estimate_
 from consistency.stereo.characterising.coordinate import Levels
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
 from consistency.stereo.characterising.residuals import Residuals, RowSelection, select
-from consistency.stereo.characterising.tails import IntervalEstimate, ResidualTails, rate, ratios, tails
+from consistency.stereo.characterising.tails import ResidualTails, rate, ratios, tails
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # chance that any interval misses
@@ -31,11 +32,11 @@ class Coordinate:
     """Estimates for one coordinate, u, v or d."""
 
     name: str
-    sigma: IntervalEstimate  # px, of what is drawn anew
+    sigma: Interval  # px, of what is drawn anew
     pooled: float  # px, about the mean of all rows: noise, offsets and bias together; NaN where that is not known
     about_tracks: float  # px, about the means of tracks; NaN likewise
-    correlation: IntervalEstimate | None  # with the step before
-    offset: IntervalEstimate | None  # share of the variance about the bias map
+    correlation: Interval | None  # with the step before
+    offset: Interval | None  # share of the variance about the bias map
     tails: ResidualTails
     lags: Array  # (lags,), autocorrelation along tracks
     bounds: Array  # (lags,), 95 % bound if white
@@ -60,7 +61,7 @@ class DisparityNoise:
     """Standard deviation of disparity by disparity."""
 
     nodes: Array  # (m,), px
-    sigma: tuple[IntervalEstimate, ...]  # px, at each node
+    sigma: tuple[Interval, ...]  # px, at each node
     p_value: float  # that it is the same at all
     shown: bool
 
@@ -74,14 +75,14 @@ class Characterisation:
     coordinates: tuple[Coordinate, Coordinate, Coordinate]
     growth: DisparityNoise | None
     bias: BiasEstimate | None  # None where it cannot be told from where the landmarks are
-    gross: IntervalEstimate  # share of rows that are grossly wrong
+    gross: Interval  # share of rows that are grossly wrong
     tracks: int
     rows: int
     left_out: Mapping[str, int]  # reason: rows
     level: Levels
     kept: Residuals
     notes: tuple[str, ...] = ()  # what could not be estimated, and limits
-    ratio: tuple[IntervalEstimate, ...] = ()  # sd while moving over sd at rest, of u, v, d
+    ratio: tuple[Interval, ...] = ()  # sd while moving over sd at rest, of u, v, d
 
 
 @one_blas_thread()  # its matrices are small: a second one takes twice the time of the processors, and gains nothing

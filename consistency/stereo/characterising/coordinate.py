@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.types import Array
 from consistency.stereo.characterising.likelihood import LikelihoodFit
-from consistency.stereo.characterising.tails import IntervalEstimate
 
 LAGS = 10  # of the autocorrelation that is shown
 
@@ -42,7 +42,7 @@ def half_width(gradient: Array, fit: LikelihoodFit, level: float) -> float:
     return float(max(model * stats.norm.isf(level / 2), robust * stats.t.isf(level / 2, dof)))
 
 
-def noise(fit: LikelihoodFit, level: float) -> IntervalEstimate:
+def noise(fit: LikelihoodFit, level: float) -> Interval:
     """Standard deviation of what is drawn anew, in the root mean square over the rows, px."""
     log_sigma, gradient = log_level(fit)
     return _exponential(log_sigma, half_width(gradient, fit, level))
@@ -56,7 +56,7 @@ def log_level(fit: LikelihoodFit) -> tuple[float, Array]:
     return float(0.5 * np.log(np.mean(sd**2))), gradient
 
 
-def at_nodes(fit: LikelihoodFit, level: float) -> list[IntervalEstimate]:
+def at_nodes(fit: LikelihoodFit, level: float) -> list[Interval]:
     """Standard deviation at each node of disparity, px."""
     m = len(fit.theta) - 2
     return [_exponential(float(fit.theta[j]), half_width(np.eye(m + 2)[j], fit, level)) for j in range(m)]
@@ -76,20 +76,20 @@ def growth_p_value(fit: LikelihoodFit) -> float:
     return max(values)
 
 
-def correlation(fit: LikelihoodFit, level: float) -> IntervalEstimate:
+def correlation(fit: LikelihoodFit, level: float) -> Interval:
     """Correlation of the noise with that of the step before."""
     m = len(fit.theta) - 2
     middle, half = float(fit.theta[m]), half_width(np.eye(m + 2)[m], fit, level)
-    return IntervalEstimate(float(np.tanh(middle)), float(np.tanh(middle - half)), float(np.tanh(middle + half)))
+    return Interval(float(np.tanh(middle)), float(np.tanh(middle - half)), float(np.tanh(middle + half)))
 
 
-def offset_share(fit: LikelihoodFit, level: float) -> IntervalEstimate:
+def offset_share(fit: LikelihoodFit, level: float) -> Interval:
     """Share of the offsets of tracks in the variance about the bias map; an interval ends at 0."""
     m, n = len(fit.theta) - 2, max(fit.rows.length, 1.0)
     middle, half = float(fit.theta[-1]), half_width(np.eye(m + 2)[-1], fit, level)
     q = np.maximum(np.expm1(np.array([middle, middle - half, middle + half])) / n, 0.0)
     value, low, high = q / (1.0 + q)
-    return IntervalEstimate(float(value), float(low), float(high))
+    return Interval(float(value), float(low), float(high))
 
 
 def bias(fit: LikelihoodFit, level: float) -> tuple[Array, Array, Array]:
@@ -128,5 +128,5 @@ def autocorrelation(fit: LikelihoodFit) -> tuple[Array, Array]:
     return values, bounds
 
 
-def _exponential(middle: float, half: float) -> IntervalEstimate:
-    return IntervalEstimate(float(np.exp(middle)), float(np.exp(middle - half)), float(np.exp(middle + half)))
+def _exponential(middle: float, half: float) -> Interval:
+    return Interval(float(np.exp(middle)), float(np.exp(middle - half)), float(np.exp(middle + half)))

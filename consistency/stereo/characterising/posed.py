@@ -7,6 +7,7 @@ from scipy import stats
 
 from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.nodes import hats
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
 from consistency.stereo.characterising.basis import octaves
@@ -22,7 +23,7 @@ from consistency.stereo.characterising.characterise import (
 from consistency.stereo.characterising.coordinate import LAGS, Levels
 from consistency.stereo.characterising.landmarks import Fitted, Seen, fit_points, without_gross
 from consistency.stereo.characterising.residuals import MARGIN
-from consistency.stereo.characterising.tails import IntervalEstimate, rate, ratios, tails
+from consistency.stereo.characterising.tails import rate, ratios, tails
 
 FREE = 0.1  # share of a value that the fits must leave for it to tell of the shape of the noise
 FIXED = (
@@ -116,7 +117,7 @@ def _by_disparity(plain: Fitted, f: float, B: float, free_poses: bool) -> tuple[
     return nodes, fit_points(plain.seen, f, B, parts, start, free_poses)
 
 
-def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple[IntervalEstimate, float]:
+def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple[Interval, float]:
     """Standard deviation of the values in ``chosen`` (N, 3), and the variance of its log.
 
     The wider of two: chi-square with the degrees of freedom that are left, for Gaussian noise, and the scatter of the
@@ -130,7 +131,7 @@ def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple
     model, robust = np.sqrt(0.5 / dof), 0.5 * np.sqrt((of_tracks**2).sum()) / (dof * sigma**2)
     half = max(model * stats.norm.isf(level / 2), robust * stats.t.isf(level / 2, max(tracks - 1, 1)))
     variance = max(model**2, robust**2)
-    return IntervalEstimate(sigma, float(sigma * np.exp(-half)), float(sigma * np.exp(half))), float(variance)
+    return Interval(sigma, float(sigma * np.exp(-half)), float(sigma * np.exp(half))), float(variance)
 
 
 def _growth(nodes: Array, of: Fitted, levels: Levels) -> DisparityNoise:
@@ -154,7 +155,7 @@ def _coordinate(k: int, of: Fitted, plain: Fitted, levels: Levels) -> Coordinate
     )
 
 
-def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, IntervalEstimate | None]:
+def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, Interval | None]:
     """Autocorrelation (lags,) along tracks of coordinate ``k``, its 95 % bound if white, and the interval of lag 1.
 
     The fit of a point correlates the residuals of a track; what it does to neighbours is taken off. It also hides part
@@ -174,7 +175,7 @@ def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, Interv
     error = float(np.sqrt((np.bincount(where, products - value * weight) ** 2).sum()) / weight.sum())
     half = error * float(stats.t.isf(level / 2, max(where.max(), 1)))
     lags[0], bounds[0] = value, 1.96 * error
-    return lags, bounds, IntervalEstimate(value, max(value - half, -1.0), min(value + half, 1.0))
+    return lags, bounds, Interval(value, max(value - half, -1.0), min(value + half, 1.0))
 
 
 def _shared(of: Fitted, free_poses: bool) -> tuple[str, ...]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Text, table
 from consistency.stereo.characterising.characterise import Characterisation
-from consistency.stereo.characterising.tails import IntervalEstimate
 from consistency.stereo.characterising.wording import counted, interval, sentences
 
 HEADS = ("noise px", "correlation", "offset share", "1/nu", "kurtosis", "pooled px")
@@ -23,5 +23,5 @@ def blocks(of: Characterisation) -> tuple[Block, ...]:
     return Text(counted(of)), table(columns, rows, "Estimates of the sensor"), *map(Text, sentences(of))
 
 
-def _or_dash(estimate: IntervalEstimate | None) -> Cell:
+def _or_dash(estimate: Interval | None) -> Cell:
     return Quantity(None) if estimate is None else interval(estimate, 2)

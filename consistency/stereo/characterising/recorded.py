@@ -101,7 +101,7 @@ def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None
     """
     parts, tracks = [], 0
     for number, trial in enumerate(trials):
-        step = np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
+        step = trial.step
         rest = np.zeros(trial.steps, np.int64) if rests is None else rests[number]
         place = rest[step - 1]
         track = trial.landmark + trial.n_landmarks * place
@@ -127,7 +127,7 @@ def _in_space(trial: Trial, path: Path) -> Seen:
 
 def seen_from(trial: Trial, R: Array, t: Array) -> Seen:
     """What is seen from poses R (T + 1, 3, 3), world from sensor axes, and t (T + 1, 3), m."""
-    step = np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
+    step = trial.step
     order = np.lexsort((step, trial.landmark))
     rows = step[order]
     return Seen(trial.z[order], R[rows], t[rows], trial.landmark[order], rows, np.ones(len(rows), bool))

@@ -61,7 +61,7 @@ def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Resid
         assert trial.landmarks is not None
         real = trial.landmark < len(trial.landmarks)
         strange += int((~real).sum())
-        step = np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))[real]
+        step = trial.step[real]
         landmark, z = trial.landmark[real], trial.z[real]
         body = point.to_robot(*trial.truth[step].T, *trial.landmarks[landmark].T)
         assert sensor.f is not None

@@ -9,6 +9,7 @@ from scipy import optimize, special, stats
 
 from consistency.referee.diagnostics.gaussian import normality
 from consistency.referee.diagnostics.intervals import binomial_interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.types import Array
 
 HEAVIEST = 0.49  # 1 / nu: at 1/2 the variance is infinite
@@ -17,23 +18,10 @@ FEWEST = 100  # rows at rest, and moving, that are compared
 
 
 @dataclass(frozen=True)
-class IntervalEstimate:
-    """A value with its interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def holds(self, value: float) -> bool:
-        """Whether a value is inside."""
-        return self.low <= value <= self.high
-
-
-@dataclass(frozen=True)
 class ResidualTails:
     """Shape of standardised residuals."""
 
-    weight: IntervalEstimate  # 1 / nu of Student's distribution; 0 is the normal one
+    weight: Interval  # 1 / nu of Student's distribution; 0 is the normal one
     skewness: float
     excess_kurtosis: float
     p_value: float  # of normality, D'Agostino & Pearson (1973)
@@ -77,9 +65,7 @@ def tails(w: Array, level: float) -> ResidualTails:
     mixture, fitted = two_normals(w) if low > 0 else (None, np.inf)
     # one parameter more than Student's: by the information criterion of Schwarz (1978)
     better = mixture if 2.0 * fitted + np.log(len(w)) < least else None
-    return ResidualTails(
-        IntervalEstimate(value, low, high), shape.skewness, shape.excess_kurtosis, shape.p_value, better
-    )
+    return ResidualTails(Interval(value, low, high), shape.skewness, shape.excess_kurtosis, shape.p_value, better)
 
 
 def two_normals(w: Array) -> tuple[Mixture, float]:
@@ -110,13 +96,13 @@ def _negative(w: Array, weight: float, log_scale: float) -> float:
     return float(0.5 * (nu + 1.0) * np.log1p(x2 / nu).sum() + len(w) * (log_scale - constant))
 
 
-def rate(count: int, total: int, level: float) -> IntervalEstimate:
+def rate(count: int, total: int, level: float) -> Interval:
     """A share with the interval of Clopper & Pearson (1934)."""
     low, high = binomial_interval(count, total, 1.0 - level)
-    return IntervalEstimate(count / total, float(low), float(high))
+    return Interval(count / total, float(low), float(high))
 
 
-def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -> tuple[IntervalEstimate, ...]:
+def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -> tuple[Interval, ...]:
     """Noise while moving over noise at rest, of u, v, d; nothing where one of the two has too few data.
 
     Parameters
@@ -141,5 +127,5 @@ def ratios(w: Array, weight: Array, moving: Array, track: Array, level: float) -
             variance += 0.25 * max(float((spread**2).sum()) / dof.sum() ** 2, 2.0 / dof.sum())
         half = float(np.sqrt(variance) * stats.norm.isf(level / 2))
         value = logs[0] - logs[1]
-        out.append(IntervalEstimate(float(np.exp(value)), float(np.exp(value - half)), float(np.exp(value + half))))
+        out.append(Interval(float(np.exp(value)), float(np.exp(value - half)), float(np.exp(value + half))))
     return tuple(out)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.diagnostics.wording import p_text
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
-from consistency.stereo.characterising.tails import IntervalEstimate
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian
 
 
-def interval(estimate: IntervalEstimate, digits: int = 4, factor: float = 1.0) -> str:
+def interval(estimate: Interval, digits: int = 4, factor: float = 1.0) -> str:
     """A value and its interval, ``1.34 (1.31 to 1.36)``."""
     value, low, high = (f"{factor * x:.{digits}g}" for x in (estimate.value, estimate.low, estimate.high))
     return f"{value} ({low} to {high})"

@@ -18,6 +18,7 @@ from consistency.bench.scenario.effects.disparity_growth import DisparityGrowth
 from consistency.referee.diagnostics.export import plain
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.folders import writing
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation
 from consistency.stereo.characterising.wording import counted, interval, sentences
@@ -94,11 +95,11 @@ def as_json(of: Characterisation) -> str:
         "source": of.source, "observations": of.rows, "tracks": of.tracks, "left_out": dict(of.left_out),
         "confidence": 1.0 - of.level.rate, "sensor": believed(of).model_dump(mode="json", exclude_none=True),
         "coordinates": {c.name: _coordinate(c) for c in of.coordinates},
-        "gross": vars(of.gross), "notes": list(of.notes), "sentences": sentences(of),
-        "moving_over_rest": [vars(r) for r in of.ratio],
+        "gross": of.gross._asdict(), "notes": list(of.notes), "sentences": sentences(of),
+        "moving_over_rest": [r._asdict() for r in of.ratio],
     }  # fmt: skip
     if of.growth is not None:
-        nodes = [{"disparity": d} | vars(s) for d, s in zip(of.growth.nodes, of.growth.sigma, strict=True)]
+        nodes = [{"disparity": d} | s._asdict() for d, s in zip(of.growth.nodes, of.growth.sigma, strict=True)]
         out["growth"] = {"nodes": nodes, "p_value": of.growth.p_value, "shown": of.growth.shown}
     if of.bias is not None:
         grid = of.bias.grid
@@ -108,8 +109,8 @@ def as_json(of: Characterisation) -> str:
 
 
 def _coordinate(c: Any) -> dict[str, Any]:
-    estimates = {key: None if (e := getattr(c, key)) is None else vars(e) for key in ("sigma", "correlation", "offset")}
-    shape = {"tail_weight": vars(c.tails.weight), "skewness": c.tails.skewness,
+    estimates = {key: (e := getattr(c, key)) and e._asdict() for key in ("sigma", "correlation", "offset")}
+    shape = {"tail_weight": c.tails.weight._asdict(), "skewness": c.tails.skewness,
              "excess_kurtosis": c.tails.excess_kurtosis, "normality_p": c.tails.p_value,
              "mixture": None if c.tails.mixture is None else vars(c.tails.mixture)}  # fmt: skip
     return estimates | shape | {"pooled": c.pooled, "about_tracks": c.about_tracks, "autocorrelation": c.lags}
@@ -129,19 +130,14 @@ def require_free_file(path: Path, overwrite: bool) -> None:
         raise InputError(f"--out {path}: must end in .toml")
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
-            pass
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
+    with writing(path), tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+        pass
 
 
 def write_sensor(path: Path, text: str) -> None:
     """Write the file whole or not at all."""
-    try:
+    with writing(path):
         write_whole(path, text.encode("utf-8"))
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None
 
 
 def _pair(key: str, values: Any) -> str:

@@ -42,9 +42,9 @@ def wall_texture(rng: np.random.Generator) -> Texture:
     return Painted(RandomTexture.draw(rng, FINEST, OCTAVES, CONTRAST), Blobs.draw(rng))
 
 
-def pose_at(x: float, attitude: Array | None = None) -> Array:
-    """Pose (6,) on the world's x axis, looking along it, turned by roll, pitch and heading in rad."""
-    return np.concatenate([[x, 0.0, 0.0], np.zeros(3) if attitude is None else attitude])
+def pose_at(x: float) -> Array:
+    """Pose (6,) on the world's x axis, looking along it."""
+    return np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def stand(

@@ -66,7 +66,7 @@ def screened(trials: Sequence[Trial], belief: Belief, gate: Array) -> Screened:
 
 def _pairs(trial: Trial) -> tuple[Indices, Indices]:
     """Rows (n,) of observations, and of those of the same landmark in the step after; sorted by step."""
-    step = np.repeat(np.arange(trial.steps), np.diff(trial.first))
+    step = trial.step - 1
     order = np.lexsort((step, trial.landmark))
     follows = (np.diff(trial.landmark[order]) == 0) & (np.diff(step[order]) == 1)
     before, after = order[:-1][follows], order[1:][follows]
@@ -76,7 +76,7 @@ def _pairs(trial: Trial) -> tuple[Indices, Indices]:
 
 def _misfits(trial: Trial, before: Indices, after: Indices, belief: Belief, gate: Array) -> Array:
     """Seen less expected (n, s) at the common motion of each step, over its standard deviation by leverage."""
-    step = np.repeat(np.arange(trial.steps), np.diff(trial.first))[after]
+    step = trial.step[after] - 1
     out = np.empty((len(after), trial.z.shape[1]))
     for k in np.unique(step):
         rows = np.flatnonzero(step == k)

@@ -63,7 +63,7 @@ def register_ransac(
         raise InputError("S1, S2: give both covariances or none")
     if S1 is not None and S2 is not None:
         S1, S2 = checks.covariances("S1", S1, len(p1), 3), checks.covariances("S2", S2, len(p1), 3)
-    least = fewest(len(p1), minimum)
+    least = fewest(len(p1)) if minimum is None else minimum
 
     def inliers_of(R: Array, t: Array) -> Array:
         return squared_distances(p1, p2, R, t, S1, S2) <= threshold**2
@@ -85,9 +85,9 @@ def register_ransac(
     return register_svd(p1[best], p2[best]), best
 
 
-def fewest(points: int, minimum: int | None) -> int:
+def fewest(points: int) -> int:
     """Inliers that a motion needs."""
-    return max(4, int(np.ceil(SHARE * points))) if minimum is None else minimum
+    return max(4, int(np.ceil(SHARE * points)))
 
 
 def draws_for(share: float, most: int) -> float:

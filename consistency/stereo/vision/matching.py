@@ -74,12 +74,12 @@ def fundamental(rig: StereoRig) -> Array:
     return np.asarray(np.linalg.inv(rig.K_right).T @ cross @ rig.R.T @ np.linalg.inv(rig.K_left))
 
 
-def is_rectified(rig: StereoRig, tolerance: float = 0.01) -> bool:
+def is_rectified(rig: StereoRig) -> bool:
     """Whether rows of both images correspond: same axes and focal lengths, baseline along x within 1 %."""
     same = np.allclose(rig.R, np.eye(3), atol=1e-6)
     focal = np.allclose(np.delete(rig.K_left, 2, axis=1), np.delete(rig.K_right, 2, axis=1), rtol=1e-6)
     rows = abs(rig.K_left[1, 2] - rig.K_right[1, 2]) < 1e-3
-    return bool(same and focal and rows and np.linalg.norm(rig.t[1:]) <= tolerance * rig.t[0])
+    return bool(same and focal and rows and np.linalg.norm(rig.t[1:]) <= 0.01 * rig.t[0])
 
 
 def homogeneous(uv: Array) -> Array:

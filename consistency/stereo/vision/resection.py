@@ -36,7 +36,6 @@ def resect_ransac(
     *,
     gate: float,
     rng: np.random.Generator,
-    minimum: int | None = None,
 ) -> tuple[RelativePose, Array]:
     """The pose that most matches agree on, p0 = R p1 + t, and these matches.
 
@@ -49,7 +48,6 @@ def resect_ransac(
     sigma0, sigma1 : (N, 4), their standard deviations, px
     gate : standard deviations that an inlier may miss by; see :func:`inliers_within`
     rng : the only source of chance
-    minimum : inliers that a motion needs; 4 and a tenth of the matches unless given
 
     Returns
     -------
@@ -60,14 +58,14 @@ def resect_ransac(
     InputError
         Shapes do not fit, or OpenCV is not installed.
     ConsensusError
-        No motion has enough inliers.
+        No motion has enough inliers: 4, and a tenth of the matches.
     """
     uv0, uv1 = checks.rows("uv0", uv0, 4), checks.rows("uv1", uv1, 4)
     checks.same_length("uv0, uv1", uv0, uv1)
     sigma0, sigma1 = checks.rows("sigma0", sigma0, 4), checks.rows("sigma1", sigma1, 4)
     checks.same_length("sigma0, sigma1", sigma0, sigma1)
     checks.same_length("uv0, sigma0", uv0, sigma0)
-    least = fewest(len(uv0), minimum)
+    least = fewest(len(uv0))
     found, inliers = _search(rig, triangulate(rig, uv0), uv1, sigma0**2 + sigma1**2 + SLACK_PX**2, gate, rng)
     if found is not None:
         inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, found), gate, inliers)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -13,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import forks
 import pytest
 
 from consistency.bench.filters.kernel import foreseen, kept
@@ -55,14 +55,11 @@ class Sum(Compiled):
                 os.kill(os.getpid(), signal.SIGKILL)
             if what in ("hang", "abandon"):
                 os.kill(here, signal.SIGINT)
-                time.sleep(60.0)
+                time.sleep(600.0)
         self.kernel.compile(self.values)
 
 def case():
     os.environ["NUMBA_CACHE_DIR"] = f"{folder}/cache"
-    for number, name in ((1, "out"), (2, "err")):
-        os.dup2(os.open(f"{folder}/{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background of a shell
     filters = [Sum("two", (1.0, 2.0)), Sum("three", (1.0, 2.0, 3.0)), Sum("again", (4.0, 5.0))]
     if what == "full":
         resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
@@ -82,28 +79,7 @@ def case():
 
 os.environ["NUMBA_CACHE_DIR"] = os.devnull
 Kernel(total)((1.0,))  # what another user may not read is loaded
-for line in sys.stdin:  # each case in a copy of this process, as loading Numba takes seconds
-    folder, what, jobs = line.rstrip("\\n").split("\\t")
-    if not (child := os.fork()):
-        here = os.getpid()
-        try:
-            case()
-            sys.stdout.flush()
-        except BaseException as error:
-            os.write(2, repr(error).encode())
-            os._exit(1)
-        os._exit(0)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-
-
-@pytest.fixture(scope="module")
-def cases() -> Iterator[subprocess.Popen[str]]:
-    """A process that does a case for each line: folder, what happens, jobs."""
-    pipe = subprocess.PIPE
-    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdin=pipe, stdout=pipe, text=True) as process:
-        yield process
-        process.stdin.close()  # type: ignore[union-attr]
 
 
 @pytest.fixture
@@ -118,17 +94,14 @@ def folder() -> Iterator[Path]:
 
 
 @pytest.fixture
-def done(cases: subprocess.Popen[str], folder: Path) -> Done:
+def done(folder: Path) -> Done:
     """Does a case, and gives what it says on standard output and error."""
 
     def done(what: str = "", jobs: int = 2) -> tuple[str, str]:
-        assert cases.stdin is not None
-        assert cases.stdout is not None
-        cases.stdin.write(f"{folder}\t{what}\t{jobs}\n")
-        cases.stdin.flush()
-        status, out, err = int(cases.stdout.readline()), (folder / "out").read_text(), (folder / "err").read_text()
-        assert status == (-signal.SIGKILL if what == "abandon" else 0), err
-        return out.strip(), err
+        code = f"folder, what, jobs, here = {str(folder)!r}, {what!r}, {jobs}, os.getpid(); case()"
+        program = forks.done(SCRIPT, code, "-c", cwd=folder)
+        assert program.returncode == (-signal.SIGKILL if what == "abandon" else 0), program.stderr
+        return program.stdout.strip(), program.stderr
 
     return done
 

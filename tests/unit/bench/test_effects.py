@@ -23,7 +23,6 @@ from consistency.bench.simulation import World, draw_landmarks, planned_controls
 from consistency.bench.simulation.sensing import purpose_of
 from consistency.bench.store.frames import observations_table
 from consistency.bench.store.log import read_log
-from consistency.bench.types import Trial
 from consistency.referee.cli.app import app
 from consistency.referee.types import Array
 
@@ -138,10 +137,6 @@ def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
     DRAWN.clear()
 
 
-def steps_of(trial: Trial) -> Array:
-    return np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
-
-
 def with_effects(
     small: Small, *effects: dict[str, Any], name: str = "herath2007-stereo", **changes: Any
 ) -> cs.Scenario:
@@ -190,7 +185,7 @@ def test_field_of_view_noise_and_search_range_are_a_plain_sensor(
     scenario = small(name, truth__motion__noise_on=noise_on, truth__sensor__mount=tilted, **changes)
     trial = cs.simulate(scenario, run=2, seed=3)
     step, landmark, z = plainly(scenario, 2, 3)
-    assert np.array_equal(steps_of(trial), step)
+    assert np.array_equal(trial.step, step)
     assert np.array_equal(trial.landmark, landmark)
     assert np.allclose(trial.z, z, rtol=0, atol=1e-9)
     assert not np.allclose(cs.simulate(scenario, run=2, seed=4).z[:5], z[:5], rtol=0, atol=1e-9)  # negative control
@@ -309,7 +304,7 @@ def test_things_have_ids_of_their_own_and_labels(small: Small) -> None:
     real = ~trial.spurious
     assert np.array_equal(trial.source[real], plain.landmark)
     assert np.array_equal(trial.z[real], plain.z)
-    assert np.array_equal(steps_of(trial)[real], steps_of(plain))
+    assert np.array_equal(trial.step[real], plain.step)
     assert np.array_equal(trial.landmarks, plain.landmarks)
     for step in range(1, trial.steps + 1):
         assert np.all(np.diff(trial.observation(step).landmarks) > 0)

@@ -30,12 +30,8 @@ BIAS = {"kind": "local-bias", **MAP}
 WIDE = {"truth__sensor__disparity": (1e-6, 1e6)}
 
 
-def steps_of(trial: Trial) -> Array:
-    return np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
-
-
 def ideal_of(scenario: cs.Scenario, trial: Trial) -> Array:
-    return World(scenario.truth).context(trial.truth).measure(steps_of(trial), trial.landmark)
+    return World(scenario.truth).context(trial.truth).measure(trial.step, trial.landmark)
 
 
 def test_a_map_is_bilinear_between_its_nodes_and_constant_beyond(rng: np.random.Generator) -> None:

@@ -70,7 +70,7 @@ def test_the_log_is_the_drive_after_the_calibration(folder: Path) -> None:
     assert dropped.gross == 1
     assert trial.steps == pytest.approx((400.0 - conversion.CALIBRATION) / conversion.DT, abs=5)
     assert trial.landmarks is not None
-    pose = trial.truth[np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))]
+    pose = trial.truth[trial.step]
     offset = (trial.landmarks[trial.landmark, :2] - pose[:, :2]) @ [1.0, 1j]
     turn = np.angle(np.exp(1j * (trial.z[:, 1] + pose[:, 2])) * np.conj(offset))
     assert np.abs(turn).max() < 0.05  # 5 sigma: moved to the step, without the lag of the camera

@@ -179,8 +179,9 @@ def test_file_cut_short(folder: Path, name: str, keep: int) -> None:
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["estimates", "failures"])
-def test_file_missing(folder: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["estimates", "failures", "truth", "landmarks"])
+def test_a_table_that_was_written_and_is_gone(folder: Path, name: str) -> None:
+    """Without its truth an overconfident filter would pass by the NIS."""
     (folder / f"{name}.parquet").unlink()
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: missing"):
         cs.read_results(folder)
@@ -191,14 +192,6 @@ def test_results_without_truth_are_judged_by_the_nis(results: cs.Results, tmp_pa
     back = cs.read_results(tmp_path / "out")
     assert back.truth is None
     assert "no truth" in cs.analyse(back)["ekf-xyz"].reasons[0]
-
-
-@pytest.mark.parametrize("name", ["truth", "landmarks"])
-def test_a_table_that_was_written_and_is_gone(folder: Path, name: str) -> None:
-    """Without its truth an overconfident filter would pass by the NIS."""
-    (folder / f"{name}.parquet").unlink()
-    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: missing"):
-        cs.read_results(folder)
 
 
 def test_results_do_not_replace_a_log(folder: Path, uvd: cs.Scenario, tmp_path: Path) -> None:

@@ -35,10 +35,6 @@ def pair(*effects: dict[str, Any], run: int = 0, **changes: Any) -> tuple[Trial,
     return cs.simulate(plain, run, SEED), cs.simulate(plain.variant("with", truth__sensor__effects=effects), run, SEED)
 
 
-def steps_of(trial: Trial) -> Array:
-    return np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
-
-
 def tracks_of(step: Array, landmark: Array) -> list[list[int]]:
     """Rows of each track, one row after the other."""
     tracks: dict[int, list[int]] = {}
@@ -101,7 +97,7 @@ def test_the_error_of_a_track_is_a_stationary_gauss_markov_process() -> None:
     c = 0.8
     sigma = np.array([1.0, 2.0, 0.3])
     plain, trial = pair({"kind": "track-error", "sigma_px": sigma.tolist(), "correlation": c})
-    error, tracks = (trial.z - plain.z) / sigma, tracks_of(steps_of(plain), plain.landmark)
+    error, tracks = (trial.z - plain.z) / sigma, tracks_of(plain.step, plain.landmark)
     firsts = np.array([error[rows[0]] for rows in tracks])
     fresh = np.concatenate([error[rows][1:] - c * error[rows][:-1] for rows in tracks]) / np.sqrt(1.0 - c**2)
     assert len(fresh) > 1000
@@ -115,7 +111,7 @@ def test_the_error_of_a_track_is_a_stationary_gauss_markov_process() -> None:
 def test_after_a_gap_the_error_is_another_one() -> None:
     """Almost constant along a track, so that a gap of a landmark shows."""
     plain, trial = pair({"kind": "track-error", "sigma_px": [1.0, 1.0, 0.3], "correlation": 0.999999})
-    error, tracks = trial.z - plain.z, tracks_of(steps_of(plain), plain.landmark)
+    error, tracks = trial.z - plain.z, tracks_of(plain.step, plain.landmark)
     label = [plain.landmark[rows[0]] for rows in tracks]
     again = [i for i in range(len(tracks)) if label[i] in label[:i]]
     assert again
@@ -146,7 +142,7 @@ def test_a_mismatch_has_a_disparity_of_nothing(disparity: tuple[float, float] | 
 def test_a_swap_carries_another_of_the_same_step() -> None:
     rate = 0.1
     plain, trial = pair({"kind": "swap", "rate": rate})
-    step, hit = steps_of(plain), trial.spurious
+    step, hit = plain.step, trial.spurious
     seen = np.bincount(step)[step]
     assert np.array_equal(trial.landmark, plain.landmark)
     assert as_often(int(hit.sum()), int((seen > 1).sum()), rate)
@@ -163,7 +159,7 @@ def test_a_swap_carries_another_of_the_same_step() -> None:
 
 def test_all_are_swapped_that_have_another() -> None:
     plain, trial = pair({"kind": "swap", "rate": 1.0})
-    alone = np.bincount(steps_of(plain))[steps_of(plain)] == 1
+    alone = np.bincount(plain.step)[plain.step] == 1
     assert alone.any()
     assert np.array_equal(trial.spurious, ~alone)
     assert len(trial.things) == 0 or np.all(trial.things < len(trial.landmarks))
@@ -177,8 +173,8 @@ def test_a_mismatch_that_is_swapped_is_still_of_no_landmark() -> None:
 @pytest.mark.parametrize(("rate", "speed"), [(0.03, 2.0), (0.2, 15.0), (1.0, 0.001)])
 def test_a_drifting_track_slides_until_it_ends_or_leaves_the_image(rate: float, speed: float) -> None:
     plain, trial = pair({"kind": "drift", "rate": rate, "speed_px": speed})
-    at = {key: row for row, key in enumerate(zip(steps_of(trial), trial.landmark, strict=True))}
-    step, angles, begun, could, left = steps_of(plain), [], 0, 0, 0
+    at = {key: row for row, key in enumerate(zip(trial.step, trial.landmark, strict=True))}
+    step, angles, begun, could, left = plain.step, [], 0, 0, 0
     for rows in tracks_of(step, plain.landmark):
         row = [at.get((step[i], plain.landmark[i])) for i in rows]
         known = [i for i in row if i is not None]
@@ -228,8 +224,8 @@ def test_a_track_that_has_slid_out_of_the_image_does_not_come_back() -> None:
 def test_images_come_after_so_many_steps_in_turn() -> None:
     plain, trial = pair({"kind": "frames", "every": [1, 2, 4]})
     images = sorted({each for k in range(0, 500, 7) for each in (k + 1, k + 3, k + 7) if each <= 500})
-    kept = np.isin(steps_of(plain), images)
-    assert set(steps_of(trial)) == set(steps_of(plain)[kept])
+    kept = np.isin(plain.step, images)
+    assert set(trial.step) == set(plain.step[kept])
     assert trial.landmark.tolist() == plain.landmark[kept].tolist()
 
 
@@ -238,7 +234,7 @@ def test_walls_hide_what_is_behind_them_from_where_the_sensor_is() -> None:
     plain, trial = pair({"kind": "occlusion", "walls": [wall]}, truth__sensor__mount=mount)
     assert plain.truth is not None
     assert plain.landmarks is not None
-    step = steps_of(plain)
+    step = plain.step
     heading = plain.truth[step, 2]
     c, s = np.cos(heading), np.sin(heading)
     sensor = plain.truth[step, :2] + np.stack([c * 0.4 + s * 0.6, s * 0.4 - c * 0.6], axis=1)
@@ -249,7 +245,7 @@ def test_walls_hide_what_is_behind_them_from_where_the_sensor_is() -> None:
     hidden = (t > 0) & (t < 1) & (u > 0) & (u < 1)
     seen = set(zip(step[~hidden], plain.landmark[~hidden], strict=True))
     assert 20 < hidden.sum() < len(hidden) - 20
-    assert set(zip(steps_of(trial), trial.landmark, strict=True)) == seen
+    assert set(zip(trial.step, trial.landmark, strict=True)) == seen
 
 
 # --- mistakes -------------------------------------------------------------------------------------------------

@@ -31,10 +31,6 @@ def variance_fits(normalised: Array) -> bool:
     return bool(low <= total <= high)
 
 
-def steps_of(trial: Trial) -> Array:
-    return np.repeat(np.arange(1, trial.steps + 1), np.diff(trial.first))
-
-
 def same(a: Trial, b: Trial) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(_arrays(a), _arrays(b), strict=True))
 
@@ -148,7 +144,7 @@ def test_seen_is_what_is_in_range_and_in_the_image(small: Small, world: str) -> 
     trial = cs.simulate(scenario, run=1)
     expected = seen_by_hand(scenario, trial.truth, trial.landmarks)
     assert expected
-    assert set(zip(steps_of(trial), trial.landmark, strict=True)) == expected
+    assert set(zip(trial.step, trial.landmark, strict=True)) == expected
     if world == "robot pushed about":  # negative control: the planned path is not what decides
         assert expected != seen_by_hand(scenario, planned_path(scenario.truth), trial.landmarks)
 
@@ -156,7 +152,7 @@ def test_seen_is_what_is_in_range_and_in_the_image(small: Small, world: str) -> 
 def test_seen_by_a_mounted_sensor(small: Small, tilted: dict[str, list[float]]) -> None:
     scenario = small("herath2007-xyz", truth__steps=40, truth__sensor__mount=tilted)
     trial = cs.simulate(scenario)
-    seen = set(zip(steps_of(trial), trial.landmark, strict=True))
+    seen = set(zip(trial.step, trial.landmark, strict=True))
     assert seen == seen_by_hand(scenario, trial.truth, trial.landmarks)
     plain = small("herath2007-xyz", truth__steps=40)
     assert seen != seen_by_hand(plain, trial.truth, trial.landmarks)
@@ -171,7 +167,7 @@ def test_measured_disparity_outside_the_search_range_is_no_observation(small: Sm
     assert (wide.z[:, 2] > 5.0).any()
     assert np.array_equal(narrow.z, wide.z[found])
     assert np.array_equal(narrow.landmark, wide.landmark[found])
-    assert np.array_equal(steps_of(narrow), steps_of(wide)[found])
+    assert np.array_equal(narrow.step, wide.step[found])
 
 
 def test_observations_are_ordered(uvd: cs.Scenario) -> None:
@@ -205,10 +201,10 @@ def test_observation_noise_has_the_stated_variance(small: Small, name: str) -> N
 
 def _noise_free(scenario: cs.Scenario, trial: Trial) -> Array:
     sensor = PointSensor(scenario.belief.sensor, uvd=scenario.truth.sensor.model == "uvd")
-    pose, landmark = trial.truth[steps_of(trial)], trial.landmarks[trial.landmark]
+    pose, landmark = trial.truth[trial.step], trial.landmarks[trial.landmark]
     if scenario.truth.sensor.model != "linear":
         return sensor.measure(pose, landmark)
-    reference = planned_path(scenario.truth)[steps_of(trial)]
+    reference = planned_path(scenario.truth)[trial.step]
     H = np.array([sensor.jacobians(p, m)[0] for p, m in zip(reference, landmark, strict=True)])
     return sensor.measure(reference, landmark) + np.einsum("mij,mj->mi", H, pose - reference)
 
@@ -270,7 +266,7 @@ def test_linear_world_superposes(small: Small) -> None:
     reference = planned_path(once.truth)
     assert np.allclose(b.truth - reference, 3 * (a.truth - reference), rtol=0, atol=1e-12)
     assert np.array_equal(a.landmark, b.landmark)
-    nominal = PointSensor(once.belief.sensor, uvd=False).measure(reference[steps_of(a)], a.landmarks[a.landmark])
+    nominal = PointSensor(once.belief.sensor, uvd=False).measure(reference[a.step], a.landmarks[a.landmark])
     assert np.allclose(b.z - nominal, 3 * (a.z - nominal), rtol=0, atol=1e-12)
     assert np.abs(a.truth - reference).max() > 0.1
 
@@ -303,7 +299,7 @@ def test_linear_world_sees_the_same_in_every_run(linear: cs.Scenario) -> None:
     assert np.array_equal(a.first, b.first)
     assert not np.array_equal(a.truth, b.truth)
     expected = seen_by_hand(linear, planned_path(linear.truth), a.landmarks)
-    assert set(zip(steps_of(a), a.landmark, strict=True)) == expected
+    assert set(zip(a.step, a.landmark, strict=True)) == expected
 
 
 def test_a_world_out_of_the_search_range_is_refused() -> None:

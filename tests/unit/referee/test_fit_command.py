@@ -23,10 +23,9 @@ from consistency.referee.diagnostics.export import flat, plain
 from consistency.referee.extras import is_installed
 from consistency.referee.fitting.drives import Drive, drive_of
 from consistency.referee.fitting.model import NoiseModel
-from consistency.referee.fitting.motions import vectors
 from consistency.referee.fitting.snippets import ceres, gtsam, robot_localization, seconds, straight, toml
 from consistency.referee.fitting.writing import write_model
-from consistency.referee.geometry.groups import composed
+from consistency.referee.geometry.groups import composed, vectors
 from consistency.referee.parsing.options import Reading
 from consistency.referee.types import Array
 

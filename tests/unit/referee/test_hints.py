@@ -95,11 +95,6 @@ def weighed(p: Poses, part: slice, factor: float) -> Poses:
     return replace(p, covariance=p.covariance * np.outer(scale, scale))
 
 
-def deviations(p: Poses) -> Poses:
-    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
-    return replace(p, covariance=sigma[:, :, None] * np.eye(sigma.shape[1]))
-
-
 SWAP = [3, 4, 5, 0, 1, 2]
 W_FIRST = [0, 1, 2, 6, 3, 4, 5]
 FAR = np.array([10.0, -3.0, 1.0])
@@ -135,7 +130,7 @@ MIXED: dict[str, tuple[Make, Mess, str]] = {
     "truth in mm": (
         spatial, lambda p: replace(p, truth=p.truth * ([1e3] * 3 + [1] * 4)), "positions of the truth are in millim",
     ),
-    "deviations": (lambda rng: spatial(rng, plain=True), deviations, "its diagonal holds standard deviations"),
+    "deviations": (lambda rng: spatial(rng, plain=True), world.deviations, "its diagonal holds standard deviations"),
     "information": (spatial, lambda p: replace(p, covariance=np.linalg.inv(p.covariance)), "information matrix"),
     "y before x": (
         spatial, lambda p: replace(p, estimate=p.estimate[:, [1, 0, 2, 3, 4, 5, 6]]),
@@ -158,7 +153,9 @@ MIXED: dict[str, tuple[Make, Mess, str]] = {
     "true headings in degrees": (
         planar, lambda p: replace(p, truth=p.truth * ANGLES), "the headings of the truth are in degrees",
     ),
-    "planar deviations": (lambda rng: planar(rng, plain=True), deviations, "its diagonal holds standard deviations"),
+    "planar deviations": (
+        lambda rng: planar(rng, plain=True), world.deviations, "its diagonal holds standard deviations",
+    ),
     "shifted world": (
         planar, lambda p: moved(p, WorldTransform.about_z(0.0, FAR[:2])), "the world of the estimates is shifted by (-",
     ),

@@ -54,13 +54,6 @@ FALSE_ALARM = 1e-5
 P = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.003]])  # m^2, m rad, rad^2
 
 
-@pytest.fixture
-def fresh() -> np.random.Generator:
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
-
-
 def autoregression(rng: np.random.Generator, runs: int, steps: int, n: int, coefficient: float) -> Array:
     w = rng.standard_normal((runs, steps, n))
     for k in range(1, steps):

@@ -19,7 +19,7 @@ from consistency.referee.diagnostics import (
     judge,
     verdict_parts,
 )
-from consistency.referee.diagnostics.questions import ABOUT, MAIN, OF_MAP, SHARES, answers
+from consistency.referee.diagnostics.questions import ABOUT, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, answers
 from consistency.referee.diagnostics.skipping import Skip, Skipped
 from consistency.referee.diagnostics.verdict_parts import Innovations
 from consistency.referee.types import Array
@@ -167,7 +167,7 @@ def test_every_status_has_a_meaning_and_every_question_a_share() -> None:
         "consistent", "overconfident", "conservative", "biased", "heavy-tailed", "inconsistent", "undecided", "failed",
     ]  # fmt: skip
     assert set(SHARES) == set(ABOUT)
-    two_sided = {q: s for q, s in SHARES.items() if q not in ("scale in some direction", *OF_MAP)}
+    two_sided = {q: s for q, s in SHARES.items() if q not in ("scale in some direction", JOINT, JOINT_DISTRIBUTION)}
     assert SHARES[MAIN] == 0.5
     assert sum(two_sided.values()) == pytest.approx(1.0)
 

@@ -37,7 +37,7 @@ def test_the_bias_has_the_pooled_spread_of_the_chapter(bias: ModuleType) -> None
 
 
 def steps_of(trial: cs.Trial) -> list[tuple[int, int, Any]]:
-    step = np.repeat(np.arange(trial.steps), np.diff(trial.first))
+    step = trial.step - 1
     return [(int(k), int(label), z) for k, label, z in zip(step, trial.landmark, trial.z, strict=True)]
 
 

@@ -102,11 +102,6 @@ class Kernel:
             size * (foreseen.AGAIN if name in self._functions else 1.0) for name, size in content.functions.items()
         )
 
-    @property
-    def signatures(self) -> list[Any]:
-        """Signatures compiled or loaded in this process."""
-        return list(self._entries)
-
     def _made(self, signature: tuple[Any, ...]) -> Any:
         content = self._contents.get(signature) or self._content(signature)
         entry = numba.njit(**OPTIONS)(self.function)

@@ -291,11 +291,12 @@ def ardupilot(at: Path, s: Study) -> Drawn:
     return log.write(at / "flight.bin"), {}
 
 
-def bags(at: Path, s: Study, suffix: str, kind: str) -> Drawn:
+def bags(at: Path, s: Study, suffixes: Sequence[str], kind: str) -> Drawn:
     """A bag for each run, of ROS 2 without its metadata; the truth is on a topic of its own or in TF."""
     write_bag, t = runpy.run_path(str(HELPERS / "bag.py"))["write"], T - T[0]
     (at / "est").mkdir()
     for run, own in enumerate(s.own):
+        suffix = suffixes[run % len(suffixes)]
         drive = SimpleNamespace(t=t, own=own[:, :7], P=s.P[:6, :6], true_t=t, true=s.true[:, :7])
         if suffix == ".bag":
             write_bag(at / f"est/{run}.bag", 1, kind, drive)
@@ -322,9 +323,9 @@ ROWS: dict[str, Callable[[Path, Study], Drawn]] = {
     "RTKLIB, earth-centred": centred_fixes, "KITTI": kitti, "matrices with covariances": matrices,
     "speeds and turn rates": rates, "planar table": planar, "OpenVINS": openvins, "OpenVINS's simulator": simulated,
     "poses with velocity and biases": states, "archive of SE2(3)": archive, "uncertain truth, s = 0.2": uncertain,
-    "ROS 1, Odometry and TF": partial(bags, suffix=".bag", kind="odometry"),
-    "ROS 2 (.db3), PoseWithCovarianceStamped": partial(bags, suffix=".db3", kind="pose"),
-    "ROS 2 (.mcap), Odometry and TF": partial(bags, suffix=".mcap", kind="odometry"), "ROS, NavSatFix": satellites,
+    "ROS 1, Odometry and TF": partial(bags, suffixes=(".bag",), kind="odometry"),
+    "ROS 2, PoseWithCovarianceStamped": partial(bags, suffixes=(".db3", ".mcap"), kind="pose"),
+    "ROS 1, NavSatFix": satellites,
     "PX4": px4, "ArduPilot, odometry": ardupilot,
 }  # fmt: skip
 FLIGHTS = (px4, ardupilot)

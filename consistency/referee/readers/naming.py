@@ -39,7 +39,8 @@ MOVING_LABELS = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # 
 PREFIXES = ("p_", "p", "cov_", "cov", "t")  # before two labels
 DEVIATIONS = ("sigma_{}", "std_{}", "s{}", "s_{}", "sd_{}", "sigma{}", "std{}", "stddev_{}")  # standard, not squared
 APART = {"p": ("x", "y", "z"), "q": ("r", "p", "y")}  # two triangles of cnspy: position, rotation
-OTHER_UNITS = re.compile(r"[\[(]\s*((?:deg|°|mm|cm|km|mph|kph|ft|feet|rpm)[^\])]*)[\])]", re.IGNORECASE)  # than SI, rad
+_OTHER = r"deg(?:rees?)?|°|mm|cm|km(?:/?h)?|mph|kph|ft|feet|rpm"
+OTHER_UNITS = re.compile(rf"[\[(]\s*((?:{_OTHER})(?![a-z_])[^\])]*)[\])]", re.IGNORECASE)  # than SI and rad
 NUMBERED = re.compile(r"(.*?)(?:covariance|cov)_?(\d+)(?:_(\d+))?")
 
 

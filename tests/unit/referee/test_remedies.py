@@ -10,7 +10,7 @@ from test_layouts import lines
 
 import consistency as cs
 from consistency.referee.readers.matching import unit_apart
-from consistency.referee.readers.naming import fields_of
+from consistency.referee.readers.naming import fields_of, require_units
 from consistency.referee.readers.sheet import TableRows
 
 T = 100.0 + 0.1 * np.arange(60)
@@ -76,6 +76,13 @@ def test_a_refusal_names_the_remedy(
     lines("truth.csv", "t,x,y,heading", [T, T, T, T])
     with pytest.raises(cs.InputError, match=said):
         cs.read(name.split("/")[0], truth="truth.csv")
+
+
+def test_units_of_the_si_and_other_words_are_let_pass() -> None:
+    require_units(["t [ns]", "v (m/s)", "omega[rad/s]", "P_xx [m^2]", "x [cmd]", "x (degraded)"], Path("o.csv"))
+    for name in ("v (km/h)", "P_hh [deg^2]", "yaw [ ° ]", "pitch (degrees)", "z [CM]"):
+        with pytest.raises(cs.InputError, match=r"o\.csv: column .* units are SI and radians"):
+            require_units([name], Path("o.csv"))
 
 
 def test_a_list_in_a_cell() -> None:

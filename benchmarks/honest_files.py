@@ -13,7 +13,9 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ from consistency.referee.readers.fixes import axes_at, centred, geodetic
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch
 
-HELPERS = Path(__file__).parents[1] / "tests/helpers"  # writers of flight logs
+HELPERS = Path(__file__).parents[1] / "tests/helpers"  # writers of flight logs and bags
 
 RUNS, STEPS = 50, 6
 POWERED = 20  # draws with x2 in P, at most
@@ -289,12 +291,41 @@ def ardupilot(at: Path, s: Study) -> Drawn:
     return log.write(at / "flight.bin"), {}
 
 
+def bags(at: Path, s: Study, suffixes: Sequence[str], kind: str) -> Drawn:
+    """A bag for each run, of ROS 2 without its metadata; the truth is on a topic of its own or in TF."""
+    write_bag, t = runpy.run_path(str(HELPERS / "bag.py"))["write"], T - T[0]
+    (at / "est").mkdir()
+    for run, own in enumerate(s.own):
+        suffix = suffixes[run % len(suffixes)]
+        drive = SimpleNamespace(t=t, own=own[:, :7], P=s.P[:6, :6], true_t=t, true=s.true[:, :7])
+        if suffix == ".bag":
+            write_bag(at / f"est/{run}.bag", 1, kind, drive)
+        else:
+            [file] = write_bag(at / f"{run}", 2, kind, drive, suffix).glob(f"*{suffix}")
+            file.rename(at / f"est/{file.name}")
+    return at / "est", {"truth_topic": "map:body" if kind == "odometry" else "/vicon", "time_offset": 0.0}
+
+
+def satellites(at: Path, s: Study) -> Drawn:
+    """A bag for each run, of NavSatFix against NavSatFix."""
+    write_fixes, near = runpy.run_path(str(HELPERS / "bag.py"))["write_fixes"], s.true[0, :3]
+    own = geodetic(centred(PLACE) + (near - s.e[..., :3].reshape(-1, 3)) @ axes_at(PLACE)).reshape(RUNS, STEPS, 3)
+    true, P = geodetic(centred(PLACE) + near[None] @ axes_at(PLACE)), np.tile(s.P[:3, :3], (STEPS, 1, 1))
+    (at / "est").mkdir()
+    for run, places in enumerate(own):
+        write_fixes(at / f"est/{run}.bag", 3, places, np.tile(true, (STEPS, 1)), P)
+    return at / "est", {"topic": "/fix", "truth_topic": "/rtk", "time_offset": 0.0}
+
+
 ROWS: dict[str, Callable[[Path, Study], Drawn]] = {
     "TUM": plain, "EuRoC": euroc, "Newer College": newer_college, "poses by names": named,
     "standard deviations alone": deviations, "truth of positions, lever arm": positions, "RTKLIB": rtklib,
     "RTKLIB, earth-centred": centred_fixes, "KITTI": kitti, "matrices with covariances": matrices,
     "speeds and turn rates": rates, "planar table": planar, "OpenVINS": openvins, "OpenVINS's simulator": simulated,
     "poses with velocity and biases": states, "archive of SE2(3)": archive, "uncertain truth, s = 0.2": uncertain,
+    "ROS 1, Odometry and TF": partial(bags, suffixes=(".bag",), kind="odometry"),
+    "ROS 2, PoseWithCovarianceStamped": partial(bags, suffixes=(".db3", ".mcap"), kind="pose"),
+    "ROS 1, NavSatFix": satellites,
     "PX4": px4, "ArduPilot, odometry": ardupilot,
 }  # fmt: skip
 FLIGHTS = (px4, ardupilot)

@@ -43,6 +43,10 @@ NO_GUESS = {
 }
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_SHARED = ("shared", "shared_from", "shared_truth")
+HINTS = {
+    **dict.fromkeys((".ulg", ".bin"), "; flight logs are for 'consistency monitor'"),
+    ".gz": "; unpack it",
+}  # for files of unknown kinds
 OF_WINDOWS = ("relative", "motions", "windows")
 
 
@@ -203,7 +207,8 @@ def _by_kind(estimates: Path, r: Reading, over: Relative | None) -> list[Evidenc
     _refuse(estimates, r, *(OF_BAGS if kind is None else kind.refused))
     if kind is None:
         known = f"{', '.join(SUFFIXES)} (TUM trajectories)"
-        raise InputError(f"{estimates}: unknown kind of file; known are {known}")
+        hint = HINTS.get(estimates.suffix.lower(), "")
+        raise InputError(f"{estimates}: unknown kind of file; known are {known}{hint}")
     return _with_frame(function_at(kind.records)(estimates, r, over), r)
 
 

@@ -21,6 +21,7 @@ from consistency.referee.readers.naming import (
     Roles,
     fields_of,
     head_of,
+    require_units,
     roles_of,
     unit_of,
 )  # fmt: skip
@@ -99,6 +100,7 @@ def _named(path: Path, head: Head, roles: Roles, true: bool) -> Lines:
 
 def read_named(path: Path, head: Head, places: Sequence[int]) -> tuple[Lines, list[Array]]:
     """Some columns of a file with names, and lines that hold none of them yet."""
+    require_units([head.names[i] for i in places], path)
     if head.comment or head.spaced:
         layout = f"{len(head.names)} columns as named"
         lines = read_rows(path, [len(head.names)], layout, 0 if head.comment else head.line)

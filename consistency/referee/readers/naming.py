@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 import re
 import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +39,8 @@ MOVING_LABELS = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # 
 PREFIXES = ("p_", "p", "cov_", "cov", "t")  # before two labels
 DEVIATIONS = ("sigma_{}", "std_{}", "s{}", "s_{}", "sd_{}", "sigma{}", "std{}", "stddev_{}")  # standard, not squared
 APART = {"p": ("x", "y", "z"), "q": ("r", "p", "y")}  # two triangles of cnspy: position, rotation
+_OTHER = r"deg(?:rees?)?|°|mm|cm|km(?:/?h)?|mph|kph|ft|feet|rpm"
+OTHER_UNITS = re.compile(rf"[\[(]\s*((?:{_OTHER})(?![a-z_])[^\])]*)[\])]", re.IGNORECASE)  # than SI and rad
 NUMBERED = re.compile(r"(.*?)(?:covariance|cov)_?(\d+)(?:_(\d+))?")
 
 
@@ -281,7 +285,19 @@ def unit_of(t: Array, unit: int | None = None) -> int:
     return next((each for least, each in EPOCHS if middle > least), 1)
 
 
+def require_units(names: Sequence[str], path: Path) -> None:
+    """Refuse columns whose names state a unit that is not of the SI, such as ``heading [deg]``."""
+    for name in names:
+        if found := OTHER_UNITS.search(name):
+            raise InputError(
+                f"{path}: column '{name}' is in {found[1].strip()}; units are SI and radians: convert and rename it"
+            )
+
+
 def fields_of(line: str) -> list[str]:
     """Fields of a line, apart by commas, semicolons or tabs, or by white space where it has none of them."""
     separator = max(",;\t", key=line.count)
+    if '"' in line and separator in line:
+        with suppress(csv.Error):  # of a line with a null character
+            return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
     return [field.strip().strip('"') for field in (line.split(separator) if separator in line else line.split())]

@@ -41,7 +41,8 @@ def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
         places, rates = places_of(head.names, (SPEEDS, TURNS)), True
     if places is None:
         raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(head.names[:12])}")
-    stated = [name for name in COVARIANCE if name in head.names]
+    lower = [f"P_{name[3]}{name[2]}" for name in COVARIANCE]
+    stated = [name for name in dict.fromkeys([*COVARIANCE, *lower]) if name in head.names]
     lines, columns = read_named(path, head, (*clock[0], *places, *(head.names.index(name) for name in stated)))
     first = len(clock[0])
     t, unit = times_of(lines, clock[0], columns[:first], clock[1])

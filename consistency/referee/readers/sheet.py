@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,6 +78,8 @@ class TableRows:
         bad = np.isnan(values) & ~self.empty(column)
         other = not all(isinstance(cell, str) for cell in cells[bad])
         what = "a truth value or a date, which is to be written as a number" if other else "not a number"
+        if any(hasattr(cell, "__len__") for cell in cells[bad]) and other:
+            what = "a list, of which each number needs a column of its own"
         if not bad.any() and (finite or whole):
             bad, what = ~np.isfinite(values), "not a finite number"
         if not bad.any() and whole:
@@ -85,6 +88,8 @@ class TableRows:
             bad, what = np.abs(values) > WHOLE, "a number too large to be counted exactly"
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
+            if re.fullmatch(r"[-+]?\d+,\d+", str(cells[row])):
+                what += " with a decimal point"
             raise InputError(f"{self.place(row)}: column '{column}': {what} ({one_line(cells[row], 60)})")
         return values
 
@@ -374,7 +379,8 @@ def _number_rows(
     for number, line in lines:
         fields = line.replace(",", " ").split()
         if len(fields) not in widths:
-            raise InputError(f"{path}, line {number}: has {len(fields)} columns; should be {layout}")
+            hint = "; columns apart by semicolons need names, and numbers decimal points" * (";" in line)
+            raise InputError(f"{path}, line {number}: has {len(fields)} columns; should be {layout}{hint}")
         width = width or len(fields)
         if len(fields) != width:
             raise InputError(f"{path}, line {number}: has {len(fields)} columns, the lines before {width}")

@@ -14,8 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.hints import hints
-from consistency.referee.readers.matching import common_times, truth_at
-from consistency.referee.readers.naming import UNIT_NAMES, unit_of
+from consistency.referee.readers.matching import common_times, truth_at, unit_apart
 from consistency.referee.readers.offset import clocks_and_frames
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.record import Track, assemble
@@ -168,11 +167,7 @@ def _stretch(run: int, poses: Poses, path: Path | str, truth: Path | str, shift:
 def apart(path: Path | str, t: Array, other: Path | str, other_t: Array, tolerance: float, what: str) -> InputError:
     """Message that no timestamp of one is near one of the other."""
     own_span, span = (f"{each[0]:.10g} to {each[-1]:.10g}" for each in (t, other_t))
-    units, odd = (unit_of(t), unit_of(other_t)), ""
-    if units[0] != units[1]:
-        which, unit = (path, units[0]) if units[0] > units[1] else (other, units[1])
-        odd = f"; {which} seems to be in {UNIT_NAMES[unit]}, and has to be in seconds"
-    where = f"t is {own_span}, but {span} in {other}{odd}"
+    where = f"t is {own_span}, but {span} in {other}{unit_apart(t, other_t, (path, other))}"
     return InputError(f"{path}: no estimate has a {what} within {tolerance:g} s (--max-dt): {where}")
 
 

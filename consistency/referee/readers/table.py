@@ -137,7 +137,9 @@ def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
     if truth is not None and ("step" in sheet or "t" in sheet):
         has = "step" if "step" in sheet else "t"
         raise InputError(f"{truth.path}: column '{has}' is missing; {sheet.path} is numbered by it")
-    raise InputError(f"{sheet.path}: column 'step' or 't' is missing; there are: {sheet.columns}")
+    spaced = len(sheet.data) == 1 and " " in sheet.columns
+    hint = "; separate columns by commas, semicolons or tabs" * spaced
+    raise InputError(f"{sheet.path}: column 'step' or 't' is missing; there are: {sheet.columns}{hint}")
 
 
 def _recording(

@@ -15,6 +15,7 @@ from consistency.referee.types import Array, Indices
 
 POSE = ("x", "y", "heading")
 OWN_NAMES = {(POSE[i], POSE[j]): name for name, (i, j) in COVARIANCE.items()}
+LOWER_NAMES = {pair: f"P_{name[3]}{name[2]}" for pair, name in OWN_NAMES.items()}
 
 
 def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
@@ -65,7 +66,9 @@ def stated_deviations(sheet: TableRows, axes: tuple[str, ...]) -> Array | None:
     """Standard deviations (N, n) of a table without cross terms: sigma_x, std_x, sx, or P_x_x alone; None of others."""
     n = len(axes)
     pairs = [(axes[i], axes[j]) for i, j in itertools.combinations(range(n), 2)]
-    if any(f"P_{a}_{b}" in sheet or f"P_{b}_{a}" in sheet or OWN_NAMES.get((a, b)) in sheet.data for a, b in pairs):
+    if any(f"P_{a}_{b}" in sheet or f"P_{b}_{a}" in sheet for a, b in pairs):
+        return None
+    if any(names.get(pair) in sheet.data for names in (OWN_NAMES, LOWER_NAMES) for pair in pairs):
         return None
     variances = [f"P_{a}_{a}" if f"P_{a}_{a}" in sheet else OWN_NAMES.get((a, a), "") for a in axes]
     if n > 1 and all(name in sheet for name in variances):
@@ -91,7 +94,7 @@ def stated_covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False
     for i in range(n):
         for j in range(i, n):
             upper = [f"P_{axes[i]}_{axes[j]}", *([OWN_NAMES[axes[i], axes[j]]] if axes == POSE else [])]
-            lower = [f"P_{axes[j]}_{axes[i]}"]
+            lower = [f"P_{axes[j]}_{axes[i]}", *([LOWER_NAMES[axes[i], axes[j]]] if axes == POSE else [])]
             there = [column for column in (*upper, *lower) if column in sheet]
             if not there:
                 wanted = upper[-1]

@@ -9,7 +9,7 @@ import numpy as np
 from consistency.referee.diagnostics.numbers_in_words import plural
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import COLUMNS
-from consistency.referee.readers.matching import Manifold, nearest, truth_at
+from consistency.referee.readers.matching import Manifold, nearest, truth_at, unit_apart
 from consistency.referee.readers.record import listed
 from consistency.referee.readers.sheet import TableRows
 from consistency.referee.readers.table_columns import require_columns, row_order, stated_covariance
@@ -84,7 +84,8 @@ def matched(
             furthest = max(furthest, float(apart.max(initial=0.0)))
         if not len(own):
             spans = [f"{each.min():.10g} to {each.max():.10g}" for each in (keys[rows], there.keys)]
-            within = f" within {tolerance:g} s (--max-dt)" if key == "t" else ""
+            odd = unit_apart(keys[rows], there.keys, (sheet.path, truth.path))
+            within = f" within {tolerance:g} s (--max-dt){odd}" if key == "t" else ""
             raise InputError(
                 f"{sheet.path}: no {key} of run {run} ({spans[0]}) is in {truth.path} ({spans[1]}){within}"
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -20,6 +21,7 @@ from consistency.referee.types import Array, Indices
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much
 REFUSAL = "not a text file; known are .csv, .parquet, .npz, and .txt or .tum"
 BOM = b"\xef\xbb\xbf"
+WIDE = re.compile(rb"\xff\xfe[^\0]\0|\xfe\xff\0[^\0]")  # the mark of UTF-16 and a character of ASCII
 SPECIAL = b'"#\x0b\x0c\x1c\x1d\x1e'  # quotes, comments, and what str.splitlines takes for the end of a line
 IS_SPACE = np.isin(np.arange(256), np.frombuffer(b" \t\r\n", np.uint8))
 NEWLINE = ord("\n")
@@ -109,6 +111,8 @@ def blocks(path: Path) -> Iterator[Block]:
         file = opened(path)
     with file:
         first, pieces = 1, [_read(path, file).removeprefix(BOM)]
+        if WIDE.match(pieces[0]):
+            raise InputError(f"{path}: is text in UTF-16, as PowerShell and Excel write it; save it as UTF-8")
         while pieces[-1]:
             require_room(path, file.tell())
             head, end, tail = pieces[-1].rpartition(b"\n")

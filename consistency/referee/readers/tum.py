@@ -14,7 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.parsing.options import COLUMNS, Reading
 from consistency.referee.readers.fixes import Fixes, localised
-from consistency.referee.readers.kinds import is_drive, trajectory_files
+from consistency.referee.readers.kinds import TABLES, is_drive, trajectory_files
 from consistency.referee.readers.kitti import read_drive
 from consistency.referee.readers.layouts import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, read_poses
 from consistency.referee.readers.matching import associate
@@ -123,6 +123,8 @@ def _parts(own: Lines) -> Mapping[str, range]:
 def _origin(parts: Mapping[str, range]) -> str:
     if parts in (WHOLE, ALONE):
         return "as in ROS messages with a covariance; declare yours with --error"
+    if parts is POINTS:
+        return "positions alone"
     return "written by OpenVINS" + "; --error so3 where it comes from another ROS topic" * (parts is BLOCKS)
 
 
@@ -135,7 +137,9 @@ def _runs(estimates: Path, truth: Path, covariance: Path | None) -> list[tuple[P
         return [(estimates, truth, covariance)]
     files = trajectory_files(estimates)
     if not files:
-        raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json")
+        tables = any(path.suffix.lower() in TABLES for path in estimates.iterdir())
+        hint = "; tables of several runs go into one file with a column 'run'" * tables
+        raise InputError(f"{estimates}: holds no .txt or .tum file and no manifest.json{hint}")
     stems = [path.stem for path in files]
     if twice := next((path for path in files if stems.count(path.stem) > 1), None):
         raise InputError(f"{estimates}: holds the run '{twice.stem}' twice, as .txt and .tum; keep one of them")

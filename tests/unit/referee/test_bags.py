@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,12 @@ from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.types import Array
 
 pytest.importorskip("rosbags", reason="needs the extra 'ros'")
 
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from bag import START, write, write_fixes
 
-START, STEPS = 1_700_000_000, 150
+STEPS = 150
 SIGMA = np.array([0.1, 0.2, 0.05, 0.01, 0.02, 0.03])
 P = np.diag(SIGMA**2)
 
@@ -40,62 +36,7 @@ class Drive:
         true = self.true[: 5 * STEPS : 5]
         turn = Rotation.from_rotvec(-e[:, 3:]) * Rotation.from_quat(true[:, 3:])
         self.own = np.hstack([true[:, :3] - e[:, :3], turn.as_quat()])
-        self.error = e
-
-
-def messages(store: Any, kind: str, drive: Drive, ros1: bool) -> Iterator[tuple[str, str, int, Any]]:
-    """Topic, type, time of writing and message; the stamps are those of the drive, the times a little later."""
-    T = store.types
-
-    def header(t: float, frame: str) -> Any:
-        ns = START * 10**9 + round(t * 1e9)
-        stamp = T["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
-        extra = {"seq": 0} if ros1 else {}
-        return T["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **extra)
-
-    def pose(values: Array) -> Any:
-        point = T["geometry_msgs/msg/Point"](*map(float, values[:3]))
-        return T["geometry_msgs/msg/Pose"](point, T["geometry_msgs/msg/Quaternion"](*map(float, values[3:])))
-
-    zero = T["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    stated = T["geometry_msgs/msg/PoseWithCovariance"]
-    for t, values in zip(drive.t, drive.own, strict=True):
-        content = stated(pose(values), P.ravel())
-        if kind == "odometry":
-            twist = T["geometry_msgs/msg/TwistWithCovariance"](T["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36))
-            message = T["nav_msgs/msg/Odometry"](header(t, "map"), "base", content, twist)
-            yield "/odom", "nav_msgs/msg/Odometry", late(t), message
-        else:
-            name = "geometry_msgs/msg/PoseWithCovarianceStamped"
-            yield "/pose", name, late(t), T[name](header(t, "map"), content)
-    for t, values in zip(drive.true_t, drive.true, strict=True):
-        if kind == "odometry":
-            turn = T["geometry_msgs/msg/Quaternion"](*map(float, values[3:]))
-            moved = T["geometry_msgs/msg/Transform"](T["geometry_msgs/msg/Vector3"](*map(float, values[:3])), turn)
-            each = T["geometry_msgs/msg/TransformStamped"](header(t, "/map"), "body", moved)
-            yield "/tf", "tf2_msgs/msg/TFMessage", late(t), T["tf2_msgs/msg/TFMessage"]([each])
-        else:
-            name = "geometry_msgs/msg/PoseStamped"
-            yield "/vicon", name, late(t), T[name](header(t, "map"), pose(values))
-
-
-def late(t: float) -> int:
-    return START * 10**9 + round((t + 0.3) * 1e9)
-
-
-def write(path: Path, ros: int, kind: str, drive: Drive) -> Path:
-    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
-    if ros == 1:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    writer = Writer1(path) if ros == 1 else Writer2(path, version=9)
-    with writer:
-        connections: dict[str, Any] = {}
-        for topic, name, at, message in messages(store, kind, drive, ros == 1):
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=store)
-            raw = store.serialize_ros1(message, name) if ros == 1 else store.serialize_cdr(message, name)
-            writer.write(connections[topic], at, raw)
-    return path
+        self.error, self.P = e, P
 
 
 @pytest.mark.parametrize("ros", [1, 2])
@@ -197,20 +138,10 @@ def test_damaged_bags_are_refused(tmp_path: Path) -> None:
 # --- files of ROS 2 by themselves, positions by satellite, and what is not stated ------------------------
 
 
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_a_file_of_ros_2_without_its_metadata(tmp_path: Path, storage: str) -> None:
-    from rosbags.rosbag2 import StoragePlugin
-
-    store, drive = get_typestore(Stores.ROS2_HUMBLE), Drive()
-    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    with Writer2(tmp_path / "drive", version=9, storage_plugin=plugin) as writer:
-        connections: dict[str, Any] = {}
-        for topic, name, at, message in messages(store, "pose", drive, False):
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=store)
-            writer.write(connections[topic], at, store.serialize_cdr(message, name))
-    suffix = ".mcap" if storage == "mcap" else ".db3"
-    [file] = (tmp_path / "drive").glob(f"*{suffix}")
+@pytest.mark.parametrize("suffix", [".db3", ".mcap"])
+def test_a_file_of_ros_2_without_its_metadata(tmp_path: Path, suffix: str) -> None:
+    drive = Drive()
+    [file] = write(tmp_path / "drive", 2, "pose", drive, suffix).glob(f"*{suffix}")
     alone = file.rename(tmp_path / f"flight{suffix}")
     [r] = read_recordings(alone, truth_topic="/vicon")
     np.testing.assert_allclose(r.error[0], drive.error, atol=1e-6)  # type: ignore[index]
@@ -219,23 +150,6 @@ def test_a_file_of_ros_2_without_its_metadata(tmp_path: Path, storage: str) -> N
         (tmp_path / "parts" / f"flight_{k}{suffix}").write_bytes(alone.read_bytes())
     with pytest.raises(cs.InputError, match=rf"flight_0{suffix} and others are parts of one recording; .*reindex"):
         read_recordings(tmp_path / "parts", truth_topic="/vicon")
-
-
-def write_fixes(path: Path, kind: int, own: Array, true: Array, C: Array, body: str = "gps", status: int = 0) -> Path:
-    """Fixes on /fix with covariances C (N, 3, 3), true ones on /rtk, at 10 Hz; the second of /fix has ``status``."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-    T = store.types
-    with Writer1(path) as writer:
-        for topic, places, number in (("/fix", own, kind), ("/rtk", true, 3)):
-            connection = writer.add_connection(topic, "sensor_msgs/msg/NavSatFix", typestore=store)
-            for k, (place, stated) in enumerate(zip(places, C, strict=True)):
-                ns = START * 10**9 + k * 10**8
-                stamp = T["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
-                header = T["std_msgs/msg/Header"](seq=k, stamp=stamp, frame_id=body if topic == "/fix" else "gps")
-                fix = T["sensor_msgs/msg/NavSatStatus"](status=status if k == 1 and topic == "/fix" else 2, service=1)
-                message = T["sensor_msgs/msg/NavSatFix"](header, fix, *map(float, place), stated.ravel(), number)
-                writer.write(connection, ns, store.serialize_ros1(message, "sensor_msgs/msg/NavSatFix"))
-    return path
 
 
 def test_fixes_against_fixes(tmp_path: Path) -> None:
@@ -276,13 +190,10 @@ def test_the_type_of_a_covariance_counts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1e9])
-def test_blocks_that_are_not_stated_are_not_judged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: float
-) -> None:
-    rotations = P.copy()
-    rotations[3:, 3:] = value * np.eye(3)
-    monkeypatch.setitem(globals(), "P", rotations)
+def test_blocks_that_are_not_stated_are_not_judged(tmp_path: Path, value: float) -> None:
     drive = Drive()
+    drive.P = P.copy()
+    drive.P[3:, 3:] = value * np.eye(3)
     bag = write(tmp_path / "a.bag", 1, "pose", drive)
     [r] = read_recordings(bag, truth_topic="/vicon")
     assert r.axes == ("x", "y", "z")

@@ -484,6 +484,17 @@ def skewed(d: Drive) -> str:
     return lines("t.txt", "", [*matrices(d.true, 4)[:15], np.full(STEPS, 2.0)], " ")
 
 
+def semicolons(path: str) -> str:
+    text = Path(path).read_text()
+    Path(path).write_text(text.replace(",", ";").replace(".", ","))
+    return path
+
+
+def recoded(path: str) -> str:
+    Path(path).write_bytes(Path(path).read_text().encode("utf-16"))
+    return path
+
+
 REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
     "a quaternion that is no unit": (
         lambda d: lines("t.csv", "t,x,y,z,qw,qx,qy,qz", [d.t, *with_w_first(1.01 * d.true)]),
@@ -510,6 +521,18 @@ REFUSED: dict[str, tuple[Callable[[Drive], str], str]] = {
     "nanoseconds without a name": (
         lambda d: lines("t.txt", "", [nanoseconds(d.t), *d.true.T], " "),
         r"no estimate has a truth within .* in t\.txt; t\.txt seems to be in nanoseconds, and has to be in seconds$",
+    ),
+    "another unit in a name": (
+        lambda d: lines("t.csv", "t,x [mm],y [mm],z [mm],qx,qy,qz,qw", [d.t, *d.true.T]),
+        r"t\.csv: column 'x \[mm\]' is in mm; units are SI and radians: convert and rename it",
+    ),
+    "decimal commas": (
+        lambda d: semicolons(lines("t.csv", NAMES, [d.t, *d.true.T])),
+        r"t\.csv, line 1: has 1 columns; .*; columns apart by semicolons need names, and numbers decimal points$",
+    ),
+    "UTF-16": (
+        lambda d: recoded(lines("t.txt", "", [d.t, *d.true.T], " ")),
+        r"t\.txt: is text in UTF-16, as PowerShell and Excel write it; save it as UTF-8",
     ),
     "runs in one table": (
         lambda d: lines("t.csv", f"run,{NAMES}", [np.zeros(STEPS), d.t, *d.true.T]),

@@ -14,9 +14,9 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics import Evidence, judge, nees
-from consistency.referee.diagnostics.pieces import in_pieces
+from consistency.referee.diagnostics.log_pieces import in_pieces
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.spatial import spatial_error
+from consistency.referee.geometry.space_errors import spatial_error
 from consistency.referee.types import Array
 
 STEPS, DOF, RHO = 20_000, 3, 0.95

@@ -27,8 +27,8 @@ from consistency.referee.defaults import DETECT
 from consistency.referee.errors import InputError
 from consistency.referee.fitting.drives import Drive, drive_of
 from consistency.referee.fitting.likelihood import terms_of
-from consistency.referee.fitting.model import decided
 from consistency.referee.fitting.noise import fit_noise, intervals
+from consistency.referee.fitting.noise_model import decided
 from consistency.referee.fitting.persistence import doubts, persistent
 from consistency.referee.fitting.ratios import folds_of, judged_by
 from consistency.referee.fitting.refusals import growth_of, require_sound

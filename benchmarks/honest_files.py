@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.diagnostics import Verdict, judge
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers import read_recordings
-from consistency.referee.readers.fixes import axes_at, centred, geodetic
+from consistency.referee.readers.geodetic import axes_at, centred, geodetic
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitoring import make_monitor, read_innovations, watch
 

@@ -22,10 +22,10 @@ import numpy as np
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.tuning.bench import BeliefScorer
 from consistency.bench.tuning.fit import FactorFit
-from consistency.bench.tuning.groups import groups_of, scaled
-from consistency.bench.tuning.parts import parts_of
+from consistency.bench.tuning.noise_groups import groups_of, scaled
+from consistency.bench.tuning.setting_scores import BeliefScorer
+from consistency.bench.tuning.split import parts_of
 from consistency.bench.tuning.tune import _Tuner
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics import Settings

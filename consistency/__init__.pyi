@@ -32,8 +32,8 @@ from .referee.errors import InputError as InputError
 from .referee.fitting.drives import Drive as Drive
 from .referee.fitting.drives import drive_of as drive_of
 from .referee.fitting.drives import read_drives as read_drives
-from .referee.fitting.model import NoiseModel as NoiseModel
-from .referee.fitting.model import fit_covariance as fit_covariance
+from .referee.fitting.noise_model import NoiseModel as NoiseModel
+from .referee.fitting.noise_model import fit_covariance as fit_covariance
 from .referee.notebook.records import judge as judge
 from .referee.notebook.records import read as read
 from .referee.verdicts.judge import analyse as analyse

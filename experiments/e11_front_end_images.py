@@ -21,7 +21,7 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.finding import findings_table
+from consistency.bench.runs.claims import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.diagnostics import Evidence, Verdict, judge, nees
 from consistency.referee.show.terminal import show

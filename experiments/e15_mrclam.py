@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.finding import findings_table
+from consistency.bench.runs.claims import findings_table
 from consistency.bench.runs.findings import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.records import record_of

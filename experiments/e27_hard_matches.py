@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.finding import findings_table
+from consistency.bench.runs.claims import findings_table
 from consistency.bench.runs.findings import OURS, command_line, sibling
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free

@@ -21,7 +21,7 @@ from edited import accept_changes
 from flight import Flight
 
 import consistency as cs
-from consistency.bench.store.frames import failures_table, rejections_table
+from consistency.bench.store.data_frames import failures_table, rejections_table
 from consistency.bench.store.log import read_log
 from consistency.bench.store.trial_rows import Rejected
 from consistency.referee.cli import main

@@ -14,7 +14,7 @@ from consistency.stereo.vision import RelativePose, StereoRig, register_svd, tri
 from consistency.stereo.vision.propagation import registration_derivatives, triangulation_derivatives
 from consistency.stereo.vision.refinement import _profile
 from consistency.stereo.vision.rig import solved
-from consistency.stereo.vision.robust import loss
+from consistency.stereo.vision.robust_loss import loss
 from consistency.stereo.vision.twoframe import Measure, PixelMatches, PointMatches, TwoFrames
 from consistency.stereo.vision.twoframe import derivatives as two_frame_derivatives
 

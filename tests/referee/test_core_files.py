@@ -14,7 +14,7 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.spatial import se3_log, spatial_error
+from consistency.referee.geometry.space_errors import se3_log, spatial_error
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers import read_recordings
 from consistency.referee.readers.hints import hints

@@ -22,8 +22,8 @@ from scipy import stats
 
 from consistency.referee.diagnostics import Evidence, Interval, Settings, Verdict, judge, outliers
 from consistency.referee.diagnostics.export import plain
+from consistency.referee.diagnostics.verdict_in_words import off_by, p_text, plural, short
 from consistency.referee.diagnostics.verdict_parts import STATUSES
-from consistency.referee.diagnostics.wording import off_by, p_text, plural, short
 from consistency.referee.types import Array, Failure
 
 SURE = 1e-5

@@ -10,9 +10,9 @@ from functools import partial
 
 import numpy as np
 
-from consistency.bench.challenging.bench import ChallengeScorer, Part, has_map
 from consistency.bench.challenging.search import RUNGS, Budget, Candidate, ranked, search, standard_error
 from consistency.bench.challenging.shrink import shrink
+from consistency.bench.challenging.world_scores import ChallengeScorer, Part, has_map
 from consistency.bench.challenging.worlds import Point, Space, require_right_belief, space_of
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.stepping import name_of

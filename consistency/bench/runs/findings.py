@@ -17,13 +17,13 @@ from joblib.externals.loky import Future, ProcessPoolExecutor
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.backends.local import worker_count
+from consistency.bench.runs.claims import findings_table
 from consistency.bench.runs.compiling import compile_all, first_trials
-from consistency.bench.runs.finding import findings_table
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.records import record_of
 from consistency.bench.scenario import Scenario, data_folder, load_scenario
+from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.results import Results, joined
-from consistency.bench.store.storage import write_folder
 from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding
 from consistency.referee.diagnostics import Record, Verdict

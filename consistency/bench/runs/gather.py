@@ -14,11 +14,17 @@ from typing import Any, Protocol
 import numpy as np
 import pandas as pd
 
-from consistency.bench.store.frames import estimates_table, failures_table, map_table, rejections_table, truth_table
+from consistency.bench.store.data_frames import (
+    estimates_table,
+    failures_table,
+    map_table,
+    rejections_table,
+    truth_table,
+)
+from consistency.bench.store.folder_tables import with_tables
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.parquet import Columns, Writer, write_table
 from consistency.bench.store.results import MAP_NUMBERS, NUMBERS, OWN_NUMBERS, Results, StoredResults, Tables
-from consistency.bench.store.storage import with_tables
 from consistency.bench.store.trial_rows import Rejected, RunOutcome
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.columns import COLUMNS

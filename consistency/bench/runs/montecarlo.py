@@ -24,8 +24,8 @@ from consistency.bench.scenario.tables import UNITS
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.log import Log, write_log
+from consistency.bench.store.log_tables import require_format
 from consistency.bench.store.results import Results, StoredResults, Tables
-from consistency.bench.store.tables import require_format
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 from consistency.referee.system.folders import require_free

@@ -25,9 +25,9 @@ from consistency.bench.scenario import (
     toml_text,
 )
 from consistency.bench.scenario.tables import SIGMA_UNITS
-from consistency.bench.store.frames import controls_table, observations_table, truth_of
-from consistency.bench.store.storage import write_folder
-from consistency.bench.store.tables import read_table_file, require_format, table_file
+from consistency.bench.store.data_frames import controls_table, observations_table, truth_of
+from consistency.bench.store.folder_tables import write_folder
+from consistency.bench.store.log_tables import read_table_file, require_format, table_file
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading

@@ -14,9 +14,9 @@ import pandas as pd
 from pydantic import ValidationError
 
 from consistency.bench.scenario import Scenario, explain
+from consistency.bench.store.folder_tables import require_unchanged, write_folder
 from consistency.bench.store.parquet import OPTIONAL, Columns, read_batches, read_parquet, require_table
 from consistency.bench.store.soundness import require_manifest, require_rows
-from consistency.bench.store.storage import require_unchanged, write_folder
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.parsing.columns import COLUMNS

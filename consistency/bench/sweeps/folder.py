@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from consistency.bench.scenario import Scenario
+from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.store.storage import write_folder
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep, alone, number_of_points

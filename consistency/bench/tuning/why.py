@@ -8,7 +8,7 @@ from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.scenario import Scenario, misbelief
 from consistency.referee.diagnostics import Settings, Verdict
 from consistency.referee.diagnostics.questions import BIAS, SCALE
-from consistency.referee.diagnostics.wording import short
+from consistency.referee.diagnostics.verdict_in_words import short
 from consistency.referee.terminal.progress import quiet
 from consistency.referee.verdicts.judge import analyse
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.log import Log
-from consistency.bench.store.storage import write_folder
-from consistency.bench.tuning.groups import sigma_by_channel
+from consistency.bench.tuning.noise_groups import sigma_by_channel
 from consistency.bench.tuning.result import Setting, Tuning, files
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.export import plain

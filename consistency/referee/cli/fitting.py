@@ -59,7 +59,7 @@ def fit_covariance(
     from dataclasses import replace
 
     from consistency.referee.fitting.drives import read_drives
-    from consistency.referee.fitting.model import fit_covariance as fit
+    from consistency.referee.fitting.noise_model import fit_covariance as fit
     from consistency.referee.fitting.wording import document
     from consistency.referee.system.folders import require_free
 

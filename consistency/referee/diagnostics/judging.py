@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from consistency.referee.diagnostics.questions import SHARES
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import DEFAULT, judge_alone
+from consistency.referee.diagnostics.verdict_in_words import plain
 from consistency.referee.diagnostics.verdict_parts import Settings, Verdict
-from consistency.referee.diagnostics.wording import plain
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.early_stopping import Design
@@ -59,7 +59,7 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
         return replace(judge_guesses(record, settings, judge_runs), notes=tuple(record.notes))
     runs, truth = record.as_runs, None
     if record.truth_covariance is not None:
-        from consistency.referee.diagnostics.uncertain import uncertain_truth
+        from consistency.referee.diagnostics.uncertain_truth import uncertain_truth
 
         truth = uncertain_truth(record)
     if truth is not None:
@@ -69,7 +69,7 @@ def judge_runs(record: Record, settings: Settings = DEFAULT, design: Design | No
     world = None if record.world is None else judge_alone(record.in_world, settings)
     if not runs.parts:
         return _beside(judge_alone(runs, settings, truth=truth), record, world)
-    from consistency.referee.diagnostics.parts import judge_parts
+    from consistency.referee.diagnostics.separate_components import judge_parts
 
     return _beside(judge_parts(runs, settings), record, world)
 

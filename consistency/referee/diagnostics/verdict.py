@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics import wording
+from consistency.referee.diagnostics import verdict_in_words
 from consistency.referee.diagnostics.band import simultaneous_band
 from consistency.referee.diagnostics.early_ending import early_ends
 from consistency.referee.diagnostics.equivalence import equivalence, equivalence_by_betting, equivalence_of_innovations
@@ -38,7 +38,7 @@ from consistency.referee.diagnostics.whitening import entries
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.joint import JointTest
-    from consistency.referee.diagnostics.uncertain import UncertainTruth
+    from consistency.referee.diagnostics.uncertain_truth import UncertainTruth
 
 DEFAULT = Settings()
 
@@ -90,7 +90,7 @@ def judge_alone(
     verdict = replace(verdict, status=status_of(verdict, sample, tests, joint))
     verdict = verdict if truth is None else truth.of_estimate(verdict)
     verdict = replace(verdict, axis=deciding_axis(verdict))
-    return replace(verdict, reasons=tuple(wording.reasons(verdict)))
+    return replace(verdict, reasons=tuple(verdict_in_words.reasons(verdict)))
 
 
 def _joint(evidence: Record, settings: Settings) -> tuple[JointTest | None, set[str]]:

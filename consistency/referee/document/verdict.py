@@ -14,7 +14,15 @@ import numpy as np
 
 from consistency.referee.diagnostics import Verdict
 from consistency.referee.diagnostics.export import flat
-from consistency.referee.diagnostics.wording import UNCERTAIN, p_text, percent, plain, plural, question_text, short
+from consistency.referee.diagnostics.verdict_in_words import (
+    UNCERTAIN,
+    p_text,
+    percent,
+    plain,
+    plural,
+    question_text,
+    short,
+)
 from consistency.referee.document.blocks import (
     Block,
     Cell,

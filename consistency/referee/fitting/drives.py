@@ -12,7 +12,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import composed, matrices
 from consistency.referee.outside import function_at
 from consistency.referee.parsing.options import Reading
-from consistency.referee.readers.kinds import (
+from consistency.referee.readers.file_kinds import (
     TABLES,
     TRAJECTORIES,
     is_bag,

@@ -14,7 +14,7 @@ from consistency.referee.document.blocks import Block, Chapter, Document
 from consistency.referee.document.drawing import Axis, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, Span
 from consistency.referee.document.looks import EXPECTED, LIMIT, SHADE, ZERO, solid, style
 from consistency.referee.extras import require
-from consistency.referee.fitting.model import NoiseModel, error_windows
+from consistency.referee.fitting.noise_model import NoiseModel, error_windows
 from consistency.referee.fitting.ratios import Judged
 from consistency.referee.fitting.windows import span_of
 from consistency.referee.fitting.wording import document

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.fitting.model import NoiseModel
+from consistency.referee.fitting.noise_model import NoiseModel
 from consistency.referee.fitting.windows import PIECES, ways
 from consistency.referee.fitting.wording import correction, data
 from consistency.referee.types import Array

@@ -9,11 +9,11 @@ import numpy as np
 
 from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.export import flat
+from consistency.referee.diagnostics.verdict_in_words import plural, short
 from consistency.referee.diagnostics.verdict_parts import Interval
-from consistency.referee.diagnostics.wording import plural, short
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fitting.likelihood import ENOUGH
-from consistency.referee.fitting.model import NoiseModel
+from consistency.referee.fitting.noise_model import NoiseModel
 from consistency.referee.fitting.persistence import SHARED, Second
 from consistency.referee.fitting.ratios import DECIDE, HALF, Ratio
 from consistency.referee.fitting.windows import span_of

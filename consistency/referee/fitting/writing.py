@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from consistency.referee.extras import is_installed
-from consistency.referee.fitting.model import NoiseModel
 from consistency.referee.fitting.motions import write_motions
+from consistency.referee.fitting.noise_model import NoiseModel
 from consistency.referee.fitting.page import page
 from consistency.referee.fitting.snippets import snippets
 from consistency.referee.fitting.wording import document

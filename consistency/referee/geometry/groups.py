@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry.conventions import se2_log
-from consistency.referee.geometry.spatial import se3_log
+from consistency.referee.geometry.space_errors import se3_log
 from consistency.referee.types import Array
 
 

@@ -14,7 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers import read_frames, read_recordings
 from consistency.referee.readers.archive import record_of_arrays
-from consistency.referee.readers.uncertain import declared, require_truth_options
+from consistency.referee.readers.uncertain_truth import declared, require_truth_options
 from consistency.referee.verdicts.judge import analyse
 from consistency.referee.verdicts.options import settings_of, skip_asked
 

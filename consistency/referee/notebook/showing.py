@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from consistency.referee.diagnostics import Record, Verdict
-from consistency.referee.diagnostics.wording import plural
+from consistency.referee.diagnostics.verdict_in_words import plural
 from consistency.referee.document.blocks import Bullets, Facts
 from consistency.referee.document.verdict import summary
 from consistency.referee.extras import require

@@ -10,8 +10,8 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.diagnostics import Evidence, Verdict, laws
-from consistency.referee.diagnostics.uncertain import of_both
-from consistency.referee.diagnostics.wording import plural
+from consistency.referee.diagnostics.uncertain_truth import of_both
+from consistency.referee.diagnostics.verdict_in_words import plural
 from consistency.referee.document.blocks import Block, Chapter, Document, Facts, Text
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Line, Mark, Panel, Points, Rule, Sheet, xy
 from consistency.referee.document.looks import EXPECTED, LIMIT, SHADE, SIGMAS, ZERO, Look, style

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.diagnostics import Evidence, laws
-from consistency.referee.diagnostics.wording import plural
+from consistency.referee.diagnostics.verdict_in_words import plural
 from consistency.referee.document.drawing import Axis, Band, Figure, Key, Mark, Panel, Points, Rule, Sheet
 from consistency.referee.document.looks import EXPECTED, SHADE, SIGMAS, ZERO, style
 from consistency.referee.pages.judged import wide

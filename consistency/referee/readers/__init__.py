@@ -19,7 +19,7 @@ from consistency.referee.outside import function_at
 from consistency.referee.parsing import require_name
 from consistency.referee.parsing.options import Reading, flag_of
 from consistency.referee.readers.alignment import require_alignment
-from consistency.referee.readers.kinds import (
+from consistency.referee.readers.file_kinds import (
     OF_BAGS,
     OF_TRAJECTORIES,
     SUFFIXES,
@@ -29,7 +29,7 @@ from consistency.referee.readers.kinds import (
     kind_of,
     trajectory_files,
 )
-from consistency.referee.readers.text import is_cut, without_end
+from consistency.referee.readers.text_blocks import is_cut, without_end
 
 if TYPE_CHECKING:
     from consistency.referee.readers.windows import Relative
@@ -182,17 +182,17 @@ def _asked(records: list[Evidence], r: Reading, over: Relative | None) -> list[E
     """Records with what is declared of their truth, in pieces or without what all share where that is asked."""
     pieces = pieces_asked(r)
     if r.given(OF_TRUTH) or any(record.truth_covariance is not None for record in records):
-        from consistency.referee.readers.uncertain import declared
+        from consistency.referee.readers.uncertain_truth import declared
 
         records = declared(records, r)
     if r.shared is not None:
-        from consistency.referee.readers.shared import less_shared, other_drives
+        from consistency.referee.readers.shared_errors import less_shared, other_drives
 
         others = None if r.shared_from is None else _by_kind(r.shared_from, other_drives(r), over)
         return less_shared(records, others, r.shared)
     if pieces is None:
         return records
-    from consistency.referee.diagnostics.pieces import in_pieces
+    from consistency.referee.diagnostics.log_pieces import in_pieces
 
     return [in_pieces(record, pieces or None) for record in records]
 
@@ -250,11 +250,11 @@ def _checked(r: Reading, over: Relative | None) -> Reading:
     if over is not None and offset == "estimate":
         raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
     if r.given(OF_TRUTH):
-        from consistency.referee.readers.uncertain import require_truth_options
+        from consistency.referee.readers.uncertain_truth import require_truth_options
 
         require_truth_options(r)
     if r.given(OF_SHARED):
-        from consistency.referee.readers.shared import require_shared_options
+        from consistency.referee.readers.shared_errors import require_shared_options
 
         require_shared_options(r)
     align = require_alignment(r.align, r.truth or r.truth_topic)

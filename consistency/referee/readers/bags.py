@@ -17,15 +17,15 @@ from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
 from consistency.referee.parsing import reading
 from consistency.referee.parsing.options import COLUMNS, Reading
-from consistency.referee.readers.fixes import Fixes, localised
-from consistency.referee.readers.kinds import is_one_bag
-from consistency.referee.readers.layouts import POSE
+from consistency.referee.readers.file_kinds import is_one_bag
+from consistency.referee.readers.geodetic import Fixes, localised
+from consistency.referee.readers.pose_rows import POSE
 from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.positions import fixed, position_source, positions
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.relative import MARGINAL
 from consistency.referee.readers.sheet import Lines, Places
-from consistency.referee.readers.spatial import (
+from consistency.referee.readers.space_trajectories import (
     ALONE,
     AXES,
     POINTS,

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.frames import matched
 from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.world_frames import matched
 from consistency.referee.types import Array
 
 

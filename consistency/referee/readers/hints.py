@@ -10,12 +10,12 @@ import numpy as np
 from consistency.referee.diagnostics import laws
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.fits import ReadingFit, fit_of
+from consistency.referee.readers.likelihoods import ReadingFit, fit_of
 from consistency.referee.readers.poses import Poses
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.readers.guesses import Guess
+    from consistency.referee.readers.mix_ups import Guess
 
 MOST = 4000  # estimates that are looked at, of all runs together
 MOST_RUNS = 200  # that are looked at, evenly over all
@@ -34,7 +34,7 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
 
     Where the NEES of a median estimate is off by a decade or more, the guess that brings it nearest to a right one is
     named. Where it is off by less, a guess is named if all errors then agree with the covariance, and no simple fault
-    of a filter explains as much (:mod:`consistency.referee.readers.fits`).
+    of a filter explains as much (:mod:`consistency.referee.readers.likelihoods`).
     """
     if not runs:
         return []
@@ -69,7 +69,7 @@ def hints(name: str, axes: Sequence[str], runs: Sequence[Poses], shift: float = 
 
 
 def _guesses(runs: Sequence[Poses], axes: Sequence[str]) -> list[Guess]:
-    from consistency.referee.readers.guesses import guesses_of  # few files need them
+    from consistency.referee.readers.mix_ups import guesses_of  # few files need them
 
     return guesses_of(runs, axes)
 

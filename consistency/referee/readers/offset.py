@@ -62,8 +62,8 @@ def clocks_and_frames(
     """
     if align is None:
         return *clock_shift(name, runs, time_offset), Aligned(runs)
-    from consistency.referee.readers.frames import moved
     from consistency.referee.readers.residuals import aligned, frames_of
+    from consistency.referee.readers.world_frames import moved
 
     shift = time_offset if isinstance(time_offset, float) else 0.0
     for _ in range(ROUNDS):

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.fitting import Sound, sound_of, tangent
-from consistency.referee.readers.frames import WorldTransform
+from consistency.referee.readers.frame_fit import Sound, sound_of, tangent
 from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.world_frames import WorldTransform
 from consistency.referee.types import Array
 
 

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.parsing.columns import COVARIANCE, POSE
-from consistency.referee.readers.kinds import PLACES, SPEEDS, TURNS, is_poses
-from consistency.referee.readers.layouts import POSE as WIDTH
-from consistency.referee.readers.layouts import read_named, read_poses, times_of
-from consistency.referee.readers.naming import UNIT_NAMES, clock_of, head_of, places_of
+from consistency.referee.readers.file_kinds import PLACES, SPEEDS, TURNS, is_poses
+from consistency.referee.readers.named_poses import UNIT_NAMES, clock_of, head_of, places_of
+from consistency.referee.readers.pose_rows import POSE as WIDTH
+from consistency.referee.readers.pose_rows import read_named, read_poses, times_of
 from consistency.referee.readers.sheet import Lines, TableRows, increasing
 from consistency.referee.types import Array
 

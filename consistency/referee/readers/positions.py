@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading, flag_of
-from consistency.referee.readers.fixes import Fixes
+from consistency.referee.readers.geodetic import Fixes
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Lines, Places
-from consistency.referee.readers.spatial import AXES, TrajectorySource
+from consistency.referee.readers.space_trajectories import AXES, TrajectorySource
 from consistency.referee.readers.windows import Relative
 from consistency.referee.types import Array
 

@@ -14,8 +14,8 @@ import numpy as np
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.independence import ENOUGH, Independence, independence
 from consistency.referee.diagnostics.numbers_in_words import plural
+from consistency.referee.diagnostics.verdict_in_words import p_text
 from consistency.referee.diagnostics.whitening import whiten
-from consistency.referee.diagnostics.wording import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, carried, composed, inverse, log, matrices, to_left
 from consistency.referee.readers.matching import common_times

@@ -11,10 +11,10 @@ from consistency.referee.diagnostics.fitted import ENOUGH, inflation_of_mean, le
 from consistency.referee.diagnostics.questions import BIAS, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment import Aligned
-from consistency.referee.readers.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.frames import WorldTransform, moved
+from consistency.referee.readers.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.origin import frame_of_first_pose, from_first_pose
 from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.world_frames import WorldTransform, moved
 
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
     ("posyaw", "spatial"): np.eye(6)[[0, 1, 2, 5]],

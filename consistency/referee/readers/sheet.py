@@ -17,7 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.outside import outside
 from consistency.referee.parsing import HUGE, MOST_DOF, WHOLE, is_file, one_line, reading, require_name
-from consistency.referee.readers.text import Block, blocks
+from consistency.referee.readers.text_blocks import Block, blocks
 from consistency.referee.types import Array, Indices
 
 Column = Array  # (N,), floats with NaN where a cell is empty; or objects, text for one, with None there

@@ -17,10 +17,10 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR, planar_error
 from consistency.referee.parsing.options import Reading
 from consistency.referee.readers.alignment import Aligned
+from consistency.referee.readers.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.hints import hints
-from consistency.referee.readers.kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.matching import common_steps, common_times
-from consistency.referee.readers.naming import begins_with_numbers, head_of
+from consistency.referee.readers.named_poses import begins_with_numbers, head_of
 from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.record import Track, assemble
 from consistency.referee.readers.sheet import Places, TableRows, read_sheet

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.columns import COVARIANCE, OWN_COVARIANCE
-from consistency.referee.readers.naming import DEVIATIONS
+from consistency.referee.readers.named_poses import DEVIATIONS
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import TableRows, are_dof
 from consistency.referee.types import Array, Indices

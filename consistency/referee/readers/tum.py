@@ -13,17 +13,17 @@ from consistency.referee.diagnostics.symmetric import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.parsing.options import COLUMNS, Reading
-from consistency.referee.readers.fixes import Fixes, localised
-from consistency.referee.readers.kinds import TABLES, is_drive, trajectory_files
+from consistency.referee.readers.file_kinds import TABLES, is_drive, trajectory_files
+from consistency.referee.readers.geodetic import Fixes, localised
 from consistency.referee.readers.kitti import read_drive
-from consistency.referee.readers.layouts import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, read_poses
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.openvins import LAYOUT, States, read_deviations
+from consistency.referee.readers.pose_rows import DEVIATIONS, FULL, POINT, POSE, SPLIT, TRIANGLE, read_poses
 from consistency.referee.readers.poses import NamedPoses, Poses
 from consistency.referee.readers.positions import fixed, position_source, positions
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Lines, Places, read_numbers
-from consistency.referee.readers.spatial import (
+from consistency.referee.readers.space_trajectories import (
     ALONE,
     BLOCKS,
     POINTS,

@@ -33,7 +33,7 @@ from consistency.referee.document.drawing import (
     kept,
 )
 from consistency.referee.document.thin import LIMIT
-from consistency.referee.show.frames import (
+from consistency.referee.show.legends import (
     SMALL,
     dots,
     frame,

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from consistency.bench.store.folder_tables import write_folder
 from consistency.bench.store.log import View, write_log
-from consistency.bench.store.storage import write_folder
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of

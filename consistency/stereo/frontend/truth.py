@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.parsing.kitti import NANO, place_of, read_times
-from consistency.referee.readers.kinds import is_drive
+from consistency.referee.readers.file_kinds import is_drive
 from consistency.referee.readers.kitti import BODIES, drive_poses
 from consistency.referee.readers.matching import associate
 from consistency.referee.readers.tum import UNIT, read_trajectory

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.types import Array
-from consistency.stereo.vision import checks, small
+from consistency.stereo.vision import checks, small_inverses
 from consistency.stereo.vision.errors import ConvergenceError, DegenerateError
 from consistency.stereo.vision.pose import RelativePose, rotation_derivatives
 from consistency.stereo.vision.registration import matched
@@ -36,7 +36,7 @@ def implicit_covariance(C_yy: Array, C_yx: Array, S_x: Array) -> Array:
     DegenerateError
         C_yy is not positive definite: x does not fix y.
     """
-    inverse, definite = small.inverse(C_yy)
+    inverse, definite = small_inverses.inverse(C_yy)
     if not definite.all():
         raise DegenerateError("the cost has no minimum here: its second derivative is not positive definite")
     S = inverse @ (_wide(C_yx @ S_x) @ np.swapaxes(_wide(C_yx), -1, -2)) @ inverse

@@ -12,13 +12,13 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.vision import checks, small
+from consistency.stereo.vision import checks, small_inverses
 from consistency.stereo.vision.errors import ConvergenceError, DegenerateError
 from consistency.stereo.vision.pose import RelativePose
 from consistency.stereo.vision.propagation import implicit_covariance
 from consistency.stereo.vision.registration import matched, register_svd
 from consistency.stereo.vision.rig import StereoRig, triangulate
-from consistency.stereo.vision.robust import Robust, loss, threshold
+from consistency.stereo.vision.robust_loss import Robust, loss, threshold
 from consistency.stereo.vision.twoframe import Derivatives, PixelMatches, PointMatches, TwoFrames, derivatives
 
 STEPS = 100  # of Levenberg and Marquardt, at most; ten do for honest matches
@@ -144,7 +144,7 @@ def _refined(frames: TwoFrames, S1: Array, S2: Array, pose: RelativePose, q: Arr
 
 def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
     """C_dd (6, 6) and C_dz (2N, 6, k) of the cost of the pose alone, each point at its best position."""
-    inverse, definite = small.inverse(f.qq)
+    inverse, definite = small_inverses.inverse(f.qq)
     if not definite.all():
         k = int(np.argmin(definite))
         raise DegenerateError(f"match {k}: its point is not fixed by the images; leave it out", k)
@@ -197,7 +197,7 @@ def _step(f: Derivatives, weight: Array, bend: Array, damping: float) -> tuple[A
     dd, qq = f.dd, f.qq
     if damping:
         dd, qq = dd * (1.0 + damping * np.eye(6)), qq * (1.0 + damping * np.eye(3))
-    inverse, definite = small.inverse(qq)
+    inverse, definite = small_inverses.inverse(qq)
     gain = f.dq @ inverse
     g = f.d - (gain @ f.q[:, :, None])[:, :, 0]
     H = np.dot(weight[None], (dd - gain @ np.swapaxes(f.dq, 1, 2)).reshape(-1, 36)).reshape(6, 6)

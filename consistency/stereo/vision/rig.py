@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.vision import checks, small
+from consistency.stereo.vision import checks, small_inverses
 from consistency.stereo.vision.errors import PointError
 
 NEAREST = 1e-3  # depth in baselines up to which a point is at the camera: a disparity of a thousand focal lengths
@@ -155,7 +155,7 @@ def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
 
 def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
     AtA = np.einsum("kin,kjn->ijn", A, A)
-    inverse, definite = small.inverse(np.moveaxis(AtA, -1, 0))
+    inverse, definite = small_inverses.inverse(np.moveaxis(AtA, -1, 0))
     inverse = np.moveaxis(inverse, 0, -1)
     alone = np.einsum("iin,iin->in", inverse, AtA)
     definite &= (alone < 1.0 / FIXED).all(axis=0)

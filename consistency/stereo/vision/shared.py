@@ -1,8 +1,8 @@
 """Errors that the motions of a drive share: calibration of the rig, mounting and clock of the truth.
 
 Pixel noise is independent from match to match; these are not, and no number of matches averages them out.
-:mod:`consistency.referee.diagnostics.shared` fits them to a part of a drive, with a prior as wide as calibrations
-usually are, and predicts them for another.
+:mod:`consistency.referee.diagnostics.shared_errors` fits them to a part of a drive, with a prior as wide as
+calibrations usually are, and predicts them for another.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics import shared
-from consistency.referee.diagnostics.shared import SharedError as SharedError
+from consistency.referee.diagnostics import shared_errors
+from consistency.referee.diagnostics.shared_errors import SharedError as SharedError
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.vision.bridging import neighbours
@@ -75,7 +75,7 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
 
 
 def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
-    """Shared errors and floor of highest likelihood (``consistency.referee.diagnostics.shared.fit_shared``).
+    """Shared errors and floor of highest likelihood (``consistency.referee.diagnostics.shared_errors.fit_shared``).
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
     InputError
         Fewer than 12 motions, or shapes that do not fit.
     """
-    return shared.fit_shared(errors, J, S, np.array(list(SHARED.values())))
+    return shared_errors.fit_shared(errors, J, S, np.array(list(SHARED.values())))
 
 
 def _twist(pose: RelativePose) -> Array:

@@ -37,8 +37,8 @@ from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.results import read_results
 from consistency.referee.diagnostics import Answer, Evidence, Interval, Settings, judge
 from consistency.referee.diagnostics.questions import DIRECTION, STEP
+from consistency.referee.diagnostics.verdict_in_words import short
 from consistency.referee.diagnostics.verdict_parts import STATUSES
-from consistency.referee.diagnostics.wording import short
 from consistency.referee.document.blocks import Document
 from consistency.referee.document.drawing import Figure, Intervals, Line, Points, Span
 from consistency.referee.document.thin import thin

@@ -36,12 +36,12 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers import offset, residuals
 from consistency.referee.readers.alignment import Aligned
-from consistency.referee.readers.fitting import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.frames import WorldTransform, moved
+from consistency.referee.readers.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.offset import clocks_and_frames
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.residuals import ALL_BUT_SCALE, FREE, aligned
 from consistency.referee.readers.sheet import Places
+from consistency.referee.readers.world_frames import WorldTransform, moved
 from consistency.referee.types import Array
 
 STEPS = 30

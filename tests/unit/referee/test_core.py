@@ -81,8 +81,8 @@ print(*(name.removeprefix("consistency.referee.") for name in sys.modules if nam
     assert len(ours) <= 90
     assert {"readers.table", "diagnostics.scale"} <= {*ours}
     assert not {*ours} & {
-        "readers.bags", "readers.tum", "readers.archive", "readers.relative", "readers.guesses", "readers.residuals",
-        "diagnostics.monitor", "diagnostics.comparison", "diagnostics.uncertain", "diagnostics.joint",
+        "readers.bags", "readers.tum", "readers.archive", "readers.relative", "readers.mix_ups", "readers.residuals",
+        "diagnostics.monitor", "diagnostics.comparison", "diagnostics.uncertain_truth", "diagnostics.joint",
     }  # fmt: skip
 
 

@@ -13,8 +13,8 @@ import pytest
 from consistency.referee.diagnostics import Comparison, Evidence, Interval, MapScore, judge
 from consistency.referee.diagnostics.comparison import Difference
 from consistency.referee.diagnostics.questions import ABOUT, ALONE
+from consistency.referee.diagnostics.verdict_in_words import reasons
 from consistency.referee.diagnostics.verdict_parts import JointScore, RejectionScore
-from consistency.referee.diagnostics.wording import reasons
 from consistency.referee.document.blocks import (
     Answer,
     Bullets,

@@ -22,7 +22,7 @@ from consistency.referee.cli.app import main
 from consistency.referee.diagnostics.export import flat, plain
 from consistency.referee.extras import is_installed
 from consistency.referee.fitting.drives import Drive, drive_of
-from consistency.referee.fitting.model import NoiseModel
+from consistency.referee.fitting.noise_model import NoiseModel
 from consistency.referee.fitting.snippets import ceres, gtsam, robot_localization, seconds, straight, toml
 from consistency.referee.fitting.writing import write_model
 from consistency.referee.geometry.groups import composed, vectors

@@ -16,8 +16,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.fitting.drives import Drive, drive_of
 from consistency.referee.fitting.likelihood import blocks_of, fit_terms, interval_of, nees_of, terms_of
 from consistency.referee.fitting.means import Mean, carriers, design_of, fit_mean
-from consistency.referee.fitting.model import caution
 from consistency.referee.fitting.noise import fit_noise, with_jitter
+from consistency.referee.fitting.noise_model import caution
 from consistency.referee.fitting.ratios import Ratio, folds_of, ratio_of
 from consistency.referee.fitting.windows import Windows, in_plane, span_of, windows_of
 from consistency.referee.geometry.groups import composed, inverse, log

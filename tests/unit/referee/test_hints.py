@@ -16,15 +16,15 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.geometry.spatial import spatial_error
+from consistency.referee.geometry.space_errors import spatial_error
 from consistency.referee.readers import hints as readers_hints
 from consistency.referee.readers.bodies import BodyTransform, fitted_body, on_body
-from consistency.referee.readers.fits import FACTOR, ReadingFit, fit_of
-from consistency.referee.readers.frames import WorldTransform, carried, fitted_frame, moved
-from consistency.referee.readers.guesses import _ned
 from consistency.referee.readers.hints import decades, hints, turns
+from consistency.referee.readers.likelihoods import FACTOR, ReadingFit, fit_of
+from consistency.referee.readers.mix_ups import _ned
 from consistency.referee.readers.poses import Poses
 from consistency.referee.readers.sheet import Places
+from consistency.referee.readers.world_frames import WorldTransform, carried, fitted_frame, moved
 from consistency.referee.types import Array
 
 RUNS, STEPS = 3, 60

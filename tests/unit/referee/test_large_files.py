@@ -14,7 +14,7 @@ import pytest
 
 from consistency.referee.diagnostics.blocks import FEWER as ROWS
 from consistency.referee.errors import InputError
-from consistency.referee.readers import text
+from consistency.referee.readers import text_blocks
 from consistency.referee.readers.record import symmetric
 from consistency.referee.readers.sheet import Block, read_numbers, read_sheet
 
@@ -23,7 +23,7 @@ LAYOUT = "t and two numbers"
 
 @contextmanager
 def blocks_of(size: int) -> Iterator[None]:
-    with mock.patch.object(text, "BLOCK", size):
+    with mock.patch.object(text_blocks, "BLOCK", size):
         yield
 
 

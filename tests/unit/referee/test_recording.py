@@ -24,7 +24,7 @@ from consistency.referee.cli import main
 from consistency.referee.diagnostics import Settings, nees
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import planar_error, se2_log
-from consistency.referee.geometry.spatial import se3_log, spatial_error
+from consistency.referee.geometry.space_errors import se3_log, spatial_error
 from consistency.referee.readers.matching import associate, common_times
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge import analyse

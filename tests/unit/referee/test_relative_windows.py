@@ -15,7 +15,7 @@ from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.independence import ENOUGH
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, to_left
-from consistency.referee.geometry.spatial import spatial_error
+from consistency.referee.geometry.space_errors import spatial_error
 from consistency.referee.readers.relative import windows_of
 from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.types import Array

@@ -10,7 +10,7 @@ from test_layouts import lines
 
 import consistency as cs
 from consistency.referee.readers.matching import unit_apart
-from consistency.referee.readers.naming import fields_of, require_units
+from consistency.referee.readers.named_poses import fields_of, require_units
 from consistency.referee.readers.sheet import TableRows
 
 T = 100.0 + 0.1 * np.arange(60)

@@ -14,9 +14,9 @@ import consistency as cs
 from consistency.referee.cli import main
 from consistency.referee.diagnostics import Evidence, judge
 from consistency.referee.diagnostics.questions import BIAS
-from consistency.referee.diagnostics.shared import KINDS, VAGUE, fit_record, growth, halves, without_shared
+from consistency.referee.diagnostics.shared_errors import KINDS, VAGUE, fit_record, growth, halves, without_shared
 from consistency.referee.errors import InputError
-from consistency.referee.readers.shared import ONE_LOG, less_shared
+from consistency.referee.readers.shared_errors import ONE_LOG, less_shared
 from consistency.referee.types import Array
 
 RUNS, STEPS, N = 40, 12, 3

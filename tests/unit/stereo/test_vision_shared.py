@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.diagnostics.shared import posterior
+from consistency.referee.diagnostics.shared_errors import posterior
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.vision import RelativePose, StereoRig, refine_reprojection

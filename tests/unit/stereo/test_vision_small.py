@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from consistency.stereo import vision
-from consistency.stereo.vision import small
+from consistency.stereo.vision import small_inverses
 
 
 @pytest.mark.parametrize("m", [2, 3, 6])
 def test_inverses_are_lapacks(m: int, rng: np.random.Generator) -> None:
     root = rng.normal(size=(40, m, m))
     C = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(m)
-    inverse, definite = small.inverse(C)
+    inverse, definite = small_inverses.inverse(C)
     assert definite.all()
     assert inverse == pytest.approx(np.linalg.inv(C), rel=1e-8)
 
@@ -28,11 +28,11 @@ def test_what_is_not_positive_definite_is_told(m: int, rng: np.random.Generator)
         values = np.ones(m)
         values[k] = -0.1
         C = np.stack([np.eye(m), turn * values @ turn.T])
-        inverse, definite = small.inverse(C)
+        inverse, definite = small_inverses.inverse(C)
         assert definite.tolist() == [True, False]
         assert np.isfinite(inverse).all()
-    assert small.inverse(-np.eye(m)[None])[1].tolist() == [False]
-    assert small.inverse(np.full((1, m, m), np.nan))[1].tolist() == [False]
+    assert small_inverses.inverse(-np.eye(m)[None])[1].tolist() == [False]
+    assert small_inverses.inverse(np.full((1, m, m), np.nan))[1].tolist() == [False]
 
 
 def test_the_mathematics_needs_no_opencv() -> None:

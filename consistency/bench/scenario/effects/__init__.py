@@ -10,7 +10,7 @@ from consistency.bench.scenario.effects.distortion import Distortion
 from consistency.bench.scenario.effects.drift import Drift as Drift
 from consistency.bench.scenario.effects.effect import EFFECTS, Effect, ListedEffect, register
 from consistency.bench.scenario.effects.field_of_view import FieldOfView
-from consistency.bench.scenario.effects.frames import Frames as Frames
+from consistency.bench.scenario.effects.frame_rate import Frames as Frames
 from consistency.bench.scenario.effects.heavy_tails import HeavyTails as HeavyTails
 from consistency.bench.scenario.effects.junction import Junction as Junction
 from consistency.bench.scenario.effects.local_bias import LocalBias

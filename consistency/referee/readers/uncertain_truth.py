@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.diagnostics import Evidence
 from consistency.referee.diagnostics.numbers_in_words import plural
-from consistency.referee.diagnostics.uncertain import DECLARED
+from consistency.referee.diagnostics.uncertain_truth import DECLARED
 from consistency.referee.diagnostics.validity import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading, flag_of

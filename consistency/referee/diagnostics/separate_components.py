@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics import wording
+from consistency.referee.diagnostics import verdict_in_words
 from consistency.referee.diagnostics.equivalence import worst
 from consistency.referee.diagnostics.headline import clear, few_lost
 from consistency.referee.diagnostics.lost import lost_of
@@ -46,7 +46,7 @@ def judge_parts(record: Record, settings: Settings) -> Verdict:
     verdict = replace(verdict, status=_status(verdict))
     has_wrong_size = any(question in SCALE for part in parts.values() for question in part.faults)
     verdict = replace(verdict, axis=clear(verdict.worst_axis) if has_wrong_size else None)
-    return replace(verdict, reasons=tuple(wording.reasons(verdict)))
+    return replace(verdict, reasons=tuple(verdict_in_words.reasons(verdict)))
 
 
 def _part(record: Record, index: Sequence[int], names: tuple[str, ...]) -> Record:

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.diagnostics.blocks import by_runs
 from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
-from consistency.referee.readers.frames import IDENTITY, WorldTransform, fitted_frame, moved, turned_frame
 from consistency.referee.readers.matching import Known
 from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.world_frames import IDENTITY, WorldTransform, fitted_frame, moved, turned_frame
 from consistency.referee.types import Array, Indices
 
 STEP = 1e-6  # m or rad, over which the change of an error is taken

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from consistency.referee.diagnostics import Evidence
-from consistency.referee.diagnostics.shared import KINDS, SharedError, fit_record, halves, without_shared
+from consistency.referee.diagnostics.shared_errors import KINDS, SharedError, fit_record, halves, without_shared
 from consistency.referee.errors import InputError
 from consistency.referee.parsing.options import Reading, flag_of
 

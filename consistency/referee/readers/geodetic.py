@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.readers.sheet import Lines, increasing
-from consistency.referee.readers.text import blocks
+from consistency.referee.readers.text_blocks import blocks
 from consistency.referee.types import Array
 
 A, F = 6378137.0, 1.0 / 298.257223563  # m and 1: semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)

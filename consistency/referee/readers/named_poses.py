@@ -16,7 +16,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file
-from consistency.referee.readers.text import opened
+from consistency.referee.readers.text_blocks import opened
 from consistency.referee.types import Array
 
 PEEKED = 2**16  # bytes of a file that hold its header and its first row

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
 from consistency.referee.readers.bodies import fitted_body, on_body
-from consistency.referee.readers.frames import WorldTransform, fitted_frame, moved, spread
 from consistency.referee.readers.poses import Poses
+from consistency.referee.readers.world_frames import WorldTransform, fitted_frame, moved, spread
 from consistency.referee.types import Array
 
 ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.fixes import read_solution
-from consistency.referee.readers.kinds import is_solution
-from consistency.referee.readers.naming import (
+from consistency.referee.readers.file_kinds import is_solution
+from consistency.referee.readers.geodetic import read_solution
+from consistency.referee.readers.named_poses import (
     UNIT_NAMES,
     Head,
     Roles,
@@ -28,7 +28,7 @@ from consistency.referee.readers.naming import (
 from consistency.referee.readers.openvins import FULL as STATES
 from consistency.referee.readers.openvins import as_states
 from consistency.referee.readers.sheet import Lines, increasing, read_rows, read_sheet
-from consistency.referee.readers.text import blocks
+from consistency.referee.readers.text_blocks import blocks
 from consistency.referee.types import Array, Indices
 
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from consistency.referee.parsing.options import Reading
-from consistency.referee.readers.naming import begins_with_numbers, clock_of, head_of, places_of, roles_of
+from consistency.referee.readers.named_poses import begins_with_numbers, clock_of, head_of, places_of, roles_of
 
 TABLES = (".csv", ".parquet", ".pq")
 TRAJECTORIES = (".txt", ".tum")

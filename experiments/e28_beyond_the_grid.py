@@ -24,7 +24,7 @@ FINDINGS = ("consistent-elsewhere",)
 LONG = True
 
 OURS, BESIDE = PARKED.name, "robocentric-ekf-uvd"
-REMEDIES = ("recency", "curvature", "promptness", "spread", "patience", "moments", "tempering")
+REMEDIES = ("recency", "curvature", "promptness", "spread", "patience", "moments", "tempering", "adrift")
 BEFORE = compiled(RobotCentredKalman("before", Corrections()._replace(**dict.fromkeys(REMEDIES, False))))
 TIMED = 3  # times that each filter takes a trial, by turns; the fastest counts
 # --- rules, written with the worlds and before the filter was changed; 120 runs, seeds 601 and 602 ------------

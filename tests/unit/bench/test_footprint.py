@@ -200,7 +200,7 @@ def test_a_local_base_grows_until_it_is_due(parts: Slam) -> None:
 
 
 def test_parked_landmarks_are_left_alone() -> None:
-    parking = Parking(every=5, unseen=3, doubt=0.1, whole=False, patience=True, start=60)
+    parking = Parking(every=5, unseen=3, doubt=0.1, adrift=1.0, whole=False, patience=True, start=60)
     data = seen([list(range(40)), *[[0, 1, 2]] * 12, [5, 0]])
     factors = make_factors(63, 126, 42)
     reach = touched._parked(parking, data, 126, factors)

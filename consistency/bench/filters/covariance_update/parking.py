@@ -48,7 +48,8 @@ WORTH = 1.1  # variables of the whole state for each of active part and base fro
 class Parking(NamedTuple):
     """Steps between two rounds of parking, 0 for none, and without a sight before a landmark is parked.
 
-    A return is in doubt where the variance of the turn since the clone is above ``doubt``, rad^2; if ``whole``, a step
+    A return is in doubt where the variance of the turn since the clone is above ``doubt``, rad^2, or that of the heading
+    above ``adrift``; if ``whole``, a step
     with such a return works on the whole state. With ``patience`` a round waits while the robot sees
     nothing, and saw something less than ``unseen`` steps ago. ``start`` is the number of variables in the state
     from which updates are local.
@@ -57,6 +58,7 @@ class Parking(NamedTuple):
     every: int
     unseen: int
     doubt: float
+    adrift: float
     whole: bool
     patience: bool
     start: int = LOCAL_FROM
@@ -190,7 +192,7 @@ def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clon
         if number >= 0:
             o = local.here[number] + 2
             local.doubt[label] = 0
-            if P[2, 2] + P[o, o] - 2.0 * P[2, o] > covariance.doubt:
+            if P[2, 2] > covariance.adrift or P[2, 2] + P[o, o] - 2.0 * P[2, o] > covariance.doubt:
                 any_doubted = True
                 local.doubt[label] = 2 if local.seen[label] == step else 1
                 _note_doubt(label, local)

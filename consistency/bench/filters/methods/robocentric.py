@@ -17,6 +17,7 @@ from consistency.bench.filters.sensor.conversion import Pixels
 from consistency.bench.filters.sensor.growth import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched
 from consistency.bench.filters.textbook.robocentric import (
+    ADRIFT,
     COOLING,
     COOLING_EARLY,
     DOUBT,
@@ -47,6 +48,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         )  # fmt: skip
         every, unseen = rounds(which)
         doubt, clones = DOUBT**2 if which.iteration else np.inf, len(controls) // every if every > 0 else 0
+        adrift = ADRIFT**2 if which.iteration and which.adrift else np.inf
         passes, chain = PASSES if which.iteration else 1, PASSES_CHAINED if which.tempering else PASSES_EARLY
         decades, cooling = (0.0, COOLING) if which.tempering else (TEMPERED, COOLING_EARLY)
         waiting = KNOWN if which.waiting else 0.0
@@ -57,7 +59,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
                 pixels, waiting, passes, chain if which.turning else 0, clones, which.recency, which.curvature,
                 which.spread, decades, cooling,
             ),
-            Parking(every, unseen, doubt, which.turning, which.patience),
+            Parking(every, unseen, doubt, adrift, which.turning, which.patience),
         )  # fmt: skip
 
     return Compiled(textbook, parts, sensors=("uvd",), uvd=True)

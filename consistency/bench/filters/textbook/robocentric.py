@@ -79,6 +79,7 @@ from consistency.referee.types import Array
 EVERY, UNSEEN = 10, 4  # steps between two rounds of parking, and without a sight before a landmark is parked
 EVERY_LATE, UNSEEN_LATE = 50, 20  # without promptness
 DOUBT = 0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is no linear update
+ADRIFT = 0.2  # rad, standard deviation of the heading from which any return is in doubt
 KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 16  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
@@ -237,12 +238,13 @@ class RobotCentredKalman:
         return Solution(delta, C, H, S, W, innovation, is_settled)
 
     def _is_in_doubt(self, state: CentredState, label: int) -> bool:
-        """Whether the turn since the clone of a parked landmark was little known before the motion of this step."""
+        """Whether the turn since the clone of a parked landmark, or the heading, was little known before this motion."""
         if not self.which.iteration or label not in state.parked:
             return False
         clone = state.clones[state.parked[label]] + 2
-        turn = state.P[2, 2] + state.P[clone, clone] - 2.0 * state.P[2, clone]
-        return bool(turn - state.noise[2] @ state.noise[2] > DOUBT**2)
+        own, turn = state.P[2, 2], state.P[2, 2] + state.P[clone, clone] - 2.0 * state.P[2, clone]
+        is_adrift = self.which.adrift and own - state.noise[2] @ state.noise[2] > ADRIFT**2
+        return bool(is_adrift or turn - state.noise[2] @ state.noise[2] > DOUBT**2)
 
     def _waits(self, state: CentredState, label: int) -> bool:
         """Whether the distance of a parked landmark from its clone is well known."""

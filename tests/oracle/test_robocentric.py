@@ -479,6 +479,29 @@ def test_a_return_whose_distance_is_hardly_known_turns_nothing_around() -> None:
     assert worst[1] > 1.0
 
 
+def test_where_the_heading_is_little_known_a_return_tells_nothing_of_the_world() -> None:
+    """Landmarks are parked and seen again within ten steps, where the robot is known to 1.5 m and 0.45 rad."""
+    path = {"shape": "rounded-rectangle", "length": 8.27, "width": 5.17, "corner_radius": 1.01, "speed": 0.5}
+    landmarks = {"layout": "uniform", "count": 100, "seed": 40, "x": (-8.1, 8.1), "y": (-6.6, 6.6), "z": (-1.25, 1.25)}
+    noise = {"sigma_v": 0.1, "sigma_omega": np.deg2rad(10.0)}
+    scenario = cs.load_scenario("herath2007-stereo").variant(
+        "adrift", truth__path=path | {"start": (0.0, -2.585), "heading": 0.0}, truth__landmarks=landmarks,
+        truth__dt=0.41, truth__steps=110, truth__sensor__range=(0.5, 2.6),
+        **{f"{side}__motion__{key}": value for side in ("truth", "belief") for key, value in noise.items()},
+    )  # fmt: skip
+    ratio, trial = [], cs.simulate(scenario, run=3, seed=779)
+    for adrift in (True, False):
+        filter_ = rc.compiled(textbook.RobotCentredKalman("trial", inverse_range.Corrections(adrift=adrift)))
+        nees = record_of(cs.run_trials(scenario, [filter_], 100, 779, 1), "trial").nees
+        assert nees is not None
+        ratio.append(float(np.median(nees[:, -1])) / 3.0)
+        ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
+        sigma = np.sqrt(np.einsum("kii->ki", twin.covariance))
+        assert (np.abs(ours.pose - twin.pose) / np.maximum(sigma, 1e-9))[5:].max() < 1e-6
+    assert ratio[0] < 2.0
+    assert ratio[1] > 5.0
+
+
 def test_landmarks_are_parked_and_come_back(small: Small) -> None:
     scenario = small("herath2007-stereo", **CLOSING)
     trial, filter_ = cs.simulate(scenario, run=3), textbook.RobotCentredKalman("trial", inverse_range.Corrections())

@@ -238,7 +238,7 @@ class RobotCentredKalman:
         return Solution(delta, C, H, S, W, innovation, is_settled)
 
     def _is_in_doubt(self, state: CentredState, label: int) -> bool:
-        """Whether the turn since the clone of a parked landmark, or the heading, was little known before this motion."""
+        """Whether the turn since the clone of a parked landmark or the heading was little known before the motion."""
         if not self.which.iteration or label not in state.parked:
             return False
         clone = state.clones[state.parked[label]] + 2

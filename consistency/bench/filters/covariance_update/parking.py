@@ -49,9 +49,9 @@ class Parking(NamedTuple):
     """Steps between two rounds of parking, 0 for none, and without a sight before a landmark is parked.
 
     A return is in doubt where the variance of the turn since the clone is above ``doubt``, rad^2, or that of the
-    heading above ``adrift``; if ``whole``, a step with such a return works on the whole state. With ``patience`` a round waits while the robot sees
-    nothing, and saw something less than ``unseen`` steps ago. ``start`` is the number of variables in the state
-    from which updates are local.
+    heading above ``adrift``; if ``whole``, a step with such a return works on the whole state. With ``patience`` a
+    round waits while the robot sees nothing, and saw something less than ``unseen`` steps ago. ``start`` is the number
+    of variables in the state from which updates are local.
     """
 
     every: int

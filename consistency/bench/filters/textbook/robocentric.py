@@ -8,7 +8,8 @@ to first order only; one that has not been seen for a while is therefore *parked
 a clone of the pose, and is carried over at once, by an iterated update, when it is seen again.
 
 The error of pose and clones is right-invariant, T_true = Exp(xi) T; M(p) takes (dp, dheading) to xi. A return whose
-turn since the clone is little known is *in doubt*. It corrects poses by decimetres, and what is known of the motion
+turn since the clone is little known, or that comes where the heading itself is (*adrift*), is *in doubt*. It corrects
+poses by decimetres, and what is known of the motion
 from one clone to the next is known in the frame of the first, wherever that is moved. So the poses are moved along a
 chain, E_j = E_j-1 Exp(xi_j - xi_j-1), T_j <- E_j T_j, and the covariance is *turned* with them: the error about the
 moved poses is that of pose j - 1 plus Ad(E_j-1) J_l(xi_j - xi_j-1) times the difference of what is left of xi_j and
@@ -17,12 +18,15 @@ its clone: the robot may then be anywhere on a circle about it, a straight line 
 of the robot would keep p + R m / rho to first order only. From the second such step on the robot hangs on that clone,
 since a turn about a point is Exp of one xi, and of a sum of many to first order only.
 
+Where a return is hardly predicted, Gauss-Newton overshoots: its noise begins at what is not known of it and falls by ten
+in a pass (*tempering*).
+
 What an iterated update finds of the robot's error where nothing is in doubt is mostly the noise nu of the last motion,
 T_true = Exp(xi) Exp(nu) T. The error about Exp(nu) T is xi, and not J_l(nu) xi (*recency*). The noise of turn and
 drive also moves the mean of a landmark by half of its variance times the landmark's second derivative (*curvature*),
 and adds the variance of that term and of the error of rho times the noise of the drive (*spread*). A clone that was
-made before its noise nu is known would be turned by nu / 2 when that is found, so that nothing is parked where the
-robot sees nothing and saw something lately (*patience*). The covariance of the pose is that of Exp(xi) T about T
+made before its noise nu is known would be turned by nu / 2 when that is found, so that parking waits where the robot
+sees nothing and saw something lately (*patience*). The covariance of the pose is that of Exp(xi) T about T
 (*moments*).
 
 Two more corrections concern the conversion. A disparity is only reported inside the search range of the matcher, so

@@ -14,7 +14,7 @@ from typing import Any
 
 from consistency.bench.scenario import Scenario
 from consistency.bench.store.folder_tables import write_folder
-from consistency.bench.store.journal import Journal, Unfinished
+from consistency.bench.store.journal import Journal, Unfinished, unfinished_of
 from consistency.bench.sweeps.axes import Axis
 from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep, alone, number_of_points
@@ -110,6 +110,10 @@ class SweepFolder:
             return self.done(work) is None
         except StaleCell:
             return True
+
+    def is_cluttered(self, work: CellWork) -> bool:
+        """Whether unfinished work is there, of a process at work or of one that was killed as it ended."""
+        return unfinished_of(self.place(work)).exists()
 
     def require_usable(self, overwrite: bool) -> None:
         """Refuse, before any work, a folder of something else, and cells that were made with other inputs.

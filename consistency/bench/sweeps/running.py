@@ -63,7 +63,7 @@ def run_sweep(
     folder.require_usable(overwrite)
     share = folder.all_work(part, parts)
     folder.begin()
-    todo = [work for work in share if folder.is_missing(work)]
+    todo = [work for work in share if folder.is_missing(work) or folder.is_cluttered(work)]
     if len(todo) < len(share):
         say(f"{len(share) - len(todo)} of {len(share)} are there already")
     with stoppable() as stop:

@@ -14,7 +14,7 @@ import consistency as cs
 from consistency.bench.runs.backends.local import LocalThreads
 from consistency.bench.runs.work import TrialWork as Runs
 from consistency.bench.scenario import data_folder
-from consistency.bench.store.journal import Journal
+from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.sweeps import cell as cells
 from consistency.bench.sweeps import running
@@ -82,6 +82,27 @@ def grid(at: Path, old: str = "", new: str = "") -> Sweep:
     assert old in GRID
     (at / "grid.toml").write_text(GRID.replace(old, new))
     return load_sweep(at / "grid.toml")
+
+
+def test_what_is_left_of_a_cell_that_was_just_written_goes(
+    at: Path, stop_after: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_sweep(grid(at), at / "whole", jobs=1)
+    with monkeypatch.context() as patched:
+
+        def killed(self: Unfinished, *_: object) -> None:
+            self._leave()
+            raise Killed
+
+        patched.setattr(Unfinished, "__exit__", killed)
+        with pytest.raises(Killed):
+            run_sweep(grid(at), at / "out", jobs=1)
+    assert hidden(at / "out") == [".kf.unfinished"]
+    done = stop_after(100, Killed())
+    run_sweep(grid(at), at / "out", jobs=1)
+    assert len(done) == 2 * 14  # the other two cells
+    assert hidden(at / "out") == []
+    assert content(at / "out") == content(at / "whole")
 
 
 @pytest.mark.parametrize("error", [Killed(), KeyboardInterrupt()], ids=["killed", "ctrl-c"])

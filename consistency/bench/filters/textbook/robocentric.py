@@ -18,8 +18,8 @@ its clone: the robot may then be anywhere on a circle about it, a straight line 
 of the robot would keep p + R m / rho to first order only. From the second such step on the robot hangs on that clone,
 since a turn about a point is Exp of one xi, and of a sum of many to first order only.
 
-Where a return is hardly predicted, Gauss-Newton overshoots: its noise begins at what is not known of it and falls by ten
-in a pass (*tempering*).
+Where a return is hardly predicted, Gauss-Newton overshoots: its noise begins at what is not known of it and falls by
+ten in a pass (*tempering*).
 
 What an iterated update finds of the robot's error where nothing is in doubt is mostly the noise nu of the last motion,
 T_true = Exp(xi) Exp(nu) T. The error about Exp(nu) T is xi, and not J_l(nu) xi (*recency*). The noise of turn and

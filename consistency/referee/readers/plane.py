@@ -15,6 +15,7 @@ from consistency.referee.readers.named_poses import UNIT_NAMES, clock_of, head_o
 from consistency.referee.readers.pose_rows import POSE as WIDTH
 from consistency.referee.readers.pose_rows import read_named, read_poses, times_of
 from consistency.referee.readers.sheet import Lines, TableRows, increasing
+from consistency.referee.readers.table_columns import LOWER_NAMES
 from consistency.referee.types import Array
 
 
@@ -41,8 +42,7 @@ def read_plane(path: Path, motions: bool = False) -> tuple[TableRows, str]:
         places, rates = places_of(head.names, (SPEEDS, TURNS)), True
     if places is None:
         raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(head.names[:12])}")
-    lower = [f"P_{name[3]}{name[2]}" for name in COVARIANCE]
-    stated = [name for name in dict.fromkeys([*COVARIANCE, *lower]) if name in head.names]
+    stated = [name for name in dict.fromkeys([*COVARIANCE, *LOWER_NAMES.values()]) if name in head.names]
     lines, columns = read_named(path, head, (*clock[0], *places, *(head.names.index(name) for name in stated)))
     first = len(clock[0])
     t, unit = times_of(lines, clock[0], columns[:first], clock[1])

@@ -246,9 +246,9 @@ class RobotCentredKalman:
         if not self.which.iteration or label not in state.parked:
             return False
         clone = state.clones[state.parked[label]] + 2
-        own, turn = state.P[2, 2], state.P[2, 2] + state.P[clone, clone] - 2.0 * state.P[2, clone]
-        is_adrift = self.which.adrift and own - state.noise[2] @ state.noise[2] > ADRIFT**2
-        return bool(is_adrift or turn - state.noise[2] @ state.noise[2] > DOUBT**2)
+        fresh, turn = state.noise[2] @ state.noise[2], state.P[2, 2] + state.P[clone, clone] - 2.0 * state.P[2, clone]
+        is_adrift = self.which.adrift and state.P[2, 2] - fresh > ADRIFT**2
+        return bool(is_adrift or turn - fresh > DOUBT**2)
 
     def _waits(self, state: CentredState, label: int) -> bool:
         """Whether the distance of a parked landmark from its clone is well known."""
